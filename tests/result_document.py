@@ -1,4 +1,4 @@
-"""A whole ``result.json`` as plain values, for tests that want a result folder and no run."""
+"""A whole ``result.json`` as plain values, for tests that need a result folder without a run."""
 
 from __future__ import annotations
 
@@ -87,12 +87,12 @@ def anchor_entry(position_m: list[float] | None, **others: Any) -> dict[str, Any
 
 
 def result_document(**changes: Any) -> dict[str, Any]:
-    """What ``changes`` say goes into the objects there are; anything else takes the place of what there is."""
+    """Return the document with ``changes``: objects are merged, and other values are replaced."""
     return merged(copy.deepcopy(_RESULT), changes)
 
 
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """``base``, changed in place as ``result_document`` says."""
+    """Merge ``changes`` into ``base`` in place, as ``result_document`` says."""
     for key, value in changes.items():
         both = isinstance(value, dict) and isinstance(base.get(key), dict)
         base[key] = merged(base[key], value) if both else value

@@ -403,9 +403,7 @@ def test_photos_say_how_far_a_map_was_moved_from_where_they_have_it() -> None:
 
 
 def test_priors_may_err_otherwise_than_the_residuals_of_photos() -> None:
-    """If priors err less than their stddevs say, the centres are more certain; if they err as they say, nothing
-    changes.
-    """
+    """Priors that err less than their stddevs say make the centres more certain."""
     survey = joint(model())
     rows = np.zeros(0, dtype=np.int64)
     nothing = csr_array((0, 1))

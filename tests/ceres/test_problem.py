@@ -211,9 +211,7 @@ def test_what_is_kept_from_elimination_ends_at_the_same_place(
 def adjuster_with_free_anchor(
     reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> tuple[pycolmap.CeresBundleAdjuster, Array, Array]:
-    """Return an adjuster with exact ranges from every frame to an anchor that starts elsewhere; the anchor and its
-    bias.
-    """
+    """Return an adjuster with exact ranges to an anchor that starts at a wrong position; the anchor and its bias."""
     adjuster, anchor, bias = adjuster_of(reconstruction), ANCHOR_IN_WORLD_M + START_ERROR_M, np.zeros(1)
     for frame_id in reconstruction.reg_frame_ids():
         pose = pose_block(reconstruction, frame_id)

@@ -153,9 +153,7 @@ def test_quaternion_too_long_to_be_measured_is_refused_without_a_warning(tmp_pat
 
 
 def test_a_gap_of_the_limit_is_none_whatever_the_date() -> None:
-    """Double-precision seconds since 1970 have steps of 2.4e-7 s, so samples every 0.1 s are sometimes slightly further
-    apart.
-    """
+    """Seconds since 1970 have steps of 2.4e-7 s, so samples every 0.1 s are sometimes slightly further apart."""
     times = 1.7e9 + 0.1 * np.arange(20, dtype=np.float64)
     assert np.ptp(np.diff(times)) > 0
     reference = Reference(np.arange(60.0).reshape(20, 3), timestamps_s=times)

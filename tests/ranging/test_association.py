@@ -311,9 +311,7 @@ class TestLongGaps:
         np.testing.assert_allclose(whole.centers, alone.centers, atol=1e-12)
 
     def test_a_gap_of_the_limit_is_none_whatever_the_date(self) -> None:
-        """Double-precision seconds since 1970 have steps of 2.4e-7 s, so photos every 2 s are sometimes slightly
-        further apart.
-        """
+        """Seconds since 1970 have steps of 2.4e-7 s, so photos every 2 s are sometimes slightly further apart."""
         times = 1.7e9 + 0.1 + 2.0 * np.arange(20) + 1e-7 * np.arange(20)
         assert np.ptp(np.diff(times)) > 0
         found = associate(log_at(times[:-1] + 1.0), trajectory_of(times, straight(times - times[0])), TAG_IN_CAM_M)

@@ -1,4 +1,4 @@
-"""A drifted chain of keyframes: a model of known truth whose photos fit, and which is bent all the same."""
+"""A chain of keyframes with known truth, and a way to bend it as drift does, so that its photos still fit."""
 
 from __future__ import annotations
 
@@ -40,7 +40,10 @@ def poses_and_rays(model: SyntheticModel) -> tuple[Poses, Observations]:
 
 
 def bent(poses: Poses, turn_deg: float, growth: float) -> tuple[Poses, Array]:
-    """The chain with a turn and a growth that build up evenly, and its local scale: what drift does to a map."""
+    """Return the chain with a rotation and a change of scale that build up evenly, and its local scale.
+
+    Drift does the same to a map.
+    """
     n = len(poses)
     turn = Rotation.from_rotvec(np.radians(turn_deg) * np.linspace(0, 1, n)[:, None] * [0.2, 0.3, 1.0]).as_matrix()
     scale = growth ** np.linspace(0, 1, n)

@@ -1,4 +1,4 @@
-"""A given calibration beside photos that know better, or do not."""
+"""A given calibration beside photos that determine a better one, or do not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rangesfm.refine.problem import add_calibration, parameter_stddevs
 
 @pytest.fixture(scope="module")
 def survey() -> Survey:
-    """Its mapper kept to a calibration that is off by 2 %."""
+    """A survey whose map was made with a focal length that is off by 2 %."""
     made = make_survey(pixel_stddev=0.5)
     camera = made.sfm.camera(1)
     params = np.array(camera.params)

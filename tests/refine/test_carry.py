@@ -1,4 +1,4 @@
-"""A model carried along with its keyframes still fits its photos."""
+"""A model that is moved with its keyframes still fits its photos."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_points_follow_a_bend_and_a_growth_of_the_map(chain: SyntheticModel) -> 
     points = np.array([metric.point3D(int(point_id)).xyz for point_id in rays.point_ids])
     residuals = ray_residuals(rays, project(rays, after, points)[1])
     assert np.median(np.linalg.norm(left_behind[np.isfinite(left_behind).all(axis=1)], axis=1)) > 20
-    # A bend between keyframes cannot fit exactly: 3 degrees are two thirds of a pixel from one to the next.
+    # A bend between keyframes cannot fit exactly: 3 degrees are two thirds of a pixel from one keyframe to the next.
     assert np.median(np.linalg.norm(residuals, axis=1)) < 1.0
     assert np.isfinite(residuals).all()
 

@@ -1,6 +1,6 @@
 """The study of drift, with a third of the lap.
 
-All of it: ``python -m tests.studies.drift``.
+For all of it, run ``python -m tests.studies.drift``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def test_drift_is_bent_back_in_few_iterations(lap: drift.Lap) -> None:
     assert run.is_good
     assert run.summary.converged
     assert run.summary.misfits == ()
-    # The noise that the scale stage saw was mostly drift.
+    # Most of the noise that the scale stage saw was drift.
     assert run.summary.errors.stddev_m[0] == pytest.approx(0.1, rel=0.25)
 
 

@@ -1,4 +1,4 @@
-"""The keyframe graph: what the photos bind and what they leave open, and ranges that unbend a map with it."""
+"""The keyframe graph: what the photos determine and what they leave open, and how ranges unbend a map with it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TAG_IN_CAM_M = np.array([0.1, -0.2, 0.05])
 def make_graph(
     model: SyntheticModel, origin: Poses, *, stddev_m: float, anchors_are_free: bool = False, held_frame: int | None = 0
 ) -> KeyframeGraph:
-    """Exact ranges to four anchors, at every keyframe and half-way to the next."""
+    """Build a graph with exact ranges to four anchors, at every keyframe and half-way to the next."""
     truth, rays = poses_and_rays(model)
     n, m = len(truth), len(ANCHORS_M)
     before = np.repeat(np.arange(n - 1), 2 * m)
@@ -52,7 +52,7 @@ def make_graph(
 
 
 def errors_of(anchor_index: npt.NDArray[np.int64], stddev_m: float) -> RangeErrors:
-    """Independent ones, under no loss to speak of."""
+    """Independent errors, with a loss that has practically no effect."""
     n = len(anchor_index)
     known, label = np.full(n, stddev_m), np.arange(n)
     return RangeErrors(
@@ -98,7 +98,7 @@ def test_gradient_and_hessian_are_those_of_the_cost(chain: SyntheticModel) -> No
 
     slope = approx_fprime(np.zeros(1), cost, 1e-8)[0]
     assert terms.gradient[layout.free] @ direction == pytest.approx(slope, rel=1e-3)
-    # At the origin, where all residuals are small, Gauss-Newton's Hessian is the Hessian.
+    # At the origin all residuals are small, so Gauss-Newton's approximation is the true Hessian.
     start = graph.start()
     at_start = keyframe_graph._Terms.at(graph, layout, start)
     full = np.zeros(layout.num)
@@ -138,10 +138,10 @@ def test_ranges_unbend_a_drifted_chain(chain: SyntheticModel, anchors_are_free: 
     assert drift > 0.5
     graph = make_graph(chain, drifted, stddev_m=1e-3, anchors_are_free=anchors_are_free, held_frame=held_frame)
     solution = solve_graph(graph, graph.start(), tolerance_m=1e-5)
-    # The relative poses of the bent map are wrong by nature; exact ranges to four anchors outvote them.
+    # The relative poses of the bent map are wrong; exact ranges to four anchors outweigh them.
     assert np.sqrt(np.mean(graph.residuals_m(solution.state) ** 2)) < 0.02
     centers = solution.state.poses.centers
-    # Unknown anchors beside a way this straight would let it bend; known ones do not.
+    # On such a straight way, unknown anchors would leave the map free to bend; known anchors do not.
     if not anchors_are_free:
         assert rmse(centers - truth.centers) < 0.5 * drift
     if held_frame is not None:
@@ -171,7 +171,7 @@ def test_a_free_map_turns_on_arcs_and_a_keyframe_that_is_held_stays(
 
 
 def aligned(poses: Poses, truth: Poses) -> Poses:
-    """As the scale stage leaves a map in the site frame."""
+    """Align poses with the truth, as the scale stage does in the site frame."""
     similarity = align_points(poses.centers, truth.centers)
     return Poses(similarity.rotation @ poses.world_from_rig, similarity.apply(poses.centers))
 
@@ -184,7 +184,7 @@ def test_the_ranges_determine_no_more_than_there_is(chain: SyntheticModel) -> No
 
 
 def test_neighbours_of_one_place_have_no_scale_of_their_own(chain: SyntheticModel) -> None:
-    """As where a camera turns on a tripod: its centres differ by rounding."""
+    """When a camera turns on a tripod, its centres differ only by rounding."""
     truth, rays = poses_and_rays(chain)
     still = Poses(truth.world_from_rig, truth.centers.copy())
     still.centers[:12] = truth.centers[0]

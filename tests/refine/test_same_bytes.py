@@ -1,4 +1,4 @@
-"""The same refinement twice: the same bytes."""
+"""The same refinement, run twice, gives the same bytes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
 
-COLMAPS_OWN_LIMIT = 50_000  # residuals, above which it takes threads
+COLMAPS_OWN_LIMIT = 50_000  # residuals; above this number COLMAP uses several threads
 
 
 def test_more_residuals_than_colmap_gives_to_one_thread_are_added_up_by_one() -> None:

@@ -1,4 +1,4 @@
-"""A solver that has come to rest is told from one that cannot take the steps it would need."""
+"""A solver that has come to rest is distinguished from one that cannot take the steps it needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FREE, TIMID = 1e10, 1e2
 
 
 def after(chain: SyntheticModel, *steps: Step) -> Stillness:
-    """Of a map that does not move."""
+    """Return the state after these steps on a map that does not move."""
     stillness = Stillness(chain.reconstruction, residual_stddev=0.5, tolerance_m=1e-3)
     for step in steps:
         stillness.is_over(step)
@@ -41,7 +41,7 @@ def test_what_free_steps_promise_and_timid_ones_do_not_reach_is_none(chain: Synt
 
 @pytest.mark.parametrize(("gain", "is_stuck"), [(249.9, False), (249.0, True)])
 def test_smaller_steps_may_get_there(chain: SyntheticModel, gain: float, is_stuck: bool) -> None:
-    """Half a square of a stddev, 0.125 here, may be left."""
+    """A cost of up to half a squared stddev (here 0.125) may remain."""
     assert after(chain, refused(FREE, 250.0), kept(TIMID, gain)).is_stuck == is_stuck
 
 

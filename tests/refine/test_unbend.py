@@ -1,4 +1,4 @@
-"""The motion of a whole map."""
+"""The motion of a map as a whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A point that wrong matches put into a camera, or next to it, is told from one that is only near."""
+"""A point that wrong matches put into a camera, or next to it, is distinguished from one that is only near."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def misplaced_ids(model: pycolmap.Reconstruction) -> list[int]:
 
 
 def put_to_depth(model: pycolmap.Reconstruction, depth: float) -> int:
-    """Move a point on the ray of one of the photos that see it; its id."""
+    """Move a point on the ray of one of the photos that see it, and return its id."""
     point_id = min(model.points3D)
     point = model.point3D(point_id)
     image = model.image(point.track.elements[0].image_id)

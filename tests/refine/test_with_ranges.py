@@ -1,4 +1,4 @@
-"""Bundle adjustment with ranges: it finds the scale, keeps what is known, and bends drift back."""
+"""Bundle adjustment with ranges finds the scale, keeps what is known, and bends drift back."""
 
 from __future__ import annotations
 
@@ -57,8 +57,9 @@ class Survey:
     """An unscaled model, ranges on its path, and the truth in a metric frame.
 
     Attributes:
-        sfm: the model; timestamps_s: of its photos.
-        frame: "site" or "first_camera": the metric frame.
+        sfm: the model.
+        timestamps_s: times of its photos.
+        frame: the metric frame, "site" or "first_camera".
         metric_from_sfm, centers_m, anchors_m: the truth in that frame.
     """
 
@@ -72,7 +73,7 @@ class Survey:
     anchors_m: dict[str, Array]
 
     def anchors(self, stddev_m: float, bias_stddev_m: float = 0.0) -> list[AnchorEstimate]:
-        """At their true places, where a prior of this stddev puts them; inf: nothing was known."""
+        """Return the anchors at their true positions, with priors of this stddev there (inf: no prior)."""
         return [
             AnchorEstimate(
                 anchor_id=name,
@@ -90,7 +91,7 @@ class Survey:
     def refine(
         self, anchors: Sequence[AnchorEstimate], scale_error: float = 1.0, **changes: Any
     ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-        """From the true similarity, its scale off by a factor; ``errors`` may be the stddev of all ranges."""
+        """Refine from the true similarity with a wrong scale; ``errors`` may be the stddev of all ranges."""
         start = Similarity(scale_error, np.eye(3), np.zeros(3)) @ self.metric_from_sfm
         observations = changes.pop("observations", self.observations)
         errors = changes.pop("errors", RANGE_STDDEV_M)
@@ -126,7 +127,7 @@ def make_survey(
     seed: int = 0,
     **model_options: Any,
 ) -> Survey:
-    """A loop of 20 s; ranges at the keyframes, or all the time at the radio's rate."""
+    """Simulate a loop of 20 s, with ranges at the keyframes, or all the time at the radio's rate."""
     path = path or loop_path(20.0, unsteadiness_m=0.1, seed=3)
     times = np.linspace(path.start_s, path.end_s, num_keyframes)
     model_options = {"num_observations": 60, **model_options}
@@ -162,7 +163,7 @@ def unbend_with_known_errors(problem: RefinementProblem, rays: Observations, err
 
 
 def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
-    """Bring a model with noise to where a mapper would leave it."""
+    """Adjust a noisy model as a mapper would."""
     config = pycolmap.BundleAdjustmentConfig()
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for image_id in sfm.reg_image_ids():
@@ -176,7 +177,7 @@ def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
 
 @pytest.fixture
 def adjusters(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[pycolmap.CeresBundleAdjuster]]:
-    """The bundle adjusters that the refinement makes, to look into their problems."""
+    """The bundle adjusters that the refinement makes, so that tests can inspect their problems."""
     ceres.check_compatibility()
     make, made = pycolmap.create_default_ceres_bundle_adjuster, []
 
@@ -190,7 +191,7 @@ def adjusters(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[pycolmap.CeresBu
 
 
 def add_point_in_camera(model: pycolmap.Reconstruction, depth: float) -> int:
-    """A point right before one photo's camera, which the photo behind it sees too."""
+    """Add a point right in front of one photo's camera, which the photo behind also sees; return its id."""
     behind, image = sorted(model.images.values(), key=lambda image: image.name)[10:12]
     xyz = image.cam_from_world().inverse() * np.array([0.1 * depth, -0.05 * depth, depth])
     track = pycolmap.Track()
@@ -367,7 +368,7 @@ class TestWhatIsKnownStays:
             np.testing.assert_array_equal(anchor.position_m, survey.anchors_m[anchor.anchor_id])
 
     def test_surveyed_anchors_move_by_no_more_than_they_may(self) -> None:
-        """One of four was written down 0.2 m off: the ranges tell, as far as its stddev lets them."""
+        """One of four anchors was written down 0.2 m off; the ranges correct it as far as its stddev allows."""
         survey = make_survey(pixel_stddev=0.5, num_epochs=5)
         wrong = survey.anchors_m["A"] + [0.0, 0.0, 0.2]
         moved = {}
@@ -396,7 +397,7 @@ class TestWhatIsKnownStays:
 
 
 def with_ranges_between_anchors(survey: Survey, error_m: float = 0.0, first_pair: int = 0) -> RangeObservations:
-    """The survey's, and one range between any two anchors."""
+    """Return the survey's ranges, and one range between each pair of anchors."""
     log, ids = survey.observations.log, list(survey.anchors_m)
     pairs = list(itertools.combinations(ids, 2))[first_pair:]
     lengths = [np.linalg.norm(survey.anchors_m[a] - survey.anchors_m[b]) + error_m for a, b in pairs]
@@ -447,7 +448,7 @@ class TestDistances:
         distance = TapedDistance(("door", "wall"), length, 0.002, "control", 2)
         tape = Tape((distance,), {"door": marker_of(survey.sfm, points[0]), "wall": marker_of(survey.sfm, points[1])})
         held, summary = survey.refine(survey.anchors(np.inf), 1.04, observations=with_long_ranges(survey), tape=tape)
-        # The anchors are metres off at first, and alone would keep the solver to steps of micrometres.
+        # The anchors start metres off; without care they would limit the solver to steps of micrometres.
         assert summary.converged
         assert located_m(tape, held) == pytest.approx([length], abs=2 * distance.stddev_m)
         assert set(held.points3D) == set(survey.sfm.points3D)
@@ -465,7 +466,7 @@ class TestDistances:
     def test_markers_are_not_eliminated_with_the_points(
         self, adjusters: list[pycolmap.CeresBundleAdjuster], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        # The problem refers to the markers' points, and is to be solved once more.
+        # Keep the markers' points, because the problem refers to them and is solved once more below.
         monkeypatch.setattr("rangesfm.refine.with_ranges.remove_marker_points", lambda model, marker_ids: None)
         survey = make_survey("first_camera", pixel_stddev=0.5)
         points = sorted(survey.sfm.points3D.values(), key=lambda point: point.track.length())[:2]
@@ -587,7 +588,7 @@ class TestWithNoise:
     def test_where_most_ranges_are_wrong_the_map_does_not_follow_them(
         self, frame: str, num_epochs: int, kind: str, share: float, max_error_m: float
     ) -> None:
-        """Nor do an anchor's good ranges count for less than another's because it has more wrong ones."""
+        """Moreover, an anchor's good ranges do not lose weight because it has more wrong ones."""
         radio = Radio(range_stddev_m=0.1)
         survey = make_survey(frame, pixel_stddev=0.3, radio=radio, num_epochs=num_epochs, seed=1)
         log = survey.observations.log
@@ -601,7 +602,7 @@ class TestWithNoise:
         assert rmse(survey.centers(refined) - survey.centers_m) < max_error_m
 
     def test_a_place_where_the_camera_lingered_draws_the_map_no_more_than_in_the_scale(self) -> None:
-        """Ranges of one place err alike; three of twenty places have most of them."""
+        """Ranges of one place have the same error, and three of twenty places have most of the ranges."""
         survey = make_survey("first_camera", pixel_stddev=0.3, num_epochs=60, seed=1)
         log, rng = survey.observations.log, np.random.default_rng(1)
         place = 4 * survey.observations.before + log.anchor_index
@@ -614,7 +615,7 @@ class TestWithNoise:
             replace(observations, status=status), survey.trajectory, surveyed, anchor_frame="first_camera"
         )
         moved = {}
-        # Of noise that is known, so that the shares stay as they are.
+        # The noise is given, so that the shares stay as they are.
         weighed = replace(scale.errors, given_m=scale.errors.stddev_m)
         for name, errors in (("weighed", weighed), ("alike", replace(weighed, share=np.ones(len(log))))):
             refined, _ = replace(survey, metric_from_sfm=scale.metric_from_sfm).refine(
@@ -630,7 +631,7 @@ class TestWithNoise:
     def test_a_map_that_stands_a_little_askew_is_turned_at_once(
         self, stddev_m: float, errors_are_known: bool, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """Also after its ranges were weighed anew."""
+        """The two cases test the first unbending, and the one after ranges are reweighted."""
         if errors_are_known:
             monkeypatch.setattr(with_ranges, "unbend", unbend_with_known_errors)
         survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=stddev_m), num_epochs=4)
@@ -640,12 +641,13 @@ class TestWithNoise:
         )
         refined, summary = askew.refine(survey.anchors(0.0), errors=stddev_m)
         straight, _ = survey.refine(survey.anchors(0.0), errors=stddev_m)
-        # To Ceres' steps a turn of the whole world is no straight line: each gains less than it promised.
+        # A rotation of the whole world is curved in Ceres' parameters, so that each of its steps gains less than
+        # expected.
         assert summary.num_iterations <= 5
         np.testing.assert_allclose(survey.centers(refined), survey.centers(straight), atol=2e-3)
 
     def test_parts_that_hang_together_by_few_points_are_turned_at_once(self) -> None:
-        """By less than the ranges' noise, which is no straight line to Ceres' steps either."""
+        """The rotation is smaller than the ranges' noise; it, too, is curved in Ceres' parameters."""
         stddev_m = 0.5
         survey = make_survey(
             path=sequence_path(59.0, seed=2),
@@ -671,7 +673,7 @@ class TestWithNoise:
 
     @pytest.mark.parametrize("depth_m", [0.01, 1e-5, 1e-6, 1e-10])
     def test_a_point_in_a_camera_changes_nothing(self, depth_m: float) -> None:
-        """Nor does it keep the solver from free steps, or the covariance from being found."""
+        """The point neither limits the solver's steps nor prevents the covariance from being found."""
         path, radio = lap_path(60.0, share=0.1), Radio(range_stddev_m=RANGE_STDDEV_M)
         survey = make_survey(path=path, num_keyframes=30, pixel_stddev=0.5, radio=radio, max_track_length=6)
         without, summary_without = survey.refine(survey.anchors(0.0))
@@ -683,7 +685,7 @@ class TestWithNoise:
         assert point_id in refined.points3D
 
     def test_drift_is_bent_back(self) -> None:
-        """No similarity can do it: the refined centres are nearer to the truth than after the best one."""
+        """No similarity can do this: the refined centres are nearer to the truth than after the best similarity."""
         path = sequence_path(59.0, seed=2)
         anchors = {"A": (10.0, 12.0, 3.0), "B": (25.0, -10.0, 5.0), "C": (40.0, 11.0, 0.0), "D": (55.0, -9.0, 2.0)}
         survey = make_survey(
@@ -704,7 +706,7 @@ class TestWithNoise:
 
 
 class TestBesideTheMap:
-    """What is held by default, and found if it is given a stddev."""
+    """Parameters beside the map that are held by default, and estimated when they are given a stddev."""
 
     def survey(self, **options: Any) -> Survey:
         options = {"num_keyframes": 41, "radio": Radio(rate_hz=10.0, range_stddev_m=0.03), **options}
@@ -721,7 +723,7 @@ class TestBesideTheMap:
         placed = associate(survey.observations.log, survey.trajectory, wrong)
         given: dict[str, Any] = {"observations": placed, "tag_in_cam_m": wrong}
         given["errors"] = 0.01
-        if not at_keyframes:  # as the scale stage hands them on: with the stddev of each place
+        if not at_keyframes:  # as the scale stage passes them on: with the stddev of each place
             given["errors"] = np.hypot(0.01, placed.placing_stddev_m(survey.metric_from_sfm.scale))
         bent, held = survey.refine(survey.anchors(0.0), **given)
         np.testing.assert_array_equal(held.tags_in_cam_m, [wrong])
@@ -741,7 +743,7 @@ class TestBesideTheMap:
         assert (summary.tags_in_cam_m != wrong).any()
 
     def test_a_wrong_clock_offset_is_put_right(self) -> None:
-        # At an even speed round a loop, a late clock and a map turned back are the same.
+        # At an even speed around a loop, a late clock cannot be distinguished from a map that is turned back.
         survey = self.survey(path=loop_path(20.0, unsteadiness_m=1.0, seed=3), num_keyframes=81)
         late = associate(survey.observations.log, survey.trajectory, TAG_IN_CAM_M, time_offset_s=-0.1)
         bent, held = survey.refine(survey.anchors(0.0), observations=late, errors=0.03)
@@ -776,7 +778,7 @@ class TestBesideTheMap:
 
 
 def shared_covariance(survey: Survey) -> Array:
-    """(n, n) of an error of each anchor's antenna that depends on the direction, and one of all with the distance."""
+    """(n, n) covariance of two errors: one per anchor with the direction, one of all ranges with the distance."""
     log, metric = survey.observations.log, survey.metric_from_sfm
     at = metric.apply(survey.observations.centers) + survey.observations.tag_from_center @ metric.rotation.T
     from_anchor = at - np.array([survey.anchors_m[name] for name in log.anchor_ids])[log.anchor_index]
@@ -794,7 +796,7 @@ def with_shared_errors(survey: Survey, seed: int) -> RangeObservations:
 
 
 def told_of_shared_errors(survey: Survey, noise_m: float) -> RangeErrors:
-    """As if the scale stage had learnt exactly what the ranges get wrong."""
+    """Errors as if the scale stage had learnt their covariance exactly."""
     log = survey.observations.log
     each, apart = np.arange(len(log)), np.tile([1.0, 0.0, 0.0], (len(log), 1))
     turns = np.tile(np.eye(3), (len(log), 1, 1))
@@ -806,7 +808,7 @@ def told_of_shared_errors(survey: Survey, noise_m: float) -> RangeErrors:
 
 class TestCovariance:
     def mean_square(self, *, has_shared_errors: bool, is_told: bool = False) -> float:
-        """Of the centres' errors in their stddevs."""
+        """Return the mean squared error of the centres' coordinates in stated stddevs."""
         squares, noise_m = [], 0.1
         for seed in range(6 if has_shared_errors else 4):
             survey = make_survey(
@@ -848,7 +850,7 @@ class TestProblem:
         survey = make_survey(pixel_stddev=0.5, num_keyframes=41, radio=radio, at_keyframes=False)
         between = survey.observations.before != survey.observations.after
         assert 0.2 < np.mean(between) < 0.95
-        # Without a robust loss, whose square root the problem's residuals would hold.
+        # Without a robust loss, because the problem's residuals would include its square root.
         _, summary = survey.refine(
             survey.anchors(0.0),
             errors=known_errors(survey.observations, RANGE_STDDEV_M, inflation=3.0),
@@ -858,7 +860,7 @@ class TestProblem:
         residuals = np.asarray(adjusters[-1].problem.evaluate_residuals())[-np.count_nonzero(placed) :]
         unit = 3.0 * RANGE_STDDEV_M / summary.pixel_stddev
         expected = (summary.predicted_m - survey.observations.log.range_m)[placed]
-        # Those of one place and anchor stand together in the problem.
+        # The problem keeps the residuals of one place and anchor together.
         at = survey.observations
         expected = expected[np.lexsort([at.log.anchor_index[placed], at.after[placed], at.before[placed]])]
         np.testing.assert_allclose(unit * residuals, expected, atol=1e-6)
@@ -874,7 +876,7 @@ class TestProblem:
             survey.anchors(0.0),
         )
         placed = survey.observations.has_place
-        # Up to what interpolation misses.
+        # The tolerance is the error of the interpolation.
         np.testing.assert_allclose(predicted[placed], survey.observations.log.range_m[placed], atol=0.02)
         assert np.all(np.isnan(predicted[~placed]))
 
@@ -895,7 +897,7 @@ class TestProblem:
     def test_free_anchors_and_biases_leave_the_points_to_be_eliminated_alone(
         self, adjusters: list[pycolmap.CeresBundleAdjuster], num_keyframes: int, num_anchors: int
     ) -> None:
-        """What keeps Ceres' fastest kernels: blocks of 3 in rows of 2, seen by blocks of 6; "d" would be any size."""
+        """Ceres' fastest kernels have blocks "2,3,6": 2 rows, points of 3, poses of 6; "d" would be any size."""
         positions = np.random.default_rng(0).normal(size=(num_anchors, 3)) * [6.0, 6.0, 2.0]
         survey = make_survey(
             "first_camera",

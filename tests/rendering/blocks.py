@@ -1,4 +1,4 @@
-"""Boxes made of rectangles, and decorations of their paint: the vocabulary in which a place is described."""
+"""Boxes made of rectangles and decorations of their paint, from which scenes are built."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ def box(
 def ledge(
     wall: Rectangle, at_m: tuple[float, float], size_m: tuple[float, float], depth_m: float, paint: Paint
 ) -> Iterator[Panel]:
-    """A block that stands out from a wall; ``at_m`` is its corner right and down on the wall."""
+    """A block that stands out from a wall; ``at_m`` is its corner, right and down on the wall."""
     right, down = wall.edge_u_m / wall.width_m, wall.edge_v_m / wall.height_m
     corner = wall.corner_m + at_m[0] * right + at_m[1] * down + depth_m * wall.normal
     return block(corner, size_m[0] * right, size_m[1] * down, depth_m, paint, paint)
 
 
 def decorated(paint: Paint, *decorations: Decoration) -> Paint:
-    """The paint with things pasted on it, in this order."""
+    """Return the paint with decorations pasted on it, in this order."""
 
     def decorated_paint(canvas: Canvas) -> Material:
         material = paint(canvas)
@@ -114,7 +114,7 @@ def fallen_leaves(per_square_metre: float) -> Decoration:
 
 
 def ivy(left_m: float, width_m: float, height_m: float) -> Decoration:
-    """Climbs from the foot of a wall, around ``left_m``, about so wide and high."""
+    """Ivy that climbs from the foot of a wall around ``left_m``, about so wide and high."""
 
     def decorate(canvas: Canvas, material: Material) -> None:
         aside = np.abs(canvas.x - np.float32(left_m)) / np.float32(width_m)

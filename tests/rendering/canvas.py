@@ -1,4 +1,4 @@
-"""Canvas: the area that a procedural material is painted on, with its noise."""
+"""The area that a procedural material is painted on, with its noise."""
 
 from __future__ import annotations
 
@@ -79,10 +79,10 @@ class Canvas:
     def fractal(
         self, cell_m: float, octaves: int = 4, gain: float = 0.55, stretch_x: float = 1.0, stretch_y: float = 1.0
     ) -> FloatArray:
-        """(h, w) sum of noises, each of half the cell and ``gain`` the amplitude of the last; about in [-1, 1].
+        """(h, w) sum of noises, each of half the cell and ``gain`` times the amplitude of the last; about in [-1, 1].
 
-        The octaves are added up on the lattice of the coarser ones, refined by two each time,
-        so that only the finest is ever interpolated to all texels.
+        The octaves are added on the lattice of the coarser ones, refined by two each time, so that only the finest is
+        interpolated to all texels.
         """
         cell = np.array([cell_m * stretch_y / self.texel_m[0], cell_m * stretch_x / self.texel_m[1]])
         octaves = max(1, min(octaves, 1 + int(np.log2(max(1.0, cell.max())))))
@@ -107,7 +107,7 @@ class Canvas:
         return self.rng.random((num_rows, num_columns), dtype=np.float32) * 2 - 1
 
     def grain(self) -> FloatArray:
-        """(h, w) independent values in [-1, 1], one a texel."""
+        """(h, w) independent values in [-1, 1], one per texel."""
         return self.rng.random(self.shape, dtype=np.float32) * 2 - 1
 
 

@@ -31,7 +31,7 @@ from rangesfm.demo.survey import ANCHORS_M
 WIDTH_M = 14.0
 DEPTH_M = 11.0
 
-_TEXEL_M = 0.006  # of the walls; smaller things are a little finer
+_TEXEL_M = 0.006  # for the walls; smaller things are a little finer
 
 _FRESH_PLANKS = partial(materials.planks, palette=materials.FRESH_WOOD)
 _UPRIGHT_PLANKS = partial(materials.planks, palette=materials.FRESH_WOOD, upright=True)
@@ -62,14 +62,14 @@ def courtyard() -> Scene:
 
 
 def _coarseness(rectangle: Rectangle) -> float:
-    """Texels relative to the walls': large for what is far away, small for what one can walk up to."""
+    """Return the texel size relative to the walls': large for what is far away, small for what one can walk up to."""
     is_far = rectangle.corners_m[:, 2].max() > 4.5
     is_small = rectangle.width_m * rectangle.height_m < 8
     return 3.0 if is_far else 0.65 if is_small else 1.0
 
 
 def _faces_the_yard(rectangle: Rectangle) -> bool:
-    """Whether someone who walks there could see its front."""
+    """Return whether someone who walks in the yard could see its front."""
     where = np.array([(x, y, z) for x in (0.2, WIDTH_M - 0.2) for y in (0.2, DEPTH_M - 0.2) for z in (0.5, 2.2)])
     return bool(((where - rectangle.corner_m) @ rectangle.normal).max() > 0)
 
@@ -118,7 +118,7 @@ def _walls() -> Iterator[Panel]:
 
 
 def _on_the_walls() -> Iterator[Panel]:
-    """Sills, lintels, doors, pipes: what stands out from the walls."""
+    """Things that stand out from the walls: sills, lintels, doors, pipes."""
     for wall, places in ((_NORTH, _NORTH_WINDOWS), (_SOUTH, _SOUTH_WINDOWS)):
         for left, top, width, height in places:
             yield from ledge(wall, (left - 0.10, top + height), (width + 0.20, 0.07), 0.12, _STONE)

@@ -1,4 +1,4 @@
-"""Things on walls: posters, signs, windows, doors, fallen leaves. Drawn, then worn, then pasted on a material."""
+"""Things on walls: posters, signs, windows, doors, fallen leaves; drawn, worn and pasted on a material."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def paste(
     wear: float = 0.3,
     relief_m: float = 0.0,
 ) -> None:
-    """Paste an RGBA picture, one pixel a texel, in place; one that does not fit on the canvas is left out.
+    """Paste an RGBA picture in place, one pixel per texel; a picture that does not fit on the canvas is left out.
 
     ``wear`` in [0, 1] is the share that has come off; with ``relief_m`` the picture has its own height.
     """
@@ -46,7 +46,7 @@ def paste(
         alpha = alpha * smooth_step(1.5 * wear - 1.3, 1.5 * wear - 1.2, patch.fractal(0.25, 6))
     tone = 1 + 0.16 * patch.fractal(0.2, 5) + 0.06 * patch.grain()
     colour = (pixels[..., :3].transpose(2, 0, 1) / 255) ** 2.2 * tone
-    # Sun and rain bleach what hangs outside.
+    # Sun and rain bleach things that hang outside.
     colour += np.float32(0.25) * (np.float32(0.35) - colour) * np.clip(wear * 2, 0, 1)
     albedo = material.albedo[:, rows, columns]
     albedo += alpha * (colour - albedo)
@@ -86,7 +86,7 @@ def poster(canvas: Canvas, width_m: float, height_m: float) -> Image.Image:
 
 
 def lettering(canvas: Canvas, text: str, width_m: float, colour: Colour) -> Image.Image:
-    """Painted letters without a ground, ``width_m`` long."""
+    """Painted letters without a background, ``width_m`` long."""
     size = _size_in_texels(canvas, width_m, 0.5 * width_m)
     picture = Image.new("RGBA", size, (*colour, 0))
     bottom = _write(ImageDraw.Draw(picture), text, (0, 0), size[0], colour)
@@ -116,7 +116,7 @@ def window(canvas: Canvas, width_m: float, height_m: float, frame: Colour) -> Im
 
 
 def leaves(canvas: Canvas, per_square_metre: float, colours: tuple[Colour, ...], density: FloatArray) -> Image.Image:
-    """Leaves on a clear ground as large as the canvas, each kept with the chance that ``density`` (h, w) gives."""
+    """Leaves on a transparent ground as large as the canvas, kept with the probabilities ``density`` (h, w)."""
     rng = canvas.rng
     picture = Image.new("RGBA", (canvas.shape[1], canvas.shape[0]), (*colours[0], 0))
     draw = ImageDraw.Draw(picture)

@@ -1,4 +1,4 @@
-"""Light a scene once, for all photos: sun with shadows, sky where it can be seen, what the surroundings throw back."""
+"""Light a scene once, for all photos: sun with shadows, visible sky, and light that the surroundings reflect."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _SKY_GRID_M = 0.15
 # Points of the sun's disc, as offsets of its direction.
 _SUN_DISC = 0.006 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
 _NUM_SKY_DIRECTIONS = 48
-# Shadows in the light of the whole sky are soft: smaller things cast none to speak of.
+# Shadows in the light of the whole sky are soft: things smaller than this cast none worth computing.
 _MIN_SKY_OCCLUDER_M2 = 0.25
-# Occluders are taken together as long as their values on the grid fit into the processor's cache.
+# Occluders are processed together as long as their values on the grid fit into the processor's cache.
 _MAX_VALUES_AT_ONCE = 30_000
-# What is this close to a surface is as dark as the corner they share.
+# Surfaces closer than this are as dark as the corner that they share.
 _NEAR_M = 0.5
 
 
@@ -35,11 +35,11 @@ class Panel:
 
 @dataclass(frozen=True)
 class Light:
-    """Where light comes from. Radiance leaving white paint, linear RGB.
+    """Sources of light, as the linear RGB radiance that leaves white paint.
 
     Attributes:
         sun_direction: (3,) towards the sun.
-        sun, sky, surroundings: (3,) of full sun, of the open sky, of sunlit walls and ground around.
+        sun, sky, surroundings: (3,) light of the full sun, of the open sky, of sunlit walls and ground around.
     """
 
     sun_direction: npt.NDArray[np.float64]
@@ -62,8 +62,8 @@ class Light:
 class Beam:
     """Parallel light from afar, and all rectangles that may stand in its way.
 
-    For one direction and one rectangle, the distance along the ray to its plane and the place
-    of the hit within it are affine in the point that the light is to reach.
+    For one direction and one rectangle, the distance along the ray to its plane and the place of the hit within it are
+    affine in the point that the light is to reach.
     """
 
     def __init__(self, direction: npt.NDArray[np.float64], occluders: Sequence[Rectangle]):
@@ -84,7 +84,7 @@ class Beam:
         )
 
     def hits(self, rectangle: Rectangle, shape: tuple[int, int]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        """(h, w) is something in the way to each cell of ``rectangle``; and is it near?"""
+        """(h, w) whether something is in the way to each cell of ``rectangle``, and whether that is near."""
         at_corner = np.einsum("nij,nj->ni", self._functions, rectangle.corner_m - self._corner)
         along_u, along_v = self._functions @ rectangle.edge_u_m, self._functions @ rectangle.edge_v_m
         at_corners = np.stack([at_corner, at_corner + along_u, at_corner + along_v, at_corner + along_u + along_v])
@@ -153,7 +153,7 @@ def _facing_sun(rectangle: Rectangle, canvas: Canvas, material: Material, light:
 
 
 def _sun_share(rectangle: Rectangle, shape: tuple[int, int], sun: Sequence[Beam]) -> FloatArray:
-    """(h, w) how much of the sun's disc each texel sees, in [0, 1]."""
+    """(h, w) share of the sun's disc that each texel sees, in [0, 1]."""
     grid = _grid(rectangle, shape, _SUN_GRID_M)
     share = np.zeros(grid, dtype=np.float32)
     for beam in sun:
@@ -163,7 +163,7 @@ def _sun_share(rectangle: Rectangle, shape: tuple[int, int], sun: Sequence[Beam]
 
 
 def _ambient_light(rectangle: Rectangle, shape: tuple[int, int], sky: Sequence[Beam], light: Light) -> FloatArray:
-    """(3, h, w) light from the sky and, where that is hidden, from what hides it."""
+    """(3, h, w) light from the sky and, where the sky is hidden, from what hides it."""
     grid = _grid(rectangle, shape, _SKY_GRID_M)
     from_sky, from_surroundings = np.zeros(grid, dtype=np.float32), np.zeros(grid, dtype=np.float32)
     total = np.float32(0)
@@ -181,7 +181,7 @@ def _ambient_light(rectangle: Rectangle, shape: tuple[int, int], sky: Sequence[B
 
 
 def _directions(count: int) -> npt.NDArray[np.float64]:
-    """(count, 3) unit vectors evenly over the sphere, on a golden spiral."""
+    """(count, 3) unit vectors spread evenly over the sphere, on a golden spiral."""
     index = np.arange(count) + 0.5
     z = 1 - 2 * index / count
     angle = np.pi * (1 + np.sqrt(5)) * index
@@ -189,7 +189,7 @@ def _directions(count: int) -> npt.NDArray[np.float64]:
 
 
 def _grid(rectangle: Rectangle, shape: tuple[int, int], cell_m: float) -> tuple[int, int]:
-    """Cells for a quantity that varies slowly: about ``cell_m``, at least four, at most the texels."""
+    """Number of cells for a quantity that varies slowly: about ``cell_m`` large, at least four, at most the texels."""
     return (
         min(shape[0], max(4, round(rectangle.height_m / cell_m))),
         min(shape[1], max(4, round(rectangle.width_m / cell_m))),

@@ -1,9 +1,9 @@
-"""The photos that ship with the demo, made again, and the way of their camera:
+"""Render the photos that ship with the demo, and the path of their camera.
 
     python -m tests.rendering.make_demo_photos [FOLDER]
 
-Writes ``IMG_0001.jpg`` to ``IMG_0040.jpg`` and ``path.csv`` to a folder, by default that of the package. Two minutes on
-two cores.
+Writes ``IMG_0001.jpg`` to ``IMG_0040.jpg`` and ``path.csv`` to a folder, by default that of the package. Takes two
+minutes on two cores.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _JPEG_QUALITY = 80  # 40 photos are 4 MB, and as many of their features match as
 
 
 def walk() -> tuple[CameraPath, FloatArray]:
-    """Around the things in the middle of the yard a little more than once, and the (40,) times of the photos."""
+    """The path, a little more than once around the middle of the yard, and the (40,) times of the photos."""
     duration = NUM_PHOTOS - 1 + 2.0 * NUM_ROWS_AROUND
     path = loop_path(
         duration,
@@ -63,10 +63,10 @@ def take_photo(scene: Scene, camera: PhotoCamera, path: CameraPath, times_s: Flo
 
 
 def photo_exif(camera: PhotoCamera, timestamp_s: float, zone: tzinfo) -> Image.Exif:
-    """What a camera notes about a photo: itself, the time to the millisecond, the focal length."""
+    """The camera's notes about a photo: its make, the time to the millisecond, the focal length."""
     milliseconds = round(timestamp_s * 1000)
     time = datetime.fromtimestamp(milliseconds // 1000, zone)
-    # The 35 mm equivalent compares diagonals; that of the film is 43.27 mm.
+    # The 35 mm equivalent compares diagonals; the diagonal of the film is 43.27 mm.
     equivalent_mm = camera.focal_px * 43.27 / float(np.hypot(camera.width_px, camera.height_px))
     exif = Image.Exif()
     exif[Base.Make] = "rangesfm"

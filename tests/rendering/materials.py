@@ -1,4 +1,4 @@
-"""Procedural building materials: each function paints a canvas. No two places of one look alike."""
+"""Procedural building materials: each function paints a canvas, and no two places of one look alike."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROOF_TILE: tuple[Colour, ...] = ((140, 96, 78), (124, 84, 68), (150, 108, 90), (
 
 
 def linear(colour: Colour) -> FloatArray:
-    """(3, 1, 1) linear reflectance of a colour given as on a screen."""
+    """(3, 1, 1) linear reflectance of a colour given as sRGB bytes."""
     return ((np.array(colour) / 255.0) ** 2.2).astype(np.float32)[:, None, None]
 
 
@@ -41,7 +41,7 @@ def bricks(canvas: Canvas, palette: Sequence[Colour] = RED_BRICK, damp_m: float 
 
 
 def plaster(canvas: Canvas, colour: Colour, damp_m: float = 0.7, peeled: float = 0.9) -> Material:
-    """Painted plaster with stains and cracks; where it has come off, bricks (more for a lower ``peeled``)."""
+    """Painted plaster with stains and cracks; where it has come off, bricks show (more for a lower ``peeled``)."""
     stains = canvas.fractal(1.3, 5)
     paint = linear(colour) * (1 + 0.10 * stains + 0.05 * canvas.fractal(0.08, 4) + 0.05 * canvas.grain())
     paint *= 1 - 0.35 * _cracks(canvas, 1.1, 0.012)
@@ -189,7 +189,7 @@ class _Courses:
     edge_distance_m: FloatArray
 
     def per_cell(self, canvas: Canvas) -> FloatArray:
-        """(h, w) one random value in [-1, 1] a stone."""
+        """(h, w) one random value in [-1, 1] per stone."""
         return (canvas.rng.random(self.num_cells, dtype=np.float32) * 2 - 1)[self.cell]
 
 
@@ -212,7 +212,7 @@ def _courses(canvas: Canvas, height_m: float, length_m: float, length_variation:
 def _stones_of_rows(
     canvas: Canvas, num_rows: int, length_m: float, length_variation: float
 ) -> tuple[npt.NDArray[np.int32], FloatArray, int]:
-    """For each row and column of texels: the stone's number and the distance to its ends; and how many there are."""
+    """Return each texel row's and column's stone number and distance to its ends, and the number of stones."""
     x = canvas.x[0]
     cells = np.empty((num_rows, canvas.shape[1]), dtype=np.int32)
     distances = np.empty((num_rows, canvas.shape[1]), dtype=np.float32)
@@ -249,7 +249,7 @@ def _boards(canvas: Canvas, palette: Sequence[Colour], width_m: float) -> Materi
     colours = _pick(canvas, palette, count) * (1 + 0.2 * (canvas.rng.random(count, dtype=np.float32) * 2 - 1))
     grain = canvas.fractal(0.03, 5, stretch_x=16.0)
     hearts = _knots(canvas)
-    # Rings: level lines of a field drawn out along the board, bent around a few knots.
+    # Rings: level lines of a field drawn out along the board and bent around a few knots.
     rings = np.sin(9 * (canvas.noise(0.16, stretch_x=6.0) + 0.8 * hearts) + 2 * grain)
     tone = 1 + 0.13 * grain + 0.09 * rings + 0.09 * canvas.fractal(0.012, 2, stretch_x=5.0) + 0.08 * canvas.grain()
     albedo = colours[:, board] * tone

@@ -1,4 +1,4 @@
-"""Photos of a scene: an ideal camera by perspective-correct texture mapping, then what a real one does to the light."""
+"""Photos of a scene: perspective-correct texture mapping, followed by the effects of a real camera on the light."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from tests.rendering.canvas import FloatArray
 from tests.rendering.scene import Rectangle, Scene, Surface
 
-# Rays a pixel and direction: edges are smooth, and textures keep detail where they are seen at a slant.
+# Rays per pixel in each direction: more than one makes edges smooth and keeps detail on slanted textures.
 _SUPERSAMPLING = 2
 _NEAR_M = 0.05
 
@@ -93,7 +93,7 @@ def render(scene: Scene, camera: PhotoCamera, cam_from_world: npt.NDArray[np.flo
 
 
 def develop(radiance: FloatArray, exposure: float, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    """What sensor and camera make of the light: vignetting, noise, tone curve, 8 bits.
+    """Turn radiance into 8-bit pixels as sensor and camera do: vignetting, noise, tone curve.
 
     Args:
         radiance: (h, w, 3) linear.
@@ -105,10 +105,10 @@ def develop(radiance: FloatArray, exposure: float, rng: np.random.Generator) -> 
     column = np.linspace(-1, 1, width, dtype=np.float32)[None, :] * np.float32(width / height)
     light = radiance * (exposure / (1 + 0.10 * (row**2 + column**2)) ** 2)[..., None].astype(np.float32)
     light += np.sqrt(1e-5 + 1.2e-4 * light) * rng.standard_normal(light.shape, dtype=np.float32)
-    # Stray light in the lens, and colours not quite apart on the sensor.
+    # Stray light in the lens, and crosstalk of colours on the sensor.
     light = np.maximum(light + np.float32(0.006), 0)
     light += np.float32(0.12) * ((light @ np.full((3, 1), 1 / 3, dtype=np.float32)) - light)
-    # A toe and a shoulder, as film has: deep shadows go black, the sky does not burn out; then the screen's gamma.
+    # A film-like tone curve: deep shadows go black, and the sky does not burn out. Then the screen's gamma.
     toned = light**1.3 / (light**1.3 + np.float32(0.5))
     return np.asarray((255 * np.clip(1.2 * toned, 0, 1) ** np.float32(1 / 2.2) + 0.5).astype(np.uint8))
 
@@ -117,8 +117,8 @@ def develop(radiance: FloatArray, exposure: float, rng: np.random.Generator) -> 
 class _View:
     """A surface as one camera sees it.
 
-    On the picture, 1 / depth, u / depth and v / depth are affine in the ray's x and y:
-    the rows of ``affine`` are these three functions.
+    On the picture, 1 / depth, u / depth and v / depth are affine in the ray's x and y: the rows of ``affine`` are these
+    three functions.
     """
 
     surface: Surface
@@ -128,7 +128,7 @@ class _View:
 
     @classmethod
     def of(cls, surface: Surface, camera: PhotoCamera, cam_from_world: npt.NDArray[np.float64]) -> _View | None:
-        """None if the camera sees its back, or it lies outside the picture."""
+        """Return the view of a surface, or None if the camera sees its back or it lies outside the picture."""
         rotation, translation = cam_from_world[:, :3], cam_from_world[:, 3]
         rectangle = surface.rectangle
         frame = np.stack(
@@ -155,7 +155,7 @@ class _View:
     def draw(
         self, number: int, nearest: FloatArray, index: npt.NDArray[np.int16], x: FloatArray, y: FloatArray
     ) -> None:
-        """Write ``number`` where this is nearer (its 1 / depth greater) than what was drawn before."""
+        """Write ``number`` where this surface is nearer (its 1 / depth greater) than what was drawn before."""
         block = (self.rows, self.columns)
         u, v, inverse_depth = (_evaluate(row, x[block], y[block]) for row in self.affine)
         hit = inverse_depth > nearest[block]
@@ -182,10 +182,10 @@ class _View:
         ray_x, ray_y = x[block][visible], y[block][visible]
         u, v, inverse_depth = (_evaluate(row, ray_x, ray_y) for row in self.affine)
         depth = np.float32(1) / inverse_depth
-        # Texels under one ray: the determinant of the map from rays to texels; its root is a length.
+        # The number of texels under one ray: the determinant of the map from rays to texels, and its root is a length.
         scale = self.surface.texture.num_texels * np.linalg.det(self.affine) / rays_per_unit**2
         level = 0.5 * np.log2(np.float32(scale) * depth**3)
-        # The rays of one pixel take neighbouring levels in the share that blends them.
+        # The rays of one pixel are spread over two neighbouring levels, so that they blend.
         dither = ((rows % 2) * 2 + (columns % 2)).astype(np.float32) / 4 + np.float32(0.125)
         chosen = np.clip(level + dither, 0, 100).astype(np.int8)
         radiance[rows + self.rows.start, columns + self.columns.start] = self.surface.texture.sample(
@@ -204,7 +204,7 @@ def _evaluate(coefficients: npt.NDArray[np.float64], x: FloatArray, y: FloatArra
 def _picture_bounds(
     rectangle: Rectangle, rotation: npt.NDArray[np.float64], translation: npt.NDArray[np.float64]
 ) -> tuple[float, float, float, float] | None:
-    """Least and greatest x and y at depth 1 of the part before the camera; None if there is none."""
+    """Least and greatest x and y at depth 1 of the part in front of the camera; None if there is none."""
     corners = rectangle.corners_m @ rotation.T + translation
     following = np.roll(corners, -1, axis=0)
     crosses = (corners[:, 2] < _NEAR_M) != (following[:, 2] < _NEAR_M)

@@ -1,4 +1,4 @@
-"""Scene: lit, textured rectangles under a sky; what the simulated camera looks at."""
+"""Lit, textured rectangles under a sky, which the simulated camera looks at."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from tests.rendering.canvas import FloatArray
 
-# Radiance that a texture's byte 255 stands for; bytes hold its square root, as fine as the eye is in the dark.
+# Radiance that a texture's byte 255 stands for; bytes hold its square root, which is finer in the dark, like the eye.
 _MAX_RADIANCE = 2.0
 _NUM_MIP_LEVELS = 5
 
@@ -54,7 +54,7 @@ class Rectangle:
 
 
 class Texture:
-    """Radiance on a rectangle at several resolutions, each half the one before."""
+    """Radiance on a rectangle at several resolutions, each half of the one before."""
 
     def __init__(self, radiance: FloatArray):
         """Take (3, h, w) linear radiance, row 0 the upper edge, texels filling the rectangle."""
@@ -69,7 +69,7 @@ class Texture:
 
     @property
     def num_texels(self) -> int:
-        """At the finest resolution."""
+        """Number of texels at the finest resolution."""
         return int(self._starts[1])
 
     def sample(self, u: FloatArray, v: FloatArray, level: npt.NDArray[np.int8]) -> FloatArray:
@@ -91,7 +91,7 @@ class Texture:
 
 
 class Sky:
-    """Radiance from beyond everything: bright at the horizon, blue above, with clouds."""
+    """Radiance of the sky behind everything: bright at the horizon, blue above, with clouds."""
 
     zenith = np.array([0.20, 0.36, 0.72], dtype=np.float32)
     horizon = np.array([0.66, 0.78, 0.94], dtype=np.float32)
@@ -136,7 +136,7 @@ class Scene:
 
 
 def _encode(radiance: FloatArray) -> npt.NDArray[np.uint32]:
-    """(h * w,) four bytes a texel in one word, so that one look-up fetches a colour."""
+    """(h * w,) four bytes per texel in one word, so that one look-up fetches a colour."""
     root = np.sqrt(np.clip(radiance, 0, _MAX_RADIANCE) * np.float32(255**2 / _MAX_RADIANCE)) + np.float32(0.5)
     texels = np.zeros((radiance.shape[1] * radiance.shape[2], 4), dtype=np.uint8)
     for channel in range(3):

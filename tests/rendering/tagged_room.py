@@ -1,4 +1,4 @@
-"""A room with printed tags on its walls: photos, and the model that COLMAP would make of them."""
+"""A room with printed tags on its walls: photos, and a model of them as from COLMAP."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.simulated.path import look_at
 DICTIONARY, SIDE_M = "APRILTAG_36h11", 0.36
 NUM_TAGS, NUM_PHOTOS = 3, 8
 _SIZE_PX, _FOCAL_PX = (400, 300), 330.0
-# Modules of a tag of this family with its black rim, and of the white paper around it.
+# Modules of a tag of this family with its black rim, and modules of white paper around it.
 _MODULES, _RIM = 8, 2
 _TEXELS = 16
 
@@ -52,7 +52,7 @@ def tagged_room(folder: Path, *, with_tags: bool = True) -> SyntheticModel:
 
 
 def _upright(x_m: float, y_m: float, z_m: float, size_m: float) -> Rectangle:
-    """A square whose middle is there and that faces south."""
+    """A square with its middle at this point, facing south."""
     corner = np.array([x_m - size_m / 2, y_m, z_m + size_m / 2])
     return Rectangle(corner, np.array([size_m, 0, 0]), np.array([0, 0, -size_m]))
 

@@ -1,4 +1,4 @@
-"""The photos that ship with the demo are those that the renderer makes, and their camera is where its file says."""
+"""The renderer makes the photos that ship with the demo, and their camera is where its file says."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def test_a_shipped_photo_is_what_the_renderer_makes(scene: Scene, number: int) -
     with Image.open(PHOTOS / f"IMG_{number + 1:04d}.jpg") as photo:
         assert photo.size == rendered.size
         error = _averaged(rendered) - _averaged(photo)
-    # Of 255. The loss of JPEG is 1.4; a camera two centimetres away is off by 3.5.
+    # On a scale of 255. The loss of JPEG is 1.4; a camera two centimetres away would give 3.5.
     assert np.abs(error).mean() < 2
 
 
 def _averaged(photo: Image.Image) -> npt.NDArray[np.float64]:
-    """Over 4 x 4 pixels."""
+    """Average the photo over blocks of 4 x 4 pixels."""
     return np.asarray(photo.resize((photo.width // 4, photo.height // 4), Image.Resampling.BOX), dtype=np.float64)
 
 

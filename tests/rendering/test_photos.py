@@ -1,4 +1,4 @@
-"""A simulated photo is what COLMAP's camera would take of the scene."""
+"""A simulated photo shows what COLMAP's camera model would see of the scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NO_CLOUDS = Sky(np.zeros((4, 4), dtype=np.float32))
 
 
 def _wall(radiance: float | FloatArray, y_m: float, half_size_m: float = 2.0) -> Surface:
-    """A square upright at ``y_m``, facing south, its middle 1 m up."""
+    """An upright square at ``y_m``, facing south, its middle 1 m up."""
     corner = np.array([-half_size_m, y_m, 1 + half_size_m])
     rectangle = Rectangle(corner, np.array([2 * half_size_m, 0, 0]), np.array([0, 0, -2 * half_size_m]))
     picture = np.broadcast_to(np.asarray(radiance, dtype=np.float32), (3, 256, 256)).copy()
@@ -31,7 +31,7 @@ def _pose(center: tuple[float, float, float], target: tuple[float, float, float]
 
 
 def _marked_wall(u: float, v: float) -> Surface:
-    """Dark, with a round bright spot, 0.1 of the side wide, around (u, v)."""
+    """A dark wall with a round bright spot, 0.1 of the side wide, around (u, v)."""
     across = (np.arange(256) + 0.5) / 256
     distance = np.hypot(across[None, :] - u, across[:, None] - v)
     return _wall(0.02 + 0.9 * np.clip(256 * (0.05 - distance), 0, 1), 3.0)
@@ -64,7 +64,7 @@ def test_spot_on_a_wall_appears_where_the_camera_projects_it(
     wall = _marked_wall(u, v)
     pose = _pose(center, (0.0, 3.0, 1.0), roll_deg=4.0)
     photo = render(Scene([wall], NO_CLOUDS), CAMERA, pose)
-    # The spot's outline, projected: perspective moves the middle of its image off the image of its middle.
+    # Project the spot's outline: in perspective, the middle of its image is not the image of its middle.
     angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     outline = np.array([wall.rectangle.point(u + 0.05 * np.cos(a), v + 0.05 * np.sin(a)) for a in angle])
     pixels = CAMERA.project(outline @ pose[:, :3].T + pose[:, 3])
@@ -122,5 +122,5 @@ def test_development_is_repeatable_brightens_with_exposure_and_darkens_the_corne
 
 
 def _is_wall(photo: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """The wall is grey, the sky is not."""
+    """Return which pixels show the wall: it is grey, and the sky is not."""
     return np.asarray(np.ptp(photo, axis=2) < 0.02)

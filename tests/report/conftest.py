@@ -1,4 +1,4 @@
-"""A plausible result folder, made up: a loop through a room with eight anchors."""
+"""Made-up but plausible result folders: a loop through a room with eight anchors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ANCHORS = np.array([(x, y, z) for x in (-2.6, 2.6) for y in (-3.1, 3.1) for z in
 
 @pytest.fixture
 def make_result(tmp_path: Path) -> MakeResult:
-    """Writes a result folder and returns it; see ``write_result`` for what can be varied."""
+    """Return a function that writes a result folder; ``write_result`` documents what can be varied."""
 
     def make(name: str = "survey", **options: Any) -> Path:
         return write_result(tmp_path / name, **options)
@@ -37,7 +37,7 @@ def make_result(tmp_path: Path) -> MakeResult:
 
 @pytest.fixture(scope="session")
 def make_shared_result() -> MakeResult:
-    """As ``make_result``, at a path of its own, for results that several tests look at."""
+    """Return ``write_result``, which takes a path, for results that several tests share."""
     return write_result
 
 
@@ -54,7 +54,7 @@ def write_result(
     offset_m: tuple[float, float, float] | Array = (0.0, 0.0, 0.0),
     changes: dict[str, Any] | None = None,
 ) -> Path:
-    """A whole result folder; ``changes`` are made to result.json (see ``merged``).
+    """Write a whole result folder; ``changes`` are applied to result.json (see ``merged``).
 
     Args:
         offset_m: of the whole site, as in the coordinates of a national grid.
@@ -87,7 +87,7 @@ def write_result(
 
 
 def _write_scale_tables(folder: Path, rows: list[list[Any]]) -> None:
-    """The tables of how the scale and the offset came about, of plausible shape."""
+    """Write the tables about the estimates of scale and time offset, with plausible shapes."""
     rng = np.random.default_rng(5)
     times = [float(row[0]) for row in rows]
     noise = rng.normal(0, 0.02, len(rows))
@@ -101,7 +101,7 @@ def _write_scale_tables(folder: Path, rows: list[list[Any]]) -> None:
 
 
 def _write_photos(folder: Path, num: int) -> Path:
-    """One plain picture for each photo, no two of one colour."""
+    """Write one plain picture for each photo, each of another colour."""
     folder.mkdir()
     for i, name in enumerate(_names(num)):
         Image.new("RGB", (320, 240), (i * 255 // num, 80, 255 - i * 255 // num)).save(folder / name)

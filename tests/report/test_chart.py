@@ -1,4 +1,4 @@
-"""Charts: where data lands on them."""
+"""Charts: the positions at which data are drawn."""
 
 from __future__ import annotations
 

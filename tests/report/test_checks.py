@@ -1,4 +1,4 @@
-"""Quality checks: which light comes on at which value."""
+"""Quality checks: the values at which each light changes."""
 
 from __future__ import annotations
 

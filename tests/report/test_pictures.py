@@ -1,4 +1,4 @@
-"""The report's figures as pictures for a paper, and those of ranges alone."""
+"""The report's figures as pictures for a paper, and the figures of ranges alone."""
 
 from __future__ import annotations
 

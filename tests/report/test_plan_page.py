@@ -1,4 +1,4 @@
-"""The page of a plan says what the plan says, and colours the path by how well it will be known."""
+"""The page of a plan shows the plan's figures, and colours the path by its expected uncertainty."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_every_keyframe_has_the_colour_of_its_accuracy(plan: SurveyPlan) -> None
     series = accuracy_views(plan).panels[0].series
     assert sum(np.isfinite(one.points).any() for one in series) > 2
     for one in series:
-        # "below 0.1 m", "0.1 m to 0.12 m", "above 0.2 m"
+        # Legend entries read "below 0.1 m", "0.1 m to 0.12 m" or "above 0.2 m".
         ends = [float(end) for end in re.findall(r"[\d.]+", one.name)]
         low, high = {"b": [0.0, *ends], "a": [*ends, np.inf]}.get(one.name[0], ends)
         for stddev_m, at in zip(plan.keyframe_stddevs_m, one.points, strict=True):

@@ -1,4 +1,4 @@
-"""The report page: it says what the result says, needs nothing from elsewhere, and copes with what is missing."""
+"""The report page shows what the result says, loads nothing from elsewhere, and copes with missing parts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FIGURES = {
 
 
 class Page(HTMLParser):
-    """Text, elements and ids of a page, in its order."""
+    """Text, elements and ids of a page, in their order."""
 
     def __init__(self, html: str):
         super().__init__()
@@ -62,7 +62,7 @@ class Page(HTMLParser):
 
 
 def figures_in(folder: Path) -> dict[str, Any]:
-    """What the figures of a folder's page are drawn from."""
+    """Return the data of the figures on a folder's page."""
     html = write_report(folder).read_text(encoding="utf-8")
     (data,) = re.findall(r'<script type="application/json" id="figures">(.*?)</script>', html, flags=re.DOTALL)
     figures: dict[str, Any] = json.loads(data)
@@ -121,14 +121,14 @@ def test_the_numbers_are_those_of_the_result(make_result: MakeResult) -> None:
 
 
 def value_at(summary: Any, key: str) -> Any:
-    """The value of a key joined by dots."""
+    """Return the value at a key with dots."""
     for part in key.split("."):
         summary = summary[int(part) if isinstance(summary, list) else part]
     return summary
 
 
 def numbers_in(value: Any, key: str) -> list[str]:
-    """Keys of all numbers below a value."""
+    """List the keys of all numbers below a value."""
     if isinstance(value, (dict, list)):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         return [found for name, item in items for found in numbers_in(item, f"{key}.{name}")]
@@ -151,7 +151,8 @@ def test_every_number_of_the_result_stands_on_the_page_as_it_is(make_result: Mak
     ]
     wanted += ["scale.value", "scale.stddev_formal", "scale.stddev_empirical"]
     wanted += numbers_in(summary["scale"]["two_candidate"], "scale.two_candidate")
-    # Ranges are counted in the table of statuses, surveyed positions are shown as differences, lever arms in one cell.
+    # Some numbers are shown otherwise: ranges in the table of statuses, surveyed positions as differences, lever arms
+    # in one cell.
     counts = ("num_rejected", "num_anchor_anchor", "num_tag_tag", "num_keyframes", "num_without_root")
     others = [key for key in wanted if key.endswith(counts) or "surveyed" in key or "tag_in_cam_m" in key]
     assert set(wanted) - set(others) <= {key for key, _, _ in shown}
@@ -223,7 +224,7 @@ def test_the_policy_allows_the_pages_own_script_and_no_other(make_result: MakeRe
     (script,) = re.findall(r"<script>(.*?)</script>", html, flags=re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
     assert f"script-src &#39;sha256-{digest}&#39;" in html
-    assert html.count("<script") == 3  # the others hold data
+    assert html.count("<script") == 3  # the other scripts hold data
 
 
 def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
@@ -249,7 +250,7 @@ def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
         },
     )
     page = page_of(folder)
-    assert page.tags.count("script") == 3  # the view's data, that of the figures, and the code
+    assert page.tags.count("script") == 3  # the view's data, the figures' data, and the code
     assert not any(name.startswith("on") for name, _ in page.attributes)
     assert page.texts.count(evil) >= 5
     (panel,) = figures_in(folder)["scale_per_anchor"]
@@ -364,7 +365,7 @@ def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
     expected = np.array([arms[tag_id] for tag_id in content.ranges.tag_id])
     assert set(content.ranges.tag_id) == {"tag", "other"}
     np.testing.assert_array_equal(content.tags_in_cam_m, expected)
-    # A tag in another place of the camera is nearer to the anchor or farther by at most as much.
+    # With the tag elsewhere on the camera, the distance to the anchor changes by at most the lever arm.
     assert content.final is not None
     assert content.true_ranges_m is not None
     in_camera = Content(content.result)
@@ -410,7 +411,8 @@ def test_a_thumbnail_is_made_of_no_photo_that_a_link_leads_to_elsewhere(tmp_path
     (tmp_path / "linked").symlink_to(inside)
     names = ["a.png", "b.png", "c.png", "more/a.png", "../private/a.png"]
     assert list(thumbnails(inside, names)) == ["a.png", "c.png"]
-    assert list(thumbnails(tmp_path / "linked", names)) == ["a.png", "c.png"]  # the user's own folder, so called
+    # the user's own folder, which has such a name
+    assert list(thumbnails(tmp_path / "linked", names)) == ["a.png", "c.png"]
 
 
 def test_photos_of_another_folder_are_on_the_page_only_if_the_reader_says_so(

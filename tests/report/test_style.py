@@ -1,4 +1,4 @@
-"""The page's colours: readable in both themes (WCAG 2 AA)."""
+"""The page's colours are readable in both themes (WCAG 2 AA)."""
 
 from __future__ import annotations
 

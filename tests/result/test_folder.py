@@ -1,4 +1,4 @@
-"""The result folder: what is never overwritten, what goes before a new result, and what is read back."""
+"""The result folder: files that are never overwritten, files that go before a new result, and reading it back."""
 
 from __future__ import annotations
 

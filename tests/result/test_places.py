@@ -1,4 +1,4 @@
-"""What a result tells of the machine that made it, and what it is believed on another one."""
+"""Paths that a result stores, and which of them are trusted on another machine."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_whole_paths_of_earlier_versions_are_read(tmp_path: Path) -> None:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
-    """A folder with a result, photos beside it and in it, and links from there to photos elsewhere."""
+    """A folder with a result, photos beside it and in it, and links to photos elsewhere."""
     for name in ("site/out/photos", "site/images", "private"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "site" / "linked").symlink_to(tmp_path / "private")

@@ -1,4 +1,4 @@
-"""result.json: one model, its published schema, and what it says of files that no run wrote."""
+"""result.json: its model, its published schema, and the errors for files that no run wrote."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GEOREFERENCE = {"lat_deg": 47.4, "lon_deg": 8.5, "height_m": 430.0, "crs": "EPSG
 
 
 def test_published_schema_is_that_of_the_model() -> None:
-    """If not: ``python -m rangesfm.result.summary > examples/result.schema.json``."""
+    """If this fails, run ``python -m rangesfm.result.summary > examples/result.schema.json``."""
     assert SCHEMA_PATH.read_text(encoding="utf-8") == schema()
 
 

@@ -1,4 +1,4 @@
-"""The tables of a result: read as they were written, refused by their line."""
+"""The tables of a result are read as they were written, or refused with the number of the wrong line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rangesfm.result.tables import TABLES, CenterCovariances, PhotoTimes, ScaleC
 
 
 def example(kind: type[TableFile], num_rows: int) -> TableFile:
-    """Rows of which every cell that may be empty is so in the second."""
+    """Return rows in which the second has every cell empty that may be empty."""
     columns: dict[str, Any] = {}
     for name, (format_spec, may_be_empty) in kind.columns().items():
         if format_spec == "s":

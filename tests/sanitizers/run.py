@@ -1,14 +1,15 @@
-"""The compiled part under a sanitizer: its GoogleTest suite, then the Python tests that use it.
+"""Test the compiled part under a sanitizer: its GoogleTest suite, then the Python tests that use it.
 
     python tests/sanitizers/run.py address      # memory: GCC's AddressSanitizer
     python tests/sanitizers/run.py undefined    # undefined behaviour
     python tests/sanitizers/run.py thread       # data races between Ceres' threads
 
-Needs GCC with its sanitizers and what the C++ tests need (README). Builds in a folder of its own (``--build_path``
-keeps it) and changes nothing that is installed. Exit status 0: both passed and the sanitizer said nothing.
+Needs GCC with its sanitizers, and the packages that the C++ tests need (CONTRIBUTING.md). Builds in a folder of its own
+(``--build_path`` keeps it) and changes nothing that is installed. Exit status 0 means that both suites passed without a
+finding.
 
-pycolmap, pyceres and Python itself are not built with the sanitizer: it sees what happens inside the cost functions
-and their bindings, and all memory and locks of the process, but no races within those packages.
+pycolmap, pyceres and Python itself are not built with the sanitizer. It therefore checks the cost functions and their
+bindings, and all memory and locks of the process, but it does not see races within those packages.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ OPTIONS = {
     "TSAN_OPTIONS": "halt_on_error=1",
 }
 TESTS = ("tests/ceres", "tests/ceres/test_covariance.py")
-# It looks at what the extension is linked with, which is the sanitizer here.
+# This test checks which libraries the extension needs, and here it needs the sanitizer's.
 NOT_MEANT = "tests/ceres/test_compatibility.py::test_the_compiled_part_needs_no_library_that_pycolmap_does_not_need_too"
 _SITE = "import sys\nsys.meta_path = [finder for finder in sys.meta_path if isinstance(finder, type)]\n"
 
 
 def build(sanitizer: str, folder: Path) -> None:
-    """The extension and its C++ tests."""
+    """Build the extension and its C++ tests."""
     pybind11 = subprocess.check_output([sys.executable, "-m", "pybind11", "--cmakedir"], text=True).strip()
     options = {
         "CMAKE_BUILD_TYPE": "Debug",
@@ -50,7 +51,7 @@ def build(sanitizer: str, folder: Path) -> None:
 
 
 def overlay(build_path: Path, folder: Path) -> None:
-    """A package with the sanitized extension, which PYTHONPATH puts before any installed one, editable or not."""
+    """Make a package with the sanitized extension, which PYTHONPATH puts before any installed one."""
     shutil.copytree(ROOT / "plugin" / "rangesfm", folder / "rangesfm", ignore=shutil.ignore_patterns("*.so"))
     (extension,) = build_path.glob("_cpp*.so")
     shutil.copy(extension, folder / "rangesfm")
@@ -58,12 +59,14 @@ def overlay(build_path: Path, folder: Path) -> None:
 
 
 def library(name: str) -> str:
-    """Where the compiler has a library."""
+    """Return where the compiler finds a library."""
     return subprocess.check_output(["gcc", f"-print-file-name={name}"], text=True).strip()
 
 
 def without_shuffled_addresses(sanitizer: str) -> list[str]:
-    """GCC's older thread sanitizers stop where the kernel shuffles addresses widely."""
+    """Return a command prefix that switches off wide address randomization, which older thread sanitizers do not
+    survive.
+    """
     return ["setarch", "-R"] if sanitizer == "thread" else []
 
 
@@ -82,7 +85,7 @@ def main() -> int:
         status = subprocess.run(cpp_tests, env={**environment, "ASAN_OPTIONS": "detect_leaks=1"}).returncode
         overlay(build_path, Path(temporary) / "overlay")
         environment["PYTHONPATH"] = str(Path(temporary) / "overlay")
-        # With the C++ library, of which the sanitizer looks for functions before Python has loaded it.
+        # The sanitizer looks for functions of the C++ library before Python has loaded that, so it is preloaded too.
         environment["LD_PRELOAD"] = " ".join(map(library, (RUNTIMES[args.sanitizer], "libstdc++.so.6")))
         pytest = [*prefix, sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--deselect", NOT_MEANT]
         return subprocess.run([*pytest, *args.tests], cwd=ROOT, env=environment).returncode or status

@@ -39,8 +39,8 @@ class Survey:
     """n keyframes, and ranges taken at each of them.
 
     Attributes:
-        trajectory: as a mapper leaves it.
-        site_from_sfm: the truth that a scale stage is to find.
+        trajectory: the unscaled path, as from a mapper.
+        site_from_sfm: the true similarity, which a scale stage is to find.
         times, centers_m, world_from_cam: the true path in the site frame.
         anchors_m: true positions in the site frame.
         tag_in_cam_m: lever arm.
@@ -57,16 +57,16 @@ class Survey:
     simulated: SimulatedRanges
 
     def frame_from_site(self, frame: str) -> Similarity:
-        """``frame``: "site" or "first_camera"."""
+        """Return the transform from the site to a frame, "site" or "first_camera"."""
         first_camera = Similarity(1.0, self.world_from_cam[0], self.centers_m[0])
         return IDENTITY if frame == "site" else first_camera.inverse()
 
     def truth(self, frame: str) -> Similarity:
-        """What ``metric_from_sfm`` should be."""
+        """Return the true ``metric_from_sfm``."""
         return self.frame_from_site(frame) @ self.site_from_sfm
 
     def anchors(self, frame: str, known: Collection[str]) -> list[Anchor]:
-        """All anchors; positions of the known ones in the frame they are given in."""
+        """Return all anchors; the known ones have their positions in this frame."""
         from_site = self.frame_from_site(frame)
         return [Anchor(name, from_site.apply(at) if name in known else None) for name, at in self.anchors_m.items()]
 
@@ -76,12 +76,12 @@ class Survey:
     def scale(
         self, frame: str, known: Collection[str] = (), log: RangeLog | None = None, **options: Any
     ) -> ScaleEstimate:
-        """The scale stage on this survey's ranges, or on another log."""
+        """Run the scale stage on this survey's ranges, or on another log."""
         anchors = self.anchors(frame, known)
         return initialize_scale(self.observations(log), self.trajectory, anchors, anchor_frame=frame, **options)
 
     def log_with(self, range_m: Array) -> RangeLog:
-        """The same log with other ranges."""
+        """Return the same log with other ranges."""
         return replace(self.simulated.log, range_m=range_m)
 
     def relative_error(self, estimate: ScaleEstimate) -> float:
@@ -105,7 +105,10 @@ class MakeSurvey(Protocol):
 
 @pytest.fixture(scope="session")
 def make_survey() -> MakeSurvey:
-    """A loop of 40 s, or another path by its centres; ``num_epochs`` ranges to each anchor at each keyframe."""
+    """Return a function that makes a survey.
+
+    The path is a loop of 40 s, or given by its centres; each keyframe has ``num_epochs`` ranges to each anchor.
+    """
     return _make_survey
 
 

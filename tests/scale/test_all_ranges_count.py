@@ -1,4 +1,4 @@
-"""What becomes of the ranges that are not the only one of a photo: between photos, and many at one."""
+"""Ranges between photos, and many ranges at one photo, all contribute to the scale."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Array = npt.NDArray[np.float64]
 TAG_IN_CAM_M = (0.05, -0.12, -0.03)
 TRUE_SCALE = 0.45
 RANGE_STDDEV_M = 0.1
-# Biases are known to be none, so that the bound is that of the scale alone.
+# Biases are known to be zero, so that the bound is that of the scale alone.
 RANGE_MODEL = RangeModelOptions(range_bias_stddev_m=0.0, common_bias_stddev_m=0.0)
 OPTIONS = ScaleOptions(max_relative_stddev=1.0)
 
 
 def unscaled(path: CameraPath, times: Array) -> Trajectory:
-    """Keyframes in the first one's frame, in a unit of their own."""
+    """Keyframes in the first camera's frame, in a unit of their own."""
     rotation, origin = path.world_from_cam(times[:1])[0], path.centers(times[:1])[0]
     names = tuple(f"{number:03d}.jpg" for number in range(len(times)))
     centers = (path.centers(times) - origin) @ rotation / TRUE_SCALE
@@ -64,12 +64,12 @@ def test_interpolated_ranges_give_a_far_better_scale_than_those_at_photos_alone(
         near = replace(found, status=np.where(is_far, RangeStatus.CHECK, found.status).astype(np.int8))
         errors_of_all.append(scale_error(found, trajectory, anchors))
         errors_of_near.append(scale_error(near, trajectory, anchors))
-    # Ten times as many ranges: 3.2 times as good.
+    # Ten times as many ranges make the scale up to 3.2 times as accurate.
     assert np.sqrt(np.mean(np.square(errors_of_all))) < 0.6 * np.sqrt(np.mean(np.square(errors_of_near)))
 
 
 def stop_and_go_log(stops: Array, rotations: Array, anchor_m: Array, num_at_each: int, seed: int) -> RangeLog:
-    """Ranges within a second around each stop, ten seconds apart."""
+    """A log of ranges within a second around each stop; the stops are ten seconds apart."""
     rng = np.random.default_rng([seed, num_at_each])
     stop = np.repeat(np.arange(len(stops)), num_at_each)
     times = 10.0 * stop + rng.uniform(-1.0, 1.0, len(stop))
@@ -78,7 +78,7 @@ def stop_and_go_log(stops: Array, rotations: Array, anchor_m: Array, num_at_each
     return RangeLog.from_arrays(["A"] * len(stop), ranges, timestamp_s=times)
 
 
-# The last are more than errors are learnt from.
+# With 200, there are more ranges than errors are learnt from.
 @pytest.mark.parametrize("num_at_each", [6, 20, 200])
 def test_ranges_at_a_still_camera_all_count(num_at_each: int) -> None:
     rng = np.random.default_rng(0)
@@ -90,7 +90,7 @@ def test_ranges_at_a_still_camera_all_count(num_at_each: int) -> None:
     names = tuple(f"{number:02d}.jpg" for number in range(25))
     trajectory = Trajectory(np.arange(25), names, np.linspace(0.0, 240.0, 25), stops / TRUE_SCALE, rotations)
     to_tags = stops + rotations @ np.array(TAG_IN_CAM_M) - anchor_m
-    # Each range tells the logarithm of the scale by its gradient: the part of c that points at the anchor.
+    # The derivative of a range by the logarithm of the scale is the part of the centre that points at the anchor.
     gradient = np.sum(to_tags * stops, axis=1) / np.linalg.norm(to_tags, axis=1)
     bound = RANGE_STDDEV_M / np.sqrt(num_at_each * np.sum(gradient**2))
     num_seeds, errors = 30, []
@@ -101,7 +101,7 @@ def test_ranges_at_a_still_camera_all_count(num_at_each: int) -> None:
         np.testing.assert_array_equal(found.before, np.repeat(np.arange(25), num_at_each))
         np.testing.assert_array_equal(found.before, found.after)
         errors.append(scale_error(found, trajectory, [Anchor("A", anchor_m)]))
-    # Spread within 1.1 of the bound but for chance, at one in a thousand; a Cauchy loss alone takes 1.03.
+    # The spread may exceed the bound by 1.1 and by chance, at one in a thousand; a Cauchy loss alone takes 1.03.
     most = 1.1 * np.sqrt(chi2.ppf(0.999, num_seeds) / num_seeds)
     least = np.sqrt(chi2.ppf(0.001, num_seeds) / num_seeds)
     assert least < np.sqrt(np.mean(np.square(errors))) / bound < most

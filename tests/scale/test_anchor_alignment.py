@@ -1,4 +1,4 @@
-"""Two frames are brought together by the anchors in both: what fixes the motion, and what does not."""
+"""Two frames are aligned by the anchors in both: when these determine the motion, and when they do not."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def anchors(ids: str, into: Similarity | None = None, covariance_m2: Array = SMA
 
 
 def off_m(found: Similarity) -> float:
-    """How far the path is from where it should be, at most."""
+    """Return the largest error of the path."""
     return float(np.linalg.norm(found.apply(PATH_M) - MOTION.apply(PATH_M), axis=1).max())
 
 
@@ -58,7 +58,7 @@ def test_of_mirror_places_those_are_chosen_that_fit() -> None:
 
 
 def test_an_anchor_counts_in_the_directions_in_which_its_place_is_known() -> None:
-    """Of all but one the height is not known: it is two metres off, and no matter."""
+    """The heights of three anchors are unknown and up to two metres off, which has little effect."""
     tall = np.diag([1e-4, 1e-4, 4.0])
     source = anchors("ABCDE", covariance_m2=tall)
     for id_, height in zip("ABC", (2.0, -2.0, 1.5), strict=True):

@@ -1,4 +1,4 @@
-"""The scale that most ranges agree on, exactly."""
+"""The scale on which most ranges agree, exactly."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def known_anchors(survey: Survey, range_m: Array | None = None) -> RangeProblem:
 
 
 def num_agreeing(problem: RangeProblem, scales: Array) -> Array:
-    """By trying: how many ranges agree with each scale."""
+    """Count the ranges that agree with each scale, by trying each of them."""
     offset = problem.tag_from_center - problem.anchor_mean_m[problem.anchor_index]
     distances = np.linalg.norm(scales[:, None, None] * problem.centers + offset, axis=2)
     agrees: Array = np.sum(np.abs(distances - problem.range_m) <= TOLERANCE_M, axis=1, dtype=np.float64)
@@ -54,7 +54,7 @@ def num_agreeing(problem: RangeProblem, scales: Array) -> Array:
 @pytest.mark.parametrize("obstructed_share", [0.0, 0.5, 0.8])
 @pytest.mark.parametrize("seed", range(4))
 def test_no_scale_at_all_has_more_ranges_agree(make_survey: MakeSurvey, seed: int, obstructed_share: float) -> None:
-    """The count changes at ends of intervals only, so trying every place between two of them tries every scale."""
+    """The count changes only at the ends of intervals, so one trial between any two ends covers every scale."""
     radio = Radio(range_stddev_m=STDDEV_M, obstructed_share=obstructed_share, obstructed_mean_m=2.0)
     problem = known_anchors(make_survey(scale=0.5, radio=radio, num_keyframes=15, seed=seed))
     best = consensus_scales(problem)[0]
@@ -67,7 +67,7 @@ def test_no_scale_at_all_has_more_ranges_agree(make_survey: MakeSurvey, seed: in
 def test_local_maxima_are_those_found_by_counting_at_every_place() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
-        # Whole numbers, so that many ends meet.
+        # Whole numbers, so that many ends coincide.
         starts = rng.integers(0, 30, 12).astype(np.float64)
         ends = starts + rng.integers(1, 8, 12)
         places = np.arange(-0.5, 40.0, 0.25)
@@ -121,7 +121,7 @@ def test_sixty_percent_of_wild_ranges_do_not_move_it(make_survey: MakeSurvey, se
 
 
 def test_a_lower_hill_of_agreement_is_a_candidate_too(make_survey: MakeSurvey) -> None:
-    """Sixty ranges fit one scale, fifty a second one."""
+    """Sixty ranges fit one scale, and fifty fit a second one."""
     survey = make_survey(radio=Radio(range_stddev_m=0.02), anchors_m={"A": (12.0, 1.0, 2.0)}, num_keyframes=110)
     problem = known_anchors(survey)
     distance = np.linalg.norm(5.0 * problem.centers + problem.tag_from_center - problem.anchor_mean_m[0], axis=1)
@@ -145,7 +145,7 @@ def test_a_camera_that_stands_still_is_refused(make_survey: MakeSurvey) -> None:
 
 
 def test_a_camera_that_only_rounding_keeps_from_the_origin_agrees_with_no_scale() -> None:
-    """As one that is there exactly: its range is the same at every scale."""
+    """It is treated like a camera exactly at the origin, whose range is the same at every scale."""
     away = np.array([[1.0, 0.0, 0.0]])
     offset, ranges, tolerance = np.tile([[-2.0, 0.0, 0.0]], (2, 1)), np.array([2.0, 1.0]), np.full(2, 0.5)
     exact, rounded = (

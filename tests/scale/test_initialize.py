@@ -1,4 +1,4 @@
-"""The scale stage: every case of anchors is recovered, and what the geometry leaves open is said."""
+"""The scale stage recovers every case of anchors, and says what the geometry leaves open."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class TestWithOutliers:
 
 
 class TestRefused:
-    """GeometryError: the text names what is wrong."""
+    """Surveys that end with a GeometryError whose text names what is wrong."""
 
     def refuse(self, survey: Survey, frame: str, known: str, match: str, log: RangeLog | None = None) -> None:
         with pytest.raises(GeometryError, match=match):
@@ -163,14 +163,14 @@ class TestRefused:
         self.refuse(make_survey(centers_m=np.tile([[1.0, 2.0, 1.6]], (40, 1))), frame, known, match)
 
     def test_a_camera_that_stands_still_far_from_the_origin_of_its_world(self, make_survey: MakeSurvey) -> None:
-        """Where rounding spreads its centres over nanometres."""
+        """There, rounding spreads its centres over nanometres."""
         survey = make_survey(centers_m=np.tile([[1.0, 2.0, 1.6]], (40, 1)))
         shaken = survey.trajectory.transformed(1.0, np.eye(3), np.full(3, 1e7))
         shaken.centers[:] += np.random.default_rng(0).choice([-2e-9, 0.0, 2e-9], (40, 3))
         self.refuse(replace(survey, trajectory=shaken), "first_camera", "ABCDE", "no scale explains")
 
     def test_a_circle_round_an_anchor(self, make_survey: MakeSurvey) -> None:
-        """Rounding changes the ranges, which are all alike."""
+        """All ranges are alike, and differ by rounding only."""
         angles = np.linspace(0.0, 6.0, 40)
         circle = np.stack([5.0 * np.cos(angles), 5.0 * np.sin(angles), np.zeros(40)], axis=1)
         survey = make_survey(centers_m=circle, anchors_m={"A": (0.0, 0.0, 1.0)}, tag_in_cam_m=(0, 0, 0))
@@ -193,14 +193,14 @@ class TestRefused:
     def test_a_path_on_a_sphere_and_one_unknown_anchor(
         self, make_survey: MakeSurvey, seed: int, anchor_m: tuple[float, float, float]
     ) -> None:
-        """The radius of the path and the anchor's distance from its centre can change places."""
+        """The radius of the path and the anchor's distance from its centre can be exchanged."""
         survey = make_survey(
             centers_m=on_a_sphere(), anchors_m={"A": anchor_m}, tag_in_cam_m=(0, 0, 0), radio=NOISE, seed=seed
         )
         self.refuse(survey, "unknown", "", "two scales fit.*the path lies on a sphere")
 
     def test_a_straight_path_in_the_site_frame(self, make_survey: MakeSurvey) -> None:
-        """The map can be turned about it."""
+        """The map can be rotated about the path."""
         survey = make_survey(centers_m=on_a_line(), tag_in_cam_m=(0, 0, 0), radio=NOISE)
         self.refuse(survey, "site", "ABCDE", "nearly straight")
 
@@ -230,7 +230,7 @@ class TestOpenButNotFatal:
     def test_three_unknown_anchors_settle_the_scale_of_a_path_on_a_sphere(
         self, make_survey: MakeSurvey, seed: int, obstructed_share: float
     ) -> None:
-        """Their distances from its centre differ, so that only the true radius can stand for all of them."""
+        """Their distances from the centre differ, so that only the true radius fits all of them."""
         anchors_m = {"A": (6.5, 1.0, 1.2), "B": (-6.0, 2.0, -1.2), "C": (0.5, -8.5, 1.4)}
         radio = Radio(range_stddev_m=0.05, obstructed_share=obstructed_share, obstructed_mean_m=2.0)
         survey = make_survey(
@@ -351,7 +351,7 @@ def test_ranges_set_aside_as_checks_have_no_say(make_survey: MakeSurvey) -> None
 
 
 def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.005) -> LocatedDistances:
-    """Two taped distances between cameras, longer than true by a factor."""
+    """Two taped distances between cameras, which are the true ones times a factor."""
     pairs = np.array([[0, len(survey.times) // 2], [len(survey.times) // 4, -1]])
     model = np.linalg.norm(np.diff(survey.trajectory.centers[pairs], axis=1)[:, 0], axis=1)
     metric = factor * np.linalg.norm(np.diff(survey.centers_m[pairs], axis=1)[:, 0], axis=1)
@@ -359,7 +359,7 @@ def between_cameras(survey: Survey, *, factor: float = 1.0, stddev_m: float = 0.
 
 
 def between_anchors(survey: Survey, stddev_m: float = 0.005) -> LocatedDistances:
-    """Every anchor's distance to the first, true."""
+    """The true distance from the first anchor to every other."""
     places = np.array(list(survey.anchors_m.values()))
     pairs = np.array([[0, k] for k in range(1, len(places))])
     lengths = np.linalg.norm(places[1:] - places[0], axis=1)
@@ -383,7 +383,7 @@ def test_control_distances_between_anchors_put_unknown_anchors_in_their_places(m
     truth = survey.frame_from_site("first_camera").apply(np.array(list(survey.anchors_m.values())))
 
     def spread_m(estimate: ScaleEstimate) -> float:
-        """How far distances between anchors are from the truth."""
+        """Return the largest error of the distances between anchors."""
         found = np.array([anchor.position_m for anchor in estimate.anchors])
         return float(np.abs(pdist(found) - pdist(truth)).max())
 

@@ -1,4 +1,4 @@
-"""The scale does not depend on units, on where the worlds have their origins, or on the order of anything."""
+"""The scale does not depend on units, on the origins of the worlds, or on the order of the input."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_any_unit_of_the_map_will_do(survey: Survey, exponent: float) -> None:
 def test_the_origin_of_the_map_may_be_10_000_km_away(survey: Survey, origin: tuple[float, float, float]) -> None:
     away = replace(survey, trajectory=survey.trajectory.transformed(1.0, np.eye(3), np.array(origin)))
     found, expected = estimate(away), estimate(survey)
-    # As far as the coordinates themselves are told apart there: to 2e-9.
+    # Coordinates have a resolution of 2e-9 there, which limits the accuracy.
     assert found.value == pytest.approx(expected.value, rel=1e-7)
     assert found.verdict == expected.verdict
 

@@ -1,4 +1,4 @@
-"""The scale by measured lengths alone: how sure it is, and which length does not belong to the others."""
+"""The scale by measured lengths alone: its uncertainty, and which length contradicts the others."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def rng() -> np.random.Generator:
 
 
 def path(rng: np.random.Generator) -> Array:
-    """(60, 3) of a walk in a room, in a unit of its own."""
+    """(60, 3) random positions in a room, in a unit of their own."""
     return rng.uniform(-1, 1, (60, 3)) * [4.0, 5.0, 2.0]
 
 
 def located(centers: Array, num: int, rng: np.random.Generator, bending: float = 0.0) -> LocatedDistances:
-    """Taped between cameras that are a metre apart or more, of a map in which each has a scale a little its own."""
+    """Taped distances between cameras at least a metre apart, in a map where each has a slightly different scale."""
     pairs = [(a, b) for a, b in rng.permuted(np.tile(np.arange(60), (500, 1)), axis=1)[:, :2].tolist()]
     ends = np.array([centers[[a, b]] for a, b in pairs if np.linalg.norm(centers[a] - centers[b]) > 1 / SCALE][:num])
     model = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)

@@ -1,6 +1,6 @@
-"""Most ranges are wrong, and the scale is right: some seeds of the study of breakdown.
+"""The scale is right although most ranges are wrong, for some seeds of the study of breakdown.
 
-All of it: ``tests/studies/scale_breakdown.py``.
+For all of it, run ``tests/studies/scale_breakdown.py``.
 """
 
 from __future__ import annotations

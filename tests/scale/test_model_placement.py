@@ -1,4 +1,4 @@
-"""Several models in one world: what each of them weighs there."""
+"""The weights of several models in one world."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rangesfm.scale.range_equation import solve
 
 
 def lingering_model(make_survey: MakeSurvey, seed: int = 0) -> ScaledModel:
-    """Ranges of one place err alike, and most are of three places; all err together for seconds."""
+    """A model whose ranges have errors in common, for each place and for some seconds; most are from three places."""
     survey = make_survey(num_epochs=8, radio=Radio(range_stddev_m=0.02), seed=seed)
     log, rng = survey.simulated.log, np.random.default_rng(seed)
     observations = survey.observations()
@@ -39,7 +39,7 @@ def test_a_model_weighs_the_same_alone_and_in_a_join(make_survey: MakeSurvey) ->
     np.testing.assert_allclose(joined.state.metric_from_model.rotation, estimate.metric_from_sfm.rotation, atol=1e-6)
     alone_stddev = errors.inflation * estimate.uncertainty.formal
     assert joined.log_scale_stddev == pytest.approx(alone_stddev, rel=0.02)
-    # As it would not if its ranges counted all alike.
+    # This would not hold if all its ranges counted alike.
     part = replace(model_placement._problem(model, estimate.anchors), share=None)
     alike = solve(part, joined.state, loss=errors.loss)
     assert abs(alike.state.metric_from_model.scale / estimate.value - 1) > 1e-4

@@ -34,7 +34,7 @@ def random_state(rng: np.random.Generator) -> RangeState:
 
 
 def random_problem(rng: np.random.Generator, state: RangeState) -> RangeProblem:
-    """Everything is estimated: the frame, all anchors (one unknown), all biases. Ranges fit ``state`` exactly."""
+    """A problem that estimates the frame, all anchors (one without a prior) and all biases; ranges fit ``state``."""
     problem = RangeProblem(
         centers=3 * rng.normal(size=(NUM_RANGES, 3)),
         tag_from_center=0.3 * rng.normal(size=(NUM_RANGES, 3)),
@@ -57,8 +57,9 @@ def finite_differences(function: Callable[[Array], Array], at: Array, step: floa
 
 
 def test_prediction_is_the_hand_computed_one() -> None:
-    # Scaled by 2 and turned by 90 degrees about z, the centre (1, 0, 0) is at (0, 2, 0), shifted to (1, 2, 0); the
-    # lever arm (0, 1, 0) turns to (-1, 0, 0) and is not scaled: tag at (0, 2, 0), 5 m from (0, 6, 3), bias 0.25 m.
+    # Scaled by 2, rotated by 90 degrees about z and shifted, the centre (1, 0, 0) comes to (1, 2, 0). The lever arm (0,
+    # 1, 0) is rotated to (-1, 0, 0) and not scaled. So the tag is at (0, 2, 0), 5 m from (0, 6, 3), and the bias is
+    # 0.25 m.
     quarter_turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     problem = RangeProblem(
         centers=np.array([[1.0, 0.0, 0.0]]),
@@ -162,7 +163,7 @@ def test_formal_stddev_is_the_scatter_of_estimates(rng: np.random.Generator) -> 
 
 
 def test_what_nothing_determines_is_not_certain(rng: np.random.Generator) -> None:
-    """Without motion the scale is open: the formal stddev says so rather than nothing."""
+    """Without motion the scale is open, and the formal stddev is large."""
     truth = replace(random_state(rng), metric_from_model=IDENTITY)
     problem = replace(random_problem(rng, truth), centers=np.zeros((NUM_RANGES, 3)), frame_is_free=False)
     assert solve(problem, truth).log_scale_stddev > 1e3

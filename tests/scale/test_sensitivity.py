@@ -1,4 +1,4 @@
-"""The table of sensitivities says what errors of the range model really do to the scale."""
+"""The table of sensitivities agrees with the effect of errors of the range model on the scale."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_biases_and_a_slope_change_the_scale_as_said(make_survey: MakeSurvey, fr
     cases = {
         base.sensitivity.common_bias_per_cm: np.full(len(true), 0.01),
         base.sensitivity.anchor_bias_per_cm["A"]: 0.01 * of_a,
-        # A tenth of a percent: more, and the robust loss is not linear any more.
+        # A tenth of a percent, because the robust loss is not linear for more.
         base.sensitivity.range_slope_per_percent / 10: 0.001 * true,
     }
     for expected, error in cases.items():
@@ -56,7 +56,7 @@ def test_ranges_one_percent_longer_make_a_map_of_unknown_anchors_one_percent_lar
 
 
 def test_of_ranges_as_long_as_most_none_is_short(make_survey: MakeSurvey) -> None:
-    """A circle has all its ranges to one anchor in common, and rounding puts some of them below their median."""
+    """All ranges from a circle to one anchor are equal, and rounding puts some of them below their median."""
     angles = np.linspace(0.0, 6.0, 40)
     circle = np.stack([3.0 * np.cos(angles), 3.0 * np.sin(angles), np.zeros(40)], axis=1)
     anchors_m = {"A": (0.0, 0.0, 4.0), "B": (6.0, 0.0, 0.0)}

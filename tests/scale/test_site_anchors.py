@@ -1,4 +1,4 @@
-"""Few, flat or collinear site anchors: what a word on gravity or on the camera's side adds, and what stays open."""
+"""Few, coplanar or collinear site anchors: what gravity or the camera's side adds, and what stays open."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def flat_loop(make_survey: MakeSurvey, slope: float = 0.0) -> Array:
 
 
 def up_of(survey: Survey, off_deg: float = 0.0) -> tuple[float, float, float]:
-    """Upward in the first camera's frame, wrong by some degrees."""
+    """Return the upward direction in the first camera's frame, wrong by some degrees."""
     off = np.deg2rad(off_deg)
     x, y, z = survey.world_from_cam[0].T @ [np.sin(off), 0.0, np.cos(off)]
     return float(x), float(y), float(z)
@@ -45,12 +45,12 @@ def heights(survey: Survey, options: ScaleOptions) -> Array:
 
 
 def test_the_side_that_is_told_places_a_flat_path_among_anchors_in_a_plane(make_survey: MakeSurvey) -> None:
-    # It is the tag that is mirrored; on the camera itself, so is the camera.
+    # With the tag at the camera, the camera is mirrored exactly as the tag is.
     survey = make_survey(
         centers_m=flat_loop(make_survey), anchors_m=FLAT_ANCHORS_M, radio=NOISE, num_epochs=2, tag_in_cam_m=(0, 0, 0)
     )
     np.testing.assert_allclose(heights(survey, ScaleOptions(camera_side="above")), 2.4, atol=0.1)
-    # The mirror image: the ranges cannot tell.
+    # This is the mirror image, which the ranges cannot distinguish.
     np.testing.assert_allclose(heights(survey, ScaleOptions(camera_side="below")), -0.4, atol=0.1)
 
 
@@ -68,7 +68,7 @@ def test_gravity_rules_out_the_mirror_image_of_a_slope_but_not_of_a_level_path(m
 def test_a_flat_path_among_anchors_in_a_plane_has_a_scale_and_no_place(
     make_survey: MakeSurvey, tilt: float, seed: int
 ) -> None:
-    """Its mirror image fits; parallel to the anchors' plane, that image is the same map higher or lower."""
+    """Its mirror image fits too; for a path parallel to the anchors' plane, that is the same map at another height."""
     survey = make_survey(centers_m=flat_loop(make_survey, tilt), anchors_m=FLAT_ANCHORS_M, radio=NOISE, seed=seed)
     estimate = survey.scale("site", "ABCD")
     assert estimate.frame == "first_camera"
@@ -144,7 +144,7 @@ def test_the_distance_between_two_surveyed_anchors_steadies_the_scale(make_surve
 
 
 def test_a_path_in_the_plane_of_the_anchors_is_on_neither_side(make_survey: MakeSurvey) -> None:
-    """Whatever rounding says of it, and whichever side was told."""
+    """Neither rounding nor the given side changes the result."""
     centers = make_survey().centers_m * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
     survey = make_survey(centers_m=centers, anchors_m=FLAT_ANCHORS_M, tag_in_cam_m=(0, 0, 0))
     for side in ("above", "below"):

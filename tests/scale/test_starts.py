@@ -1,4 +1,4 @@
-"""Where the range equation is started from, where symmetry leaves two answers that only rounding tells apart."""
+"""Starts of the range equation where symmetry leaves two solutions that only rounding tells apart."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def unknown_anchors(survey: Survey) -> RangeProblem:
 def test_on_which_side_of_a_flat_path_an_anchor_is_put_does_not_hang_on_rounding(
     make_survey: MakeSurvey, seed: int
 ) -> None:
-    """Both fit alike: it is that of the path's normal, wherever the anchor was thought to be."""
+    """Both sides fit alike; the side of the path's normal is taken, wherever the anchor was assumed to be."""
     centers = make_survey(seed=seed).centers_m * [1.0, 1.0, 0.0]
     survey = make_survey(
         scale=1.0, centers_m=centers, tag_in_cam_m=(0, 0, 0), radio=Radio(range_stddev_m=0.05), seed=seed
@@ -39,7 +39,7 @@ def test_on_which_side_of_a_flat_path_an_anchor_is_put_does_not_hang_on_rounding
         thought = np.array(list(survey.anchors_m.values())) * [1.0, 1.0, turned]
         state, rise = choose_sides(problem, RangeState(IDENTITY, to_model.apply(thought), np.zeros(5)))
         heights = (state.anchors_m - shape.centroid) @ shape.axes[:, 2]
-        assert heights.min() > -1e-3  # one is in the plane
+        assert heights.min() > -1e-3  # one anchor is in the plane
         assert heights.max() > 2.0
         np.testing.assert_allclose(rise, 0.0, atol=1e-6)
 

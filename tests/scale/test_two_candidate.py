@@ -19,8 +19,8 @@ def estimate(centers: list[list[float]], range_m: list[float], lever_m: Array | 
 
 
 def test_walking_towards_the_anchor_the_smaller_root_is_the_steady_one() -> None:
-    # At a true scale of 1 the cameras stand 1 m and 2 m along x, 3 m and 2 m from the anchor. A range of 3 m is also
-    # taken 7 m along x (alpha = 7), one of 2 m also 6 m along x (alpha = 3).
+    # At a true scale of 1 the cameras stand 1 m and 2 m along x, 3 m and 2 m from the anchor. A range of 3 m also fits
+    # a camera 7 m along x (alpha = 7), and one of 2 m fits a camera 6 m along x (alpha = 3).
     table = estimate([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [3.0, 2.0])
     assert table is not None
     np.testing.assert_allclose(table.duplets, [[1.0, 7.0], [1.0, 3.0]], atol=1e-12)
@@ -32,7 +32,8 @@ def test_walking_towards_the_anchor_the_smaller_root_is_the_steady_one() -> None
 
 
 def test_walking_away_beyond_the_anchor_the_larger_root_is_the_steady_one() -> None:
-    # 5 m and 6 m along x: 1 m and 2 m from the anchor, which 3 m and 2 m along x (alpha = 3/5, 2/6) are as well.
+    # The cameras are 5 m and 6 m along x, 1 m and 2 m beyond the anchor; cameras 3 m and 2 m along x have the same
+    # ranges (alpha = 3/5, 2/6).
     table = estimate([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]], [1.0, 2.0])
     assert table is not None
     np.testing.assert_allclose(table.duplets, [[0.6, 1.0], [1.0 / 3.0, 1.0]], atol=1e-12)
@@ -41,7 +42,7 @@ def test_walking_away_beyond_the_anchor_the_larger_root_is_the_steady_one() -> N
 
 
 def test_the_lever_arm_is_metric_and_never_scaled() -> None:
-    # The unit of the path is 2 m; half a metre of lever arm towards the anchor stays half a metre.
+    # The unit of the path is 2 m; a lever arm of half a metre towards the anchor stays half a metre.
     table = estimate([[0.5, 0.0, 0.0], [1.0, 0.0, 0.0]], [2.5, 1.5], lever_m=np.array([0.5, 0.0, 0.0]))
     assert table is not None
     np.testing.assert_allclose(table.duplets[:, 0], [2.0, 2.0], atol=1e-12)
@@ -65,7 +66,7 @@ def test_farther_from_the_anchor_than_the_origin_was_exactly_one_root_is_positiv
 
 
 def test_ranges_without_a_real_root_and_cameras_at_the_origin_are_dropped() -> None:
-    # Along y no camera comes nearer to the anchor than 4 m.
+    # No camera along y comes nearer to the anchor than 4 m.
     centers = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
     table = estimate(centers, [3.0, 3.0, 4.0, 2.0])
     assert table is not None
@@ -79,7 +80,7 @@ def test_with_fewer_than_two_ranges_left_there_is_nothing_to_choose() -> None:
 
 
 def test_a_path_that_first_nears_and_then_leaves_the_anchor_mixes_the_branches() -> None:
-    """Why this is not the default: even exact ranges give a wrong scale."""
+    """This is why the estimate is not the default: even exact ranges give a wrong scale."""
     centers = np.column_stack([np.linspace(1.0, 8.0, 15), np.full(15, 1.0), np.zeros(15)])
     ranges = np.linalg.norm(centers - ANCHOR_M, axis=1)
     table = two_candidate(centers, np.zeros((15, 3)), ANCHOR_M, ranges)
@@ -96,7 +97,7 @@ def test_a_camera_that_only_rounding_keeps_from_the_origin_has_no_candidates() -
 
 
 def test_where_a_ray_is_nearest_to_the_anchor_the_two_candidates_are_one() -> None:
-    """All of them: rounding makes every other discriminant negative."""
+    """This holds for all rays, although rounding makes about half of the discriminants negative."""
     angles = np.linspace(0.1, 1.4, 60)
     nearest = 4.0 * np.cos(angles)[:, None] * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
     table = two_candidate(nearest, np.zeros((60, 3)), ANCHOR_M, 4.0 * np.sin(angles))

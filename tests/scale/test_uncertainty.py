@@ -1,4 +1,4 @@
-"""How wrong the scale may be is said honestly."""
+"""The stated uncertainty of the scale is honest."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ IN_TIME = ("white", "time", "place", "view", "reweighting")
 
 
 class Rigid:
-    """Of a map that is known not to be bent."""
+    """The bending of a map that is known not to be bent."""
 
     def of_cells(self, cells: Cells, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfCells:
         return BendingOfCells((), np.zeros((len(cells), len(cells))), np.zeros(len(cells)))
@@ -53,7 +53,7 @@ def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -
 
 
 def in_time(uncertainty: ScaleUncertainty) -> float:
-    """Of all that differs from moment to moment."""
+    """Return the uncertainty from all errors that change over time."""
     return float(np.linalg.norm([uncertainty.components.get(name, 0.0) for name in IN_TIME]))
 
 
@@ -78,7 +78,7 @@ def test_with_errors_that_last_the_stddev_grows_and_is_the_scatter(make_survey: 
         errors.append(survey.relative_error(estimate))
         formals.append(estimate.uncertainty.formal)
         seen.append(in_time(estimate.uncertainty))
-    # About 20 ranges in a row of 5 a second err together.
+    # About 20 ranges in a row, at 5 a second, have correlated errors.
     assert np.median(seen) > 1.5 * np.median(formals)
     assert np.std(errors) > 1.5 * np.median(formals)
     assert np.std(errors) / np.median(seen) == pytest.approx(1.0, abs=0.4)
@@ -158,7 +158,7 @@ def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(
         best = np.array([stated[name] for name in stated if name != "reweighting"])
         chance = np.sqrt(np.sum(np.square(list(summed.values()))) - np.sum(best**2))
         assert stated["reweighting"] == abs(uncertainty.lean) <= 1.345 * chance * (1 + 1e-9)
-    # Of errors a thousandth as large nothing that the best weights say is chance any more.
+    # With a covariance a millionth as large, the lean of the best weights exceeds chance, and is limited to it.
     assert stated["reweighting"] > 0.5 * chance
 
 
@@ -174,7 +174,7 @@ def test_what_the_clocks_leave_open_is_part_of_scale_and_place(make_survey: Make
     right, off, told = estimate(0.0, 0.0), estimate(stddev_s, 0.0), estimate(stddev_s, stddev_s)
     assert CLOCKS not in off.uncertainty.components
     assert told.uncertainty.components[CLOCKS] > 0
-    # Half a second on, the whole map is turned along its loop.
+    # Half a second later, the whole map is turned along its loop.
     between = off.metric_from_sfm.rotation @ right.metric_from_sfm.rotation.T
     turn_rad = np.arccos((np.trace(between) - 1) / 2)
     assert turn_rad > 4 * heading_stddev_rad(off)

@@ -1,4 +1,4 @@
-"""What makes a scale doubtful is said, and what to do about it next time."""
+"""The verdict names what makes a scale doubtful, and what to do about it next time."""
 
 from __future__ import annotations
 

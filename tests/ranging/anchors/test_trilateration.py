@@ -191,9 +191,7 @@ class TestCovariance:
 
     @pytest.mark.parametrize("draw", ["noise", "heteroscedastic", "bias"])
     def test_of_a_radio_better_than_others_is_not_too_small(self, draw: str) -> None:
-        """The covariance is large enough even for pure noise, as it allows for other range errors that the position
-        would absorb.
-        """
+        """The covariance covers even pure noise, as it allows for other errors that the position would absorb."""
         positions, squares, stddevs = flight(), [], []
         for seed in range(12):
             rng = np.random.default_rng(seed)
@@ -348,9 +346,7 @@ class TestRounding:
 
     @pytest.mark.parametrize(("away_m", "seed"), [(20.0, 0), (60.0, 1), (200.0, 2)])
     def test_a_bias_that_is_known_does_not_make_a_place_about_a_line_certain(self, away_m: float, seed: int) -> None:
-        """The information of a known bias is 1e12 in metres; beside it, an undetermined direction keeps only rounding
-        errors.
-        """
+        """The information of a known bias is 1e12 in metres, which leaves only rounding in an open direction."""
         line = np.outer(np.linspace(-4.0, 4.0, 100), [1.0, 0.0, 0.0])
         ranges = distances(line, np.array([1.0, away_m, 3.0])) + noise(100, 0.02, seed)
         with pytest.raises(GeometryError, match="on a line, about which the anchor may stand anywhere"):

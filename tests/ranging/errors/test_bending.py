@@ -40,9 +40,7 @@ def path() -> Trajectory:
 
 
 def placed(path: Trajectory) -> tuple[Array, Array, Array]:
-    """Centres and rotations at the ranges, and lever arms in the model's axes, interpolated linearly like the
-    derivative.
-    """
+    """Linearly interpolated centres and rotations at the ranges, and lever arms in the model's axes."""
     weight = ON_PATH.weight[:, None]
     centers = (1 - weight) * path.centers[ON_PATH.before] + weight * path.centers[ON_PATH.after]
     arms = (1 - weight) * (path.world_from_cam[ON_PATH.before] @ ARM_IN_CAM_M)

@@ -131,9 +131,7 @@ def test_a_map_that_may_bend_shows_no_more_noise_than_one_that_may_not() -> None
 
 
 def test_it_begins_with_the_noise_that_the_rigid_map_showed() -> None:
-    """The noise contains neither the shared errors of short ranges nor the uncertainty of places, and no stated
-    stddevs.
-    """
+    """The noise excludes the shared errors of short ranges, the uncertainty of places, and stated stddevs."""
     shared, placing = np.full(3 * NUM_EACH, 0.2), np.full(3 * NUM_EACH, 0.05)
     rigid = replace(make_errors(), shared_m=shared, placing_m=placing).seen_by_rigid_map(noise((0.1, 0.1, 0.1)), 0.0)
     begun = rigid.for_bending_map(CAUCHY)

@@ -1,4 +1,4 @@
-"""A real browser for the tests of pages: headless Chromium, driven by Selenium, software WebGL, no network."""
+"""A real browser for the tests of pages: headless Chromium driven by Selenium, software WebGL, no network."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NO_WEBGL = ("--disable-gpu", "--disable-3d-apis")
 
 
 class Browser:
-    """One window, and what pages in it said and asked for."""
+    """One browser window, and the messages and requests of its pages."""
 
     def __init__(self, *, has_webgl: bool = True):
         selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: pip install '.[test]'")
@@ -43,7 +43,7 @@ class Browser:
         self._driver = selenium.Chrome(options=options, service=service)
 
     def open(self, page: Path, *, width: int = 1280, height: int = 900, theme: str = "light") -> None:
-        """Open a page from disk as wide as asked for, its view too; what was logged before is forgotten."""
+        """Open a page from disk in a window of this size, wait for its figures and view, and forget earlier logs."""
         features = [{"name": "prefers-color-scheme", "value": theme}]
         self.command("Emulation.setEmulatedMedia", features=features)
         is_phone = width < 600
@@ -56,33 +56,33 @@ class Browser:
         self.wait_for("!document.querySelector('#view') || window.rangesfmView")
 
     def draw_figures(self) -> None:
-        """All of them, not only those near the window."""
+        """Draw all figures, not only those near the visible part."""
         self.run("for (const charts of Object.values(rangesfmFigures)) for (const chart of charts) chart.draw()")
 
     def run(self, script: str, *arguments: Any) -> Any:
-        """What a script in the page returns."""
+        """Run a script in the page, and return its result."""
         return self._driver.execute_script(script, *arguments)
 
     def wait_for(self, condition: str) -> None:
-        """Until an expression is true in the page."""
+        """Wait until an expression is true in the page."""
         deadline = time.monotonic() + TIMEOUT_S
         while not self.run(f"return Boolean({condition})"):
             assert time.monotonic() < deadline, f"never came true: {condition}"
             time.sleep(0.05)
 
     def click_at(self, x: float, y: float) -> None:
-        """A click of the mouse at a place of the window."""
+        """Click at a position of the window."""
         for kind in ("mousePressed", "mouseReleased"):
             self.command("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Press at one place, release at another."""
+        """Press the mouse at one position and release it at another."""
         steps = [("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)]
         for kind, (x, y) in steps:
             self.command("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
     def draw_frame(self) -> None:
-        """Wait until what was done has been drawn."""
+        """Wait until everything has been drawn."""
         self._driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
 
     def picture(self, selector: str) -> Pixels:
@@ -97,13 +97,13 @@ class Browser:
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), dtype=np.int64)
 
     def console(self) -> list[str]:
-        """What the page said, but for remarks of the graphics driver on its own speed."""
+        """Return the console messages, without the graphics driver's remarks on its own speed."""
         return [
             entry["message"] for entry in self._driver.get_log("browser") if "GL Driver Message" not in entry["message"]
         ]
 
     def requests(self) -> list[str]:
-        """Addresses that the page asked for, itself and what it holds included."""
+        """Return the addresses that the page requested, including its own and its parts'."""
         messages = [json.loads(entry["message"])["message"] for entry in self._driver.get_log("performance")]
         return [
             message["params"]["request"]["url"]
@@ -112,7 +112,7 @@ class Browser:
         ]
 
     def command(self, name: str, **parameters: Any) -> Any:
-        """A command of the Chrome DevTools Protocol."""
+        """Send a command of the Chrome DevTools Protocol."""
         return self._driver.execute_cdp_cmd(name, parameters)
 
     def quit(self) -> None:
@@ -120,7 +120,7 @@ class Browser:
 
 
 def downloaded(browser: Browser, figure: str) -> list[list[str]]:
-    """The rows of a figure's CSV file, caught where its button hands it to the browser."""
+    """Return the rows of a figure's CSV file, caught where its button hands it to the browser."""
     browser.run(
         "window.made = null;"
         "URL.createObjectURL = blob => { blob.text().then(text => { window.made = text; }); return '#'; };"
@@ -133,7 +133,7 @@ def downloaded(browser: Browser, figure: str) -> list[list[str]]:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    """The browser that tests of pages share: its start takes longer than most of them."""
+    """A browser that tests of pages share, because its start takes longer than most of them."""
     shared = Browser()
     yield shared
     shared.quit()
@@ -141,7 +141,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def browser_without_webgl() -> Iterator[Browser]:
-    """One that cannot draw in three dimensions."""
+    """A browser that cannot draw in three dimensions."""
     own = Browser(has_webgl=False)
     yield own
     own.quit()

@@ -1,4 +1,4 @@
-"""The page of a comparison in a browser: all paths in one view."""
+"""The page of a comparison, in a browser: all paths in one view."""
 
 from __future__ import annotations
 

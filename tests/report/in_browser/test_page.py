@@ -1,4 +1,4 @@
-"""The report as a reader has it: opened from disk in a browser, light, dark, narrow and on paper."""
+"""The report as its readers see it: opened from disk in a browser, light, dark, narrow and in print."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser, Pixels
 
 MakeResult = Callable[..., Path]
-# Plan and elevation twice, local scale, four of scale and clock, two of mistakes, eight anchors, histogram, errors.
+# Two of plan and two of elevation, local scale, four of scale and clock, two of mistakes, eight of anchors, a
+# histogram, and errors.
 NUM_CHARTS = 21
 WIDTHS_PX = (320, 390, 768, 1280)
 EVIL = "</script><script>document.title = 'broken out'</script>"
@@ -32,7 +33,7 @@ HOSTILE = (
     "=HYPERLINK(1)",
 )
 
-# Of every text: its own colour on the nearest opaque background, as WCAG 2 has it; large text needs less.
+# Contrast of every text with the nearest opaque background, as WCAG 2 defines it; large text needs less.
 CONTRASTS = """
 const channel = c => (c /= 255) <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
 const luminance = rgb => [0.2126, 0.7152, 0.0722].reduce((sum, w, i) => sum + w * channel(rgb[i]), 0);
@@ -61,7 +62,7 @@ return poor;
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory, make_shared_result: MakeResult) -> Path:
-    """One report for the tests that only look."""
+    """A report for the tests that only look at it."""
     folder = tmp_path_factory.mktemp("page") / "a survey & more"
     return write_report(
         make_shared_result(folder, num_keyframes=60, num_ranges_per_anchor=200, num_points=4000, has_photos=True)
@@ -87,7 +88,7 @@ def test_it_opens_with_all_figures_a_silent_console_and_no_request(browser: Brow
 
 def test_it_draws_in_the_readers_theme(browser: Browser, page: Path) -> None:
     colors = {
-        "light": ((194, 87, 12), (29, 95, 209), (162, 28, 175)),  # scaled, refined, anchors
+        "light": ((194, 87, 12), (29, 95, 209), (162, 28, 175)),  # the scaled path, the refined path, the anchors
         "dark": ((251, 154, 80), (121, 169, 255), (229, 138, 242)),
     }
     for theme, other in (("light", "dark"), ("dark", "light")):
@@ -100,7 +101,7 @@ def test_it_draws_in_the_readers_theme(browser: Browser, page: Path) -> None:
 
 
 def num_pixels(picture: Pixels, color: tuple[int, int, int]) -> int:
-    """How many pixels have this colour, or nearly."""
+    """Count the pixels that have nearly this colour."""
     return int((np.abs(picture - color).max(axis=2) < 8).sum())
 
 
@@ -181,7 +182,7 @@ def test_a_figures_data_are_those_of_the_result(browser: Browser, page: Path) ->
 
 
 def place_in(browser: Browser, chart: str, x: float, y: float) -> tuple[float, float]:
-    """Where in the window a place of a chart is."""
+    """Return the window position of a point in a chart's data."""
     browser.run(f"{chart}.node.scrollIntoView({{block: 'center'}})")
     browser.wait_for(f"{chart}.view")
     left, top = browser.run(
@@ -238,7 +239,7 @@ def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(brow
     whole = domain()
     x, y = place_in(browser, chart, 95.0, 1.0)
     wheel = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -240}
-    browser.command("Input.dispatchMouseEvent", **wheel, modifiers=2)  # Ctrl
+    browser.command("Input.dispatchMouseEvent", **wheel, modifiers=2)  # the Ctrl key
     near = domain()
     assert near[1] - near[0] < 0.8 * (whole[1] - whole[0])
     browser.drag((x, y), (x + 80, y))

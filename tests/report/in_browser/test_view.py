@@ -1,4 +1,4 @@
-"""The report's 3-D view: what it draws, and what it answers to."""
+"""The report's 3-D view: what it draws, and how it responds."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def page(tmp_path_factory: pytest.TempPathFactory, make_shared_result: MakeResul
 
 @pytest.fixture(params=WIDTHS_PX)
 def opened(request: pytest.FixtureRequest, browser: Browser, page: Path) -> Browser:
-    """The page, on a telephone and on a desk, scrolled to the view."""
+    """The page on a phone and on a desktop, scrolled to the view."""
     browser.open(page, width=request.param)
     browser.run("document.querySelector('.stage').scrollIntoView({block: 'center'})")
     browser.wait_for("window.rangesfmView && rangesfmView.stage")
@@ -51,7 +51,7 @@ def toggle(browser: Browser, name: str, value: str) -> None:
 
 
 def place_of(browser: Browser, position: str) -> tuple[float, float]:
-    """Where in the window a position of the scene is."""
+    """Return the window position of a point of the scene."""
     x, y = browser.run(
         "const box = document.querySelector('.stage canvas').getBoundingClientRect();"
         f"const [x, y] = rangesfmView.stage.pixelOf({position}); return [x + box.x, y + box.y]"
@@ -115,7 +115,7 @@ def test_a_click_on_a_camera_shows_its_photo_and_its_ranges(opened: Browser) -> 
     opened.click_at(*place_of(opened, CENTER.format(wanted)))
     chosen = opened.run("return rangesfmView.chosen")
     centers = [opened.run(f"return {CENTER.format(index)}") for index in (wanted, chosen)]
-    near = np.linalg.norm(np.subtract(*centers)[:2])  # in plan one may hide another
+    near = np.linalg.norm(np.subtract(*centers)[:2])  # in plan one camera may hide another
     assert near < 0.3
     assert text_of(opened, ".photo h3") == f"image{chosen:05d}.jpg"
     assert opened.run("return document.querySelector('[name=photo]').value") == str(chosen)
@@ -165,13 +165,13 @@ def test_a_drag_turns_the_view_and_chooses_nothing(opened: Browser) -> None:
 
 
 def test_points_stand_where_the_map_has_them(opened: Browser) -> None:
-    """To the step that their packing leaves, a fraction of a millimetre."""
+    """The tolerance covers the resolution in which points are packed, a fraction of a millimetre."""
     low, high = opened.run(
         "const num = rangesfmView.scene.points.num;"
         "const all = Array.from({length: num}, (_, i) => rangesfmView.pointAt(i));"
         "return [Math.min, Math.max].map(f => [0, 1, 2].map(axis => all.reduce((m, p) => f(m, p[axis]), all[0][axis])))"
     )
-    # The room of the made-up result: walls at these places, with noise.
+    # The made-up result is a room with walls at these places, with noise.
     origin = opened.run("return rangesfmView.scene.origin")
     assert np.add(low, origin) == pytest.approx(np.array((-2.4, -2.9, 0.0)), abs=0.1)
     assert np.add(high, origin) == pytest.approx(np.array((2.4, 2.9, 2.3)), abs=0.1)
