@@ -64,8 +64,9 @@ def library(name: str) -> str:
 
 
 def without_shuffled_addresses(sanitizer: str) -> list[str]:
-    """Return a command prefix that switches off wide address randomization, which older thread sanitizers do not
-    survive.
+    """Return a command prefix that keeps addresses from being randomized widely.
+
+    GCC's older thread sanitizers stop where the kernel does that.
     """
     return ["setarch", "-R"] if sanitizer == "thread" else []
 

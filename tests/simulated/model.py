@@ -1,4 +1,4 @@
-"""A COLMAP model with a known truth and without photos: the input of everything that comes after mapping."""
+"""COLMAP models with a known truth and without photos, for everything that comes after mapping."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rangesfm.geometry.similarity import Similarity
 
 FloatArray = npt.NDArray[np.float64]
 
-# Rounds of new points for one photo; where none can be seen twice, it stays with fewer.
+# Rounds of new points for one photo; a photo in which none can be seen twice keeps fewer.
 _MAX_ROUNDS = 20
 
 
@@ -50,18 +50,18 @@ def synthetic_model(
     focal_px: float = 750.0,
     seed: int = 0,
 ) -> SyntheticModel:
-    """Points seen along a known path, as COLMAP would hand them over.
+    """Simulate a model of points seen along a known path.
 
     Args:
         timestamps_s: (n,) strictly increasing.
         centers_m: (n, 3) projection centres.
         world_from_cam: (n, 3, 3).
         num_observations: in each photo; fewer where not enough points are seen twice.
-        max_track_length: a point is seen in at most so many consecutive photos, so that the
-            model hangs together only from one to the next; None: wherever it is in the picture.
-        depth_range_m: of new points before the camera.
+        max_track_length: number of consecutive photos in which a point is seen at most, so that the
+            model is only connected from one photo to the next; None: all photos that show the point.
+        depth_range_m: of new points in front of the camera.
         pixel_stddev: noise of each pixel coordinate; 0 makes the reprojection exact.
-        metric_from_sfm: between the model's world and the metric one; None: a random one.
+        metric_from_sfm: from the model's world to the metric one; None: a random similarity.
         image_size: width and height, pixels.
         focal_px: focal length; the principal point is the middle.
         seed: of points, noise and similarity.
@@ -88,7 +88,7 @@ def synthetic_model(
 
 
 def random_similarity(rng: np.random.Generator) -> Similarity:
-    """Scale between 1/4 and 4, any rotation, some metres of translation."""
+    """Draw a similarity with a scale between 1/4 and 4, any rotation, and a translation of some metres."""
     rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
     return Similarity(float(4 ** rng.uniform(-1, 1)), rotation, 5 * rng.standard_normal(3))
 
@@ -134,7 +134,11 @@ def _scatter_points(
     depth_range_m: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[FloatArray, list[npt.NDArray[np.int64]]]:
-    """Points until each frame sees its number of them: (p, 3), and for each the frames that observe it."""
+    """Draw points until each frame sees its number of them.
+
+    Returns:
+        (p, 3) points, and for each point the frames that observe it.
+    """
     num_frames = len(frames.centers)
     wanted = np.full(num_frames, num_observations)
     points: list[FloatArray] = []
@@ -167,7 +171,7 @@ def _reconstruction(
     sfm_from_metric: Similarity,
     rng: np.random.Generator,
 ) -> pycolmap.Reconstruction:
-    """Everything put into COLMAP's structures, moved to the model's own world."""
+    """Put everything into COLMAP's structures, and move it to the model's own world."""
     observing = np.concatenate([*seen_by, np.empty(0, dtype=np.int64)])
     observed = np.repeat(np.arange(len(points)), [len(by) for by in seen_by])
     pixels, _ = frames.project(points[observed], observing)

@@ -1,4 +1,4 @@
-"""Ways of a camera, for tests and studies: a walk around a place, an orbit, a way that never returns, a rover's lap.
+"""Paths of a camera for tests and studies: a walk around a place, an orbit, a way that never returns, a rover's lap.
 
 World z is up. Camera frame as in COLMAP: x right, y down, z forward.
 """
@@ -41,7 +41,7 @@ def loop_path(
     unsteadiness_m: float = 0.05,
     seed: int = 0,
 ) -> CameraPath:
-    """A hand-held walk around ``center_m``, looking across it; more than one turn comes back to what was seen.
+    """A hand-held walk around ``center_m``, looking across it; after one turn, the same places are seen again.
 
     Args:
         duration_s: of the walk.
@@ -51,7 +51,7 @@ def loop_path(
         height_amplitude_m: how far the camera goes up and down, about 1.5 times a turn.
         num_turns: of the walk, counter-clockwise.
         start_deg: direction of the start from the centre, from x towards y.
-        unsteadiness_m: stddev of the slow sway; the gaze strays accordingly.
+        unsteadiness_m: stddev of the slow sway; the viewing direction sways accordingly.
         seed: of the sway.
     """
     rng = np.random.default_rng(seed)
@@ -62,7 +62,7 @@ def loop_path(
         [semi_axes_m[0] * np.cos(angle), semi_axes_m[1] * np.sin(angle), height_amplitude_m * wave], axis=1
     )
     centers = np.asarray(center_m) + shape + unsteadiness_m * rng.standard_normal(shape.shape)
-    # The gaze meets the plane beyond the middle, now a little left of it, now right, now lower.
+    # The camera looks at points beyond the middle that wander left, right, up and down.
     across = np.asarray(center_m) - 0.25 * shape * [1, 1, 0]
     stray = np.stack([0.25 * np.sin(2.1 * angle), 0.25 * np.cos(1.7 * angle), -0.09 + 0.05 * wave], axis=1)
     targets = across + stray * np.linalg.norm(semi_axes_m)
@@ -113,13 +113,14 @@ def lap_path(
     unevenness_m: float = 0.15,
     share: float = 0.98,
 ) -> CameraPath:
-    """A rover's lap round a soccer field, looking ahead; it ends before it sees the start again.
+    """A rover's lap around a soccer field, looking ahead; it ends before it sees the start again.
 
     Args:
         duration_s: from time 0, at constant speed.
-        size_m: of the field along x and y; its middle is the origin, the first side runs along +x at -y.
+        size_m: of the field along x and y; its middle is the origin, and the first side runs along +x at -y.
         corner_radius_m: of the turns.
-        height_m: of the camera. unevenness_m: how far the ground goes up and down.
+        height_m: of the camera.
+        unevenness_m: how far the ground goes up and down.
         share: of the lap.
     """
     sides = [size - 2 * corner_radius_m for size in size_m] * 2

@@ -1,4 +1,4 @@
-"""What somebody brings home who has a phone and a radio: photos with EXIF times, and a log."""
+"""The files of somebody who has a phone and a radio: photos with EXIF times, and a log."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from PIL.ExifTags import IFD, Base
 
 
 def write_photos(folder: Path, num: int, *, num_upright: int = 0, has_times: bool = True) -> None:
-    """Photos of 96 x 64 pixels a second apart, of which the last ones stand upright."""
+    """Write photos of 96 x 64 pixels, one a second; the last ``num_upright`` of them are in portrait format."""
     folder.mkdir(parents=True, exist_ok=True)
     for k in range(num):
         size = (64, 96) if k >= num - num_upright else (96, 64)
@@ -20,7 +20,7 @@ def write_photos(folder: Path, num: int, *, num_upright: int = 0, has_times: boo
 
 
 def write_log(path: Path, start_s: float, *, anchors: tuple[str, ...] = ("A1", "A2", "A3", "A4")) -> None:
-    """Ranges twice a second, to one anchor after the other."""
+    """Write a log of ranges twice a second, to one anchor after the other."""
     rows = [f"{start_s + 0.5 * k},{anchors[k % len(anchors)]},{3 + 0.01 * k:.2f}" for k in range(60)]
     path.write_text("timestamp_s,anchor_id,range_m\n" + "\n".join(rows) + "\n", encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""A simulated radio that measures at given poses only, as those of a model are."""
+"""A simulated radio that measures only at given poses, such as those of a model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def simulate_ranges_at(
     radio: Radio,
     seed: int = 0,
 ) -> SimulatedRanges:
-    """One range to each anchor at each of m given poses; the radio's rate is not used.
+    """Simulate one range to each anchor at each of m given poses; the radio's rate is not used.
 
     Args:
         times_s: (m,) on the camera's clock.

@@ -1,4 +1,4 @@
-"""The demo's survey with small photos: for tests of whole runs."""
+"""The demo's survey with small photos, for tests of whole runs."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _SHRINKING = 8 / 3  # from 960 x 640 pixels to 360 x 240
 
 
 def make_small_demo(folder: Path, *, num_photos: int = 14, seed: int = 0) -> DemoSurvey:
-    """The demo's survey, made beside ``folder``, and in ``folder`` with its photos shrunk, and its camera with them.
+    """Make the demo's survey beside ``folder``, and in ``folder`` with its photos and its camera scaled down.
 
-    Where the folder is there already, it is left as it is.
+    An existing folder is left as it is.
     """
     large = make_demo_survey(folder.with_name(f"{folder.name}_large"), num_photos=num_photos, seed=seed)
     if not folder.exists():

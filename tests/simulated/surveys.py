@@ -1,6 +1,7 @@
-"""Surveys as they may turn out: a planned one measured with a radio that errs, its map bent, and its scale found.
+"""Simulated outcomes of a planned survey: ranges of a radio with errors, a bent map, and what the surveyor knows.
 
-The errors are drawn as functions of time, distance and direction, each in its own way, not from covariances of cells.
+The errors are drawn as functions of time, distance and direction, each in its own way, rather than from the covariances
+of cells that the estimates use.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ class Measured:
 
 
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
-    """Of the components of its ranges' errors: as told, or as radios have them in the mean."""
+    """Stddevs of the components of the range errors: the plan's, or those that radios have on average."""
     usual = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None)
     return usual | {"bending": BENDING_M} | dict(planned.component_stddevs)
 
 
 def measured(planned: PlannedSurvey, seed: int) -> Measured:
-    """One such survey, all of its ranges."""
+    """Simulate one such survey with all of its ranges."""
     rng = np.random.default_rng(seed)
     stddevs, true = stddevs_of(planned), planned.trajectory
     times = _required(true.timestamps_s)
@@ -113,7 +114,7 @@ def errors_of_radio(
         since = times[rows]
         errors[rows] += stddevs["bias"] * rng.standard_normal() + stddevs["antenna"] * _lobes(direction[rows], rng)
         errors[rows] += stddevs["time"] * lasting(since, LASTING_S, rng)
-        # Waves of Cauchy and of Gaussian distribution: their sums are alike as exp(-d) and as exp(-d^2 / 2).
+        # Sums of waves with Cauchy and with Gaussian wave vectors have correlations of exp(-d) and of exp(-d^2 / 2).
         cauchy = rng.standard_normal((NUM_WAVES, 3)) / np.abs(rng.standard_normal((NUM_WAVES, 1)))
         errors[rows] += stddevs["place"] * _field(from_anchor[rows] / PLACE_M, cauchy, rng)
         gaussian = rng.standard_normal((NUM_WAVES, 3))
@@ -122,7 +123,7 @@ def errors_of_radio(
 
 
 def lasting(times: Array, memory_s: float, rng: np.random.Generator) -> Array:
-    """First-order autoregressive, of stddev 1."""
+    """Draw a first-order autoregressive process of stddev 1."""
     kept = np.exp(-np.diff(times) / memory_s)
     fresh = np.sqrt(1 - kept**2) * rng.standard_normal(len(kept))
     values = np.empty(len(times))
@@ -133,20 +134,20 @@ def lasting(times: Array, memory_s: float, rng: np.random.Generator) -> Array:
 
 
 def _field(at: Array, waves: Array, rng: np.random.Generator) -> Array:
-    """(n,) of stddev 1 at (n, 3), a sum of waves (k, 3) of any phase."""
+    """(n,) random field of stddev 1 at (n, 3): a sum of waves (k, 3) with random phases."""
     phases = rng.uniform(0, 2 * np.pi, len(waves))
     return np.asarray(np.sqrt(2 / len(waves)) * np.cos(at @ waves.T + phases).sum(axis=1))
 
 
 def _lobes(direction: Array, rng: np.random.Generator) -> Array:
-    """(n,) of stddev 1: half of the variance linear, half a quadratic form without a mean."""
+    """(n,) function of stddev 1 on directions: half of the variance linear, half a quadratic form without a mean."""
     form = rng.standard_normal((3, 3))
     quadratic = np.einsum("ni,ij,nj->n", direction, form, direction) - np.trace(form) / 3
     return np.asarray(direction @ rng.standard_normal(3) / np.sqrt(2) + np.sqrt(3) / 2 * quadratic)
 
 
 def _off_axis(direction: Array, index: Labels, rng: np.random.Generator) -> Array:
-    """(n,) of stddev 1, smooth in the angle from each anchor's mean direction (radians)."""
+    """(n,) function of stddev 1, smooth in the angle from each anchor's mean direction (radians)."""
     facing = np.stack([direction[index == k].mean(axis=0) for k in range(index.max() + 1)])
     facing /= np.linalg.norm(facing, axis=1)[:, None]
     angle = np.arccos(np.clip(np.sum(direction * facing[index], axis=1), -1.0, 1.0))
@@ -154,7 +155,7 @@ def _off_axis(direction: Array, index: Labels, rng: np.random.Generator) -> Arra
 
 
 def error_curve(distance: Array, rng: np.random.Generator) -> Array:
-    """A draw of a Gaussian process in the logarithm of distance, of stddev 1 and one e-fold's length."""
+    """Draw a Gaussian process in the logarithm of distance, with stddev 1 and a length scale of one e-fold."""
     knots = np.linspace(np.log(0.3), np.log(30.0), 40)
     covariance = np.exp(-0.5 * (knots[:, None] - knots) ** 2) + 1e-9 * np.eye(len(knots))
     curve = np.linalg.cholesky(covariance) @ rng.standard_normal(len(knots))
@@ -162,12 +163,12 @@ def error_curve(distance: Array, rng: np.random.Generator) -> Array:
 
 
 def _uneven(distance: Array, rng: np.random.Generator) -> Array:
-    """A random walk over the logarithm of distance that forgets within half an e-fold."""
+    """Draw an autoregressive process over the logarithm of distance with a length scale of half an e-fold."""
     return np.interp(np.log(np.maximum(distance, 0.05)), _KNOTS, lasting(_KNOTS, 0.5, rng))
 
 
 def _bend(times: Array, rng: np.random.Generator) -> Array:
-    """(n, 3) of stddev 1 in each coordinate, smooth within an eighth of the time."""
+    """(n, 3) curve of stddev 1 in each coordinate, smooth within an eighth of the time."""
     knots = np.linspace(times[0], times[-1], 60)
     apart = (knots[:, None] - knots) / (np.ptp(times) / 8)
     lower = np.linalg.cholesky(np.exp(-0.5 * apart**2) + 1e-9 * np.eye(len(knots)))

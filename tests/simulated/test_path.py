@@ -1,4 +1,4 @@
-"""A simulated path is smooth, and its poses are COLMAP's."""
+"""A simulated path is smooth, and its poses follow COLMAP's conventions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged recordings: some bytes are others, and the end is missing."""
+"""Damaged recordings: some bytes are changed, and the end is missing."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from rangesfm.sources.source import open_source
 
 @dataclass(frozen=True)
 class Damage:
-    """What happens to a file: bytes written at places, shares of its length, and the share of it that is kept."""
+    """Damage to a file: bytes written at positions given as shares of its length, and the share of it that is kept."""
 
     bytes_at: list[tuple[float, int]]
     kept: float
 
     def read_or_refused(self, path: Path) -> None:
-        """Do it, and look at all frames of what is left."""
+        """Damage the file, and look at all frames of what is left."""
         content = bytearray(path.read_bytes())
         for position, byte in self.bytes_at:
             content[int(position * len(content))] = byte

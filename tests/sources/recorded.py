@@ -1,4 +1,4 @@
-"""Photos as the video or the bag that a camera, a robot or a phone would have made of them."""
+"""Photos as the video or bag that a camera, a robot or a phone would have recorded."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from rosbags.rosbag2 import Writer as Writer2
 from tests.ranging.readers.test_readers_ros import TYPES
 
 PORTRAIT = (0, 1 << 16, 0, -1 << 16, 0, 0, 0, 0, 1 << 30)
-"""A phone's held upright, in QuickTime's words: what is to the right goes down, what is down goes to the left."""
+"""QuickTime's matrix of a phone held upright: the stored right goes down, and the stored bottom goes left."""
 _TIME_BASE = Fraction(1, 90_000)
 
-# Topic, type, time of the stamp and of arrival, and the other fields.
+# Topic, type, time of the stamp, and the other fields.
 Message = tuple[str, str, float, Mapping[str, Any]]
 
 
@@ -33,7 +33,7 @@ def write_video(
     matrix: Sequence[int] | None = None,
     crf: int = 16,
 ) -> Path:
-    """H.264 with a frame at each time, counted from the first one."""
+    """Write an H.264 video with a frame at each time, counted from the first one."""
     with av.open(path, "w") as video:
         if created is not None:
             video.metadata["creation_time"] = created
@@ -53,7 +53,7 @@ def write_video(
 
 
 def raw(pixels: npt.NDArray[np.uint8], encoding: str, *, padding: int = 0) -> dict[str, Any]:
-    """Fields of an Image with (height, width, bytes) pixels, and rows that are longer by some bytes."""
+    """Fields of an Image with (height, width, bytes) pixels, whose rows are padded with some bytes."""
     rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (0, padding)), constant_values=255)
     size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": rows.shape[1]}
     return {**size, "encoding": encoding, "is_bigendian": 0, "data": rows.ravel()}
@@ -67,7 +67,7 @@ def compressed(content: bytes, format: str = "jpeg") -> dict[str, Any]:
 def write_bag(
     path: Path, messages: Iterable[Message], *, version: int = 2, plugin: StoragePlugin = StoragePlugin.MCAP
 ) -> Path:
-    """A ROS 1 file, or a ROS 2 folder; messages arrive 0.02 s after their stamps."""
+    """Write a ROS 1 file or a ROS 2 folder, in which messages arrive 0.02 s after their stamps."""
     types = TYPES[version]
     with Writer1(path) if version == 1 else Writer2(path, version=9, storage_plugin=plugin) as writer:
         connections: dict[str, Any] = {}
@@ -102,7 +102,7 @@ def camera_info(
 
 
 def _spelled(version: int, name: str, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields as that version of ROS calls them, with those that a CameraInfo has beside."""
+    """Return the fields under their names in that version of ROS, with the other fields that a CameraInfo needs."""
     if not name.endswith("CameraInfo"):
         return dict(fields)
     region = TYPES[version].types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)

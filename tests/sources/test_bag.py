@@ -1,4 +1,4 @@
-"""The images of ROS 1 and ROS 2 bags, in all encodings, with their stamps and their camera."""
+"""The images of ROS 1 and ROS 2 bags, in all encodings, with their time stamps and their camera."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ INFO_OF_8_X_6 = camera_info((8, 6), (9, 10, 4, 3), (0.1, 0, 0, 0, 0))
 
 
 def gradient() -> Pixels:
-    """(6, 8, 3) red grows to the right, green downward, blue is the same everywhere."""
+    """(6, 8, 3) pixels: red grows to the right, green downwards, and blue is the same everywhere."""
     rows, columns = np.mgrid[:6, :8]
     return np.stack([20 * columns, 30 * rows, np.full((6, 8), 77)], axis=-1).astype(np.uint8)
 
 
 def mosaic(red: tuple[int, int]) -> Pixels:
-    """What a sensor with coloured filters sees of it."""
+    """The same image as a sensor with a colour filter mosaic records it."""
     rgb, (i, j) = gradient(), red
     seen = rgb[..., 1:2].copy()
     seen[i::2, j::2, 0] = rgb[i::2, j::2, 0]
@@ -88,7 +88,7 @@ def test_colours_between_filters_are_those_of_the_neighbours(
     encoding: str, red: tuple[int, int], tmp_path: Path
 ) -> None:
     source = open_bag(tmp_path, [("/cam/image", IMAGE, 5.5, raw(mosaic(red), encoding))])
-    inside = slice(1, -1), slice(1, -1)  # a colour that grows evenly is its neighbours' mean
+    inside = slice(1, -1), slice(1, -1)  # a colour that changes linearly is the mean of its neighbours
     np.testing.assert_array_equal(written(source, tmp_path)[inside], gradient()[inside])
 
 
@@ -98,7 +98,8 @@ def test_pixels_that_share_a_colour_with_a_neighbour_have_it(encoding: str, pixe
     shared = gradient().astype(int)
     found = written(source, tmp_path).astype(int)
     np.testing.assert_allclose(found[:, ::2], shared[:, ::2], atol=4)
-    np.testing.assert_allclose(found[:, 1::2], shared[:, 1::2], atol=26)  # red is that of 20 less
+    # red is taken from a neighbour that has 20 less
+    np.testing.assert_allclose(found[:, 1::2], shared[:, 1::2], atol=26)
 
 
 def test_a_compressed_image_is_the_photo_byte_for_byte(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Of each interval the sharpest frame becomes a photo, once, and a folder of them is whole or not there."""
+"""The sharpest frame of each interval becomes a photo, and a folder of photos is complete or does not exist."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONTRASTS = {"blurred": 10, "sharp": 200}
 
 
 def frame(number: int, time_s: float, how: str = "blurred") -> Frame:
-    """Stripes, which differ in how much they stand out from each other."""
+    """A frame of stripes whose contrast depends on ``how``."""
     stripes = np.zeros((8, 8), np.uint8)
     stripes[:, ::2] = CONTRASTS[how]
     image = Image.fromarray(stripes)
@@ -29,7 +29,7 @@ def frame(number: int, time_s: float, how: str = "blurred") -> Frame:
 
 
 class Film:
-    """A source of frames in place of a video, which counts how often it was watched."""
+    """A source of frames in place of a video, which counts how often it is read."""
 
     def __init__(self, path: Path, frames: Sequence[Frame | type[BaseException]]):
         self.path, self.frames, self.num_watched = path, frames, 0

@@ -1,4 +1,4 @@
-"""The frames of a video: when each is shown, which way up, and what its clock is."""
+"""The frames of a video: when each is shown, which way is up, and what its clock is."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TIMES_S = [20.0, 20.04, 20.5, 21.0, 21.002]
 
 
 def pictures(num: int) -> list[Image.Image]:
-    """White on the right, and the more grey on the left the later."""
+    """Pictures that are white on the right, and on the left brighter the later they are."""
     made = []
     for k in range(num):
         pixels = np.full((48, 64), 20 * k, np.uint8)

@@ -1,11 +1,11 @@
-"""Whether advice gains what it promises: in ten weak surveys it is followed, and both are measured in simulation.
+"""Check whether advice gains what it promises: in ten weak surveys it is followed, and both are simulated.
 
 Run: python -m tests.studies.advice_followed --rows FILE [--num_seeds 100] [--surveys NAME]
 
-Of each survey the first advice for the scale, the first that is no tape, and the first for the place are followed.
-Prints what each promises and what it does: the stddev afterwards as a share of that before, both predicted and as the
-spread of simulated runs has it. Where nothing is known before (open), the stddevs afterwards are compared. FILE keeps
-what is done, as in ``planned_surveys``.
+For each survey, three pieces of advice are followed: the first for the scale, the first for the scale that is no taped
+distance, and the first for the place. Prints what each promises and what it achieves, as the stddev afterwards relative
+to that before: predicted, and by the spread of simulated runs. Where nothing is known before (open), the stddevs
+afterwards are compared. FILE keeps the runs that are done, as in ``planned_surveys``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
 
 
 def first_of(plan: SurveyPlan) -> Iterator[tuple[str, Advice]]:
-    """Each with what it is for, "scale" or "place"."""
+    """Yield the first pieces of advice, each with its purpose, "scale" or "place"."""
     for_scale = plan.advice_for_scale
     yield from (("scale", advice) for advice in for_scale[:1] if advice.kind == "tape")
     yield from (("scale", advice) for advice in [advice for advice in for_scale if advice.kind != "tape"][:1])

@@ -1,17 +1,17 @@
-"""How well is an anchor found from ranges of which many are wrong? Its error over many simulated flights.
+"""Measure how well an anchor is located from ranges of which many are wrong, over many simulated flights.
 
     python -m tests.studies.anchor_initialization [--num_seeds 500] [--outlier_shares 0,0.15,0.3,0.5]
 
 Each seed draws a flight (a loop of 8 x 6 m that rises and falls by 1.5 m, 120 known poses), an anchor 2 to 10 m from
-its middle, between 1 m below the ground and a height of 6 m, and one range at each pose: noise of 0.1 m, and a share
-of outliers that are 1 to 5 m too long or too short. Nothing of this is told to the estimate, and its options are the
-defaults; once more with the range bias known to be 0, as it is.
+its middle, between 1 m below the ground and a height of 6 m, and one range at each pose: noise of 0.1 m, and a share of
+outliers that are 1 to 5 m too long or too short. The estimator is told none of this, and its options are the defaults.
+In a second run it is told that the range bias is 0, which is true.
 
-The table gives the median, the 95 % quantile and the largest error of the position, how many are above 0.3 m, how many
-anchors were refused or came with a mirror image, and how honest the covariance is: the mean of the squared error over
-the covariance (3 if it is right, less where it allows for a bias that the simulation does not have) and the share
-within the 95 % ellipsoid. "knowing the inliers" is plain least squares on the ranges that are no outliers, from the
-true position: what nobody could do better than by much.
+The table gives the median, the 95 % quantile and the largest error of the position, the number of errors above 0.3 m,
+the number of anchors that were refused or came with a mirror image, and two figures of how honest the covariance is:
+the mean of the squared error over the covariance (3 if it is right, less where it allows for a bias that the simulation
+does not have), and the share within the 95 % ellipsoid. "knowing the inliers" is plain least squares on the inliers
+alone, from the true position: nobody could do much better.
 
 Exit status 1 if, with 15 % outliers or fewer, a median error is above 0.10 m or any error above 0.3 m, or if a
 covariance is too small.
@@ -44,8 +44,8 @@ ANCHOR_HEIGHT_M = (-1.0, 6.0)
 MAX_MEDIAN_M = 0.10
 MAX_ERROR_M = 0.30
 MAX_OUTLIER_SHARE = 0.15
-# Of the mean squared error over covariance, 3 if right: three standard errors of 500 draws, and for the
-# noise being estimated from 120 ranges.
+# Limit of the mean squared error over covariance, which is 3 if the covariance is right. It allows three standard
+# errors of 500 draws, and the noise being estimated from 120 ranges.
 MAX_MEAN_SQUARE = 3.5
 
 
@@ -54,10 +54,10 @@ class Flight:
     """Known positions, ranges, and the truth.
 
     Attributes:
-        positions_m: (n, 3) of the tag.
+        positions_m: (n, 3) positions of the tag.
         range_m: (n,).
         is_outlier: (n,).
-        anchor_m: (3,).
+        anchor_m: (3,) true position of the anchor.
     """
 
     positions_m: Array
@@ -73,7 +73,7 @@ class Summary:
     Attributes:
         error_m: (k,).
         squares: (k,) squared error over covariance; NaN where there is none.
-        num_mirrored, num_refused: out of all seeds.
+        num_mirrored, num_refused: counted over all seeds.
     """
 
     error_m: Array
@@ -103,7 +103,7 @@ def _draw_anchor(middle: Array, rng: np.random.Generator) -> Array:
 
 
 def estimate(outlier_share: float, num_seeds: int, options: TrilaterationOptions) -> Summary:
-    """What ``trilaterate`` makes of flights 0 to ``num_seeds`` - 1."""
+    """Run ``trilaterate`` on flights 0 to ``num_seeds`` - 1."""
     errors, squares, num_mirrored, num_refused = [], [], 0, 0
     for seed in range(num_seeds):
         flight = draw_flight(outlier_share, seed)
@@ -120,7 +120,7 @@ def estimate(outlier_share: float, num_seeds: int, options: TrilaterationOptions
 
 
 def estimate_knowing_the_inliers(outlier_share: float, num_seeds: int) -> Summary:
-    """Plain least squares without the outliers, from the truth."""
+    """Run plain least squares without the outliers, from the truth."""
     errors = []
     for seed in range(num_seeds):
         flight = draw_flight(outlier_share, seed)
@@ -138,7 +138,7 @@ def _misses(flight: Flight, rows: npt.NDArray[np.bool_]) -> Callable[[Array], Ar
 
 
 def is_good(summary: Summary) -> bool:
-    """Whether all anchors were found, close enough, and with an honest covariance."""
+    """Return whether all anchors were found, close enough, and with an honest covariance."""
     return (
         summary.num_refused == 0
         and float(np.median(summary.error_m)) <= MAX_MEDIAN_M

@@ -1,13 +1,12 @@
-"""How honest the stddev of an estimated clock offset is, on short logs with errors that stay for seconds.
+"""Measure how honest the stddev of an estimated time offset is, on short logs with errors that last for seconds.
 
     python -m tests.studies.clock_coverage [--num_seeds 40] [--durations_s 20 40 60 190] [--num_anchors 1 4 8]
 
-A hand-held walk in a room of about 8 x 8 m, a photo a second, five ranges a second to each of
-some anchors that nobody surveyed. The ranges have white noise, a slow error as of multipath and
-antenna patterns (exponentially correlated over ``--correlation_s``, each anchor its own), and some
-that are far too long. For every length of the log and number of anchors it prints how many logs
-were refused, the true root mean square error of the offset, the median stated stddev, the share of
-estimates whose error is within 1.96 stated stddevs (95 % if honest), and the root mean square of
+A hand-held walk in a room of about 8 x 8 m, a photo a second, five ranges a second to each of some anchors at unknown
+positions. The ranges have white noise, a slow error as from multipath and antenna patterns (exponentially correlated
+over ``--correlation_s``, independent for each anchor), and some are far too long. For every length of the log and
+number of anchors it prints how many logs were refused, the true root mean square error of the offset, the median stated
+stddev, the share of estimates whose error is within 1.96 stated stddevs (95 % if honest), and the root mean square of
 the errors in stddevs (1 if honest).
 """
 
@@ -34,7 +33,7 @@ PHOTO_STDDEV_M = 0.005
 
 
 def walk(duration_s: float, seed: int) -> CameraPath:
-    """A new direction about every two seconds."""
+    """A path with a new direction about every two seconds."""
     rng = np.random.default_rng([seed, 1])
     times = np.arange(0.0, duration_s + 2.0, 2.0)
     centers = rng.normal(0, 1, (len(times), 3)) * [1.8, 1.8, 0.4]
@@ -43,7 +42,7 @@ def walk(duration_s: float, seed: int) -> CameraPath:
 
 
 def photos_of(path: CameraPath, duration_s: float, seed: int) -> Trajectory:
-    """A keyframe a second, in a world of another size."""
+    """A keyframe a second, in a world of another scale."""
     rng = np.random.default_rng([seed, 2])
     times = np.arange(0.1, duration_s, 1.0)
     centers = path.centers(times) + PHOTO_STDDEV_M * rng.standard_normal((len(times), 3))
@@ -52,7 +51,7 @@ def photos_of(path: CameraPath, duration_s: float, seed: int) -> Trajectory:
 
 
 def log_of(path: CameraPath, num_anchors: int, correlation_s: float, seed: int) -> RangeLog:
-    """With noise that is white, slow, and now and then far too long."""
+    """Ranges with white noise, slow errors, and some that are far too long."""
     rng = np.random.default_rng([seed, 3])
     positions = rng.uniform([-5, -5, 0], [5, 5, 2.5], (num_anchors, 3))
     anchors = {f"A{number}": position for number, position in enumerate(positions)}
@@ -67,7 +66,7 @@ def log_of(path: CameraPath, num_anchors: int, correlation_s: float, seed: int) 
 
 
 def exponentially_correlated(times: Array, rng: np.random.Generator) -> Array:
-    """(n,) of stddev 1 whose correlation falls to 1/e over a time of 1."""
+    """(n,) process of stddev 1 whose correlation falls to 1/e over a time of 1."""
     kept = np.exp(-np.diff(times, prepend=-np.inf))
     fresh = np.sqrt(1 - kept**2) * rng.standard_normal(len(times))
     values = np.zeros(len(times))

@@ -1,29 +1,29 @@
-"""The paper's experiment, simulated: a rover's lap round a soccer field, and how far ranges bend its drift back.
+"""Simulate the paper's experiment, a rover's lap around a soccer field, and measure how far ranges remove its drift.
 
     python -m tests.studies.drift [--num_seeds 20] [--anchor beside] [--level_by scaling] [--anchor_frame unknown]
 
-600 keyframes of a forward camera, tracks of at most 8 of them, no loop closure, one anchor on a mast near the middle
-of the field (or beside it), known in the first camera's frame, one range of stddev 0.1 m at each keyframe. The drift
-is that of vision itself: COLMAP's bundle adjustment of noisy features, so that the drifted map is the one that fits
-the photos best. What the stages after the mapping know is what a survey would tell them: scale, noise of ranges and
-of features are estimated.
+600 keyframes of a forward camera, tracks of at most 8 of them, no loop closure, one anchor on a mast near the middle of
+the field (or beside it), known in the first camera's frame, one range of stddev 0.1 m at each keyframe. The drift is
+that of vision itself: COLMAP adjusts noisy features, so the drifted map is the one that fits the photos best. The
+stages after the mapping know only what a survey would tell them: scale, noise of ranges and noise of features are
+estimated.
 
-Chance makes drift small or large from the same noise, so each run's drift is brought to the level, and no seed is
-passed over:
+The same noise gives small or large drift by chance. Therefore each run's drift is brought to the level, and no seed is
+skipped:
 
-- ``mixing``: the features' stddev is the one with which drift is the level on average (root mean square, by the
-  normal equations of the noise-free map). A seed draws errors of that stddev until one draw drifts less than the
-  level and the next one more, or the other way round; in between lies the mixture that drifts as far as the level.
-  The squared weights of a mixture sum to 1, so it is noise of the same stddev.
-- ``scaling``: the seed's errors are multiplied by what brings their drift to the level. A seed of small drift then
-  has far noisier features than another, and the ranges have less to hold on to. One that would need features of more
-  than 4 pixels is refused: no survey has such.
+- ``mixing``: the features have the stddev with which the drift is at the level on average (root mean square, by the
+  normal equations of the noise-free map). A seed draws errors of that stddev until one draw drifts less than the level
+  and the next one more, or the other way round. A mixture between the two drifts exactly as far as the level. The
+  squared weights of a mixture sum to 1, so it is noise of the same stddev.
+- ``scaling``: the seed's errors are multiplied by the factor that brings their drift to the level. A seed with small
+  drift then has far noisier features than another, and the refinement has to rely more on the ranges. A seed that would
+  need features of more than 4 pixels is refused, because no survey has such features.
 
 Prints, in the shape of the paper's table, the root mean square error of the keyframes in the first camera's frame,
-without alignment: at the true scale, at the estimated scale, and refined; then their ratio, the iterations of the
-full problem, the features' stddev, and what the Cramer-Rao bound leaves of the drift: no method can expect a smaller
-ratio. Seeds that are refused, by the study or by the scale stage, are named and counted; medians are of the others.
-Exit status 1 if at some level the median ratio or a single run misses its limit, or no run is left.
+without alignment: at the true scale, at the estimated scale, and refined. Then come their ratio, the iterations of the
+full problem, the features' stddev, and the share of the drift that the Cramer-Rao bound leaves: no method can expect a
+smaller ratio. Seeds that are refused, by the study or by the scale stage, are named and counted; medians are over the
+others. Exit status 1 if at some level the median ratio or a single run misses its limit, or no run is left.
 """
 
 from __future__ import annotations
@@ -69,10 +69,11 @@ class NoSuchDriftError(Exception):
 
 @dataclass(frozen=True)
 class Level:
-    """How far vision drifts: root mean square over the keyframes, at the true scale.
+    """A level of drift from vision: root mean square over the keyframes, at the true scale.
 
     Attributes:
-        num_observations: features in a keyframe. max_median_ratio: of refined to true-scale error.
+        num_observations: features in a keyframe.
+        max_median_ratio: largest median ratio of refined to true-scale error.
     """
 
     drift_m: float
@@ -85,10 +86,11 @@ LEVELS = (Level(0.5, 150, 0.2), Level(5.0, 60, 0.12), Level(12.0, 40, 0.06))
 
 @dataclass(frozen=True)
 class Drift:
-    """One run: errors in metres, and what the refinement says.
+    """One run: errors in metres, and what the refinement reports.
 
     Attributes:
-        pixel_stddev: of the features. bound_m: on the refined error's root mean square.
+        pixel_stddev: of the features.
+        bound_m: lower bound on the refined error's root mean square.
     """
 
     true_scale_m: float
@@ -112,8 +114,8 @@ class Lap:
     """A survey at a level of drift.
 
     Attributes:
-        pixel_stddev: of the features, with which drift is the level on average.
-        bound_m: on the root mean square of the refined error, with such features.
+        pixel_stddev: of the features; with it, the drift is at the level on average.
+        bound_m: lower bound on the root mean square of the refined error, with such features.
     """
 
     survey: Survey
@@ -142,10 +144,10 @@ def study_run(lap: Lap, seed: int, *, level_by: str = "mixing", obstructed_share
 
 
 def scaled_to_level(lap: Lap, seed: int) -> tuple[Array, pycolmap.Reconstruction]:
-    """Pixel errors that are a multiple of the seed's, and the map that drifts as far as asked.
+    """Scale the seed's pixel errors so that the map drifts as far as asked; return both.
 
     Raises:
-        NoSuchDriftError: only with features that no survey has, if at all.
+        NoSuchDriftError: no multiple drifts so far, or only with features that no survey has.
     """
     errors = lap.pixel_stddev * unit_pixel_errors(lap.survey, seed)
     for _ in range(_MAX_NUM_TRIALS):
@@ -161,10 +163,10 @@ def scaled_to_level(lap: Lap, seed: int) -> tuple[Array, pycolmap.Reconstruction
 
 
 def mixed_to_level(lap: Lap, seed: int) -> tuple[Array, pycolmap.Reconstruction]:
-    """Pixel errors between two of the seed's draws, and the map that drifts as far as asked.
+    """Mix two of the seed's draws of pixel errors so that the map drifts as far as asked; return both.
 
     Raises:
-        NoSuchDriftError: no mixture does.
+        NoSuchDriftError: no mixture drifts so far.
     """
     drawn: list[tuple[Array, float]] = []
     for k in itertools.count():
@@ -175,7 +177,7 @@ def mixed_to_level(lap: Lap, seed: int) -> tuple[Array, pycolmap.Reconstruction]
     (less, below), (more, above) = sorted(drawn[-2:], key=lambda one: one[1])
     low, high = 0.0, 0.5 * np.pi
     for _ in range(_MAX_NUM_TRIALS):
-        # Between the linear guess and the middle, so that a crooked curve is bracketed all the same.
+        # Between the linear guess and the middle, so that the bracket shrinks even for a curved function.
         angle = low + (high - low) * (0.25 + 0.5 * below / (below - above))
         errors = np.cos(angle) * less + np.sin(angle) * more
         sfm = mapped(lap.survey, errors)
@@ -187,7 +189,7 @@ def mixed_to_level(lap: Lap, seed: int) -> tuple[Array, pycolmap.Reconstruction]
 
 
 def log_excess(lap: Lap, sfm: pycolmap.Reconstruction) -> float:
-    """Logarithm of drift over the level."""
+    """Return the logarithm of the drift over the level."""
     return float(np.log(rmse(drift_of(lap.survey, sfm)) / lap.level.drift_m))
 
 
@@ -232,7 +234,7 @@ def main() -> int:
 
 
 def runs_at_level(lap: Lap, arguments: argparse.Namespace) -> list[Drift]:
-    """Of the seeds that were not refused; prints them all."""
+    """Run all seeds, print them, and return those that were not refused."""
     runs: list[Drift] = []
     level = f"{lap.level.drift_m:g} m"
     for seed in range(arguments.num_seeds):

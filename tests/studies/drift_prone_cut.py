@@ -1,21 +1,21 @@
-"""A survey of yours, with true positions, cut into one that drifts: no photo knows any but its neighbours.
+"""Cut a survey with true positions into one that drifts, in which photos share points with their neighbours only.
 
 Run: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT [--first 0]
      [--num_photos 120] [--overlap 2] [--max_num_features 1000] [--ranges_in_mapping]
  or: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
      [--max_track_length 3] [--share_of_points 0.15] [--num_seeds 3]
 
-The first maps a stretch of successive photos (all of them, whatever the survey file thins out, so that neighbours
-overlap well), each matched with the ``--overlap`` ones before it and with no other: no place that is seen again closes
-a loop. What was matched and mapped before in OUT is used again.
+The first command maps a stretch of successive photos (all of them, even if the survey file skips some, so that
+neighbours overlap well). Each photo is matched with the ``--overlap`` photos before it and with no other, so that no
+loop is closed. Matches and models of an earlier run in OUT are used again.
 
-In a room even such a sequence hardly drifts, for features are seen many times over. The second therefore takes a model
-that is there and gives it the memory of a fast camera: of its points a random share, each track cut into pieces of
-successive photos, from a random one on, and all adjusted again from there, without ranges, until it is still. Features
-and their errors are as they were; the drift is what the photos then have no say against.
+In a room even such a sequence hardly drifts, because features are seen many times. The second command therefore takes
+an existing model and shortens its tracks, as if from a fast camera: it keeps a random share of the points, cuts each
+track into pieces of successive photos, starting at a random photo, and adjusts everything from there without ranges
+until it converges. Features and their errors stay as they were; the drift is what the photos then leave undetermined.
 
 Prints root mean square errors of the keyframes' centres, in metres, without alignment, after the best rigid motion and
-after the best similarity: of the unscaled model, at the true scale, at the estimated one and refined. The survey file
+after the best similarity: of the unscaled model, at the true scale, at the estimated scale and refined. The survey file
 names reference, anchors and ranges.
 """
 
@@ -39,11 +39,11 @@ from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.workflows.photos import AdjustmentWithRanges
 from rangesfm.workflows.run import refine_model
 
-# What differs little from the last steps of a solver that converges.
+# A tolerance small enough that the solver runs to convergence.
 _TOLERANCE = 1e-10
 _MAX_NUM_ITERATIONS = 200
 _NUM_ROUNDS = 3
-# As COLMAP's mapper filters: points of less parallax may go behind the horizon.
+# As in COLMAP's mapper: points with less parallax may go behind the horizon.
 _MAX_REPROJECTION_ERROR_PX = 4.0
 _MIN_TRI_ANGLE_DEG = 1.5
 
@@ -84,7 +84,7 @@ def times_of_stretch(survey: Survey, first: int, num_photos: int) -> ImageTimes:
 def mapped(
     survey: Survey, times: ImageTimes, overlap: int, max_num_features: int, *, ranges_in_mapping: bool
 ) -> pycolmap.Reconstruction:
-    """The largest model of the stretch."""
+    """Return the largest model of the stretch."""
     mapper = survey.mapper.changed(
         matching="sequential",
         pairing={"overlap": overlap, "quadratic_overlap": False},
@@ -109,7 +109,7 @@ def mapped(
 def forgetful(
     whole: pycolmap.Reconstruction, max_track_length: int, share_of_points: float, seed: int
 ) -> pycolmap.Reconstruction:
-    """Some of the features in tracks of few successive photos, bundle-adjusted without ranges."""
+    """Keep some of the points, cut into tracks of few successive photos, and adjust them without ranges."""
     model, rng = pycolmap.Reconstruction(whole), np.random.default_rng(seed)
     for point_id, point in sorted(whole.points3D.items()):
         model.delete_point3D(point_id)
@@ -129,7 +129,7 @@ def forgetful(
 
 
 def adjust_alone(model: pycolmap.Reconstruction) -> None:
-    """Photos alone, in place."""
+    """Adjust the model in place with its photos alone."""
     options = pycolmap.BundleAdjustmentOptions(
         print_summary=False, refine_focal_length=False, refine_extra_params=False
     )
@@ -141,7 +141,7 @@ def adjust_alone(model: pycolmap.Reconstruction) -> None:
 
 
 def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
-    """Unscaled, scaled and refined against the reference."""
+    """Print the errors of the unscaled, scaled and refined map against the reference."""
     lengths = [point.track.length() for point in sfm.points3D.values()]
     print(f"{sfm.num_reg_images()} photos, {len(lengths)} points, seen {np.mean(lengths):.1f} times on average")
     path = survey.output.path / "cut"

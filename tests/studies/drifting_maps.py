@@ -1,24 +1,24 @@
-"""How clean surveys of maps that drift are judged: what is kept, what is said to be known, and what is named wrongly.
+"""Check how clean surveys of drifting maps are judged: what is kept, what is stated, and what is wrongly named.
 
 Run: python -m tests.studies.drifting_maps [--kinds lap hall ...] [--num_seeds 2] [--seed 0] [--out FILE]
 
-Nothing is wrong with any of these surveys but what is wrong with all of them: features are located to 0.7 pixels, so
-that COLMAP's bundle adjustment of them bends and drifts, and radios err.
+These surveys have only the errors that all surveys have: features are noisy (0.7 pixels in the hall), so that COLMAP's
+bundle adjustment of them bends and drifts, and radios have errors.
 
-- ``lap``: a rover's lap of 300 m round a field, forward camera, tracks of at most 8 photos, no loop closed, one
-  anchor on a mast beside the middle, known in the first camera's frame, Gaussian ranges of 0.1 m. How many features a
-  photo has, and how noisy they are, brings its drift to 0.2, 0.5, 1, 2, 5 and 15 m on average over seeds.
-- ``lap_unknown``: the same, nobody measured the anchor. ``lap_site``: four surveyed anchors round the field.
-- ``lap_radio``: as ``lap_site``, with a radio drawn from the population of real ones, one range in 25 obstructed.
-- ``hall``: 120 s in a hall, tracks of at most 8 photos, six surveyed anchors, likewise.
-- ``poses``: keyframes of ``lap_site`` without points, scaled only.
-- ``desk``: real monocular keyframes (ORB-SLAM on TUM's fr2_desk), scaled only, with four surveyed anchors round the
+- ``lap``: a rover's lap of 300 m around a field, forward camera, tracks of at most 8 photos, no loop closed, one anchor
+  on a mast beside the middle, known in the first camera's frame, Gaussian ranges of 0.1 m. The number of features in a
+  photo and their noise give it a drift of 0.2, 0.5, 1, 2, 5 and 15 m on average over seeds.
+- ``lap_unknown``: the same with an unknown anchor. ``lap_site``: four surveyed anchors around the field.
+- ``lap_radio``: like ``lap_site``, with a radio drawn from the population of real ones, one range in 25 obstructed.
+- ``hall``: 120 s in a hall, tracks of at most 8 photos, six surveyed anchors, with the same kind of radio.
+- ``poses``: keyframes of ``lap_site`` with such a radio and without points, scaled only.
+- ``desk``: real monocular keyframes (ORB-SLAM on TUM's fr2_desk), scaled only, with four surveyed anchors around the
   desk and simulated ranges of 0.08 m. Needs --data.
 
-Prints for each kind: refinements kept that are nearer to the truth than the scaled map was, and those thrown away; how
-many of the delivered scales lie in their 95 % interval, and its median half width; errors of scale and of keyframes in
-their stated stddevs (root mean square: 1 where what is stated is so); and how many surveys are doubted, and have a
-mistake named. With --out each run is a line of a file, and what stands there is not run again.
+Prints for each kind: how many refined maps are nearer to the truth than the scaled map, and how many of these are kept;
+how many of the delivered scales lie in their 95 % interval, and its median half width; errors of scale and of keyframes
+in their stated stddevs (root mean square: 1 if the stddevs are honest); and how many surveys are doubted, and have a
+mistake named. With --out each run is a line of a file, and runs that are there already are not repeated.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ Line = dict[str, Any]
 LEVELS_M = (0.2, 0.5, 1.0, 2.0, 5.0, 15.0)
 HALL_PIXELS = 0.7
 MAST_M = {"A1": (10.0, 5.0, 8.0)}
-# At heights that tell the map from its mirror image.
+# At heights that distinguish the map from its mirror image.
 ROUND_THE_FIELD_M = {"N": (5.0, 52.0, 14.0), "E": (68.0, -4.0, 2.0), "S": (-8.0, -50.0, 18.0), "W": (-66.0, 9.0, 4.0)}
 
 
 @dataclass(frozen=True)
 class Made:
-    """A survey as its user has it, and the truth of its keyframes in the world of the result."""
+    """A survey as its user has it, and the true centres of its keyframes in the world of the result."""
 
     sfm: pycolmap.Reconstruction
     trajectory: Trajectory
@@ -85,14 +85,14 @@ class Made:
 
 
 def lap(seed: int, frame: str = "first_camera", *, with_radio: bool = False) -> Made:
-    """One lap; its level of drift is the next one with each seed."""
+    """Simulate one lap; successive seeds go through the levels of drift."""
     return lap_of_drift(LEVELS_M[seed % len(LEVELS_M)], seed, frame, with_radio=with_radio)
 
 
 def lap_of_drift(
     level_m: float, seed: int, frame: str = "first_camera", *, with_radio: bool = False, num_keyframes: int = 600
 ) -> Made:
-    """One lap that drifts so far on average."""
+    """Simulate one lap with this drift on average."""
     num_observations = 150 if level_m < 3 else 60 if level_m < 10 else 40
     anchors_m = ROUND_THE_FIELD_M if frame == "site" else MAST_M
     path, times = lap_path(300.0, share=0.98), np.linspace(0.0, 300.0, num_keyframes)
@@ -116,12 +116,12 @@ def poses(seed: int) -> Made:
 
 
 def without_points(survey: Made) -> Made:
-    """Its path alone, which can be scaled."""
+    """Return the survey with its path alone, which can only be scaled."""
     return replace(survey, sfm=pycolmap.Reconstruction(), refine=False)
 
 
 def desk(folder: Path, seed: int) -> Made:
-    """Real keyframes; the truth's times are matched, its gaps are left."""
+    """Read real keyframes, matched with the truth by time; those in gaps of the truth are left out."""
     keyframes, truth = (np.loadtxt(folder / name) for name in ("fr2_desk_ORB_kf_mono.txt", "fr2_desk_groundtruth.txt"))
     rng = np.random.default_rng([seed, 11])
     nearest = np.abs(truth[:, 0] - keyframes[:, :1]).argmin(axis=1)
@@ -152,7 +152,7 @@ def truth_of(
     num_observations: int,
     depth_range_m: tuple[float, float],
 ) -> Truth:
-    """Without noise, in the world of the result."""
+    """A model without noise, in the world of the result."""
     centers, world_from_cam = path.centers(times), path.world_from_cam(times)
     rotation, origin = (np.eye(3), np.zeros(3)) if frame == "site" else (world_from_cam[0], centers[0])
     model = synthetic_model(
@@ -181,7 +181,7 @@ def made(
     *,
     with_radio: bool,
 ) -> Made:
-    """Mapped from noisy features, in a world of its own, and ranged to its anchors in turn."""
+    """Map the survey from noisy features in a world of its own, and simulate ranges to its anchors in turn."""
     rng = np.random.default_rng([seed, 5])
     sfm = mapped(survey, pixel_stddev * unit_pixel_errors(survey, seed))
     turned = Rotation.from_quat(rng.normal(size=4)).as_matrix()
@@ -205,7 +205,7 @@ def made(
 
 
 def drawn_errors(survey: Truth, at_s: Array, ids: npt.NDArray[np.str_], rng: np.random.Generator) -> Array:
-    """Of a radio as they are, with ranges that were obstructed."""
+    """Draw range errors of a radio from the population, some of whose ranges are obstructed."""
     model, anchors_m = survey.model, survey.anchors_m
     log = RangeLog.from_arrays(ids, np.ones(len(ids)), timestamp_s=at_s)
     true = replace(
@@ -223,7 +223,7 @@ def drawn_errors(survey: Truth, at_s: Array, ids: npt.NDArray[np.str_], rng: np.
 
 
 def run(survey: Made, seed: int) -> MetricResult:
-    """From the scale on, with all defaults."""
+    """Run all stages from the scale on, with all defaults."""
     settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
     anchors = tuple(Anchor(name, None if survey.frame == "unknown" else at) for name, at in survey.anchors_m.items())
     inputs = RangingInputs(
@@ -242,7 +242,7 @@ def run(survey: Made, seed: int) -> MetricResult:
 
 
 def of_poses(path: Trajectory) -> pycolmap.Reconstruction:
-    """A model without points."""
+    """Make a model without points."""
     model = synthetic_model(
         np.arange(float(len(path))), path.centers, path.world_from_cam, num_observations=0, metric_from_sfm=IDENTITY
     ).reconstruction
@@ -252,7 +252,7 @@ def of_poses(path: Trajectory) -> pycolmap.Reconstruction:
 
 
 def told(survey: Made, kind: str, seed: int) -> Line:
-    """What counts of a run."""
+    """Run a survey, and return the figures that the report needs."""
     line: Line = {"kind": kind, "seed": seed}
     try:
         metric = run(survey, seed)
@@ -262,7 +262,7 @@ def told(survey: Made, kind: str, seed: int) -> Line:
     scaled_m, final_m = (metric.trajectory.as_in(model).centers for model in (metric.scaled, metric.final))
     kept = metric.kept_refinement is not None
     estimate = metric.estimate
-    # Before the judgement came last, the interval was the scaled map's, whatever was delivered.
+    # The interval belongs to the delivered map, so the error is that of its scale.
     delivered = metric.refined_scale if kept else estimate.value
     low, high = estimate.interval_95
     variances = metric.center_covariance_m2
@@ -297,14 +297,14 @@ def _traces(covariances: Array) -> Array:
 
 
 def _covered(off_m: Array, covariances: Array) -> float:
-    """Share of coordinates within 1.96 of their stddevs, of all keyframes that are not held."""
+    """Return the share of coordinates within 1.96 of their stddevs, over all keyframes that are not held."""
     stddevs = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     free = stddevs.min(axis=1) > 1e-9
     return float(np.mean(np.abs(off_m[free]) <= 1.96 * stddevs[free]))
 
 
 def surveys(data: Path | None) -> dict[str, Callable[[int], Made]]:
-    """By kind."""
+    """Functions that simulate a survey, by kind."""
     found: dict[str, Callable[[int], Made]] = {
         "lap": lap,
         "lap_unknown": lambda seed: lap(seed, "unknown"),
@@ -319,7 +319,7 @@ def surveys(data: Path | None) -> dict[str, Callable[[int], Made]]:
 
 
 def report(lines: list[Line]) -> Iterator[str]:
-    """A row for each kind."""
+    """Yield a row for each kind."""
     for kind in dict.fromkeys(line["kind"] for line in lines):
         own = [line for line in lines if line["kind"] == kind]
         judged = [line for line in own if not line["refused"]]

@@ -1,4 +1,4 @@
-"""Simulated surveys without photos that may have a mistake in them, and the scale stage with its tests on them."""
+"""Simulated surveys without photos that may contain a mistake, and the scale stage with its tests on them."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ LASTING_STDDEV_M = 0.0018
 DRIFT_STDDEV_M, DRIFT_S = 0.01, 60.0
 OBSTRUCTED_SHARE, OBSTRUCTED_MEAN_M = 0.04, 0.7
 BEND_SHARE = 0.002
-# A camera's x right, y down, z forward by a robot's x forward, y left, z up.
+# A camera's axes (x right, y down, z forward) in terms of a robot's (x forward, y left, z up).
 Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 X_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 @dataclass(frozen=True)
 class Site:
-    """A kind of survey; the anchor frame as of ``initialize_scale``."""
+    """A kind of survey; the anchor frame as in ``initialize_scale``."""
 
     name: str
     path: Callable[[int], CameraPath]
@@ -102,7 +102,7 @@ SITES = (
 class Given:
     """What a surveyor hands over, right or wrong, and the truth; times in seconds of the camera's clock.
 
-    ``needs_search``: the truth is no start for the scale's solution.
+    ``needs_search`` is set if the truth is not a valid start for the solution of the scale.
     """
 
     trajectory: Trajectory
@@ -129,7 +129,7 @@ class Given:
 
 
 def surveyed(site: Site, seed: int) -> Given:
-    """A clean survey."""
+    """Simulate a clean survey."""
     rng = np.random.default_rng([seed, len(site.name)])
     path = site.path(seed)
     duration = path.end_s - path.start_s
@@ -153,7 +153,7 @@ def distances(given: Given) -> Array:
 
 
 def mapped(path: CameraPath, rng: np.random.Generator) -> Trajectory:
-    """The path as a mapper leaves it: bent a little, in a unit and a world of its own."""
+    """Return the path as from a mapper: slightly bent, in a unit and a world of its own."""
     times = np.arange(path.start_s, path.end_s, 0.5)
     centers, rotations = path.centers(times), path.world_from_cam(times)
     knots = np.linspace(times[0], times[-1], 7)
@@ -184,7 +184,7 @@ def radio_errors(given: Given, stddev_m: float, rng: np.random.Generator) -> Arr
 
 @dataclass(frozen=True)
 class Run:
-    """One survey as it went; None where the scale was refused."""
+    """The outcome of one survey; None where the scale was refused."""
 
     given: Given
     estimate: ScaleEstimate | None
@@ -194,7 +194,7 @@ class Run:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the scale lies outside its interval."""
+        """Return whether the true scale lies outside the stated interval."""
         if self.estimate is None:
             return False
         low, high = self.estimate.interval_95
@@ -202,7 +202,7 @@ class Run:
 
     @property
     def doubts(self) -> list[str]:
-        """All that speaks against the map, as a survey that is not refined has it."""
+        """List everything that speaks against the map of a survey that is not refined."""
         assert self.estimate is not None
         assert self.trust is not None
         no_points = PointErrors(np.zeros(0), np.zeros((0, 3)), np.inf)
@@ -212,7 +212,7 @@ class Run:
 
     @property
     def place_in_stddevs(self) -> float:
-        """How far the middle of the map is out of place, in its stated stddevs; 0 without a place."""
+        """Return how far the middle of the map is displaced, in its stated stddevs; 0 without a place."""
         if self.estimate is None or self.estimate.placement is None:
             return 0.0
         centers_m = self.estimate.metric_from_sfm.apply(self.given.trajectory.centers)
@@ -222,7 +222,7 @@ class Run:
 
 
 def run(given: Given, seed: int) -> Run:
-    """The scale stage, from near the truth where that is a start, and the tests after it."""
+    """Run the scale stage and the tests after it, starting near the truth if that is a valid start."""
     log = RangeLog.from_arrays(
         np.array(given.ids)[given.anchor], np.maximum(given.range_m, 0.02), timestamp_s=given.time_s
     )

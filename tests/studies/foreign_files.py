@@ -1,16 +1,16 @@
-"""Files of somebody else's in the places of a command's inputs and outputs, in five hundred random runs.
+"""Put files of other owners at a command's inputs and outputs, in five hundred random runs.
 
     python -m tests.studies.foreign_files [--num_runs 500] [--seed 0]
 
-Each run takes a copy of a small photo survey that has been run once, puts files that rangesfm did not write at random
-among its inputs and outputs (under every name that the tool uses, in the place of files that it wrote, inside folders
-that it wrote, as links, and as further links to files that it wrote), and starts a random command there. A third of the
-commands are killed at a random moment, and another command follows; a tenth may write no file beyond a random size, as
-on a full disk; a tenth find the result of a version that kept no record of what it wrote.
+Each run takes a copy of a small photo survey that has been run once. It puts files that rangesfm did not write at
+random among the inputs and outputs: under every name that the tool uses, in place of files that it wrote, inside
+folders that it wrote, as links, and as further links to files that it wrote. Then it starts a random command there. A
+third of the commands are killed at a random moment, and another command follows. A tenth may write no file beyond a
+random size, as on a full disk. A tenth find the result of a version that kept no record of what it wrote.
 
-Afterwards every such file, every input and everything that a link leads to must be what it was, byte by byte, and no
-command may end in a way that the contract does not know. Prints a line for each run that went wrong, and how the
-commands ended. Exit status 1 if anything did.
+Afterwards every such file, every input and everything that a link leads to must be unchanged, byte by byte, and every
+command must end with an exit status of the contract. Prints a line for each run that went wrong, and how the commands
+ended. Exit status 1 if anything went wrong.
 """
 
 from __future__ import annotations
@@ -89,8 +89,9 @@ class Site:
     """A survey with its results, and files that are not the tool's.
 
     Attributes:
-        folder: in which commands run; outside: what links lead to.
-        foreign: each such path, with what it was.
+        folder: where commands run.
+        outside: a folder that links lead to.
+        foreign: each path that must not change, with its content.
     """
 
     folder: Path
@@ -103,12 +104,12 @@ class Site:
             self.foreign[path] = content_of(path)
 
     def own_files(self) -> list[Path]:
-        """What the run before has left, but for what it keeps to itself."""
+        """List the files that the earlier run left, without the tool's hidden records."""
         files = [path for path in (self.folder / "out").rglob("*") if path.is_file() and not path.is_symlink()]
         return sorted(path for path in files if PRIVATE_NAME not in path.parts and path not in self.foreign)
 
     def place_somewhere(self) -> None:
-        """Put a file, a folder with one in it, or a link under a name that the tool uses."""
+        """Put a file, a folder that holds one, or a link under a name that the tool uses."""
         parent = self.folder / str(self.rng.choice([*FOLDERS, *OUTPUTS]))
         path = parent / str(self.rng.choice(NAMES))
         if any(other.is_symlink() or other.is_file() for other in (parent, *parent.parents)):
@@ -132,13 +133,14 @@ class Site:
         self.protect(path)
 
     def change_an_own_file(self) -> None:
-        """Make a file of the tool's somebody else's: by other bytes in it or in its place, or by a link."""
+        """Turn one of the tool's files into a foreign one, by changing or replacing its content, or by a link."""
         if not (own := self.own_files()):
             return
         path = own[self.rng.integers(len(own))]
         kind = self.rng.choice(["same file", "new file", "appended", "same size", "link"])
         data = path.read_bytes()
-        if kind in ("new file", "link") or path.stat().st_nlink > 1:  # else its other name would change as well
+        # otherwise the content under its other name would change as well
+        if kind in ("new file", "link") or path.stat().st_nlink > 1:
             path.unlink()
         if kind == "link":
             path.symlink_to(self.outside / "file.txt")
@@ -171,13 +173,13 @@ class Site:
                     self.protect(file)
 
     def forget_the_record(self) -> None:
-        """Have the results be those of a version that kept no record: then all of them are somebody else's."""
+        """Turn the results into those of a version that kept no record, so that all of them count as foreign."""
         shutil.rmtree(self.folder / "out" / PRIVATE_NAME)
         for path in (self.folder / "out").rglob("*"):
             self.protect(path)
 
     def lost(self) -> list[str]:
-        """Paths that are not what they were."""
+        """List the paths that have changed."""
         return [str(path) for path, before in self.foreign.items() if content_of(path) != before]
 
 
@@ -186,14 +188,14 @@ def _moved(path: Path, source: Path, target: Path) -> Path:
 
 
 def content_of(path: Path) -> bytes | str:
-    """What a link leads to, or the bytes of a file; a word for what is neither."""
+    """Return the target of a link, the bytes of a file, or the word "gone"."""
     if path.is_symlink():
         return os.readlink(path)
     return path.read_bytes() if path.is_file() else "gone"
 
 
 def make_template(folder: Path) -> None:
-    """A survey that was run, a second result of it, exports, and a project in COLMAP's own layout."""
+    """Make a survey that was run, a second result of it, exports, and a project in COLMAP's own layout."""
     survey = make_small_demo(folder / "survey", num_photos=10).folder
     for command in (RUN, ("export", "out", "--formats", ",".join(FORMATS)), ("report", "out")):
         words = [sys.executable, "-m", "rangesfm", *command]
@@ -207,7 +209,7 @@ def make_template(folder: Path) -> None:
 
 
 def make_site(template: Path, folder: Path, rng: np.random.Generator) -> Site:
-    """A copy of the template with somebody else's files in it."""
+    """Copy the template, and put foreign files into it."""
     shutil.copytree(template, folder / "survey", symlinks=True)
     site = Site(folder / "survey", folder / "outside", rng)
     site.outside.mkdir()
@@ -230,7 +232,7 @@ def make_site(template: Path, folder: Path, rng: np.random.Generator) -> Site:
 
 
 def start(command: tuple[str, ...], site: Site) -> tuple[int, str]:
-    """Run a command, perhaps with little room, perhaps until it is killed; its exit status and what it said."""
+    """Run a command, in some cases with limited file size or until it is killed; return exit status and messages."""
     rng = site.rng
     max_bytes = int(10 ** rng.uniform(2, 6.5)) if rng.random() < 0.1 else resource.RLIM_INFINITY
     after_s = rng.exponential(4.0) if rng.random() < 1 / 3 else None

@@ -1,4 +1,4 @@
-"""Are ranges between the photos worth having? Scale and path from all ranges, and from those at photos alone.
+"""Compare scale and path from all ranges with those from the ranges at photos alone.
 
     python -m tests.studies.interpolation RESULT_FOLDER REFERENCE ANCHORS [--tag_in_cam=X,Y,Z]
 
@@ -9,10 +9,10 @@ scale from
 - all: every range that has a place, interpolated between keyframes;
 - near: only ranges within ``--near_s`` of a keyframe;
 
-each from all of its ranges and from ``--num_parts`` random parts of the log, a tenth of it each. It prints the scale
-error and the root mean square error of the keyframe centres without alignment: for the whole log, and mean and stddev
-over the parts. The stddev over the parts says how much chance there is in the figures of the whole log; errors that
-all ranges share (of the radio's calibration, or the anchors' survey) are in the means of both alike.
+in each case from all of these ranges, and from ``--num_parts`` random parts of the log, a tenth of it each. It prints
+the scale error and the root mean square error of the keyframe centres without alignment: for the whole log, and mean
+and stddev over the parts. The stddev over the parts says how much chance there is in the figures of the whole log.
+Errors that all ranges share (of the radio's calibration, or the anchors' survey) are in both means alike.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Survey:
     Attributes:
         trajectory: of n keyframes, unscaled.
         observations: all ranges.
-        anchors: in the site frame; without positions the scale alone is compared.
-        is_near: (m,) ranges next to a keyframe.
+        anchors: in the site frame; without positions, only the scale is compared.
+        is_near: (m,) whether each range is next to a keyframe.
         centers_m: (n, 3) true centres; NaN where unknown.
         metric_from_sfm: the similarity that fits them best.
     """
@@ -61,7 +61,7 @@ class Survey:
     metric_from_sfm: Similarity
 
     def errors(self, chosen: npt.NDArray[np.bool_]) -> tuple[float, float]:
-        """Scale error, percent, and root mean square error of the centres, metres, from some of the ranges."""
+        """Return the scale error (percent) and the centres' root mean square error (metres) from some of the ranges."""
         status = self.observations.status.copy()
         status[~chosen & (status == RangeStatus.USED)] = RangeStatus.CHECK
         estimate = initialize_scale(
@@ -76,7 +76,7 @@ def read_survey(folder: Path, reference: Path, anchors: Path, tag_in_cam_m: Arra
     times = read_image_times_csv(folder / "images.csv")
     trajectory = trajectory_from_reconstruction(read_model(folder / "sparse" / "0"), times.by_name())
     log = read_ranges(folder / "ranges.csv")
-    # Those are what the run found, not what the radio said.
+    # These stddevs are the run's findings, not the radio's statements.
     log = replace(log, range_stddev_m=np.full(len(log), np.nan))
     result = json.loads((folder / "result.json").read_text())
     offset_s = float(result["time_offset"]["value_s"])
@@ -100,7 +100,7 @@ def read_survey(folder: Path, reference: Path, anchors: Path, tag_in_cam_m: Arra
 
 
 def print_table(survey: Survey, num_parts: int) -> None:
-    """A line for each choice of ranges."""
+    """Print a line for each choice of ranges."""
     everything = np.ones(len(survey.is_near), dtype=bool)
     part = np.random.default_rng(0).integers(0, 10, len(everything))
     print("ranges       num  scale_%   rmse_m | of tenths: scale_% mean stddev, rmse_m mean stddev")

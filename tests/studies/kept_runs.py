@@ -1,4 +1,4 @@
-"""Studies that keep each simulated run as a line of a file: started again, they go on there."""
+"""Studies that keep each simulated run as a line of a file, and continue there when they are started again."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Study:
-    """What the command line asks for.
+    """The arguments of a study.
 
     Attributes:
-        file: of what is done, as JSON lines. num_seeds: runs of each survey. beginning: only surveys named so.
+        file: keeps the runs that are done, as JSON lines.
+        num_seeds: runs of each survey.
+        beginning: only surveys whose names begin with this text are run.
     """
 
     file: Path
@@ -27,7 +29,7 @@ class Study:
     beginning: str
 
     def runs_of(self, name: str, run: Callable[[int], Row]) -> list[Row]:
-        """As kept in the file; those that are missing are made and added to it."""
+        """Return the runs of a survey from the file; missing ones are made and added to the file."""
         kept = [json.loads(line) for line in self.file.read_text().splitlines()] if self.file.exists() else []
         rows = [row for row in kept if row["survey"] == name and row["seed"] < self.num_seeds]
         done = {row["seed"] for row in rows}
@@ -39,7 +41,7 @@ class Study:
 
 
 def study(doc: str | None) -> Study:
-    """By the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", type=Path, required=True, help="what is done, as JSON lines")
     parser.add_argument("--num_seeds", type=int, default=100)
@@ -49,9 +51,9 @@ def study(doc: str | None) -> Study:
 
 
 def spread(rows: list[Row], name: str) -> tuple[float, float]:
-    """Root mean square of errors (of a place, of their lengths), and its relative stddev by chance.
+    """Return the root mean square of errors (of a place, of their lengths), and its relative stddev by chance.
 
-    That is half of the mean square's, whatever the errors' distribution.
+    The relative stddev is half of the mean square's, whatever the errors' distribution.
     """
     squares = np.array([float(np.sum(np.square(row[name]))) for row in rows if name in row])
     if not len(squares):

@@ -1,12 +1,11 @@
-"""SIGKILL at random moments of the pipeline, and a run into the same folder after each.
+"""Send SIGKILL at random moments of the pipeline, and run into the same folder after each.
 
     python -m tests.studies.kills [--num_kills 50] [--seed 0] [--survey FOLDER]
 
 A small survey of the demo's yard. Every second run that is killed starts in an empty folder, the others in one that
-holds the result with a slightly other camera. The moment is drawn evenly over the time that an undisturbed run takes
-there. What a killed run leaves must be no result, the old one or the new one, each of them with all its models and
-tables; the run after it must end as an undisturbed one does (scale and camera centres to 1e-9) and leave nothing
-half-written.
+holds a result with a slightly different camera. The moment is drawn evenly over the time that an undisturbed run takes
+there. A killed run must leave no result, the old one or the new one, each with all its models and tables. The run after
+it must end as an undisturbed one does (scale and camera centres to 1e-9) and leave nothing half-written.
 
 Prints a line for each kill: the moment, the step that was killed, and what it left. Exit status 1 if anything differs.
 """
@@ -35,20 +34,20 @@ from rangesfm.demo.survey import TIME_OFFSET_S
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 
 TOLERANCE = 1e-9
-# All steps depend on it; the demo's has a focal length of 280.8 pixels.
+# All steps depend on the camera; the demo's has a focal length of 280.8 pixels.
 OTHER_CAMERA = ("--camera_model", "SIMPLE_RADIAL", "--camera_params", "281,180,120,-0.04")
 MODELS = ("sparse", "sparse_scaled", "sparse_metric")
-# As printed in the tables, to 6 digits: the last may round either way.
+# Tables print 6 digits, and the last may round either way.
 TABLE_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
 class Undisturbed:
-    """Whole results, and how long their runs took.
+    """Complete results, and how long their runs took.
 
     Attributes:
         old, new: folders of results with two cameras.
-        seconds: of a run of the new one, by where it starts: in no folder (False) or in that of the old one (True).
+        seconds: duration of a run for the new result: in an empty folder (False), or in that of the old one (True).
     """
 
     old: Path
@@ -57,14 +56,14 @@ class Undisturbed:
 
 
 def start(survey: Path, output: Path, *flags: str) -> subprocess.Popen[str]:
-    """One thread: with more, COLMAP starts from whichever pair is ready first."""
+    """Start a run with one thread: with more, COLMAP starts from whichever pair is ready first."""
     flags = ("--ranges_time_offset", str(TIME_OFFSET_S), "--num_threads", "1", *flags)
     command = [sys.executable, "-m", "rangesfm", "run", "survey.toml", *flags, "--output_path", str(output)]
     return subprocess.Popen(command, cwd=survey, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def run(survey: Path, output: Path, *flags: str) -> float:
-    """Run to the end; the seconds it took."""
+    """Run to the end, and return the seconds that it took."""
     begin = time.monotonic()
     process = start(survey, output, *flags)
     _, errors = process.communicate()
@@ -86,7 +85,7 @@ def undisturbed(survey: Path, folder: Path) -> Undisturbed:
 
 
 def differences(whole: Path, other: Path) -> list[str]:
-    """In what another result is not the whole one."""
+    """List what differs between a result and the complete one."""
     found = []
     scales = [json.loads((path / "result.json").read_text())["scale"]["value"] for path in (whole, other)]
     if not math.isclose(*scales, rel_tol=TOLERANCE):
@@ -106,7 +105,7 @@ def differences(whole: Path, other: Path) -> list[str]:
 
 
 def names_in(folder: Path) -> set[str]:
-    """Of all files and folders, however deep."""
+    """Return the names of all files and folders below a folder."""
     return {path.relative_to(folder).as_posix() for path in paths_below(folder)}
 
 
@@ -127,7 +126,7 @@ def _same_cell(first: str, second: str) -> bool:
 
 
 def killed(process: subprocess.Popen[str], after_s: float) -> str | None:
-    """Kill it then; the step it was in, or None if it had come to its end."""
+    """Kill a process after some seconds; return the step it was in, or None if it had already ended."""
     try:
         process.wait(timeout=after_s)
     except subprocess.TimeoutExpired:
@@ -140,7 +139,7 @@ def killed(process: subprocess.Popen[str], after_s: float) -> str | None:
 
 
 def left_by_killed(output: Path, whole: Undisturbed) -> str:
-    """What there is now, in a word; one that is neither whole result says in what it differs."""
+    """Return a word for what is there now; a mixture of both results is described by its differences."""
     if not (output / "result.json").exists():
         return "none"
     from_old, from_new = differences(whole.old, output), differences(whole.new, output)
@@ -171,7 +170,7 @@ def main() -> int:
             after_s = rng.uniform(0.0, whole.seconds[onto_old])
             step = killed(start(survey, output), after_s)
             if step is None:
-                continue  # too late: another moment
+                continue  # too late: try another moment
             what = left_by_killed(output, whole)
             run(survey, output)
             wrong = differences(whole.new, output) + sorted(names_in(output) - names_in(whole.new))

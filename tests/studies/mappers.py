@@ -1,14 +1,15 @@
-"""How the cost of mapping grows with the number of photos, by COLMAP's three mappers.
+"""Measure how the cost of mapping grows with the number of photos, for COLMAP's three mappers.
 
     python -m tests.studies.mappers [--num_photos 125 250 500] [--methods incremental global hierarchical]
         [--leaf_size 100] [--max_refined 2000]
 
-Simulated keyframes, half a metre apart on one wide round: features with noise, each seen in at most 8 photos in a row,
-go into a COLMAP database with their matches; nothing is rendered. Each mapping is a process of its own with one thread;
-its processor seconds and its peak memory are its own account. Hierarchical mapping takes clusters of ``--leaf_size``
-photos that share 20. RMSE is of the keyframe centres against the truth: after the best similarity, and, up to
-``--max_refined`` photos, without any alignment after ``rangesfm refine`` with ranges to eight surveyed anchors (stddev
-0.1 m, 2 Hz each), scaled and refined. Last, the exponent of the cost over the photos, by least squares of logarithms.
+Simulated keyframes, half a metre apart on one wide round: noisy features, each seen in at most 8 photos in a row, go
+into a COLMAP database with their matches; nothing is rendered. Each mapping is a process of its own with one thread,
+and its processor seconds and peak memory are measured alone. Hierarchical mapping takes clusters of ``--leaf_size``
+photos that share 20. The RMSE is that of the keyframe centres against the truth: after the best similarity; and, for up
+to ``--max_refined`` photos, without any alignment after ``rangesfm refine`` with ranges to eight surveyed anchors
+(stddev 0.1 m, 2 Hz each), scaled and refined. Last comes the exponent of the cost over the number of photos, by least
+squares of logarithms.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from rangesfm.vision.steps import Workspace
 
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 _STEP_M = 0.5
-_CIRCUMFERENCE_PER_AXIS = 5.53  # of an ellipse whose axes are as 4 to 3
+_CIRCUMFERENCE_PER_AXIS = 5.53  # for an ellipse whose axes are as 4 to 3
 _MAX_TRACK_LENGTH = 8
 _NUM_OBSERVATIONS = 80
 _PIXEL_STDDEV = 0.7
@@ -53,7 +54,7 @@ METHODS = ("incremental", "global", "hierarchical")
 
 
 def simulate(folder: Path, num_photos: int, seed: int) -> None:
-    """A database with features and verified matches, a radio log, anchors, times and the truth."""
+    """Write a database with features and verified matches, a radio log, anchors, times and the truth."""
     axis = num_photos * _STEP_M / _CIRCUMFERENCE_PER_AXIS
     times = np.arange(num_photos, dtype=np.float64)
     path = loop_path(
@@ -94,7 +95,7 @@ def simulate(folder: Path, num_photos: int, seed: int) -> None:
 
 
 def map_database(folder: Path, method: str, leaf_size: int) -> None:
-    """All photos of a simulated database; its models go to sparse, in the place of another method's."""
+    """Map all photos of a simulated database; its models replace those of an earlier method in ``sparse``."""
     database = folder / "database.db"
     with pycolmap.Database.open(database) as opened:
         names = tuple(image.name for image in sorted(opened.read_all_images(), key=lambda image: image.image_id))
@@ -114,7 +115,7 @@ def map_database(folder: Path, method: str, leaf_size: int) -> None:
 
 
 def cost_of(*arguments: object) -> tuple[float, float]:
-    """Processor seconds and peak megabytes of one mapping, in a process of its own with one thread."""
+    """Return the processor seconds and peak megabytes of one mapping, in a process of its own with one thread."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "GLOG_minloglevel": "2"}
     command = [sys.executable, "-m", "tests.studies.mappers", "--map", *map(str, arguments)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -125,13 +126,13 @@ def cost_of(*arguments: object) -> tuple[float, float]:
 
 
 def _own_cost() -> list[float]:
-    """Of this process, or of the one that it had do the mapping."""
+    """Return the cost of this process, or of the child that did the mapping."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return [sum(u.ru_utime + u.ru_stime for u in used), max(peak_bytes() / 1e6, used[1].ru_maxrss / 1e3)]
 
 
 def rmse_m(folder: Path, model: pycolmap.Reconstruction) -> float:
-    """Of the keyframe centres, metres, after the best similarity."""
+    """Return the RMSE of the keyframe centres after the best similarity, metres."""
     truth = read_reference(folder / "reference.csv")
     place = dict(zip(truth.image_names or (), truth.positions_m, strict=True))
     images = [image for image in model.images.values() if image.has_pose]
@@ -144,7 +145,7 @@ def rmse_m(folder: Path, model: pycolmap.Reconstruction) -> float:
 
 
 def refined(folder: Path, model: Path, output: Path) -> str:
-    """RMSE of the map with the estimated scale, and refined, metres; or why there is none."""
+    """Return the RMSE of the map with the estimated scale, and refined, metres; or why there is none."""
     tag = ",".join(map(str, TAG_IN_CAM_M))
     flags = ["--ranges", "uwb.csv", "--anchors", "anchors.csv", "--images", "images.csv", "--tag_in_cam", tag]
     flags += ["--ranges_time_offset", "0", "--reference", "reference.csv", "--num_threads", "1", "--quiet"]

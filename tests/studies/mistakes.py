@@ -1,17 +1,19 @@
-"""How often a mistake in a survey is found and rightly named, and how often a clean survey is doubted.
+"""Measure how often a mistake in a survey is found and rightly named, and how often a clean survey is doubted.
 
 Run: python -m tests.studies.mistakes --out FILE [--num_seeds 20] [--num_clean 67] [--surveys hall] [--kinds anchor]
      [--room FOLDER --model FOLDER]
      python -m tests.studies.mistakes --out FILE --report
 
-Three simulated surveys without photos, whose path is the true one with a smooth bend: a hall with six surveyed
-anchors, a yard with four, a drone with one unknown anchor; and the real room, mapped before, with a tenth of its
-ranges. Errors as of real radios: white, lasting for seconds, of the direction, of the distance, and ranges without line
-of sight. Of each seed first a clean survey, then each kind of mistake that the survey allows, of one of several sizes
-in terms of the smallest that the tests of the clean one say would be found. Each run is a line of the file, and is not
-run again where it stands there. Reported for each survey and each kind: in how many runs a mistake was found, the right
-one named at all, named first (or in the pair that nothing tells apart), the map called good, and good though its scale
-lies outside its interval or its place is more than three stddevs off.
+Three simulated surveys without photos, whose path is the true one with a smooth bend: a hall with six surveyed anchors,
+a yard with four, a drone with one unknown anchor; and the real room, mapped before, with a tenth of its ranges. The
+range errors are like those of real radios: white noise, errors that last for seconds, errors that depend on direction
+and on distance, and ranges without line of sight. Each seed gives first a clean survey, then one with each kind of
+mistake that the survey allows. The mistake's size is one of several multiples of the smallest size that the tests of
+the clean survey say would be found. Each run is a line of the file, and runs that are there already are not repeated.
+
+Reported for each survey and each kind: in how many runs a mistake was found, the right one was named at all, or was
+named first (or in the pair that nothing tells apart); the map was called good; and the map was called good though its
+scale lies outside its interval or its place is more than three stddevs off.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ Mistake = Callable[[Given, float, np.random.Generator], None]
 Line = dict[str, Any]
 Lines = dict[tuple[str, str, int], Line]
 CLEAN = "clean"
-# Times the smallest size that is found; twice that is what must be found.
+# Sizes in terms of the smallest size that is found; mistakes of twice that size must be found.
 FACTORS = (2.0, 1.0, 2.0, 5.0)
 
 
@@ -41,9 +43,10 @@ class Kind:
     """A kind of mistake.
 
     Attributes:
-        name: of the kind. make: puts it into a survey, of a size.
-        of: name and subject of the test whose smallest detectable size is the unit; None: there is but one size.
-        right: names (with subjects where they count) of which one must be named.
+        name: of the kind.
+        make: puts a mistake of some size into a survey.
+        right: names (with subjects where they count), one of which must be named.
+        of: name and subject of the test whose smallest detectable size is the unit; None: there is only one size.
     """
 
     name: str
@@ -53,7 +56,7 @@ class Kind:
 
 
 def kinds(ids: list[str]) -> list[Kind]:
-    """All that a survey allows with these anchors in their places."""
+    """List all kinds of mistakes that a survey with these anchors allows."""
     made: list[Kind] = []
     for k, name in enumerate(ids[:3]):
         for axis, letter in enumerate("xyz"):
@@ -241,7 +244,7 @@ def _clock_jump(given: Given, size: float, rng: np.random.Generator) -> None:
 
 
 def _tag_slips(given: Given, size: float, rng: np.random.Generator) -> None:
-    """Half way along the camera's z, so that what was measured of it is wrong from then on."""
+    """Let the tag slip along the camera's z at half time, so that its measured position is wrong from then on."""
     after = given.time_s > np.quantile(given.time_s, 0.5)
     slipped_m = given.tags_m + after[:, None] * (
         given.world_from_cam @ np.array([0.0, 0.0, rng.choice([-1, 1]) * size])
@@ -250,13 +253,13 @@ def _tag_slips(given: Given, size: float, rng: np.random.Generator) -> None:
 
 
 def _grown(given: Given, tags_m: Array) -> Array:
-    """(n,) by how much the distances are longer from elsewhere."""
+    """(n,) increase of the distances if the tags were at ``tags_m``."""
     anchors_m = np.array(list(given.true_anchors_m.values()))[given.anchor]
     return np.asarray(np.linalg.norm(tags_m - anchors_m, axis=1) - np.linalg.norm(given.tags_m - anchors_m, axis=1))
 
 
 def _map_breaks(given: Given, size: float, rng: np.random.Generator) -> None:
-    """As if a false match had put the second half elsewhere; the truth of its place is then that of the first."""
+    """Displace the second half of the map, as a false match would; its true place is then that of the first half."""
     path = given.trajectory
     times = path.timestamps_s
     assert times is not None
@@ -267,12 +270,12 @@ def _map_breaks(given: Given, size: float, rng: np.random.Generator) -> None:
 
 
 def _warming(given: Given, size: float, rng: np.random.Generator) -> None:
-    """All ranges longer and longer."""
+    """Let all ranges grow over time."""
     given.range_m = given.range_m + size * (given.time_s - given.time_s.min()) / np.ptp(given.time_s)
 
 
 def _body(given: Given, size: float, rng: np.random.Generator) -> None:
-    """Ranges longer towards anchors behind whoever carries the camera."""
+    """Lengthen the ranges to anchors behind the person who carries the camera."""
     to_anchor = np.array(list(given.true_anchors_m.values()))[given.anchor] - given.tags_m
     given.range_m = given.range_m + size * (np.sum(to_anchor * given.world_from_cam[:, :, 2], axis=1) < 0)
 
@@ -390,7 +393,7 @@ def main() -> None:
 def runs_of_seed(
     survey: str, all_kinds: list[Kind], make: Callable[[int], Given], seed: int, args: argparse.Namespace, done: Lines
 ) -> Iterator[Line]:
-    """Those that are not done."""
+    """Yield the runs of a seed that are not done yet."""
     clean = done.get((survey, CLEAN, seed))
     if clean is None:
         clean = told(run(make(seed), seed), survey, CLEAN, seed)
@@ -414,7 +417,7 @@ def told(
     run_: Run, survey: str, kind: str, seed: int, right: tuple[str, ...] = (), factor: float | None = None,
     size: float | None = None,
 ) -> Line:  # fmt: skip
-    """What counts of a run."""
+    """Return the figures of a run that the report needs."""
     line: Line = {"survey": survey, "kind": kind, "seed": seed, "factor": factor, "size": size}
     if run_.trust is None or run_.estimate is None:
         return {**line, "refused": run_.refusal, "smallest": None}
@@ -423,7 +426,7 @@ def told(
     rejected = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected]
     of_evidence = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected and t.stddev is None]
     named = [name for name in dict.fromkeys([*rejected, *causes]) if name in causes or name in of_evidence]
-    # What comes before the causes is what the survey's first sentence says.
+    # A test named before the causes is what the survey's first sentence says.
     first = named[:1] if named and f"{tests[0].name} {tests[0].subject}".strip() not in causes else causes
     effects = [(t.effect_on_scale, f"{t.name} {t.subject}".strip()) for t in tests if t.effect_on_scale is not None]
     return {
@@ -484,7 +487,7 @@ class Tally:
 
 
 def report(lines: list[Line]) -> None:
-    """By kind and survey, by size, and in all."""
+    """Print the counts by kind and survey, by size, and in total."""
     made = [line for line in lines if line["kind"] != CLEAN]
     for survey in dict.fromkeys(line["survey"] for line in lines):
         clean = [line for line in lines if line["kind"] == CLEAN and line["survey"] == survey]

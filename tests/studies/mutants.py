@@ -1,12 +1,12 @@
-"""Of small mistakes put into the estimation packages, how many their tests notice.
+"""Put small mistakes into the estimation packages, and count how many their tests notice.
 
     pip install cosmic-ray
     python -m tests.studies.mutants --num 60 --seed 0 [--first 31]
 
-Draws mutants (another operator, a number one off, a condition turned round, ...) at random from the packages, puts each
-into a copy of the checkout, and runs the tests that mirror its file: its own, then the results of small surveys, the
-tests of its folder, of the folders that use it, and of the workflows. One that all of these pass has survived. Type
-hints, ``frozen=True`` and ``strict=True`` are left as they are: no run depends on them, unless it is wrong already.
+Draws mutants (another operator, a number one off, a negated condition, ...) at random from the packages, and puts each
+into a copy of the checkout. Then it runs the tests that mirror its file: its own, the results of small surveys, the
+tests of its folder, of the folders that use it, and of the workflows. A mutant that all of these pass has survived.
+Type hints, ``frozen=True`` and ``strict=True`` are not changed: no run depends on them unless it is wrong already.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ USED_BY = {
     "ceres": ("refine",),
 }
 MAX_SECONDS = 1200
-# Of which all that are found stand in type hints, or change nothing that runs; those of variables want names.
+# Operators that are left out: they only apply to type hints, change nothing that runs, or (those of variables) need
+# names.
 LEFT_OUT = ("BitOr", "RemoveDecorator", "ExceptionReplacer", "BitAnd", "Variable")
 
 
 class Mutant(NamedTuple):
-    """One change of one file: an operator of Cosmic Ray, and which of the places where it applies."""
+    """One change of one file: an operator of Cosmic Ray, and the number of the place where it is applied."""
 
     path: Path
     operator: str
@@ -44,7 +45,7 @@ class Mutant(NamedTuple):
 
 
 def mutants_of(path: Path) -> list[tuple[Mutant, int]]:
-    """All mutants of a file, and the line of each."""
+    """List all mutants of a file, with the line of each."""
     from cosmic_ray.ast import ast_nodes, get_ast_from_path
     from cosmic_ray.plugins import get_operator, operator_names
 
@@ -63,7 +64,7 @@ def mutants_of(path: Path) -> list[tuple[Mutant, int]]:
 
 
 def test_commands(path: Path) -> list[list[str]]:
-    """Arguments of pytest, nearest first."""
+    """Return the arguments of pytest for each set of tests, the nearest tests first."""
     folder = path.parent.relative_to(PACKAGE)
     tests = Path("tests") / folder
     own = tests / f"test_{path.stem}.py"
@@ -73,7 +74,7 @@ def test_commands(path: Path) -> list[list[str]]:
 
 
 def survives(mutant: Mutant, copy: Path) -> tuple[bool, str]:
-    """Whether every test passes, and the change as a diff."""
+    """Return whether every test passes, and the change as a diff."""
     from cosmic_ray.mutating import use_mutation
     from cosmic_ray.plugins import get_operator
 
@@ -87,7 +88,7 @@ def survives(mutant: Mutant, copy: Path) -> tuple[bool, str]:
                 done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, timeout=MAX_SECONDS)
             except subprocess.TimeoutExpired:
                 return False, changed
-            if done.returncode not in (0, 5):  # 5: no tests there
+            if done.returncode not in (0, 5):  # 5: there are no tests
                 return False, changed
     return True, changed
 
@@ -99,7 +100,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1, help="of those drawn, to go on where a run was cut")
     args = parser.parse_args()
     files = sorted(path for package in PACKAGES for path in (PACKAGE / package).glob("*.py") if path.stem != "__init__")
-    # Each place once, whatever it may be changed into.
+    # Each place counts once, however many changes it allows.
     choices: dict[tuple[Path, int, str], list[Mutant]] = {}
     for path in files:
         for mutant, line in mutants_of(path):

@@ -1,11 +1,11 @@
-"""Whether a plan knows how far photos let a map bend: predicted stddevs of keyframes, and the spread of refined maps.
+"""Check a plan's bending of the map by photos: predicted stddevs of keyframes, and the spread of refined maps.
 
 Run: python -m tests.studies.planned_bends --rows FILE [--num_seeds 40] [--surveys NAME]
 
 Simulated features of known noise are mapped, scaled and refined with ranges by the stages themselves. Prints for each
-survey the predicted stddev of keyframes (root mean square over the path) as of a map that is rigid and as its photos
-let expect, the spread of the refined keyframes about the truth with its stddev by chance, and the map's bend alone:
-predicted, and as the maps have it before any range is used.
+survey the predicted stddev of keyframes (root mean square over the path) for a rigid map and for a map that can bend as
+its photos allow; the spread of the refined keyframes about the truth, with its stddev by chance; and the map's bend
+alone, predicted and as found in the maps before any range is used.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import COMPONENTS
 
-# The simulated camera's.
+# Of the simulated camera.
 _WIDTH_PX, _FOCAL_PX = 960, 750.0
 _FIELD_OF_VIEW_DEG = float(2 * np.rad2deg(np.arctan(_WIDTH_PX / 2 / _FOCAL_PX)))
 
@@ -54,7 +54,7 @@ def photos(num_points: int, seen_m: tuple[float, float], max_track_length: int |
 
 
 def lap(num_observations: int) -> Survey:
-    """A quarter of one, of 150 keyframes."""
+    """A quarter of a lap, with 150 keyframes."""
     return lap_survey(num_observations=num_observations, anchor_m=(10.0, 5.0, 4.0), num_keyframes=150)
 
 
@@ -74,7 +74,7 @@ SURVEYS: dict[str, tuple[Callable[[], Survey], PlannedPhotos, float]] = {
 
 def planned(survey: Survey, seen: PlannedPhotos) -> PlannedSurvey:
     model = survey.model
-    # One range of each anchor at each photo, however far apart these are.
+    # One range to each anchor at each photo, however far apart the photos are.
     times = np.arange(len(model.timestamps_s)) / 2
     path = Trajectory(np.arange(len(times)), tuple(model.timestamps_s), times, model.centers_m, model.world_from_cam)
     nothing = {component.name: 1e-6 for component in COMPONENTS}
@@ -96,7 +96,7 @@ def planned(survey: Survey, seen: PlannedPhotos) -> PlannedSurvey:
 
 
 def one_run(survey: Survey, pixel_stddev: float, seed: int) -> Row:
-    """Root mean square errors of keyframes, refined, and before that away from the best similarity."""
+    """Return the root mean square errors of the keyframes: refined, and before that after the best similarity."""
     sfm = mapped(survey, pixel_stddev * unit_pixel_errors(survey, seed))
     log = range_log(survey, seed, biases_m=drawn_biases(survey, seed))
     truth = survey.model.centers_m

@@ -1,13 +1,14 @@
-"""Whether a plan's numbers are those of the survey: predicted stddevs against the spread over simulated runs.
+"""Check a plan's numbers: predicted stddevs against the spread over simulated runs.
 
 Run: python -m tests.studies.planned_surveys --rows FILE [--num_seeds 100] [--surveys NAME]
 
-Twenty surveys of different kinds, with the radios of eight public logs and with a usual one, are planned; then each is
-measured and its scale found again and again, every time with other errors of its radio, other slips in surveying the
-anchors and another bend of its map. The first two runs of each are whole scale stages, the others begin at the truth.
-FILE keeps what is done, one line a run: started again, the study goes on there.
+Twenty surveys of different kinds, with the radios of eight public logs and with a usual one, are planned. Then each is
+measured and its scale found again and again, every time with other errors of its radio, other errors in surveying the
+anchors and another bend of its map. The first two runs of each are whole scale stages; the others begin at the truth.
+FILE keeps the runs that are done, one line each; when started again, the study continues there.
+
 Prints for each survey the predicted stddev of the scale and of the place (of the keyframe known least) over the spread
-of the runs' errors, the median stddev that a run states itself, and how many runs refused.
+of the runs' errors, the median stddev that a run states itself, and how many runs were refused.
 """
 
 from __future__ import annotations
@@ -122,7 +123,10 @@ SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
 
 
 def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole: bool) -> Row:
-    """Error of the logarithm of the scale and of one keyframe's place (metres); of a whole run, what it states too."""
+    """Return the errors of the scale's logarithm and of one keyframe's place (metres).
+
+    A whole run also has its stated stddev.
+    """
     made = measured(planned, seed)
     found: Row = {}
     try:
@@ -153,7 +157,7 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
 
 
 def truth(planned: PlannedSurvey, made: Measured, posed: ScaleProblem) -> RangeState:
-    """Where a run is started that is not looked for by itself, which takes ten times as long and ends there too."""
+    """Return a start at the truth; a whole search takes ten times as long and ends at the same solution."""
     state = planned.state(posed, made.observations.log.anchor_ids)
     return replace(state, metric_from_model=replace(state.metric_from_model, scale=METRES_PER_UNIT))
 
@@ -163,7 +167,7 @@ def worst_keyframe(expected: Expected) -> int | None:
 
 
 def runs_of(asked: Study, name: str, planned: PlannedSurvey, num_whole: int = 2) -> list[Row]:
-    """Of one survey, the first ones whole."""
+    """Run one survey; its first runs are whole scale stages."""
     keyframe = worst_keyframe(expect(planned))
     return asked.runs_of(name, lambda seed: one_run(planned, keyframe, seed, is_whole=seed < num_whole))
 

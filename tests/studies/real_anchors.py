@@ -1,11 +1,4 @@
-"""Anchors found by trilateration on real logs with truth: how far off, and do the stated stddevs cover?
-
-Run: python -m tests.studies.real_anchors --data FOLDER [--sets NAME ...]
-
-The sets are those of real_logs.json. Every anchor is placed by its ranges to the true path, told whether it stands
-above or below the path's middle; and once more with its height known. A pull is the error of a coordinate over its
-stated stddev: 95 % of them should lie within +-1.96.
-"""
+"""Locate anchors by trilateration on real logs with truth, and compare their errors with the stated stddevs."""
 
 from __future__ import annotations
 
@@ -48,7 +41,7 @@ def main() -> None:
 
 
 def one_log(data: Path, name: str, described: dict[str, Any], *, know_height: bool) -> tuple[Array, Array]:
-    """Pulls of the coordinates that were sought and how far off the anchors are, (k,) metres; the table printed."""
+    """Print a log's table; return the pulls of the estimated coordinates, and (k,) errors of the anchors, metres."""
     log, anchors, path = read_set(data, described)
     truth = {anchor.anchor_id: np.asarray(anchor.position_m) for anchor in anchors}
     log = log.subset(np.isin(np.array(log.anchor_ids)[log.anchor_index], list(truth)))
@@ -70,7 +63,7 @@ def one_log(data: Path, name: str, described: dict[str, Any], *, know_height: bo
 
 
 def positions_of_tags(log: RangeLog, path: Reference, described: dict[str, Any]) -> Array:
-    """(n, 3) at each range, each tag by its own lever arm."""
+    """(n, 3) position of the tag at each range, each tag with its own lever arm."""
     offset_s = described.get("time_offset_s", 0.0)
     max_gap_s = max(described.get("max_gap_s", 0.0), MAX_GAP_S)
     arms = described.get("tags_in_body_m", dict.fromkeys(log.tag_ids, described.get("tag_in_body_m", (0.0, 0.0, 0.0))))
@@ -82,7 +75,7 @@ def positions_of_tags(log: RangeLog, path: Reference, described: dict[str, Any])
 
 
 def one_anchor(name: str, placement: AnchorPlacement, truth: Array, num: int) -> tuple[Array, Array]:
-    """Pulls of the first ``num`` coordinates, and how far these are off; nothing of a refused one."""
+    """Return the pulls of the first ``num`` coordinates and their error; both are empty for a refused anchor."""
     found = placement.found
     if found is None:
         print(f"{name:16}{placement.anchor_id:6}{placement.num_ranges:6} {placement.why_not}")

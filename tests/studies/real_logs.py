@@ -1,16 +1,16 @@
-"""Error, 95 % interval and verdict of the scale on real logs with truth, in every way of knowing their anchors.
+"""Measure error, 95 % interval and verdict of the scale on real logs with truth, for each knowledge of the anchors.
 
 Run: python -m tests.studies.real_logs --data FOLDER [--sets NAME ...] [--no_singles] [--by_photo]
      [--turned SEED] [--leave_radio_out] [--calibrated]
 
-The sets are described in real_logs.json: public logs below the folder, of each tag its place in the tracked body, the
-offset of the clocks (time of the truth minus time of the ranges) and the truth's longest gap. The path is the true
-one, at most ten poses a second, divided by a factor that is to be found again. A survey has all anchors surveyed
-(site frame), known in the
-first pose's frame, all unknown, or each alone unknown. With --by_photo ranges name the pose next to them instead of a
-time; with --turned the unscaled path lies in another frame, which should change nothing; with --leave_radio_out what is
-expected of radios comes from all others than the one at hand; with --calibrated an error curve is taken off that was
-learnt on another log of the same radio, where there is one.
+The sets are described in real_logs.json: public logs below the folder, with the position of each tag in the tracked
+body, the offset of the clocks (time of the truth minus time of the ranges) and the longest gap in the truth. The path
+is the true one, with at most ten poses a second, divided by a factor that has to be found again. The anchors are all
+surveyed (site frame), known in the first pose's frame, all unknown, or each one alone and unknown.
+
+With --by_photo, ranges name the nearest pose instead of a time. With --turned, the unscaled path lies in another frame,
+which should change nothing. With --leave_radio_out, the expected errors come from all radios but the present one. With
+--calibrated, an error curve is subtracted that was learnt on another log of the same radio, if there is one.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def read_set(data: Path, described: dict[str, Any]) -> tuple[RangeLog, list[Anch
     if "truth" in described:
         anchors = list(read_anchors(data / described["anchors"]))
         reference = read_reference(data / described["truth"])
-    else:  # STAR-loc: the tag's place stands beside each range, the anchors' ids in a column without a name
+    else:  # STAR-loc: the tag's position is beside each range, and the anchors' ids are in a column without a name
         anchors = [
             Anchor(row[""], np.array([float(row[a]) for a in "xyz"])) for row in rows(data / described["anchors"])
         ]
@@ -155,7 +155,7 @@ def placed(
 
 
 def at_photos(log: RangeLog, path: Trajectory, offset_s: float) -> tuple[RangeLog, Trajectory, float]:
-    """Ranges within 50 ms of a pose, by its name."""
+    """Keep the ranges within 50 ms of a pose, and refer to it by its name instead of the time."""
     assert log.timestamp_s is not None
     assert path.timestamps_s is not None
     times = log.timestamp_s + offset_s
@@ -176,7 +176,7 @@ def curve_of(data: Path, described: dict[str, Any]) -> ErrorCurve:
 def one_survey(
     name: str, case: Case, observations: RangeObservations, path: Trajectory
 ) -> tuple[float, float, float] | None:
-    """Error of the logarithm of the scale, and the ends of its interval about the estimate; None if refused."""
+    """Return the error of the scale's logarithm, and its interval about the estimate; None if refused."""
     began = time.process_time()
     options = ScaleOptions(max_relative_stddev=1.0)
     try:

@@ -1,4 +1,4 @@
-"""The real room's survey as it was handed over, with the truth, for the study of mistakes."""
+"""The real room's survey, with its truth, for the study of mistakes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_GAP_S = 0.05
 
 
 def real_room(folder: Path, model: Path, seed: int) -> Given:
-    """Every tenth of the ranges, beginning with another one for each seed."""
+    """Read a tenth of the ranges: every tenth, starting at another one for each seed."""
     trajectory, times, centers_m, rotations = _path_and_truth(folder, model)
     log = read_ranges(folder / "uwb.csv")
     rows = np.arange(seed % EVERY, len(log), EVERY)
@@ -73,7 +73,7 @@ def _path_and_truth(
 def _interpolated(
     times: npt.NDArray[np.float64], places: npt.NDArray[np.float64], at: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """(n, 3), NaN across gaps."""
+    """(n, 3) positions, NaN across gaps."""
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
     found = np.column_stack([np.interp(at, times, axis) for axis in places.T])
     is_in_gap = (times[after] - times[after - 1] > MAX_GAP_S) | (at < times[0]) | (at > times[-1])

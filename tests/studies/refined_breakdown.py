@@ -1,16 +1,17 @@
-"""How many outliers does the refinement survive? Its error beside that of the scaled map, from which it starts.
+"""Measure how many outliers the refinement survives: its error beside that of the scaled map, from which it starts.
 
     python -m tests.studies.refined_breakdown [--num_seeds 10] [--anchors one] [--kind long]
 
-A walk round a yard, 60 keyframes, 240 ranges of stddev 0.1 m: one to each of four site anchors at each keyframe, or
-four to one anchor that is known in the first camera's frame. Of these a share of 0 to 80 % is wrong, in the ways of
+A walk around a yard, 60 keyframes, 240 ranges of stddev 0.1 m: one to each of four site anchors at each keyframe, or
+four to one anchor that is known in the first camera's frame. A share of 0 to 80 % of these is wrong, in the ways of
 ``scale_breakdown.py``: long, short, or whole stretches of one anchor's ranges long. The features fit, so the map as it
-came has nothing but its similarity wrong, and whatever the refinement adds to its error is owed to outliers. (Drift
-and outliers together: ``drift.py --obstructed_share``.)
+came has nothing but its similarity wrong, and whatever the refinement adds to its error is due to outliers. (For drift
+and outliers together, see ``drift.py --obstructed_share``.)
 
 Prints the root mean square error of the keyframes, without alignment, scaled and refined: the median and the worst of
-the seeds, and how many were made worse by more than a fifth and a centimetre. What the scale stage refuses is left out
-and counted. Exit status 1 if the refined median is worse than the scaled one by more than a tenth and a centimetre.
+the seeds, and how many were made worse by more than a fifth and a centimetre. Runs that the scale stage refuses are
+left out and counted. Exit status 1 if the refined median is worse than the scaled one by more than a tenth and a
+centimetre.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ MAX_RATIO, MAX_RATIO_OF_RUN, TOLERANCE_M = 1.1, 1.2, 0.01
 
 @dataclass(frozen=True)
 class Yard:
-    """A survey, and how many ranges there are to an anchor at a keyframe."""
+    """A survey, and how many ranges it has to an anchor at a keyframe."""
 
     survey: Callable[[], Survey]
     num_each: int
@@ -60,7 +61,7 @@ YARDS = {
 def spoilt_log(survey: Survey, num_each: int, kind: str, share: float, seed: int) -> RangeLog:
     log = range_log(survey, seed, num_each=num_each)
     rng = np.random.default_rng([seed, KINDS.index(kind), round(100 * share)])
-    # Something stands before one anchor at a time.
+    # Sorted by anchor, so that each stretch of wrong ranges belongs to one anchor.
     rows = np.argsort(log.anchor_index, kind="stable")
     range_m = log.range_m.copy()
     range_m[rows] = spoilt(log.range_m[rows], kind, share, rng)
@@ -104,7 +105,7 @@ def main() -> int:
 
 
 def print_row(title: str, errors: Array, num_seeds: int) -> bool:
-    """Whether the refinement is no worse."""
+    """Print a row, and return whether the refinement is no worse."""
     num_refused = num_seeds - len(errors)
     if not len(errors):
         print(f"{title} {'':15} {'':15} {'':10} {num_refused:7}", flush=True)

@@ -1,20 +1,21 @@
-"""Are refined positions as good as the data allow? Their error over many noisy surveys, against the Cramer-Rao bound.
+"""Compare the error of refined positions over many noisy surveys with the Cramer-Rao bound.
 
     python -m tests.studies.refined_rmse_crb [--num_seeds 40]
 
 Simulated surveys with Gaussian noise: a yard with four site anchors, the same with one anchor known in the first
-camera's frame, and a rover's lap that drifts. Each seed draws noise of features and ranges anew, and the anchors'
+camera's frame, and a rover's lap that drifts. Each seed draws noise of features and ranges anew, and draws the anchors'
 biases from the prior that the stages assume, so that the prior's information counts like that of a measurement (van
-Trees' Bayesian form of the bound). COLMAP adjusts the model, as a mapper leaves it, then scale and refinement run
-with their defaults; they estimate the noise of features and ranges themselves.
+Trees' Bayesian form of the bound). COLMAP adjusts the model, as a mapper would, then scale and refinement run with
+their defaults; they estimate the noise of features and ranges themselves.
 
-The error is the root mean square distance of all keyframes of all seeds from the truth, without alignment. The bound
-is that of ``simulated_survey.rmse_bound_m``. These errors are those of a few slow modes of the whole map, so 40 seeds
-know their size to some 10 %. Therefore the same seeds are also solved by who knows all noise and starts from the truth
-("likeliest"): what it is off the bound by is the luck of the draw, and what the refinement is off from it is its own.
+The error is the root mean square distance of all keyframes of all seeds from the truth, without alignment. The bound is
+that of ``simulated_survey.rmse_bound_m``. The errors are those of a few slow modes of the whole map, so 40 seeds
+determine their size to some 10 %. Therefore the same seeds are also solved with all noise known and from the truth
+("likeliest"). The difference of that from the bound is chance, and the difference of the refinement from that is its
+own.
 
-Exit status 1 if the error exceeds 1.15 times the bound or the likeliest map's, or is so far below the bound that that
-itself must be wrong.
+Exit status 1 if the error exceeds 1.15 times the bound or the likeliest map's error, or is so far below the bound that
+the bound itself must be wrong.
 """
 
 from __future__ import annotations

@@ -1,19 +1,19 @@
-"""How many outliers does each way to the scale survive? One anchor known in the first camera's frame, as in the paper.
+"""Measure how many outliers each method for the scale survives, with one anchor known in the first camera's frame.
 
     python -m tests.studies.scale_breakdown [--num_seeds 20] [--plot FILE.png]
 
-A walk round a yard, 300 ranges of stddev 0.1 m, of which a share of 0 to 80 % is wrong:
+A walk around a yard with 300 ranges of stddev 0.1 m, of which a share of 0 to 80 % is wrong:
 
     long       each by a length of its own (exponential, mean 2 m), as without line of sight
-    short      each to a share of itself, anywhere from a tenth to nine tenths
-    clustered  whole stretches of 15 ranges, each by one length for all of it (exponential, mean 2 m)
+    short      each shortened to between a tenth and nine tenths
+    clustered  whole stretches of 15 ranges, each stretch by one length (exponential, mean 2 m)
 
-The methods: the scale stage (consensus, then robust least squares), the paper's mean of the steadier branch of
-candidates, the median of that branch, random sampling (RANSAC: one range gives two scales, the best of 300 trials is
-refined on its inliers), and graduated non-convexity (GNC: truncated least squares of the range equation over the scale,
-Yang, Antonante, Tzoumas and Carlone, "Graduated Non-Convexity for Robust Spatial Perception", 2020). RANSAC and GNC are
-told the noise and that the radio has no bias; the scale stage finds both. Its refusals are left out of its errors and
-counted.
+The methods: the scale stage (consensus, then robust least squares); the paper's mean of the steadier branch of
+candidates; the median of that branch; random sampling (RANSAC: one range gives two scales, and the best of 300 trials
+is refined on its inliers); and graduated non-convexity (GNC: truncated least squares of the range equation over the
+scale, Yang, Antonante, Tzoumas and Carlone, "Graduated Non-Convexity for Robust Spatial Perception", 2020). RANSAC and
+GNC are given the noise and know that the radio has no bias; the scale stage estimates both. Runs that it refuses are
+left out of its errors and counted.
 
 Prints the median and the ninth decile of the absolute scale error in percent, for each method, kind and share.
 ``--plot`` draws the medians over the share (package matplotlib).
@@ -62,7 +62,9 @@ class Case:
     Attributes:
         trajectory: unscaled.
         centers, tag_from_center: (n, 3) at the ranges; model units, metres.
-        anchor_m: (3,). range_m: (n,). times: (n,).
+        anchor_m: (3,).
+        range_m: (n,).
+        times: (n,).
     """
 
     trajectory: Trajectory
@@ -97,7 +99,7 @@ def make_case(kind: str, share: float, seed: int) -> Case:
 
 
 def spoilt(ranges: Array, kind: str, share: float, rng: np.random.Generator) -> Array:
-    """Exactly a share of the ranges is wrong (of the stretches, where it is those)."""
+    """Make exactly this share of the ranges wrong (of the stretches, if the kind has stretches)."""
     num = len(ranges)
     if kind == "clustered":
         num_stretches = -(-num // STRETCH)
@@ -132,7 +134,7 @@ def paper(case: Case, seed: int) -> float:
 
 
 def median_of_duplets(case: Case, seed: int) -> float:
-    """The same with medians: of the branch that strays less from its own median."""
+    """Do the same with medians, for the branch that strays less from its own median."""
     table = two_candidate(case.centers, case.tag_from_center, case.anchor_m, case.range_m)
     if table is None:
         return float("nan")
@@ -156,7 +158,7 @@ def ransac(case: Case, seed: int) -> float:
 
 
 def gnc(case: Case, seed: int) -> float:
-    """Truncated least squares at INLIER_M, from plain least squares and an almost convex surrogate."""
+    """Minimize truncated least squares at INLIER_M, from plain least squares and an almost convex surrogate."""
     scale = least_squares(case, 1.0, np.ones(NUM_RANGES))
     squared = residuals(case, scale) ** 2
     mu = INLIER_M**2 / max(2 * float(squared.max()) - INLIER_M**2, 1e-9)
@@ -171,7 +173,7 @@ def gnc(case: Case, seed: int) -> float:
 
 
 def truncated_weights(squared: Array, mu: float) -> Array:
-    """Yang et al., equation 14."""
+    """Return the weights of Yang et al., equation 14."""
     inside, outside = mu / (mu + 1) * INLIER_M**2, (mu + 1) / mu * INLIER_M**2
     between = INLIER_M * np.sqrt(mu * (mu + 1) / np.maximum(squared, 1e-12)) - mu
     weights: Array = np.where(squared <= inside, 1.0, np.where(squared >= outside, 0.0, between))
@@ -185,7 +187,7 @@ def residuals(case: Case, scale: float) -> Array:
 
 
 def least_squares(case: Case, scale: float, weights: Array) -> float:
-    """Gauss-Newton over the scale alone, steps bounded to a factor of two."""
+    """Minimize over the scale alone by Gauss-Newton, with steps bounded to a factor of two."""
     if not weights.any():
         return scale
     for _ in range(30):
@@ -209,7 +211,7 @@ METHODS: dict[str, Callable[[Case, int], float]] = {
 
 @dataclass(frozen=True)
 class Cell:
-    """Of one method at one share of outliers: absolute relative errors, and seeds without an answer."""
+    """Results of one method at one share of outliers: absolute relative errors, and seeds without an answer."""
 
     errors: Array
     num_refused: int

@@ -1,15 +1,15 @@
-"""How often the 95 % interval of the scale covers the truth, on simulated surveys with errors as real radios have them.
+"""Measure how often the 95 % interval of the scale covers the truth, on simulated surveys with realistic range errors.
 
 Run: python -m tests.studies.scale_coverage --rows FILE [--num_seeds 300] [--surveys "one known"]
 
-Started again with the same file it goes on where it was stopped.
+When started again with the same file, the study continues where it was stopped.
 
-Each survey has a radio of its own, drawn from the population (``rangesfm.ranging.errors.components``), and with it
-errors that are drawn as functions of time, place, distance and direction, and a bend of its map. In the calibrated
-cases the error curve is known to 0.01 m; in those by photo ranges name the photo next to them instead of a time. Prints
-for each case of anchors the share of intervals that cover the true scale with its standard error, the median half
-width, the median and the largest error, the part of the errors' mean square that the stated stddev explains (1: all),
-and how many surveys were refused.
+Each survey has a radio of its own, drawn from the population (``rangesfm.ranging.errors.components``). Its errors are
+drawn as functions of time, place, distance and direction, and its map has a bend. In the calibrated cases the error
+curve is known to 0.01 m; in the cases by photo, ranges name the nearest photo instead of a time. Prints for each case
+of anchors the share of intervals that cover the true scale with its standard error, the median half width, the median
+and the largest error, the part of the errors' mean square that the stated stddev explains (1: all), and how many
+surveys were refused.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ LEARNT_STDDEV_M = 0.01
 
 @dataclass(frozen=True)
 class Case:
-    """Anchors that are heard, the frame they are given in, whether an error curve was learnt, and what ranges name."""
+    """A case: anchors with ranges, their frame, whether an error curve was learnt, and whether ranges name photos."""
 
     name: str
     heard: str
@@ -84,7 +84,7 @@ def main() -> None:
 
 
 def summary(rows: list[Row]) -> str:
-    """Of surveys that were not refused."""
+    """Summarize the surveys that were not refused."""
     errors, low, high, stddevs = (np.array([row[name] for row in rows]) for name in ("error", "low", "high", "stddev"))
     covered, widths = float(np.mean((low <= -errors) & (-errors <= high))), (high - low) / 2
     return (
@@ -95,7 +95,7 @@ def summary(rows: list[Row]) -> str:
 
 
 def one_survey(case: Case, seed: int) -> Row:
-    """Error of the scale's logarithm, ends of its interval about the estimate, stated stddev; nothing if refused."""
+    """Return the error of the scale's logarithm, its interval about the estimate and its stddev; nothing if refused."""
     planned = PlannedSurvey(
         along(loop_path(DURATION_S, unsteadiness_m=0.3, seed=seed), KEYFRAME_RATE_HZ),
         tuple(Anchor(name, np.array(ANCHORS_M[name])) for name in case.heard),
@@ -127,7 +127,7 @@ def one_survey(case: Case, seed: int) -> Row:
 
 
 def drawn_radio(seed: int, *, is_calibrated: bool) -> dict[str, float]:
-    """Stddevs of the components of its errors."""
+    """Draw the stddevs of the components of a radio's errors."""
     rng = np.random.default_rng((seed, 1))
     medians = [c.calibrated_median if is_calibrated and c.calibrated_median else c.median for c in COMPONENTS]
     sizes = np.exp(np.array([c.spread for c in COMPONENTS]) * rng.standard_normal(len(COMPONENTS)))

@@ -1,16 +1,16 @@
-"""Is the refined scale as good as the data allow? Its error over many noisy surveys, against the Cramer-Rao bound.
+"""Compare the error of the refined scale over many noisy surveys with the Cramer-Rao bound.
 
     python -m tests.studies.scale_crb [--num_seeds 50]
 
 One simulated survey for each case of anchors: a COLMAP model of known truth and ranges taken at its keyframes. Each
-seed draws pixel noise, range noise and range biases anew; COLMAP adjusts the model, as a mapper leaves it, then scale,
+seed draws pixel noise, range noise and range biases anew. COLMAP adjusts the model, as a mapper would, then scale,
 rescaling and refinement run with their defaults. The scale error is the scale of the similarity that takes the true
 keyframe centres to the refined ones, minus 1.
 
-The bound comes from the Jacobian of everything that is estimated (poses, points, anchors, biases) at the truth, written
-out here anew; intrinsics are known. The biases have a Gaussian prior, so their true values are drawn from it: over all
-draws the prior's information counts like that of a measurement (van Trees' Bayesian form of the bound). With one true
-bias in all surveys, the estimator's belief in its prior would make it seem better or worse than it is.
+The bound comes from the Jacobian of everything that is estimated (poses, points, anchors, biases) at the truth, which
+is derived here independently; intrinsics are known. The biases have a Gaussian prior, so their true values are drawn
+from it: over all draws the prior's information counts like that of a measurement (van Trees' Bayesian form of the
+bound). With one true bias in all surveys, the prior would make the estimator seem better or worse than it is.
 
 Exit status 1 if a mean error is further from zero than 2.5 of its standard errors, if the spread exceeds 1.2 times the
 bound, or if it is so far below that the bound itself must be wrong.
@@ -49,7 +49,7 @@ TAG_IN_CAM_M = np.array([0.05, -0.12, -0.03])
 
 MAX_MEAN_STANDARD_ERRORS = 2.5
 MAX_SPREAD_OVER_BOUND = 1.2
-# A spread of 50 errors is below this share of its true value once in 200 times.
+# The spread of 50 errors is below this share of its true value once in 200 times.
 MIN_SPREAD_OVER_BOUND = 0.75
 
 
@@ -59,7 +59,7 @@ class Case:
 
     Attributes:
         anchors_m: true positions by id, in the world of the simulation.
-        anchor_frame: as of ``initialize_scale``.
+        anchor_frame: as in ``initialize_scale``.
         num_epochs: ranges to each anchor at each keyframe.
     """
 
@@ -83,7 +83,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class CaseResult:
-    """Errors of the refined scale, one a seed, and the least stddev that an unbiased estimate can have."""
+    """Errors of the refined scale, one per seed, and the least stddev that an unbiased estimate can have."""
 
     case: Case
     errors: Array
@@ -121,7 +121,7 @@ def study_case(case: Case, num_seeds: int) -> CaseResult:
 
 
 def scale_error(case: Case, model: SyntheticModel, seed: int) -> float:
-    """Of one survey: the refined scale over the true one, minus 1."""
+    """Return the refined scale of one survey over the true one, minus 1."""
     sfm = mapped_model(model, seed)
     trajectory = trajectory_from_reconstruction(sfm, model.timestamps_s)
     keyframe = range_keyframes(case, model)
@@ -162,19 +162,19 @@ def scale_error(case: Case, model: SyntheticModel, seed: int) -> float:
 
 
 def range_keyframes(case: Case, model: SyntheticModel) -> npt.NDArray[np.int64]:
-    """The keyframe of each round of ranges."""
+    """Return the keyframe of each round of ranges."""
     return np.repeat(np.arange(len(model.centers_m)), case.num_epochs)
 
 
 def bias_covariance(case: Case) -> Array:
-    """Of the anchors' biases: each its own, and one that all share."""
+    """Return the covariance of the anchors' biases: an independent part each, and a common part."""
     own = RANGE_MODEL.range_bias_stddev_m**2 * np.eye(len(case.anchors_m))
     covariance: Array = own + RANGE_MODEL.common_bias_stddev_m**2
     return covariance
 
 
 def mapped_model(model: SyntheticModel, seed: int) -> pycolmap.Reconstruction:
-    """The model with noisy keypoints, adjusted by COLMAP."""
+    """Return the model with noisy keypoints, adjusted by COLMAP."""
     rng = np.random.default_rng([seed, 1])
     sfm = pycolmap.Reconstruction(model.reconstruction)
     config = pycolmap.BundleAdjustmentConfig()
@@ -193,18 +193,18 @@ def mapped_model(model: SyntheticModel, seed: int) -> pycolmap.Reconstruction:
 
 
 def scale_bound(case: Case, model: SyntheticModel) -> float:
-    """Cramer-Rao bound on the stddev of the scale error.
+    """Return the Cramer-Rao bound on the stddev of the scale error.
 
-    Six columns for each pose, changed by a step of its centre c and a turn w: c + dc, R Exp(dw), R = world_from_cam;
-    then one for each bias and, where they are estimated, three for each anchor. The first camera's pose is not
-    estimated in its own frame.
+    Each pose has six columns, for a step of its centre c and a rotation w: c + dc, R Exp(dw), R = world_from_cam. Then
+    comes one column for each bias and, where anchors are estimated, three for each anchor. The first camera's pose is
+    not estimated in its own frame.
     """
     centers, num_poses, num_anchors = model.centers_m, len(model.centers_m), len(case.anchors_m)
     num_columns = 6 * num_poses + num_anchors + (3 * num_anchors if case.anchor_frame == "unknown" else 0)
     information = np.zeros((num_columns, num_columns))
     add_reprojections(information, model)
     add_ranges(information, model, case)
-    # The alignment's scale grows by sum (c - mean).dc / sum |c - mean|^2, whatever turns and shifts it takes along.
+    # The alignment's scale grows by sum (c - mean).dc / sum |c - mean|^2, whatever its rotation and translation.
     from_middle = centers - centers.mean(axis=0)
     gradient = np.zeros(len(information))
     gradient[: 6 * num_poses].reshape(-1, 6)[:, :3] = from_middle / np.sum(from_middle**2)
@@ -213,7 +213,7 @@ def scale_bound(case: Case, model: SyntheticModel) -> float:
 
 
 def add_reprojections(information: Array, model: SyntheticModel) -> None:
-    """Of the poses, each point eliminated (its Schur complement)."""
+    """Add the information on the poses, with each point eliminated (its Schur complement)."""
     world_from_sfm = model.metric_from_sfm
     for point in model.reconstruction.points3D.values():
         in_world = world_from_sfm.apply(point.xyz)
@@ -235,7 +235,7 @@ def add_reprojections(information: Array, model: SyntheticModel) -> None:
 
 
 def add_ranges(information: Array, model: SyntheticModel, case: Case) -> None:
-    """Of poses, biases and anchors, with the biases' prior."""
+    """Add the information on poses, biases and anchors, with the biases' prior."""
     first_bias = 6 * len(model.centers_m)
     first_anchor = first_bias + len(case.anchors_m)
     for frame in range_keyframes(case, model):
@@ -254,7 +254,7 @@ def add_ranges(information: Array, model: SyntheticModel, case: Case) -> None:
 
 
 def cross_matrix(v: Array) -> Array:
-    """v x as a matrix."""
+    """Return v x as a matrix."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 

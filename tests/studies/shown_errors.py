@@ -1,9 +1,9 @@
-"""What each component of the ranges' errors amounts to on real logs, against the true distances.
+"""Show the size of each component of the ranges' errors on real logs, against the true distances.
 
 Run: python -m tests.studies.shown_errors --data FOLDER
 
-Learnt as a survey learns them, but at the true scale and from the same start for all logs: the columns of the table in
-``rangesfm/ranging/errors/components.py``. The logs are those of ``real_logs.json``.
+The components are learnt as in a survey, but at the true scale and from the same start for all logs. They are the
+columns of the table in ``rangesfm/ranging/errors/components.py``. The logs are those of ``real_logs.json``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rangesfm.scale.range_equation import predicted_ranges
 from rangesfm.scale.solution import solve_scale
 from rangesfm.scale.uncertainty import errors_to_expect
 
-# Medians that the logs' errors suggest at first sight, metres; and how far each log may be from them.
+# Medians that the logs' errors suggest at first sight, metres, and below them how far each log may differ.
 START = {"white": 0.05, "time": 0.04, "drift": 0.01, "place": 0.03, "view": 0.035, "bias": 0.045, "common_bias": 0.2}
 START |= {
     "short": 0.2,
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
-    """Stddevs by component."""
+    """Return the stddevs of a log by component."""
     log, anchors, reference = read_set(data, described)
     path = path_of(reference)
     case = next(case for case in cases(log, anchors, path) if case.name == "known")

@@ -1,4 +1,4 @@
-"""The matches of a simulated model as COLMAP's database: what a mapper begins with."""
+"""The matches of a simulated model as COLMAP's database, from which a mapper begins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 
 
 def write_database(path: Path, model: pycolmap.Reconstruction, pixel_errors: Array) -> None:
-    """Features of all photos, and matches wherever two see the same point.
+    """Write the features of all photos, and matches wherever two photos see the same point.
 
     Args:
         pixel_errors: (num_observations, 2), added to the features in the order of the images' ids.
@@ -40,7 +40,7 @@ def write_database(path: Path, model: pycolmap.Reconstruction, pixel_errors: Arr
 
 
 def _matches(model: pycolmap.Reconstruction) -> dict[tuple[int, int], npt.NDArray[np.uint32]]:
-    """(m, 2) places of the same points in two images, by their ids."""
+    """Return (m, 2) feature indices of the same points in two images, by the images' ids."""
     pairs: dict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
     for _, point in sorted(model.points3D.items()):
         seen = sorted((element.image_id, element.point2D_idx) for element in point.track.elements)

@@ -1,4 +1,4 @@
-"""Simulated surveys of known truth, for the studies of the refinement: one noisy run, and the bound on its error."""
+"""Simulated surveys of known truth for the studies of the refinement: one noisy run, and the bound on its error."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Array = npt.NDArray[np.float64]
 
 TAG_IN_CAM_M = np.array([0.05, -0.12, -0.03])
 RANGE_MODEL = RangeModelOptions()
-# As COLMAP's mapper filters: points of less may go behind the horizon, where an adjustment gets stuck.
+# As in COLMAP's mapper: points with smaller angles may go behind the horizon, where an adjustment gets stuck.
 MIN_TRI_ANGLE_DEG = 1.5
 SITE_ANCHORS_M = {"A1": (9.0, 7.0, 3.0), "A2": (-9.0, 6.0, 0.5), "A3": (-8.0, -8.0, 3.5), "A4": (9.0, -7.0, 0.2)}
 
@@ -43,10 +43,10 @@ class Survey:
     """A survey without noise, and what is measured in it.
 
     Attributes:
-        model: the truth, in the world that the result will be in: the site, or the first camera's frame.
+        model: the truth, in the world of the result: the site, or the first camera's frame.
         anchors_m: (3,) true positions in that world, by id.
-        anchor_frame: as of ``initialize_scale``.
-        range_stddev_m: of one range to each anchor at each keyframe.
+        anchor_frame: as in ``initialize_scale``.
+        range_stddev_m: stddev of the ranges, of which there is one to each anchor at each keyframe.
     """
 
     model: SyntheticModel
@@ -76,11 +76,12 @@ def lap_survey(
     num_keyframes: int = 600,
     range_stddev_m: float = 0.1,
 ) -> Survey:
-    """A rover's lap round a soccer field: forward camera, tracks of at most 8 keyframes, no loop closure, one anchor.
+    """A rover's lap around a soccer field: forward camera, tracks of at most 8 keyframes, no loop closure, one anchor.
 
     Args:
-        num_observations: features in a keyframe. anchor_m: origin in the middle of the field, z up.
-        num_keyframes: fewer make it a part of the lap.
+        num_observations: features in a keyframe.
+        anchor_m: position with the origin in the middle of the field, z up.
+        num_keyframes: fewer than 600 give a part of the lap.
     """
     path = lap_path(300.0, share=0.98 * num_keyframes / 600)
     times = np.linspace(0.0, 300.0, num_keyframes)
@@ -99,7 +100,7 @@ def lap_survey(
 def yard_survey(
     *, anchor_frame: str = "site", range_stddev_m: float = 0.1, max_track_length: int | None = None
 ) -> Survey:
-    """A walk round a yard, its middle in view: four anchors in the site's frame, else the first of them alone."""
+    """A walk around a yard, looking at its middle: four anchors in the site's frame, else the first of them alone."""
     path = loop_path(40.0, height_amplitude_m=0.8, unsteadiness_m=0.1, seed=3)
     anchors = SITE_ANCHORS_M if anchor_frame == "site" else {"A1": SITE_ANCHORS_M["A1"]}
     times = np.linspace(0.0, 40.0, 60)
@@ -139,13 +140,13 @@ def _survey(
 
 
 def unit_pixel_errors(survey: Survey, seed: int) -> Array:
-    """(num_observations, 2) of stddev 1."""
+    """(num_observations, 2) errors of stddev 1."""
     num = sum(len(survey.model.reconstruction.image(i).points2D) for i in _image_ids(survey))
     return np.random.default_rng([seed, 1]).standard_normal((num, 2))
 
 
 def mapped(survey: Survey, pixel_errors: Array) -> pycolmap.Reconstruction:
-    """The model as a mapper leaves it: COLMAP's bundle adjustment, without ranges, of features with these errors."""
+    """Return the model as a mapper would: COLMAP's bundle adjustment of features with these errors, without ranges."""
     sfm = _with_noisy_features(survey, pixel_errors)
     config = pycolmap.BundleAdjustmentConfig()
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
@@ -156,7 +157,7 @@ def mapped(survey: Survey, pixel_errors: Array) -> pycolmap.Reconstruction:
 
 
 def _with_noisy_features(survey: Survey, pixel_errors: Array) -> pycolmap.Reconstruction:
-    """The true model, but for its features."""
+    """Return the true model with noisy features."""
     model = pycolmap.Reconstruction(survey.model.reconstruction)
     remaining = iter(pixel_errors)
     for image_id in _image_ids(survey):
@@ -182,12 +183,12 @@ def _image_ids(survey: Survey) -> list[int]:
 def range_log(
     survey: Survey, seed: int, *, biases_m: Array | None = None, obstructed_share: float = 0.0, num_each: int = 1
 ) -> RangeLog:
-    """Ranges to each anchor at each keyframe.
+    """Simulate ranges to each anchor at each keyframe.
 
     Args:
-        biases_m: of the anchors, in their order; None: none have any.
-        obstructed_share: of the ranges, which read 1 m long on average.
-        num_each: to an anchor at a keyframe.
+        biases_m: biases of the anchors, in their order; None: no biases.
+        obstructed_share: share of the ranges that are 1 m too long on average.
+        num_each: ranges to an anchor at a keyframe.
     """
     biases = {} if biases_m is None else dict(zip(survey.anchors_m, biases_m.tolist(), strict=True))
     model = survey.model
@@ -200,7 +201,7 @@ def range_log(
 
 
 def drawn_biases(survey: Survey, seed: int) -> Array:
-    """(num_anchors,) from the prior that the stages assume: each anchor's own, and one that all share."""
+    """Draw (num_anchors,) biases from the prior that the stages assume: a part for each anchor, and a common part."""
     rng = np.random.default_rng([seed, 2])
     own = RANGE_MODEL.range_bias_stddev_m * rng.standard_normal(len(survey.anchors_m))
     drawn: Array = own + RANGE_MODEL.common_bias_stddev_m * rng.standard_normal()
@@ -223,10 +224,10 @@ class Result:
 def run_stages(
     survey: Survey, sfm: pycolmap.Reconstruction, log: RangeLog, *, range_stddev_m: float | None = None
 ) -> Result:
-    """Scale and refinement with their defaults.
+    """Run scale and refinement with their defaults.
 
     Args:
-        range_stddev_m: with which the refinement weighs all ranges; None: it estimates their noise.
+        range_stddev_m: the stddev that the refinement assumes for all ranges; None: it estimates their noise.
     """
     times = survey.model.timestamps_s
     trajectory = trajectory_from_reconstruction(sfm, times)
@@ -258,15 +259,16 @@ def run_stages(
 
 
 def path_error_m(survey: Survey, path: Trajectory) -> float:
-    """Root mean square distance of the keyframes from the truth, without alignment."""
+    """Return the root mean square distance of the keyframes from the truth, without alignment."""
     return rmse(path.centers - survey.model.centers_m)
 
 
 def rmse_bound_m(survey: Survey, pixel_stddev: float, *, with_ranges: bool = True) -> float:
-    """Cramer-Rao bound on the root mean square error of the keyframes' centres.
+    """Return the Cramer-Rao bound on the root mean square error of the keyframes' centres.
 
-    From the information that features, ranges and the biases' prior have on poses, points, biases and, where they
-    are unknown, anchors, at the truth. Without ranges: of the map that moves least, which has about the true scale.
+    It follows from the information that features, ranges and the biases' prior give on poses, points, biases and
+    unknown anchors, at the truth. Without ranges it is that of the map which moves least, which has about the true
+    scale.
     """
     truth = pycolmap.Reconstruction(survey.model.reconstruction)
     adjuster, anchors, biases = _adjuster(survey, truth), _anchor_blocks(survey), _bias_blocks(survey)
@@ -277,10 +279,10 @@ def rmse_bound_m(survey: Survey, pixel_stddev: float, *, with_ranges: bool = Tru
 
 
 def likeliest_path(survey: Survey, pixel_errors: Array, log: RangeLog, *, pixel_stddev: float) -> Trajectory:
-    """What who knows the stddev of all noise, and that it is Gaussian, finds from the truth by least squares.
+    """Return the least-squares solution from the truth, with all noise known and Gaussian.
 
-    Where noise is small enough for the problem to be linear, its error's mean square is that of the bound. That of
-    the same seeds has the luck of their draw, which the bound knows nothing of.
+    Where noise is small enough for the problem to be linear, its mean squared error equals the bound. Its error for the
+    same seeds has the same chance in it as that of the refinement, which the bound does not have.
 
     Args:
         log: of ``range_log``, in the order of time.
@@ -294,14 +296,14 @@ def likeliest_path(survey: Survey, pixel_errors: Array, log: RangeLog, *, pixel_
 
 
 def true_ranges_m(survey: Survey) -> dict[str, Array]:
-    """(num_keyframes,) without noise, by anchor."""
+    """(num_keyframes,) ranges without noise, by anchor."""
     model = survey.model
     antenna = model.centers_m + model.world_from_cam @ TAG_IN_CAM_M
     return {name: np.linalg.norm(antenna - anchor, axis=1) for name, anchor in survey.anchors_m.items()}
 
 
 def _adjuster(survey: Survey, model: pycolmap.Reconstruction) -> pycolmap.CeresBundleAdjuster:
-    """Of the features, with a gauge that leaves the rest to the ranges."""
+    """Return an adjuster of the features, with a gauge that leaves the rest to the ranges."""
     config = pycolmap.BundleAdjustmentConfig()
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
     for image_id in _image_ids(survey):
@@ -328,7 +330,7 @@ def _add_ranges(
     biases: list[Array],
     pixel_stddev: float,
 ) -> None:
-    """In pixels, as the features are.
+    """Add range residuals, in pixels as the features' residuals are.
 
     Args:
         ranges_m: (num_keyframes,) by anchor.

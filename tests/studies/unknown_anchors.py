@@ -1,14 +1,15 @@
-"""Scale from anchors that nobody measured: how often it is right, refused or wrong.
+"""Count how often the scale from anchors at unknown positions is right, refused or wrong.
 
     python -m tests.studies.unknown_anchors [--num_seeds 5]
 
-Each survey has 60 keyframes and three ranges of stddev 0.05 m to each anchor at each of them; outliers read too long by
-an exponential length of 2 m in the mean. The paths: a walk round a yard that rises and falls, the same at one height, a
+Each survey has 60 keyframes and three ranges of stddev 0.05 m to each anchor at each of them; outliers are too long by
+an exponential length of 2 m on average. The paths: a walk around a yard that rises and falls, the same at one height, a
 straight line, a flat circle and a path on a sphere. A scale counts as right within three of its stated stddevs (the
 larger of formal and empirical), as wrong beyond, and as refused with a GeometryError. Prints the three counts and the
-median error of what was not refused. On a flat circle any scale fits unknown anchors, however many (their heights make
-up for it), and on a sphere one anchor leaves two scales: refusing is right there, unless the lever arm or several
-anchors break the symmetry.
+median error of what was not refused.
+
+On a flat circle any scale fits unknown anchors, however many (their heights make up for it), and on a sphere one anchor
+leaves two scales. Refusing is right there, unless the lever arm or several anchors break the symmetry.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ OUTLIER_SHARES = (0.0, 0.3, 0.5)
 
 
 def centers_of(path: str, seed: int) -> Array:
-    """(n, 3) metres."""
+    """(n, 3) centres, metres."""
     if path in ("walk", "flat walk"):
         amplitude = 0.0 if path == "flat walk" else 0.8
         centers = loop_path(60.0, height_amplitude_m=amplitude, unsteadiness_m=0.1, seed=seed).centers(TIMES)
@@ -59,7 +60,7 @@ def centers_of(path: str, seed: int) -> Array:
 def estimate_once(
     path: str, num_anchors: int, share: float, lever_m: tuple[float, float, float], seed: int
 ) -> tuple[float, float]:
-    """Relative error and stated stddev of the scale."""
+    """Return the relative error and the stated stddev of the scale."""
     centers = centers_of(path, seed)
     world_from_cam = loop_path(60.0, seed=seed).world_from_cam(TIMES)
     world_from_sfm = Similarity(SCALE, world_from_cam[0], centers[0])

@@ -1,12 +1,12 @@
-"""Does either term starve the other? Error against the weight of the ranges relative to the features.
+"""Measure the error against the weight of the ranges relative to the features: does either dominate the other?
 
     python -m tests.studies.weights [--num_seeds 8]
 
-Simulated surveys with known noise: a room that a camera looks across, with four site anchors or with one; and a
-rover's lap that drifts; biases are drawn from the prior that the stages assume. The refinement is told a stddev of all
-ranges that is the true one divided by a factor from 0.1 to 10 (the root of the weight), and once, as in practice,
-estimates all noise itself ("own"). Factors of the two terms are one thing: ten times the weight for ranges is a tenth
-for features.
+Simulated surveys with known noise: a yard that a camera looks across, with four site anchors or with one; and a rover's
+lap that drifts. Biases are drawn from the prior that the stages assume. The refinement is given a stddev of all ranges
+that is the true one divided by a factor from 0.1 to 10 (the root of the weight), and once, as in practice, estimates
+all noise itself ("own"). Only the ratio of the two weights matters: ten times the weight for ranges is a tenth for
+features.
 
 Prints the root mean square error of all keyframes of all seeds, without alignment. Exit status 1 if with its own
 weights the refinement is worse than with the best factor by more than 10 %.
