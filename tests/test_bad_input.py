@@ -1,4 +1,4 @@
-"""Whatever is wrong with the input ends as one line that names it, the right exit status, and nothing half-written."""
+"""Bad input ends in one line that names it, the right exit status, and no half-written file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def remove(name: str) -> Spoil:
 
 
 def set_line(name: str, number: int, text: str) -> Spoil:
-    """Put a text in the place of one line."""
+    """Return a function that replaces one line of a file."""
 
     def spoil(folder: Path) -> None:
         lines = (folder / name).read_text().splitlines()
@@ -50,7 +50,7 @@ def set_line(name: str, number: int, text: str) -> Spoil:
 
 
 def keep_lines(name: str, numbers: slice) -> Spoil:
-    """Keep the header row and some of the lines below it."""
+    """Return a function that keeps the header row and some of the lines below it."""
 
     def spoil(folder: Path) -> None:
         header, *lines = (folder / name).read_text().splitlines()
@@ -93,14 +93,17 @@ def nothing(folder: Path) -> None:
 
 
 class Refusal:
-    """Runs commands in one folder that must fail, and looks at what they say and leave."""
+    """Runs commands that must fail in one folder, and checks what they print and leave."""
 
     def __init__(self, folder: Path, capfd: pytest.CaptureFixture[str]):
         self._folder = folder
         self._capfd = capfd
 
     def __call__(self, *argv: str, status: int = 2) -> str:
-        """What the command says behind ``rangesfm: error:``; its output is one line, and no file is new or gone."""
+        """Return the text after ``rangesfm: error:``.
+
+        The output must be one line, and no file may be new, changed or gone.
+        """
         before = self._files()
         assert main([*argv, "--quiet"]) == status
         out, err = self._capfd.readouterr()
@@ -340,11 +343,11 @@ def test_damaged_result_is_named(
 
 
 class TestPhotos:
-    """Folders of photos from which nothing can come."""
+    """Folders of photos from which nothing can be reconstructed."""
 
     @pytest.fixture
     def photos(self, own_survey: WalkedSurvey) -> Path:
-        """Five pictures of different rugs, a second apart, in the folder of the survey."""
+        """Five pictures of different patterns, a second apart, in the folder of the survey."""
         folder = own_survey.folder / "photos"
         folder.mkdir()
         rng = np.random.default_rng(0)
@@ -438,7 +441,7 @@ class TestPhotos:
 
 
 def assert_nothing_half_written(folder: Path) -> None:
-    """Nothing here can be taken for a result, or for a part of one."""
+    """Check that nothing here could be taken for a result, or for a part of one."""
     names = [path.name for path in paths_below(folder)]
     assert "result.json" not in names
     assert not [name for name in names if name.endswith((".part", ".old")) or name.startswith(".")]
@@ -459,7 +462,7 @@ def test_format_that_cannot_be_written_costs_neither_the_result_nor_the_others(
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Start a command, as from a terminal, where Ctrl-C is not ignored."""
+    """Return a function that starts a command as a terminal does, so that Ctrl-C is not ignored."""
     started = []
 
     def start_command(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
@@ -480,13 +483,13 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
         process.communicate()
 
 
-HANGS_AFTER_S = 600.0  # far beyond any time that a loaded machine takes
+HANGS_AFTER_S = 600.0  # much longer than a loaded machine takes
 
 
 def interrupt_when(
     happened: Callable[[], bool], process: subprocess.Popen[str], by: signal.Signals = signal.SIGINT
 ) -> list[str]:
-    """Send Ctrl-C, or another signal, as soon as something has happened; what the process said."""
+    """Send Ctrl-C, or another signal, as soon as something has happened; return the process's messages."""
     deadline = time.monotonic() + HANGS_AFTER_S
     while not happened():
         assert process.poll() is None, "the process ended before"
@@ -508,7 +511,7 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(
     process = start("refine", *own_survey.flags, *flags, cwd=own_survey.folder)
     maps = Path(f"/proc/{process.pid}/maps")
     lock = own_survey.folder / "out" / LOCK_NAME
-    # It is these two that would print a stack trace.
+    # These two libraries would print a stack trace.
     lines = interrupt_when(
         lambda: lock.exists() and {"_core", "pyceres"} <= loaded(maps.read_text()), process, by=signal.SIGTERM
     )
@@ -518,7 +521,7 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(
 
 
 def loaded(maps: str) -> set[str]:
-    """Names of the libraries that a process has loaded, up to their first dot."""
+    """Return the names of the libraries that a process has loaded, up to their first dot."""
     return {Path(line.split()[-1]).name.partition(".")[0] for line in maps.splitlines() if "/" in line}
 
 

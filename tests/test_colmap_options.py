@@ -1,6 +1,6 @@
-"""COLMAP's options as they are handed over: its own defaults, but for what is written here.
+"""COLMAP's options as rangesfm passes them: COLMAP's own defaults, except for those listed here.
 
-An options object that is built anew inside of another takes the place of defaults that COLMAP has set for there.
+A newly built options object inside another one would replace defaults that COLMAP sets there.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from rangesfm.vision.photos import Photos
 from rangesfm.vision.rigs import NO_RIGS
 
 SEED = 3
-ON_PROCESSOR = {"use_gpu": False} if pycolmap.has_cuda else {}  # COLMAP's own choice where it has no CUDA
+ON_PROCESSOR = {"use_gpu": False} if pycolmap.has_cuda else {}  # COLMAP sets this itself where it has no CUDA
 KNOWN_CAMERA = CameraOptions(model="SIMPLE_PINHOLE", params=(240.0, 128.0, 96.0))
 
 
 def changes(options: Any) -> dict[str, Any]:
-    """What is not as COLMAP has it, by its name; inner options as ``outer.inner``."""
+    """Return the options that differ from COLMAP's defaults, by name; inner options as ``outer.inner``."""
     return dict(_changes(options.todict(), type(options)().todict()))
 
 
@@ -101,7 +101,7 @@ def of_clusters(changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def database_of(path: Path, *sizes: tuple[int, int]) -> Path:
-    """A photo of each of these cameras, which COLMAP calls 1, 2, ..."""
+    """Write a database with one photo of each of these cameras; COLMAP numbers them 1, 2, ..."""
     with pycolmap.Database.open(path) as database:
         for number, (width, height) in enumerate(sizes, 1):
             camera = pycolmap.Camera.create_from_model_name(number, "SIMPLE_PINHOLE", 240.0, width, height)
@@ -178,7 +178,7 @@ def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest
     matcher, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     MatchingShare(tmp_path, [(1, 2)], matcher, verification).run(SilentProgress())
     assert (handed[0], handed[2]) == (matcher, verification)
-    # As many photos at once as go by the features of each: of a database without any, one.
+    # The block size depends on the photos' features; in a database without any, it is one photo.
     assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 1}
 
 
@@ -202,7 +202,7 @@ def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:
         "ceres.solver_options.gradient_tolerance": 0.0,
         "ceres.solver_options.max_num_iterations": 77,
         "ceres.solver_options.num_threads": 1,
-        # With several threads sums are added up in an order of their own each time.
+        # Several threads would add up sums in a different order each time.
         "ceres.min_num_residuals_for_cpu_multi_threading": 1_000_000,
     }
 

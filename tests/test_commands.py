@@ -40,7 +40,7 @@ Array = npt.NDArray[np.float64]
 NUMBER, TEXT, LIST, TABLE, BOOL = (float, int), str, list, dict, bool
 OR_NULL = type(None)
 RANGE_SUMMARY = {"num": int, "num_used": int, "num_rejected": int, "rms_m": NUMBER, "median_abs_m": NUMBER}
-# What result.json has at least, whatever else there is; "*" stands for each of the keys.
+# Entries that result.json has at least; "*" stands for each key.
 RESULT = {
     "scale": {
         "value": NUMBER,
@@ -91,7 +91,7 @@ COMPARISON = {
     "rmse_sim3_m": NUMBER,
     "scale_error_percent": NUMBER,
 }
-# All that a refined model leaves with a reference, each model as one entry.
+# Everything that a refined model with a reference leaves, each model as one entry.
 REFINED_FILES = {
     "sparse_scaled/0",
     "sparse_metric/0",
@@ -125,7 +125,7 @@ class Left:
 
     @property
     def without_seconds(self) -> dict[str, Any]:
-        """A copy of result.json but for how long things took and where it lies, with whole paths of its inputs."""
+        """Return a copy of result.json without durations and its own location, with absolute paths of its inputs."""
         result = copy.deepcopy(self.result)
         del result["seconds"], result["settings"]["output"]["path"]
         paths = [(result["settings"][key.table], key.name) for key in KEYS if key.role not in (None, "output")]
@@ -137,14 +137,14 @@ class Left:
 
     @property
     def files(self) -> set[str]:
-        """Everything in the folder but the models' own files."""
+        """List the files in the folder, with each model as one entry."""
         paths = {path.relative_to(self.folder).as_posix() for path in paths_below(self.folder) if path.is_file()}
         models = {path for path in paths if path.startswith("sparse") and os.path.basename(path) in MODEL_FILES}
         return (paths - models) | {os.path.dirname(path) for path in models}
 
     @property
     def timeless_contents(self) -> dict[str, bytes]:
-        """Of all files but those that tell how long things took."""
+        """Return the contents of all files except those that state durations."""
         paths = {path.relative_to(self.folder).as_posix(): path for path in paths_below(self.folder) if path.is_file()}
         return {name: path.read_bytes() for name, path in paths.items() if name not in ("result.json", "report.html")}
 
@@ -168,13 +168,13 @@ class Left:
 
 
 def centers_of(model: Path) -> Array:
-    """(n, 3) projection centres by name."""
+    """(n, 3) projection centres, in the order of the names."""
     images = sorted(pycolmap.Reconstruction(model).images.values(), key=lambda image: image.name)
     return np.array([image.projection_center() for image in images if image.has_pose])
 
 
 def assert_has(found: Any, expected: Any, where: str = "") -> None:
-    """``found`` has every key of ``expected``, with a value of its type; what is a number is finite."""
+    """Check that ``found`` has every key of ``expected`` with a value of its type, and that numbers are finite."""
     if not isinstance(expected, dict):
         is_right = isinstance(found, expected) and (not isinstance(found, bool) or expected is BOOL)
         assert is_right, f"{where} is {found!r}"
@@ -191,7 +191,7 @@ def assert_has(found: Any, expected: Any, where: str = "") -> None:
 def run_on(
     command: Command, survey: WalkedSurvey, folder: Path, stage: str, *flags: str, drop: tuple[str, ...] = ()
 ) -> Left:
-    """A stage on the walked survey, with the results in ``folder``."""
+    """Run a stage on the walked survey, with its results in ``folder``."""
     pairs = zip(survey.flags[::2], survey.flags[1::2], strict=True)
     given = [item for pair in pairs if pair[0] not in drop for item in pair]
     done = command(stage, *given, *flags, "--output_path", str(folder), cwd=survey.folder)
@@ -200,7 +200,7 @@ def run_on(
 
 @pytest.fixture(scope="module")
 def refined(walked_survey: WalkedSurvey, rangesfm_process: Command, tmp_path_factory: pytest.TempPathFactory) -> Left:
-    """The walked survey refined in its site frame, compared with the truth; not to be written to."""
+    """The walked survey refined in its site frame and compared with the truth. Tests must not write to it."""
     folder = tmp_path_factory.mktemp("refined") / "out"
     flags = ("--anchors", "anchors.csv", "--anchor_frame", "site", "--reference", "reference.csv")
     return run_on(rangesfm_process, walked_survey, folder, "refine", *flags)
@@ -317,7 +317,7 @@ class TestRefineInASiteFrame:
 
 
 def renumber(path: Path, rng: np.random.Generator) -> None:
-    """Give the images and points of a model other numbers, in place."""
+    """Renumber the images and points of a model, in place."""
     model, renumbered = pycolmap.Reconstruction(path), pycolmap.Reconstruction()
     for camera in model.cameras.values():
         renumbered.add_camera_with_trivial_rig(camera)
@@ -336,10 +336,10 @@ def renumber(path: Path, rng: np.random.Generator) -> None:
 
 
 def close(found: Any, expected: Any) -> bool:
-    """Whether two contents of result.json are the same but for how numbers were rounded.
+    """Return whether two contents of result.json are the same up to rounding.
 
-    The likelihood of the error components is flat at its maximum: where it lies is told to the square root of the
-    rounding error of the likelihood itself.
+    The likelihood of the error components is flat at its maximum, so the maximum is only determined to the square root
+    of the likelihood's rounding error.
     """
     if isinstance(expected, dict):
         return found.keys() == expected.keys() and all(close(found[key], expected[key]) for key in expected)
@@ -390,7 +390,8 @@ class TestModelWithoutSurveyedAnchors:
                 true = np.array([float(row[key]) for key in ("x_m", "y_m", "z_m")])
                 found = left.result["anchors"][row["anchor_id"]]
                 error_m = np.linalg.norm(np.array(found["position_m"]) - true)
-                # A refined one's counts what all ranges may read long alike (0.2 m), and antennas and radio beside it.
+                # The stddev of a refined anchor includes the common bias of all ranges (0.2 m), and errors of antennas
+                # and radio.
                 assert error_m <= 3 * np.sqrt(3) * found["stddev_m"] < 1.5
 
     def test_may_be_a_path_without_points(
@@ -402,7 +403,8 @@ class TestModelWithoutSurveyedAnchors:
             model.delete_point3D(point_id)
         model.write(path)
         left = run_on(rangesfm_command, own_survey, tmp_path / "out", "scale", "--anchors", "anchors.csv")
-        # Without points the path is bent by another model than by its photos; noise alone moves the scale farther.
+        # Without points, the path is bent by another model than with photos; noise alone moves the scale more than
+        # that.
         scale = left.result["scale"]
         assert scale["value"] == pytest.approx(refined.result["scale"]["value"], abs=scale["stddev_formal"])
         assert left.result["refine"] is None
@@ -497,11 +499,11 @@ def test_offset_of_the_clocks_is_found(walked_survey: WalkedSurvey, rangesfm_com
 
 
 class TestResultFolder:
-    """What the other commands make of the folder that a run left."""
+    """Other commands on the folder that a run left."""
 
     @pytest.fixture
     def out(self, refined: Left, tmp_path: Path) -> Path:
-        # The survey's folder has the same name too: it is what the report is called by.
+        # The survey's folder keeps its name, because the report's title contains it.
         return shutil.copytree(refined.folder, tmp_path / refined.folder.parent.name / "out")
 
     def test_is_compared_with_and_without_a_reference(
@@ -513,7 +515,7 @@ class TestResultFolder:
         for name in ("true scale", "estimated scale", "refined"):
             (line,) = (line for line in text.splitlines() if line.startswith(name))
             assert f" {rmse_m[name]:.4f} " in line
-        text = rangesfm_command("compare", cwd=out.parent).stdout  # "out" is the default
+        text = rangesfm_command("compare", cwd=out.parent).stdout  # "out" is the default folder
         assert "RMSE m" not in text
         (line,) = (line for line in text.splitlines() if line.startswith("range residual RMS m"))
         assert float(line.split()[-1]) == pytest.approx(refined.result["ranges"]["rms_m"], abs=2e-3)
@@ -522,7 +524,7 @@ class TestResultFolder:
         flags = ("--formats", "colmap_text,ply_cameras,ply_anchors,transform,model_aligner", "--output_path", "more")
         done = rangesfm_command("export", out, *flags, cwd=out.parent)
         written = [out.parent / line for line in done.stdout.splitlines()]
-        assert len(written) == 6  # two transforms
+        assert len(written) == 6  # two of them are transforms
         assert all(path.exists() for path in written)
         assert pycolmap.Reconstruction(out.parent / "more" / "colmap_text").num_reg_images() == 40
 

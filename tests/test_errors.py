@@ -1,4 +1,4 @@
-"""What a user reads is one line, whatever names the files hold."""
+"""Error messages are one line, whatever names the files hold."""
 
 from __future__ import annotations
 

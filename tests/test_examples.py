@@ -1,4 +1,4 @@
-"""The examples run, and the survey files among them are surveys."""
+"""The example programs run, and the survey files among them are valid."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 def run_process(name: str, *arguments: str, cwd: Path) -> str:
-    """For those that say themselves what is imported, and in which order."""
+    """Run an example that sets its own import order, as a process of its own, and return its output."""
     command = [sys.executable, str(EXAMPLES / name), *arguments]
     done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -34,7 +34,7 @@ def run_process(name: str, *arguments: str, cwd: Path) -> str:
 
 
 def run_example(name: str, *arguments: str, cwd: Path) -> str:
-    """What it prints, run in this process, where most of what it imports has been imported already."""
+    """Run an example in this process, which saves the imports, and return its output."""
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as out:
         patch.chdir(cwd)
         patch.setattr(sys, "argv", [name, *arguments])

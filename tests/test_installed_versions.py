@@ -25,7 +25,7 @@ OTHER_VERSIONS = [("pycolmap", "4.3.0"), ("pycolmap", "4.1.1"), ("pyceres", "2.5
 
 @pytest.fixture(params=OTHER_VERSIONS, ids=lambda param: "-".join(map(str, param)))
 def complaint(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """What is said of a package in another version than needed, in a process that has not looked yet."""
+    """The expected message about a package of a wrong version, in a process that has not checked versions yet."""
     package, version = request.param
     with_installed(monkeypatch, pycolmap_cuda12=None, **{package: version})
     for check in (check_versions, check_compatibility):
@@ -61,14 +61,14 @@ def test_functions_refuse_too_and_say_so_with_an_error_of_the_package(
             first_use()
         assert str(caught.value) == complaint
     for name in ("read_ranges", "SolverError"):
-        monkeypatch.delitem(vars(rangesfm), name, raising=False)  # as before it was first used
+        monkeypatch.delitem(vars(rangesfm), name, raising=False)  # so that its first use is repeated
     with pytest.raises(rangesfm.SolverError, match=re.escape(complaint)):
         rangesfm.read_ranges  # noqa: B018
 
 
 @pytest.fixture
 def unchecked() -> Iterator[None]:
-    """Nothing is known here of versions from before, and nothing will be from here."""
+    """Forget the result of the version check before and after the test."""
     check_versions.cache_clear()
     yield
     check_versions.cache_clear()

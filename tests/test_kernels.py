@@ -1,7 +1,7 @@
-"""The numeric tests once more with the BLAS of other processors.
+"""The numeric tests once more, with the BLAS kernels of other processors.
 
-numpy and scipy bring an OpenBLAS that has kernels for many processors and takes the one that suits; each rounds in its
-own way. A test that passes with one of them alone shows a decision of the product that hangs on rounding.
+numpy and scipy bring an OpenBLAS with kernels for many processors, which selects the one that fits; each rounds in its
+own way. A test that passes with only one of them reveals a decision of the product that depends on rounding.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from tests.conftest import blas_kernels
 
-# By what a processor must have for it, as /proc/cpuinfo says.
+# Flags in /proc/cpuinfo that a processor must have for each kernel.
 NEEDED_FLAGS = {"Haswell": "avx2", "SkylakeX": "avx512vl", "Nehalem": "sse4_2"}
-# Where decisions are made on computed numbers, as far as that is quick: a quarter of a minute for a kernel.
+# Tests of decisions that are made on computed numbers, if they are quick: a quarter of a minute per kernel.
 TESTS = (
     "tests/ceres/test_covariance.py",
     "tests/comparison/test_with_reference.py",
@@ -40,7 +40,8 @@ TESTS = (
     "tests/scale/test_starts.py",
     "tests/scale/test_two_candidate.py",
 )
-# Of these, what starts so takes seconds: mostly statistics over many draws, which no rounding turns.
+# Tests among them that take seconds and are left out: mostly statistics over many draws, which rounding does not
+# change.
 SLOW = (
     "tests/ceres/test_covariance.py::test_surveys_err_as_the_covariance_says",
     "tests/ranging/anchors/test_trilateration.py::TestCovariance",

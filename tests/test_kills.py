@@ -1,4 +1,4 @@
-"""Runs that are killed outright (SIGKILL), and what the next run makes of what they leave."""
+"""Runs that are killed outright (SIGKILL), and how the next run treats what they leave."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.studies import kills
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun
 
-# Runs a command that is killed at a call of some function, after so many that it lives through.
+# Runs a command that is killed at a call of some function, after a number of calls that succeed.
 PROGRAM = """
 import importlib, os, signal, sys
 from rangesfm.cli import main
@@ -44,7 +44,7 @@ AMONG_RENAMES = ("rangesfm.files.output_folder", "_rename", 9)
 
 
 def killed(moment: tuple[str, str, int], *arguments: str, cwd: Path) -> str:
-    """What a run said until it was killed."""
+    """Run until the process is killed, and return its messages."""
     command = [sys.executable, "-c", PROGRAM, *map(str, moment), "run", *arguments]
     done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr

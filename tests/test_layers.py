@@ -1,4 +1,4 @@
-"""Imports run one way, from folder to folder; and no stage knows another."""
+"""Imports run one way, from folder to folder, and stages do not import each other."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import rangesfm
 
 PACKAGE = Path(rangesfm.__file__).parent
 
-# From the bottom to the top. A folder imports from itself and from those below its own line, so that no stage knows
-# another; the root's files are below all folders, but for the doors, which hand on what stands anywhere.
+# From the bottom to the top. A folder imports from itself and from the folders in lines below its own, so that stages
+# do not know each other. Files at the root are below all folders, except for the public modules (DOORS), which may
+# import from anywhere.
 LAYERS = (
     "files processes",
     "geometry",
@@ -46,7 +47,7 @@ MODULES = {
 
 
 def folder_of(module: str) -> str:
-    """The first folder of a module inside the package; its own name where it stands at the root."""
+    """Return the first folder of a module inside the package, or the module's name at the root."""
     return module.partition(".")[0]
 
 
@@ -55,21 +56,21 @@ def layer(module: str) -> int:
 
 
 def imports(path: Path) -> set[str]:
-    """Full names of all modules that a file imports, wherever in it."""
+    """Return the full names of all modules that a file imports, at any place in it."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}:{node.lineno}: a relative import"
-            # Of `from package import name` either may be the module.
+            # In `from package import name`, either of the two may be the module.
             found.add(str(node.module))
             found.update(f"{node.module}.{alias.name}" for alias in node.names)
     return found
 
 
 def own_imports(module: str) -> set[str]:
-    """Names of this package's modules that one of them imports."""
+    """Return the names of this package's modules that a module imports."""
     return {name.removeprefix("rangesfm.") for name in imports(MODULES[module])} & MODULES.keys()
 
 

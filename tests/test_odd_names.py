@@ -1,4 +1,4 @@
-"""Photos and anchors of any name go through all commands: as comments, formulas, markup and templates look."""
+"""Photos and anchors of any name pass through all commands: names like comments, formulas, markup and templates."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ODD = ("#", "# ", "=1+1 ", "-@", "'", "<b>&amp;", '"q"', "{{7*7}}", "\N{LEFT-TO-
 
 @pytest.fixture(params=[ODD, ("#",)], ids=["all kinds", "all as comments"])
 def odd_survey(request: pytest.FixtureRequest, own_survey: WalkedSurvey) -> WalkedSurvey:
-    """The survey with other names of its photos, and of its first anchor."""
+    """The survey with other names for its photos and for its first anchor."""
     prefixes = request.param
     name_of = {name: f"{prefixes[k % len(prefixes)]}{name}" for k, name in enumerate(own_survey.image_names)}
     folder = own_survey.folder
@@ -33,7 +33,7 @@ def odd_survey(request: pytest.FixtureRequest, own_survey: WalkedSurvey) -> Walk
     model.write(folder / "sparse" / "0")
     with (folder / "images.csv").open(newline="") as file:
         rows = [(name_of[row["image_name"]], row["timestamp_s"]) for row in csv.DictReader(file)]
-    (folder / "images.csv").unlink()  # nothing takes the place of what the tool has not written
+    (folder / "images.csv").unlink()  # the tool replaces no file that it did not write
     write_table(folder / "images.csv", ("image_name", "timestamp_s"), rows)
     for name in ("uwb.csv", "anchors.csv"):
         with (folder / name).open(newline="") as file:
@@ -85,7 +85,7 @@ def test_a_result_whose_times_are_of_no_photo_is_refused(
 def scaled_result(
     walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """A folder with a result twice, once with rows of images.csv that are comments."""
+    """A folder with two copies of a result; in one of them, rows of images.csv are comments."""
     folder = tmp_path_factory.mktemp("comments")
     flags = ("--max_relative_stddev", "0.1", *walked_survey.flags, "--anchors", "anchors.csv")
     rangesfm_command("scale", *flags, "--output_path", folder / "out", "--quiet", cwd=walked_survey.folder)

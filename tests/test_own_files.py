@@ -1,4 +1,4 @@
-"""Whole commands leave all files alone that they did not write, and a result until the new one is complete."""
+"""Commands do not change files that they did not write, and keep a result until the new one is complete."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def bytes_in(folder: Path) -> dict[str, bytes]:
 
 
 def refusal(command: Command, *arguments: str, cwd: Path) -> str:
-    """The line with which a command refuses, after which every file is as it was."""
+    """Run a command that must refuse, check that every file is unchanged, and return its message."""
     before = bytes_in(cwd)
     done = command(*arguments, "--quiet", cwd=cwd, status=2)
     assert bytes_in(cwd) == before

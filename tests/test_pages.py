@@ -1,11 +1,13 @@
-"""README.md and the pages in examples/ are true: commands run, what is shown is printed, links lead somewhere.
+"""README.md and the pages in examples/ are true: commands run, the shown output is printed, and links work.
 
-What is in a fence says what is done with it, page by page from top to bottom in one folder that holds a small survey:
+A page's fences are processed from top to bottom in one folder that holds a small survey. The kind of a fence says what
+is done with it:
 
-- ``bash``: each command is run, as it stands;
-- ``sh``: only read by the program's own parser, as it installs something, takes long, or needs what only a user has;
+- ``bash``: each command is run as it is;
+- ``sh``: the program's parser reads each command, which is not run, because it installs something, takes long, or needs
+  what only a user has;
 - ``text``: each line was printed by the block before it;
-- ``csv NAME``: the file of that name, for the blocks after it.
+- ``csv NAME``: written to a file of that name, for the blocks after it.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = (README, *sorted((ROOT / "examples").glob("*.md")))
-# Those that begin with a model; the others begin with a survey that has photos, run once.
+# Pages that begin with a model; the others begin with a survey that has photos, run once.
 WITH_A_MODEL = {
     "existing_model",
     "unknown_anchors",
@@ -54,7 +56,7 @@ class Block(NamedTuple):
 
     @property
     def commands(self) -> list[list[str]]:
-        """Words of each line; a line that ends with a backslash goes on."""
+        """Return the words of each command; a line that ends with a backslash continues."""
         lines = self.text.replace("\\\n", " ").splitlines()
         return [words for line in lines if (words := shlex.split(line, comments=True))]
 
@@ -81,7 +83,7 @@ tag_in_cam_m = {list(TAG_IN_CAM_M)}
 def model_folder(
     walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """A model without photos and its survey, the tag's places as a total station has them, and two days' results."""
+    """A model without photos with its survey, tag positions as from a total station, and results of two days."""
     folder = shutil.copytree(walked_survey.folder, tmp_path_factory.mktemp("pages") / "survey")
     (folder / "survey.toml").write_text(MODEL_SURVEY)
     shutil.copytree(folder / "sparse", folder / "out" / "sparse")
@@ -97,7 +99,7 @@ def model_folder(
 
 @pytest.fixture
 def page_folder(page: Path, request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """What a reader of this page has in the folder in which the commands are typed."""
+    """The folder in which a reader of this page types the commands."""
     if page.stem in WITH_A_MODEL:
         folder = shutil.copytree(request.getfixturevalue("model_folder"), tmp_path / "survey")
     else:
@@ -136,7 +138,7 @@ def run_program(arguments: list[str], cwd: Path) -> list[str]:
 
 
 def shown_commands() -> list[list[str]]:
-    """Every call of rangesfm in a fence, without the program's name."""
+    """Return every call of rangesfm in a fence, without the program's name."""
     words = (
         words for page in PAGES for block in blocks_of(page) if block.kind in ("bash", "sh") for words in block.commands
     )
@@ -171,7 +173,8 @@ def test_links_lead_to_what_is_there(page: Path) -> None:
 def test_every_page_is_linked_from_the_readme() -> None:
     text = README.read_text(encoding="utf-8")
     linked = {Path(target).name for target in re.findall(r"\(examples/([\w.]+)", text)}
-    assert {page.name for page in PAGES} - linked - {"README.md"} == {"radios.md"}  # which goes with the verdicts
+    # radios.md belongs to the page about verdicts, which links it
+    assert {page.name for page in PAGES} - linked - {"README.md"} == {"radios.md"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

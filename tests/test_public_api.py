@@ -1,4 +1,4 @@
-"""The package as a library: every public name is there, explained, and costs nothing until it is used."""
+"""The package as a library: every public name exists, is documented, and is imported only when it is used."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import pytest
 
 import rangesfm
 
-# Slow to load, and of no use to somebody who only wants to know what there is.
+# Packages that are slow to import, and not needed to see which names exist.
 HEAVY = {"numpy", "scipy", "pycolmap", "pyceres", "PIL", "jinja2", "vl_convert"}
 
 
 def modules_after(code: str) -> set[str]:
-    """Top-level modules that a fresh interpreter has loaded after running ``code``."""
+    """Return the top-level modules that a fresh interpreter has loaded after running ``code``."""
     code += "\nimport json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(json.loads(done.stdout))
@@ -51,7 +51,7 @@ def test_public_name_is_there_and_explained(name: str) -> None:
     assert found.__module__.partition(".")[0] == "rangesfm"
     text = inspect.getdoc(found)
     assert text is not None
-    assert not text.startswith(f"{name}(")  # what a dataclass says of itself where nobody does
+    assert not text.startswith(f"{name}(")  # the docstring that a dataclass generates if nobody writes one
     assert len(text) > 20
 
 

@@ -1,4 +1,4 @@
-"""What a release promises: one version, a changelog that names it, licences and parts of all that is shipped."""
+"""The promises of a release: one version, a changelog that names it, licences and parts of all that is shipped."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CHANGELOG = (ROOT / ".github" / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def shipped(pattern: str) -> dict[str, str]:
-    """Texts of those files in the distribution's metadata whose path fits the pattern, by that path."""
+    """Return the texts of those files in the distribution's metadata whose path matches the pattern, by path."""
     files = importlib.metadata.files("rangesfm")
     assert files is not None
     return {
@@ -42,7 +42,7 @@ def shipped(pattern: str) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def bundled() -> dict[str, tuple[str, str]]:
-    """Version and licence of each part of the wheel that is not rangesfm's own, by name."""
+    """Version and licence of each third-party part of the wheel, by name."""
     (text,) = shipped(r"sboms/").values()
     document = json.loads(text)
     assert (document["bomFormat"], document["metadata"]["component"]["version"]) == ("CycloneDX", rangesfm.__version__)
@@ -82,7 +82,7 @@ def next_minor(version: str) -> str:
 
 @pytest.fixture(scope="module")
 def project() -> dict[str, Any]:
-    """What pyproject.toml says."""
+    """Return the content of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 

@@ -1,6 +1,6 @@
-"""Small surveys of all kinds, and what was found in them before: a change of any number shows, meant or not.
+"""Golden results of small surveys of all kinds: a change of any number fails, whether intended or not.
 
-What is meant is written anew, and its difference read before it is committed:
+If the change is intended, write the results anew, and read the difference before you commit it:
 
     WRITE_RESULTS=1 pytest tests/test_same_results.py
 """
@@ -29,11 +29,12 @@ Log = dict[str, Any]
 Numbers = dict[str, Any]
 
 FILE = Path(__file__).parent / "same_results.json"
-# Relative, and of what is next to nothing. Processors and other solvers' versions differ by less, mistakes by more.
+# The relative tolerance, and the absolute one near zero. Processors and versions of solvers differ by less, mistakes by
+# more.
 TOLERANCE, NOTHING = 1e-4, 1e-6
-# Of these only what is likeliest: of the others, it hangs on little which comes first.
+# Only the likeliest tests are compared, because the order of the others depends on small differences.
 NUM_TESTS = 6
-# Of the machine, or of how it was asked.
+# Keys that depend on the machine, or on the arguments of the command.
 LEFT_OUT = ("seconds", "settings", "inputs", "versions", "message", "words", "final_cost", "bend_m")
 
 
@@ -46,7 +47,7 @@ class Case(NamedTuple):
 
 
 def erring(log: Log) -> None:
-    """As real radios err: in seconds, by distance, each anchor its own."""
+    """Add errors like those of real radios: lasting for seconds, depending on distance, different for each anchor."""
     rng, times, ranges = np.random.default_rng(4), log["timestamp_s"], log["range_m"]
     for k, name in enumerate(ANCHORS_M):
         rows = log["anchor_id"] == name
@@ -124,7 +125,7 @@ def write_log(path: Path, log: Log) -> None:
 
 
 def write_anchors(path: Path, **changed: tuple[float, float, float] | None) -> None:
-    """With their places changed; None: of one that nobody knows."""
+    """Write the anchors with some positions changed (None: unknown)."""
     places = {name: at or ("", "", "") for name, at in (ANCHORS_M | changed).items()}
     rows = [f"{name},{x},{y},{z},0.02\n" for name, (x, y, z) in places.items()]
     path.write_text("anchor_id,x_m,y_m,z_m,position_stddev_m\n" + "".join(rows))
@@ -153,7 +154,7 @@ def found_by(case: Case, survey: WalkedSurvey, command: Command) -> Numbers:
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Numbers and words by where they stand."""
+    """Yield the numbers and words with their paths."""
     if isinstance(value, dict):
         for key, inner in value.items():
             if key not in LEFT_OUT:
@@ -188,7 +189,7 @@ def test_a_survey_gives_what_it_gave(name: str, survey: WalkedSurvey, rangesfm_c
 
 
 def write_known(survey: WalkedSurvey) -> tuple[str, ...]:
-    """Where the camera truly was, and the flags that say so."""
+    """Write the true path of the camera, and return the flags that use it."""
     times = read_image_times_csv(survey.folder / "images.csv").by_name()
     placed = survey.site_from_sfm
     path = trajectory_from_reconstruction(pycolmap.Reconstruction(survey.folder / "sparse" / "0"), times)
@@ -209,7 +210,7 @@ def write_known(survey: WalkedSurvey) -> tuple[str, ...]:
 def test_a_table_says_what_it_said(
     command: str, flags: tuple[str, ...], last_digit: float, survey: WalkedSurvey, rangesfm_command: Command
 ) -> None:
-    """But for the last digit, which may be rounded either way."""
+    """The last digit may differ, because it may be rounded either way."""
     log = read_log(survey.folder / "uwb.csv")
     obstructed(log)
     write_log(survey.folder / "uwb.csv", log)

@@ -1,4 +1,4 @@
-"""One formatter, one set of rules and one type checker over everything, and the C++ part's own tests."""
+"""The formatter, the linter and the type checker pass for all files, and so do the C++ part's own tests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PYTHON_FOLDERS = [name for name in ("plugin", "tests", "examples") if any((ROOT 
 
 
 def tool(name: str) -> str:
-    """Path of a tool: that of this interpreter's environment (its version is pinned), else the system's."""
+    """Return the path of a tool: from this interpreter's environment (its version is pinned), else the system's."""
     path = shutil.which(name, path=sysconfig.get_path("scripts")) or shutil.which(name)
     if path is None:
         pytest.fail(f"{name} is missing; run: python -m pip install '.[test]', and for cmake: apt-get install cmake")
@@ -27,7 +27,7 @@ def tool(name: str) -> str:
 
 
 def run(*command: str | Path) -> str:
-    """Output of a command run at the repository's root; fails the test with all of it if the command does."""
+    """Run a command at the repository's root and return its output; if it fails, the test fails with that output."""
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     if done.returncode != 0:
         pytest.fail(f"{' '.join(map(str, command))}\n{done.stdout}", pytrace=False)
@@ -36,15 +36,15 @@ def run(*command: str | Path) -> str:
 
 @pytest.fixture(scope="module")
 def cpp_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A configured build folder of the C++ part and its tests, with the compile commands clang-tidy asks for.
+    """A configured build folder of the C++ part and its tests, with the compile commands that clang-tidy needs.
 
-    The sources of a target are compiled as one: most of the time goes into the headers of Ceres and Eigen.
+    All sources of a target are compiled as one, because most of the time goes into the headers of Ceres and Eigen.
     """
     folder = tmp_path_factory.mktemp("cpp_build")
     run(
         *(tool("cmake"), "-S", ROOT / "cpp_ext", "-B", folder),
         "-DCMAKE_BUILD_TYPE=Debug",
-        "-DCMAKE_CXX_FLAGS_DEBUG=",  # nobody debugs what is built here, and symbols take a quarter of the time
+        "-DCMAKE_CXX_FLAGS_DEBUG=",  # nobody debugs this build, and symbols take a quarter of the time
         "-DCMAKE_EXPORT_COMPILE_COMMANDS=ON",
         "-DCMAKE_UNITY_BUILD=ON",
         "-DCMAKE_UNITY_BUILD_BATCH_SIZE=0",  # all sources of a target
@@ -78,7 +78,7 @@ def test_cpp_keeps_the_rules(cpp_build: Path) -> None:
     assert [path.name for path in CPP_SOURCES if path.suffix == ".cc" and f'"{path}"' not in text] == []
 
     def check(bundle: Path) -> None:
-        # A bundle includes sources, and is not below the folder of the rules.
+        # The bundle includes sources, and it is not below the folder with the rules.
         options = ("--quiet", f"--config-file={ROOT / '.clang-tidy'}", "--checks=-bugprone-suspicious-include")
         run(tool("clang-tidy"), *options, "-p", cpp_build, bundle)
 

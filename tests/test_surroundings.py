@@ -1,4 +1,4 @@
-"""Commands in odd places: names, locales, terminals, disks and clocks that nobody had in mind."""
+"""Commands in unusual surroundings: names, locales, terminals, disks and clocks."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ NOT_TEXT = os.fsdecode(b"caf\xe9")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files under a folder, hidden ones too."""
+    """Return the contents of all files under a folder, including hidden ones."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths_below(folder) if path.is_file()}
 
 
 def quick_flags(survey: WalkedSurvey, folder: Path | None = None) -> tuple[str, ...]:
-    """All that ``rangesfm scale`` needs inside the survey's folder, or another like it, without resampling."""
+    """Return the flags of ``rangesfm scale`` for the survey's folder, or a copy of it, without resampling."""
     ((folder or survey.folder) / "quick.toml").write_text("[scale]\nmax_relative_stddev = 0.1\n")
     return ("quick.toml", *survey.flags, "--anchors", "anchors.csv")
 
@@ -66,7 +66,7 @@ def test_a_folder_of_any_name_is_written_to_and_nothing_else(
 
 @pytest.fixture
 def command(own_survey: WalkedSurvey) -> Callable[..., subprocess.CompletedProcess[bytes]]:
-    """Run ``rangesfm`` inside a survey whose anchor A1 has an odd name, in surroundings of one's own."""
+    """Return a function that runs ``rangesfm`` in given surroundings, on a survey whose anchor A1 has an odd name."""
     folder = own_survey.folder
     for name in ("uwb.csv", "anchors.csv"):
         text = (folder / name).read_text(encoding="utf-8").replace("A1", "Tür-測")
@@ -125,12 +125,12 @@ def test_full_disk_is_one_line_and_leaves_nothing_half_written(
     assert done.stderr.startswith(b"rangesfm: error: ")
     assert done.stderr.count(b"\n") == 1
     assert b"internal error" not in done.stderr
-    assert b"/out/" in done.stderr  # of what it could not write
+    assert b"/out/" in done.stderr  # the path that it could not write
     left = (
         [path.name for path in (own_survey.folder / "out").rglob("*")] if (own_survey.folder / "out").exists() else []
     )
     assert "result.json" not in left
-    assert "points3D.bin" not in left  # COLMAP would leave the part of it that fitted
+    assert "points3D.bin" not in left  # COLMAP would leave the part that fitted
     assert not [name for name in left if name.startswith(".")]
 
 

@@ -1,4 +1,4 @@
-"""The workflows are ones, and say of the project what is so."""
+"""The CI workflows are valid, and what they say about the project is true."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def jobs() -> list[Any]:
-    """Each job of each workflow, with a name that says where it is from."""
+    """Return each job of each workflow, with a name that says where it is from."""
     return [
         pytest.param(workflow, name, id=f"{workflow.stem}-{name}")
         for workflow in WORKFLOWS

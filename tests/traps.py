@@ -1,4 +1,4 @@
-"""Modules that an untrusted survey may hold beside its photos, by the names of those that everything imports."""
+"""Modules that an untrusted survey may hold beside its photos, with names that every program imports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NAMES = (
 
 
 def set_traps(folder: Path) -> Callable[[], list[str]]:
-    """Put the modules into a folder; returns what tells which of them have been imported since."""
+    """Put the modules into a folder; return a function that lists which of them have been imported since."""
     said = folder / "imported.txt"
     for name in _NAMES:
         (folder / f"{name}.py").write_text(f"open({str(said)!r}, 'a').write('{name}\\n')\nraise SystemExit(77)\n")

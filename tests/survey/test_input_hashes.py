@@ -1,4 +1,4 @@
-"""Hashes of what a result was made from."""
+"""Hashes of the inputs from which a result was made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run reads is checked against each other: tags and their lever arms, anchors and who ranges with whom."""
+"""The inputs of a run are checked against each other: tags and their lever arms, anchors, and the ends of ranges."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LEFT, RIGHT = (0.1, 0.0, 0.0), (-0.1, 0.0, 0.2)
 
 @pytest.fixture
 def survey(tmp_path: Path) -> Survey:
-    """Two tags, two anchors, and a range between two of each."""
+    """A survey of two tags and two anchors, with ranges between them, between the tags and between the anchors."""
     (tmp_path / "uwb.csv").write_text("timestamp_s,anchor_id,range_m,tag_id\n" + ROWS)
     (tmp_path / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\nA,0,0,0\nB,4.5,0,0\n")
     return Survey(ranges=RangesOptions(path=tmp_path / "uwb.csv"), anchors=AnchorOptions(path=tmp_path / "anchors.csv"))

@@ -1,4 +1,4 @@
-"""Every key of a survey file: its bounds, its flag, its place in the reference and in the list of paths."""
+"""Every key of a survey file has its bounds, its flag, and its place in the reference and in the list of paths."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NUMERIC = [item for item in KEYS if numbers_in(item.type)]
 
 
 def in_toml(hint: Any, number: str) -> str:
-    """A value of a type with a number wherever there may be one."""
+    """Return a TOML value of this type, with the number wherever one may be."""
     args = get_args(hint)
     if hint in (int, float) or int in args or (float in args and str(hint).startswith("typing.Union")):
         return number
@@ -69,7 +69,7 @@ def test_no_number_goes_through_that_could_end_as_an_internal_error(item: Key, n
     found = all_numbers(getattr(getattr(survey, item.table), item.name))
     assert all(abs(value) <= 1e10 for value in found)
     if number == "1e-320":
-        # Only where nothing is divided by it.
+        # Tiny values are only accepted for keys by which nothing is divided.
         assert item.name.endswith(
             ("interval_s", "gap_s", "difference_s", "share", "in_cam_m", "arms_m", "_height")
         ) or (item.name in ("t_off_s", "time_offset", "params", "heading_deg"))

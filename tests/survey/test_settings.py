@@ -1,4 +1,4 @@
-"""A survey file says exactly what a run does; whatever it says wrongly is named with its line."""
+"""A survey file determines what a run does; its errors are named with their line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Anchors that cannot stand as far from each other as their file says are told before anything is mapped."""
+"""Anchors that cannot stand as far apart as their file says are reported before anything is mapped."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SITE_M: dict[str, tuple[float, ...]] = {
 def log_of_walk(
     *, blocked_share: float = 0.0, range_factor: float = 1.0, by_photo: bool = False, seed: int = 0
 ) -> RangeLog:
-    """300 rounds of ranges from a walk among the anchors, 8 cm of noise, 20 ms between two ranges."""
+    """300 rounds of ranges from a walk among the anchors, with 8 cm of noise and 20 ms between two ranges."""
     rng, num = np.random.default_rng(seed), 300
     turns = np.linspace(0, 4 * np.pi, num)
     tag_m = np.column_stack([8 + 9 * np.cos(turns), 6 + 7 * np.sin(1.5 * turns), 1.5 + 0.2 * np.sin(turns)])
@@ -85,7 +85,7 @@ def test_swapped_labels_are_named() -> None:
 
 
 def test_ranges_between_anchors_tell_another_order_of_them() -> None:
-    """Which ranges of a tag in their midst do not."""
+    """Ranges to a tag in their midst would not show this."""
     tag = log_of_walk().subset(np.arange(20))
     pairs = [(a, b) for a in SITE_M for b in SITE_M if a < b]
     lengths_m = [float(np.linalg.norm(np.subtract(SITE_M[a], SITE_M[b]))) for a, b in pairs]

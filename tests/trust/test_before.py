@@ -1,4 +1,4 @@
-"""What files alone tell is said before the long work, and of a survey that is in order nothing is."""
+"""Mistakes that the files alone show are reported before the long work; a survey in order causes no report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models that a refinement breaks on leave the scaled map, or none; those that it repairs stay good."""
+"""Models on which a refinement breaks leave the scaled map, or none; models that it repairs stay good."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Spoil = Callable[[pycolmap.Reconstruction], None]
 
 
 def throw_points(model: pycolmap.Reconstruction) -> None:
-    """One in twenty to some thousand units from the path."""
+    """Move one point in twenty some thousand units away from the path."""
     rng = np.random.default_rng(0)
     for _, point in sorted(model.points3D.items()):
         if rng.random() < 0.05:
@@ -99,7 +99,7 @@ def test_a_refinement_that_did_its_work_is_kept(survey: Survey, spoil: Spoil, ow
     summary = refined(spoilt(survey, spoil)).summary
     refine, place = known(summary.refine), known(summary.place)
     assert place.verdict == "good"
-    # A camera that was out of place before is told of, though it is in place now.
+    # A camera that was out of place before is reported, though it is in place now.
     assert (summary.scale.verdict == "good") == (not summary.warnings) == (spoil is leave_as_it_is)
     assert refine.kept
     assert refine.converged
@@ -123,7 +123,7 @@ def test_where_it_breaks_the_scaled_map_is_the_result_and_says_so(survey: Survey
     np.testing.assert_array_equal(centers("sparse_metric", survey), centers("sparse_scaled", survey))
     off_m = np.linalg.norm(centers("sparse_metric", survey) - own_survey.centers_m, axis=1)
     assert off_m.max() < 3 * place.worst_keyframe_stddev_m
-    # All else is of the scaled map too.
+    # All other outputs belong to the scaled map too.
     result = read_result_folder(survey.output.path)
     ranges = known(result.read(RangesAsUsed))
     np.testing.assert_allclose(ranges.residual_m, ranges.predicted_scaled_m - ranges.range_m, atol=1e-4)
@@ -137,7 +137,7 @@ def test_where_the_model_was_none_before_nothing_is_left(survey: Survey, spoil: 
         refined(spoilt(survey, spoil))
     assert caught.value.exit_status == 4
     assert not (survey.output.path / "result.json").exists()
-    # Its path alone can be scaled, with a word on the points.
+    # The path alone can be scaled, with a warning about the points.
     scaled = scale_model(survey, progress=SilentProgress()).summary
     assert scaled.scale.verdict == "doubtful"
     assert any(warning.startswith("the model's points lie") for warning in scaled.warnings)

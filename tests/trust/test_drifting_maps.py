@@ -1,4 +1,4 @@
-"""A clean survey of a map that drifts is good: drift is nobody's mistake, and what is said is of the map delivered."""
+"""A clean survey of a drifting map is good: drift is not a mistake, and the verdict is about the delivered map."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_keyframes_err_as_their_covariances_say(lap: Made, refined: MetricResult
 
 @pytest.mark.parametrize("drift_m", [2.0, 5.0])
 def test_a_path_of_poses_is_scaled_to_where_ranges_bend_it_back(drift_m: float) -> None:
-    """With the likeliest similarity, and how far it drifts from there said as a fact."""
+    """The likeliest similarity is used, and the drift from there is stated as a fact."""
     lap = without_points(lap_of_drift(drift_m, 2, "site", num_keyframes=150))
     found = run(lap, 0)
     assert known(found.trust).causes == ()

@@ -1,4 +1,4 @@
-"""What speaks against a finished map is named with its numbers; a clean one is doubted of nothing."""
+"""Evidence against a finished map is named with its numbers, and a clean map causes no doubt."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NOT_BENT = np.zeros(0)
 
 @pytest.fixture(scope="module")
 def estimate(walked: Survey) -> ScaleEstimate:
-    """Of a clean survey with five surveyed anchors."""
+    """The estimate of a clean survey with five surveyed anchors."""
     anchors = [replace(anchor, position_stddev_m=0.02) for anchor in walked.anchors("site", tuple(walked.anchors_m))]
     return initialize_scale(walked.observations(), walked.trajectory, anchors, anchor_frame="site", options=OPTIONS)
 
@@ -138,12 +138,12 @@ def test_a_wide_place_is_doubtful(walked: Survey, estimate: ScaleEstimate, what:
 
 
 def test_a_scaled_maps_place_errs_as_its_stddevs_say(make_survey: MakeSurvey) -> None:
-    """The formal part of them; whatever widens the scale's interval does so to the place."""
+    """This tests the formal part of the stddevs; they are widened in the same way as the scale's interval."""
     squares, rng = [], np.random.default_rng(0)
     for seed in range(6):
         walked = make_survey(num_epochs=4, radio=RADIO, seed=seed)
         log = walked.simulated.log
-        # The radio's biases as they are thought possible.
+        # The biases are drawn with the stddevs that the range model assumes.
         bias_m = COMMON_BIAS_STDDEV_M * rng.standard_normal() + 0.01 * rng.standard_normal(len(log.anchor_ids))
         log = walked.log_with(log.range_m + bias_m[log.anchor_index])
         estimate = walked.scale("site", tuple(walked.anchors_m), log=log, options=OPTIONS)
@@ -152,7 +152,7 @@ def test_a_scaled_maps_place_errs_as_its_stddevs_say(make_survey: MakeSurvey) ->
         place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [], NOT_BENT))
         off_m = (path_in_site(walked, estimate) - walked.centers_m).mean(axis=0)
         squares.append((off_m / (np.array(place.stddev_m) / widening)) ** 2)
-    # Of 18 chi-squares with one degree of freedom each, one mean in a thousand is beyond.
+    # The mean of 18 chi-squares with one degree of freedom each is beyond this in one case of a thousand.
     assert 0.2 < np.mean(squares) < 2.5
 
 
@@ -171,7 +171,7 @@ def test_motions_of_a_similarity_are_its_derivatives() -> None:
 
 @pytest.mark.parametrize(("share", "is_said"), [(0.4, False), (0.6, True)])
 def test_points_thrown_away_are_said_if_they_are_most(share: float, is_said: bool) -> None:
-    """Whatever their reprojection errors: along their rays they may go far and err by little."""
+    """Reprojection errors do not show this: along its ray a point may move far with a small error."""
     points = np.random.default_rng(0).standard_normal((100, 3))
     thrown = np.where((np.arange(100) < 100 * share)[:, None], 1e4 * points, points)
     reasons = list(finished_map._elsewhere(points, thrown))

@@ -1,4 +1,4 @@
-"""What ranges would be without a mistake."""
+"""Ranges as they would be without a mistake."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_a_range_of_another_time_was_taken_beside_the_one_that_is_nearest_to_it(
 ) -> None:
     on_map = run(surveyed(SITES[2], 3), 3).on_map
     assert on_map is not None
-    # A camera that is 10 units farther each second, and goes at 1 a second where it ranges.
+    # The camera is 10 units farther each second, and moves at 1 unit a second at each range.
     num = len(on_map.time_s)
     centers = np.outer(10.0 * np.arange(num), [1.0, 0, 0])
     on_map = replace(

@@ -1,4 +1,4 @@
-"""What is said of measured lengths."""
+"""Statements about measured lengths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mistakes in simulated surveys are found and named; clean surveys are left in peace."""
+"""Mistakes in simulated surveys are found and named, and clean surveys cause no alarm."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_step_of_all_ranges_is_found_at_its_own_time() -> None:
     assert "from 50 s after the first range on the ranges read about 0.5" in trust(given).reasons[0]
 
 
-# With the first seed y, x and z together fit so much better by chance that the place is named, not the coordinate.
+# With the first seed and y, changing x and z as well fits so much better by chance that the whole place is named.
 @pytest.mark.parametrize(("axis", "letter", "seed"), [(0, "x", SEED), (1, "y", SEED + 1)])
 def test_the_coordinate_that_was_typed_wrong_is_named(axis: int, letter: str, seed: int) -> None:
     given = surveyed(replace(YARD, rate_hz=3.0), seed)
@@ -129,7 +129,7 @@ def test_two_labels_that_were_swapped_are_named() -> None:
 
 @pytest.mark.parametrize("needs_search", [False, True], ids=["placed", "not placed"])
 def test_photos_in_reverse_are_named(needs_search: bool) -> None:
-    """Also where they leave the map no place in the site, and of the anchors only their distances count."""
+    """This also holds if they leave the map without a place in the site, so that only the anchors' distances count."""
     given = surveyed(HALL, 5)
     given.time_s = given.time_s.min() + given.time_s.max() - given.time_s
     given.needs_search = needs_search
@@ -138,7 +138,7 @@ def test_photos_in_reverse_are_named(needs_search: bool) -> None:
 
 @pytest.mark.parametrize("site", [HALL, YARD])
 def test_labels_that_are_one_line_off_are_named(site: Site) -> None:
-    """The lines of the file count, not the alphabet."""
+    """The order is that of the file's lines, not the alphabet."""
     given = surveyed(site, SEED)
     at = list(given.anchors_m.values())
     given.anchors_m = dict(zip(given.anchors_m, [*at[1:], at[0]], strict=True))
@@ -163,7 +163,7 @@ def test_coordinates_that_are_too_small_are_not_called_too_large(factor: float, 
     said = re.search(r"anchors' coordinates are about ([0-9.]+) % too (\w+)", found.reasons[0])
     assert said is not None
     assert said[2] == words
-    # By how much they must grow to be right; of two causes that look alike each explains all of it.
+    # The text states the correction in percent; each of two causes that look alike explains all of it.
     assert float(said[1]) == pytest.approx(100 * abs(1 / factor - 1), abs=1.0)
     (correction,) = (cause.correction for cause in found.causes if cause.name == "anchors' scale")
     apart_m, corrected_m = (
@@ -203,7 +203,7 @@ def test_a_mistake_is_the_likeliest_cause(kind: str, size: float, name: str) -> 
 
 
 def test_a_clock_that_runs_as_no_quartz_does_is_not_named_so() -> None:
-    """Times that are stretched by 2 % are a mistake, and found; but no clock drifts by 20 000 ppm."""
+    """Times stretched by 2 % are a mistake and are found, but no clock drifts by 20 000 ppm."""
     given = surveyed(HALL, SEED)
     given.time_s = given.time_s.mean() + 1.02 * (given.time_s - given.time_s.mean())
     found = trust(given)
@@ -236,7 +236,7 @@ def test_every_hypothesis_has_a_largest_size_that_can_happen() -> None:
 
 
 def test_a_mistake_whose_steps_grow_explains_nothing() -> None:
-    """A correction that does the opposite: each step leaves twice what it was to take away."""
+    """The correction has the wrong sign: each step leaves twice what it was to remove."""
     given = surveyed(HALL, SEED)
     given.range_m = given.range_m + 0.3 * given.is_of("A1")
     problem = linearized(known(run(given, SEED).on_map))
@@ -246,7 +246,7 @@ def test_a_mistake_whose_steps_grow_explains_nothing() -> None:
     assert np.isfinite(_settled_test(problem, linear)[1])
     assert np.isfinite(_settled_test(problem, in_steps)[1])
     assert _settled_test(problem, opposite)[1] == np.inf
-    # Neither does one that leads beyond what can happen.
+    # Neither does a correction that leads beyond what can happen.
     assert _settled_test(problem, replace(linear, most=0.1))[1] == np.inf
     assert _settled_test(problem, replace(in_steps, most=0.1))[1] == np.inf
 

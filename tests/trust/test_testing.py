@@ -1,4 +1,4 @@
-"""Tests of hypotheses: their statistic, their power, and how often all together alarm for nothing."""
+"""Tests of hypotheses: their statistic, their power, and the rate of false alarms of all together."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rangesfm.trust.testing import FALSE_ALARMS, Factorization, noncentrality, r
 
 @pytest.fixture(scope="module")
 def problem() -> Linearized:
-    """Of a clean survey, with the noise that was learnt."""
+    """The linearized problem of a clean survey, with the noise that was learnt."""
     on_map = run(surveyed(SITES[2], 3), 3).on_map
     assert on_map is not None
     return find_mistakes(on_map).problem
@@ -72,7 +72,7 @@ def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(
             if np.isfinite(test.smallest_detectable):
                 told = row_of(test).size
                 signed = -share * each.most if each.num == 1 else share * each.most
-                # One that cannot happen is not told.
+                # Impossible sizes are not reported.
                 assert told == (pytest.approx(signed, rel=1e-4) if share < 1 else None)
 
 
@@ -87,7 +87,7 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
     rng, num = np.random.default_rng(1), 150
     factor, tried = np.linalg.cholesky(problem.errors.covariance_m2), hypotheses(problem)
     thresholds = np.array([test.threshold for test in Factorization(problem).test(tried, 0)])
-    # The same whatever was measured, and most of the work.
+    # The thresholds do not depend on the measurements, and they are most of the work.
     monkeypatch.setattr(testing, "_thresholds", lambda *_: thresholds)
     alarms = 0
     for _ in range(num):

@@ -1,4 +1,4 @@
-"""Photographs of the corner of a textured room, rendered in a fraction of a second."""
+"""Photos of the corner of a textured room, rendered in a fraction of a second."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Room:
 
 
 class Listener:
-    """A Progress that keeps what it hears."""
+    """A Progress that records what it is told."""
 
     def __init__(self) -> None:
         self.stages: list[str] = []
@@ -60,7 +60,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
 
 
 def _render_room(folder: Path, num_photos: int, *, seed: int = 0, prefix: str = "photo") -> Room:
-    """Walk past the corner where the planes x = 0, y = 0 and z = 0 meet; each ``seed`` papers them anew."""
+    """Render a walk past the corner where the planes x = 0, y = 0 and z = 0 meet; ``seed`` sets their textures."""
     rng = np.random.default_rng(seed)
     textures = [_texture(rng) for _ in range(3)]
     names = tuple(f"{prefix}{index:03d}.png" for index in range(num_photos))

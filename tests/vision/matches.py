@@ -1,4 +1,4 @@
-"""What is found in photos and pairs of photos, to be compared."""
+"""The content of a database of features and matches, for comparison."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pycolmap
 
 
 def content_of(database_path: Path) -> dict[Any, list[bytes]]:
-    """All that is found in photos and pairs of photos, by their ids."""
+    """Return features and matches by the ids of photos and pairs of photos."""
     with pycolmap.Database.open(database_path) as database:
         found: dict[Any, list[bytes]] = {}
         for image in database.read_all_images():

@@ -1,4 +1,4 @@
-"""Which photos share a camera, and what becomes of given parameters where photos are of several sizes."""
+"""Which photos share a camera, and how given parameters apply to photos of several sizes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MODEL, _ORIENTATION = 0x0110, 0x0112
 
 @pytest.fixture
 def photos(tmp_path: Path) -> Photos:
-    """Of two makes in two folders, one at half its size and one turned."""
+    """Photos of two makes in two folders; one is half as large, and one is turned."""
     for name, size, make in [
         ("a/0.jpg", (256, 192), "first"),
         ("a/1.jpg", (256, 192), "second"),

@@ -1,4 +1,4 @@
-"""What computes features and matches."""
+"""The device that computes features and matches."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def test_a_gpu_is_used_where_there_is_one_and_it_is_wanted(
     device: str, num: int | None, on_gpu: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with_gpus(monkeypatch, num)
-    # What COLMAP checks for itself is another matter: it knows what it was built with.
+    # COLMAP would check the device against its own build, which has no CUDA.
     monkeypatch.setattr(pycolmap.FeatureMatchingOptions, "check", lambda _: True, raising=False)
     mapper = mapper_on(device)
     matching = matching_options(mapper, 9, seed=0)
     assert feature_options(mapper).use_gpu == matching.matcher.use_gpu == on_gpu
-    # The processor's threads are processes.
+    # On the processor, several processes take the place of threads.
     assert (matching.num_processes, matching.matcher.num_threads) == ((1, NUM_CORES) if on_gpu else (NUM_CORES, 1))
     pipeline = pipeline_options(CameraOptions(), mapper.changed(method="global"), seed=0)
     assert isinstance(pipeline, pycolmap.GlobalPipelineOptions)
@@ -75,7 +75,7 @@ def test_colmaps_own_key_for_a_gpu_is_refused_where_there_is_none(monkeypatch: p
 def test_colmap_is_told_the_device_beside_the_options_which_it_would_not_heed_alone(
     on_gpu: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A build with CUDA takes a GPU otherwise, and stops where there is none."""
+    """Told only by the options, a build with CUDA would take a GPU, and stop if there is none."""
     told: list[pycolmap.Device] = []
     for name in ("extract_features", "match_image_pairs"):
         monkeypatch.setattr(pycolmap, name, lambda *_, device, **__: told.append(device))

@@ -1,4 +1,4 @@
-"""A database of COLMAP's or hloc's in the place of features and matches."""
+"""A database of COLMAP or hloc in place of features and matches."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def earlier(room: Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def given(earlier: Path, tmp_path: Path) -> Path:
-    """A copy of it, to be changed."""
+    """A copy of the database that a test may change."""
     return Path(shutil.copy(earlier, tmp_path / "given.db"))
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C, for real: a process of its own gets the signal."""
+"""Interruption by Ctrl-C: a real process gets the signal."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def many_photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempP
 
 
 def interrupt(room: Room, output: Path, step: str, min_num_done: int) -> None:
-    """Start a reconstruction, press Ctrl-C once the step is so far."""
+    """Start a reconstruction, and send Ctrl-C once the step has done so much."""
     assert room.camera.params is not None
     arguments = [room.folder, output, *room.camera.params]
     command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
@@ -71,7 +71,7 @@ def interrupt(room: Room, output: Path, step: str, min_num_done: int) -> None:
 
 
 def num_done(output: Path) -> dict[str, int]:
-    """Photos with features, and pairs of photos with matches."""
+    """Count the photos with features, and the pairs of photos with matches."""
     folder = unfinished(output) if unfinished(output).exists() else output
     with pycolmap.Database.open(folder / "database.db") as database:
         return {"features": num_photos_with_features(database), "matching": database.num_verified_image_pairs()}
@@ -90,9 +90,9 @@ def test_ends_soon_leaves_nothing_half_done_and_the_next_run_goes_on(
 ) -> None:
     interrupt(many_photos, tmp_path, step, min_num_done)
     assert names_in(tmp_path) == []
-    left = set(os.listdir(unfinished(tmp_path))) - {"mapping_snapshot"}  # there is one, or it was too soon
+    left = set(os.listdir(unfinished(tmp_path))) - {"mapping_snapshot"}  # it exists unless Ctrl-C came too soon
     assert left == {"database.db", "mapper.log", "reconstruct.json"}
-    # Ctrl-C may come when the last of few pairs has just been matched: then this step may be left or done.
+    # Ctrl-C may come when the last of the few pairs has just been matched; then this step may be left or done.
     came_late = step in ALL and num_done(tmp_path)[step] == ALL[step]
     if step in ALL:
         assert min_num_done <= num_done(tmp_path)[step] <= ALL[step]
@@ -107,7 +107,7 @@ def test_ends_soon_leaves_nothing_half_done_and_the_next_run_goes_on(
     assert listener.stages == steps_left or (came_late and listener.stages == steps_left[1:])
     assert summary.num_registered == NUM_PHOTOS
     if step != "mapping" and not came_late:
-        assert listener.updates[step][0][0] >= min_num_done  # it did not begin at nothing
+        assert listener.updates[step][0][0] >= min_num_done  # it continued where it was interrupted
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         assert {image.name for image in database.read_all_images()} == set(many_photos.names)
     assert num_done(tmp_path) == ALL

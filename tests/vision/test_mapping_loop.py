@@ -1,4 +1,4 @@
-"""The mapper's loop with another global adjustment: the same as COLMAP's where that adjustment is COLMAP's."""
+"""The mapper's loop with another global adjustment; with COLMAP's own, it gives the same as COLMAP."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rangesfm.vision.mapping_loop import adjust_whole, incremental_mapping
 
 
 def walk(num_photos: int, max_track_length: int) -> pycolmap.Reconstruction:
-    """Half a walk round a yard."""
+    """Half a walk around a yard."""
     times = np.linspace(0.0, 20.0, num_photos)
     path = loop_path(20.0, num_turns=0.4, seed=1)
     centers, world_from_cam = path.centers(times), path.world_from_cam(times)
@@ -42,7 +42,7 @@ def write_matches(path: Path, model: pycolmap.Reconstruction) -> Path:
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Matches of half a walk round a yard, and of the photos after a gap that none of them bridges."""
+    """Matches of half a walk around a yard, with a gap that no match bridges."""
     model = walk(16, max_track_length=6)
     leave_few_links(model, 10, num_links=0)
     return write_matches(tmp_path_factory.mktemp("database") / "database.db", model)
@@ -79,7 +79,7 @@ def mapped(
 
 @pytest.fixture(params=["colmaps loop", "own loop"])
 def adjust(request: pytest.FixtureRequest) -> Callable[[pycolmap.Reconstruction], bool] | None:
-    """None, or an adjustment that leaves everything to COLMAP."""
+    """The adjustment of the loop: None for COLMAP's loop, or one that leaves everything to COLMAP."""
     return None if request.param == "colmaps loop" else lambda model: False
 
 
@@ -88,7 +88,7 @@ def centers(model: pycolmap.Reconstruction) -> npt.NDArray[np.float64]:
 
 
 def off_by(model: pycolmap.Reconstruction, true: pycolmap.Reconstruction) -> float:
-    """RMSE of the photos' centres after the best similarity."""
+    """Return the RMSE of the photos' centres after the best similarity."""
     return rmse(align_points(centers(model), centers(true)).apply(centers(model)) - centers(true))
 
 
@@ -125,7 +125,7 @@ def test_what_an_adjustment_leaves_to_colmap_gives_colmaps_models(
 
 
 def test_threads_do_not_change_the_map(tmp_path: Path, options: pycolmap.IncrementalPipelineOptions) -> None:
-    """With some threads, pycolmap's own mapping of such a walk begins with one of seven pairs of photos."""
+    """With several threads, pycolmap's own mapping of such a walk begins with one of seven pairs of photos."""
     database = write_matches(tmp_path / "database.db", walk(28, max_track_length=7))
     (expected,) = mapped(database, options, None)
     assert expected.num_reg_images() == 28
@@ -138,7 +138,7 @@ def test_threads_do_not_change_the_map(tmp_path: Path, options: pycolmap.Increme
 def test_the_adjustment_is_the_last_to_move_the_map(
     database: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> None:
-    """One that bends the map beyond what COLMAP's own would leave it at."""
+    """The adjustment bends the map away from the optimum of COLMAP's own adjustment, which would undo that."""
     stretch = np.diag([1.0, 1.0, 1.02])
 
     def bend(model: pycolmap.Reconstruction) -> bool:
@@ -156,7 +156,7 @@ def test_the_adjustment_is_the_last_to_move_the_map(
     (model,) = mapped(database, options, bend)
     last = centers(model)
     assert len(bent) > 3
-    # COLMAP normalises the map in between: a similarity without rotation.
+    # COLMAP normalizes the map in between, by a similarity without rotation.
     ratio = np.ptp(last, axis=0) / np.ptp(bent[-1], axis=0)
     assert ratio == pytest.approx(np.full(3, ratio.mean()), rel=1e-9)
 

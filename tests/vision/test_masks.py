@@ -1,4 +1,4 @@
-"""Masks: features only where they are not black."""
+"""Masks: features are found only where a mask is not black."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NUM_PHOTOS = 2
 
 @pytest.fixture
 def masks(room: Room, tmp_path: Path) -> Path:
-    """Masks that leave the right half of each photo."""
+    """Masks that keep the right half of each photo."""
     for name in room.names[:NUM_PHOTOS]:
         with Image.open(room.folder / name) as photo:
             white = np.full((photo.height, photo.width), 255, dtype=np.uint8)
@@ -39,7 +39,7 @@ def masks(room: Room, tmp_path: Path) -> Path:
 
 
 def leftmost_features(room: Room, masks: Path) -> list[float]:
-    """Of each photo, as a share of its width."""
+    """Return the leftmost feature of each photo, as a share of its width."""
     mapper = MapperOptions(mask_path=masks)
     with sole_writer(masks.with_name("out")) as output:
         space = Workspace(output.private, SilentProgress())
@@ -51,7 +51,7 @@ def leftmost_features(room: Room, masks: Path) -> list[float]:
 def test_no_feature_is_where_a_mask_is_black_and_other_masks_give_others(room: Room, masks: Path) -> None:
     assert min(leftmost_features(room, masks)) > 0.5
     white = masks / f"{room.names[0]}.png"
-    Image.new("L", (256, 192), 255).save(masks / room.names[0])  # which COLMAP takes in the place of x.png.png
+    Image.new("L", (256, 192), 255).save(masks / room.names[0])  # COLMAP accepts this name in place of x.png.png
     white.unlink()
     first, second = leftmost_features(room, masks)
     assert first < 0.2

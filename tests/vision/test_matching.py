@@ -1,4 +1,4 @@
-"""Pairs of photos shared out among processes."""
+"""Pairs of photos are distributed among processes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NUM_PHOTOS, NUM_PAIRS = 9, 36
 
 @pytest.fixture(scope="module")
 def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFactory) -> Photos:
-    """Photos, and beside them a database with their features."""
+    """Photos, and a database with their features in the same folder."""
     room = render_room(tmp_path_factory.mktemp("walk"), NUM_PHOTOS)
     photos = usable_photos(room.folder, room.names)
     cameras = cameras_of_photos(room.camera, photos)
@@ -43,13 +43,13 @@ def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture
 def database(photos: Photos, tmp_path: Path) -> Path:
-    """A copy of it, to match in."""
+    """A copy of the database to match in."""
     return Path(shutil.copy(photos.folder / "database.db", tmp_path))
 
 
 @pytest.fixture
 def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Even few pairs are several shares of a process."""
+    """Let even a few pairs make several shares per process."""
     monkeypatch.setattr(matching, "_MIN_NUM_PAIRS", 1)
     monkeypatch.setattr(matching, "_MAX_NUM_PAIRS", 5)
 
@@ -117,7 +117,7 @@ def test_shares_are_of_bounded_size_hold_each_pair_once_and_are_of_few_photos(nu
 
 
 def test_processes_that_match_neighbours_share_few_photos() -> None:
-    """Each indexes the features of all its photos anew."""
+    """Each process indexes the features of all its photos again, so shared photos cost time."""
     pairs = [(first, first + step) for first in range(1, 101) for step in range(1, 11)]
     shares = list(matching._shared_out(pairs, 2))
     assert len(shares) == 2
@@ -132,7 +132,7 @@ def test_a_process_that_fails_is_told_of_and_ends_the_others(
     photos: Photos, database: Path, listener: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     listener.stage("matching")
-    monkeypatch.setattr(MatchingShare, "prepare", lambda *_: None)  # so that there is no list of pairs
+    monkeypatch.setattr(MatchingShare, "prepare", lambda *_: None)  # so that the list of pairs is missing
     with pytest.raises(ReconstructionError, match=r"Could not open .*pairs\.txt"):
         match(photos, database, listener, 2)
     assert sorted(os.listdir(database.parent)) == ["database.db", "mapper.log"]

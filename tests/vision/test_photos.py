@@ -1,4 +1,4 @@
-"""Photos of any size and kind of file: used, or left out with the reason."""
+"""Photos of any size and file format are used, or left out with a reason."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZE = (20_000, 10_000)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two photos of 200 megapixels, whose pixels are all black."""
+    """Two photos of 200 megapixels whose pixels are all black."""
     photo = Image.new("1", SIZE)
     for name in ("a.png", "b.png"):
         photo.save(tmp_path / name)
@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def write_claim(path: Path, width: int, height: int) -> None:
-    """A PNG file that only says how large it is."""
+    """Write a PNG file that only claims its size."""
     header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 0) + b"IDAT")

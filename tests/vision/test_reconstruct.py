@@ -256,7 +256,7 @@ class TestEarlierRun:
     ) -> None:
         photos, output = tmp_path / "photos", tmp_path / "out"
         photos.mkdir()
-        for name in room.names:  # without compression, so that all are of one size
+        for name in room.names:  # without compression, so that all files have the same size
             with Image.open(room.folder / name) as photo:
                 photo.save((photos / name).with_suffix(".bmp"))
         names = [Path(name).with_suffix(".bmp").name for name in room.names]
@@ -309,11 +309,11 @@ class TestEarlierRun:
 
 
 class TestOtherPhotos:
-    """Of an earlier run on partly the same photos, what is known of those is taken over."""
+    """Reconstruction after an earlier run on partly the same photos takes over what is known of those."""
 
     @pytest.fixture
     def changed(self, room: Room, tmp_path: Path) -> Room:
-        """The room with another photo in the place of the third."""
+        """The room with its third photo changed."""
         folder = shutil.copytree(room.folder, tmp_path / "changed")
         with Image.open(folder / room.names[2]) as photo:
             darker = Image.eval(photo, lambda value: value // 2)
@@ -380,7 +380,7 @@ class TestOtherPhotos:
         assert (output / "database.db").read_bytes() == changed
 
     def test_are_reconstructed_though_colmap_has_looked_at_the_database(self, room: Room, output: Path) -> None:
-        with pycolmap.Database.open(output / "database.db") as database:  # which counts that in the file's header
+        with pycolmap.Database.open(output / "database.db") as database:  # this updates a counter in the file's header
             assert database.num_images() == 6
         summary = reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER)
         assert summary.num_registered == 4
@@ -454,6 +454,6 @@ class TestBadPhotos:
 
 
 def rug(seed: int) -> Image.Image:
-    """A photo rich in features, and each its own."""
+    """A photo rich in features, different for each seed."""
     cells = np.random.default_rng(seed).integers(0, 255, (30 + 7 * seed, 41 + 9 * seed), dtype=np.uint8)
     return Image.fromarray(cells).resize((256, 192), Image.Resampling.BICUBIC)

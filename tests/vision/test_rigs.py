@@ -34,18 +34,18 @@ NAMES = [f"{prefix}frame{k:06d}.png" for k in range(NUM_FRAMES) for prefix in PR
 
 @dataclass(frozen=True)
 class Simulated:
-    """Photos of a rig (nothing is to be seen on them), the truth, and a database of matches that knows of no rig."""
+    """Blank photos of a rig, the truth, and a database of matches without rigs."""
 
     folder: Path
     truth: pycolmap.Reconstruction
 
     @property
     def poses(self) -> list[pycolmap.Rigid3d]:
-        """Of the cameras beside the reference camera."""
+        """Return the poses of the cameras other than the reference camera."""
         return poses_of(self.truth)
 
     def config(self, path: Path, known: Collection[int], **others: Any) -> Path:
-        """A configuration that tells where some of the cameras sit."""
+        """Write a configuration that gives the poses of some of the cameras."""
         cameras: list[dict[str, Any]] = [{"image_prefix": PREFIXES[0], "ref_sensor": True}]
         for k, pose in enumerate(self.poses, 1):
             cameras.append({"image_prefix": PREFIXES[k]})

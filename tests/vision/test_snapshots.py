@@ -1,4 +1,4 @@
-"""An interrupted mapping goes on from its newest snapshot, and ends as one that was not interrupted."""
+"""An interrupted mapping continues from its newest snapshot, and ends as an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NUM_PHOTOS = 13
 
 
 class Mapping:
-    """A room's photos with their matches, to be mapped again and again."""
+    """A room's photos with their matches, which can be mapped repeatedly."""
 
     def __init__(self, room: Room, output: Path):
         self.room = room
@@ -54,7 +54,7 @@ def undisturbed(render_room: Callable[..., Room], tmp_path_factory: pytest.TempP
 
 @pytest.fixture
 def mapping(undisturbed: Mapping, tmp_path: Path) -> Mapping:
-    """A copy that has its matches and no model yet."""
+    """A copy that has matches and no model yet."""
     output = shutil.copytree(undisturbed.output, tmp_path / "out")
     shutil.rmtree(output / "sparse")
     return Mapping(undisturbed.room, output)
@@ -62,7 +62,7 @@ def mapping(undisturbed: Mapping, tmp_path: Path) -> Mapping:
 
 @pytest.fixture
 def interrupted(mapping: Mapping, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Mapping]:
-    """A mapping that was interrupted when it had so many snapshots; it has the last of them."""
+    """Return a function that interrupts a mapping after this number of snapshots; the last one is kept."""
 
     def interrupt(num_snapshots: int) -> Mapping:
         kept: list[Path] = []
@@ -129,7 +129,7 @@ def test_with_a_snapshot_that_is_cut_off_begins_anew(
 
 
 def test_a_snapshot_between_two_refinements_of_the_whole_is_not_kept(undisturbed: Mapping, tmp_path: Path) -> None:
-    """Or the mapping would go on otherwise than it would have."""
+    """Continuing from it would give another map than an uninterrupted mapping."""
     model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
     (tmp_path / "scratch").mkdir()
     snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch")
@@ -150,7 +150,7 @@ def test_a_snapshot_between_two_refinements_of_the_whole_is_not_kept(undisturbed
             place = np.append(rng.normal(size=2), frame_id)
             model.frames[frame_id].rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), place)
 
-    assert not keeps_after_photo()  # nothing to compare it with
+    assert not keeps_after_photo()  # there is nothing to compare it with
     move(NUM_PHOTOS - 1)
     assert not keeps_after_photo()
     move(NUM_PHOTOS)

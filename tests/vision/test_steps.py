@@ -17,7 +17,7 @@ Run = Callable[..., list[str]]
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder in which everything is the tool's own."""
+    """A folder in which everything belongs to the tool."""
     (tmp_path / PRIVATE_NAME).mkdir()
     (tmp_path / LOCK_NAME).touch()
     return tmp_path / PRIVATE_NAME
@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(folder: Path, listener: Listener) -> Run:
-    """Runs step a and then step b, and says what was done: "prepare a", "work a", ..."""
+    """Return a function that runs steps a and b and lists what was done: "prepare a", "work a", ..."""
     tmp_path = folder
 
     def run_both(

@@ -1,4 +1,4 @@
-"""Photos that look alike by a vocabulary tree, and features that take a network."""
+"""Similar photos found by a vocabulary tree, and features that need a neural network."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DESCRIPTOR_SIZE, EMBEDDING_SIZE = 128, 64
 
 @pytest.fixture(scope="module")
 def room(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFactory) -> Room:
-    """Photos of two rooms, in turn."""
+    """Photos of two rooms, alternating."""
     folder = tmp_path_factory.mktemp("rooms")
     rooms = [render_room(folder, NUM_PHOTOS, seed=seed, prefix=f"room{seed}_") for seed in range(2)]
     return replace(rooms[0], names=tuple(name for pair in zip(*(r.names for r in rooms), strict=True) for name in pair))
@@ -38,7 +38,7 @@ def room(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture(scope="module")
 def database(room: Room) -> Path:
-    """With features of the rooms' photos."""
+    """A database with features of the rooms' photos."""
     photos = usable_photos(room.folder, room.names)
     cameras = cameras_of_photos(room.camera, photos)
     path = room.folder / "alike.db"
@@ -50,7 +50,7 @@ def database(room: Room) -> Path:
 
 @pytest.fixture(scope="module")
 def tree(database: Path) -> Path:
-    """Of the words that these photos have, by the random projection of one seed whatever ran before in this process."""
+    """A vocabulary tree of these photos' features, built with a fixed seed."""
     pycolmap.set_random_seed(0)
     with pycolmap.Database.open(database) as opened:
         found = [opened.read_descriptors(id_).data for id_ in range(1, opened.num_images() + 1)]

@@ -1,4 +1,4 @@
-"""COLMAP's mappers that take all photos at once."""
+"""COLMAP's mappers that process all photos at once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAPPER = MapperOptions(features={"sift": {"max_num_features": 250}}, num_threads
 
 @pytest.fixture(scope="module")
 def done(room: Room, tmp_path_factory: pytest.TempPathFactory) -> ReconstructionSummary:
-    """The room, photo by photo."""
+    """The room, mapped photo by photo."""
     return reconstruct(room.folder, room.names, tmp_path_factory.mktemp("out"), camera=room.camera, mapper=MAPPER)
 
 
@@ -47,7 +47,8 @@ def test_holds_every_photo_at_its_place_says_so_and_comes_again(
     room: Room, done: ReconstructionSummary, output: Path, listener: Listener, method: str, other: dict[str, Any]
 ) -> None:
     before = dump(output / "database.db")
-    asked = MAPPER.changed(method=method, num_threads=16)  # so many threads would hardly ever end twice in one order
+    # with so many threads, two runs would hardly ever end in the same order
+    asked = MAPPER.changed(method=method, num_threads=16)
     summaries = [
         reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper, seed=0, progress=listener)
         for mapper in (asked, asked.changed(pipeline=other), asked)
@@ -65,7 +66,7 @@ def test_holds_every_photo_at_its_place_says_so_and_comes_again(
 
 
 def dump(database: Path) -> list[str]:
-    """All that is in it; its bytes count how often it was opened."""
+    """Return the database's content, because its bytes count how often it was opened."""
     with closing(sqlite3.connect(database)) as connection:
         return list(connection.iterdump())
 
@@ -81,7 +82,7 @@ def test_photos_that_give_no_model_are_told_of(room: Room, output: Path) -> None
     with pytest.raises(ReconstructionError):
         reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper)
     assert not (unfinished(output) / "sparse").exists()
-    assert (output / "sparse").exists()  # that of the run before
+    assert (output / "sparse").exists()  # from the run before
 
 
 @pytest.mark.parametrize(

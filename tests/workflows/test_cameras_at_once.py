@@ -1,4 +1,4 @@
-"""Surveys of several cameras that took their photos at the same times."""
+"""Surveys of several cameras that took photos at the same times."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module")
 def joined(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with two results, and ``site``, joined of them by anchors of which one is a metre off."""
+    """A folder with two results, and ``site``, in which they are joined by anchors, one of which is a metre off."""
     folder = tmp_path_factory.mktemp("cameras")
     flags = (*walked_survey.flags, "--anchors", "anchors.csv", "--max_relative_stddev", "0.1", "--quiet")
     rangesfm_command("scale", *flags, "--output_path", folder / "left", cwd=walked_survey.folder)

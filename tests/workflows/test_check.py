@@ -1,4 +1,4 @@
-"""A check tells what a run would work with, and all that would stop it."""
+"""A check reports what a run would work with, and everything that would stop it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Metres without a radio: by taped lengths, by printed tags found in the photos; and both beside ranges."""
+"""Metres without a radio, from taped lengths or from printed tags in the photos; and both beside ranges."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ QUIET = SilentProgress()
 
 @dataclass(frozen=True)
 class Room:
-    """Photos of a room with tags and their model; its truth."""
+    """Photos of a room with tags, their model, and the truth."""
 
     folder: Path
     made: SyntheticModel
@@ -45,7 +45,7 @@ class Room:
         return survey.changed({"images.path": self.folder / "photos", "output.path": where / "out", **given})
 
     def taped(self, where: Path, pairs: Sequence[tuple[int, int]], *wrong_m: float) -> Path:
-        """A file of lengths between cameras, to 5 mm."""
+        """Write a file of lengths between cameras, accurate to 5 mm."""
         names, rng = list(self.made.timestamps_s), np.random.default_rng(1)
         lines = ["from,to,distance_m,stddev_m"]
         for k, (a, b) in enumerate(pairs):

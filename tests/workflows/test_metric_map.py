@@ -1,4 +1,4 @@
-"""Offsets of the clocks that cannot be ruled out, and the scale."""
+"""Time offsets that cannot be ruled out, and their effect on the scale."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ VALUE_S, RIVAL_S = 1.0, 4.0
 
 @dataclass
 class Scales:
-    """A scale stage whose answer depends on the offset alone."""
+    """A scale stage whose result depends on the time offset alone."""
 
     by_offset_s: dict[float, float | None]
 

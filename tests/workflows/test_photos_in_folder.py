@@ -1,4 +1,4 @@
-"""A survey of a bag is a survey of photos, with their times and their camera, as soon as it runs."""
+"""A survey of a bag becomes a survey of photos, with their times and their camera, when it is run."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_check_tells_of_a_bag_and_takes_nothing_out(survey: Survey) -> None:
 
 
 def write_demo_as_bag(demo: DemoSurvey, folder: Path) -> None:
-    """A bag with camera and radio, the anchors by the radio's numbers, the truth by time."""
+    """Write a bag with camera and radio, anchors named by the radio's numbers, and the truth by time."""
     folder.mkdir()
     log = demo.ranges.log
     assert log.timestamp_s is not None

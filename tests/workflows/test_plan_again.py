@@ -1,4 +1,4 @@
-"""A finished survey is planned again: the plan says what its run said, and what to change next time."""
+"""A finished survey is planned again: the plan agrees with its run, and says what to change next time."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def test_the_plan_is_of_the_map_that_the_run_found(
     assert planned.anchor_frame == anchors[-1]
     assert len(planned.trajectory) == 40
     assert planned.num_ranges == pytest.approx(result["ranges"]["num_used"], rel=0.01)
-    # The camera was held upright, at a height that changes by some decimetres on a loop of metres.
+    # The camera was held upright; its height changes by some decimetres on a loop of metres.
     assert np.ptp(planned.trajectory.centers[:, 2]) < 0.5 * np.ptp(planned.trajectory.centers[:, 0])
-    # Of the radio as the run has learnt it, and so no more certain than that by much, nor less.
+    # The plan takes the range errors that the run has learnt, so it expects about the same uncertainty.
     assert planned.component_stddevs == result["scale"]["error_stddevs"]
     stated = result["scale"]["stddev_empirical"] / result["scale"]["value"]
     assert expect(planned).uncertainty.empirical == pytest.approx(stated, rel=0.3)

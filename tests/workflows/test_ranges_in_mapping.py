@@ -1,4 +1,4 @@
-"""Ranges while the map grows: they bend its drift back, wait until they can, and leave no trace of what is held out."""
+"""Ranges in the growing map reduce its drift, wait until they can, and include none that are held out."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Array = npt.NDArray[np.float64]
 
 @pytest.fixture
 def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
-    """The walked survey with anchors in the site frame, the clocks' offset known; of its ranges every third."""
+    """The walked survey with anchors in the site frame, a known time offset, and every third of its ranges."""
     folder = walked_survey.folder
     header, *rows = (folder / "uwb.csv").read_text().splitlines(keepends=True)
     (tmp_path / "uwb.csv").write_text(header + "".join(rows[::3]))
@@ -51,7 +51,7 @@ def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
 
 @pytest.fixture(scope="session")
 def mapped_alone(walked_survey: WalkedSurvey) -> pycolmap.Reconstruction:
-    """The walk as photos alone have it, with coarse features: bundle-adjusted, it drifts. Not to be written to."""
+    """The walk adjusted to noisy features alone, so that it drifts. Tests must not write to it."""
     model = pycolmap.Reconstruction(walked_survey.folder / "sparse" / "0")
     rng = np.random.default_rng(0)
     for _, image in sorted(model.images.items()):
@@ -80,13 +80,13 @@ def centers(model: pycolmap.Reconstruction) -> Array:
 
 
 def distortion_m(model: pycolmap.Reconstruction, walked: WalkedSurvey) -> float:
-    """Root mean square error after the best similarity."""
+    """Return the root mean square error after the best similarity."""
     found = centers(model)
     return rmse(align_points(found, walked.centers_m).apply(found) - walked.centers_m)
 
 
 def only_first(model: pycolmap.Reconstruction, num: int) -> None:
-    """As if the others had not been registered yet."""
+    """Deregister all frames but the first ones."""
     for frame_id in sorted(model.reg_frame_ids())[num:]:
         model.deregister_frame(frame_id)
 
@@ -116,7 +116,7 @@ def test_a_map_whose_scale_is_open_is_left_to_colmap_as_it_is(
 def test_anchors_in_the_first_camera_serve_as_unknown_ones_until_it_is_there(
     survey: Survey, model: pycolmap.Reconstruction, walked_survey: WalkedSurvey
 ) -> None:
-    """Positions that refer to a photo which is not in the map yet would bend it to something else."""
+    """Positions that refer to a photo which is not in the map yet would bend it wrongly."""
     drift_m = distortion_m(model, walked_survey)
     path = walked_survey.folder / "anchors_first_camera.csv"
     anchors = survey.changed({"anchors.path": path, "anchors.frame": "first_camera"})
@@ -173,7 +173,7 @@ def test_a_run_maps_with_ranges_where_it_is_asked_to(photo_run: PhotoRun, tmp_pa
         "output.path": str(output),
         "ranges.time_offset": TIME_OFFSET_S,
         "mapper.num_threads": 1,
-        # Fewer global adjustments than usual, which is quicker.
+        # Fewer global adjustments than usual, to be quicker.
         "mapper.ba_global_max_refinements": 1,
         "mapper.ba_global_frames_ratio": 2.0,
         "mapper.ba_global_points_ratio": 10.0,

@@ -1,4 +1,4 @@
-"""A stereo rig and a radio, each of which knows the scale."""
+"""A stereo rig and a radio, each of which determines the scale."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ANCHORS_M = {"A1": (-8.0, -7.0, 1.0), "A2": (8.0, -6.0, 4.0), "A3": (7.0, 8.0, -
 
 @dataclass(frozen=True)
 class StereoSurvey:
-    """A model of a stereo rig in the unit that a baseline as configured gives it, and ranges to surveyed anchors.
+    """A model of a stereo rig, whose unit comes from the configured baseline, and ranges to surveyed anchors.
 
     Attributes:
         true_scale: metres per unit of the model.
@@ -56,7 +56,11 @@ class StereoSurvey:
 
 
 def stereo_survey(folder: Path, *, baseline_error: float = 0.0, seed: int = 0) -> StereoSurvey:
-    """Args: baseline_error: what the configuration has too much of it, as a share."""
+    """Simulate a stereo survey.
+
+    Args:
+        baseline_error: relative error of the configured baseline, positive if it is too long.
+    """
     pycolmap.set_random_seed(seed)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=NUM_FRAMES, num_points3D=200
@@ -79,7 +83,7 @@ def stereo_survey(folder: Path, *, baseline_error: float = 0.0, seed: int = 0) -
 
 
 def write_ranges(folder: Path, truth: pycolmap.Reconstruction, rng: np.random.Generator) -> None:
-    """Of each frame to each anchor, several, with independent noise; and the anchors."""
+    """Write several ranges from each frame to each anchor, with independent noise, and the anchors."""
     path = trajectory_from_reconstruction(truth)
     tags = path.centers + path.world_from_cam @ TAG_IN_CAM_M
     rows = ["image_name,anchor_id,range_m"]

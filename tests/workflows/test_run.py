@@ -56,7 +56,7 @@ def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
 
 
 def survey_of(walked_survey: WalkedSurvey, where: Path) -> Survey:
-    """The walked survey with anchors in the site frame, the clocks' offset known."""
+    """The walked survey with anchors in the site frame and a known time offset."""
     folder = walked_survey.folder
     return Survey().changed(
         {
@@ -73,7 +73,7 @@ def survey_of(walked_survey: WalkedSurvey, where: Path) -> Survey:
 
 @dataclass(frozen=True)
 class Done:
-    """What a stage made of the survey as it is, and what it told. Not to be written to."""
+    """The result of a stage on the unchanged survey, and its messages. Tests must not write to it."""
 
     survey: Survey
     result: RunResult
@@ -204,7 +204,7 @@ ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0
 
 
 class TestSeveralTags:
-    """Two tags on the camera, no noise; the anchors also range with each other and so do the tags."""
+    """Two tags on the camera, without noise; there are also ranges between the anchors and between the tags."""
 
     @pytest.fixture
     def made(self) -> SyntheticModel:
@@ -329,7 +329,7 @@ def test_a_site_in_national_coordinates_loses_nothing(survey: Survey, refined: D
 
 
 def test_two_surveyed_anchors_stay_as_far_apart_as_they_were_surveyed(survey: Survey, tmp_path: Path) -> None:
-    """They fix no frame, but a length, here one that the ranges contradict by 2 %: the refinement keeps to it."""
+    """They do not fix the frame but a length, which the ranges contradict by 2 %; the refinement keeps the length."""
     header, *rows = (survey.anchors.path or Path()).read_text().splitlines()
     names = [row.split(",")[0] for row in rows]
     places = 1.02 * np.array([row.split(",")[1:] for row in rows[:2]], dtype=np.float64)
