@@ -1,4 +1,4 @@
-"""What a user sees in an output folder: everything except the hidden folder with the tool's own records."""
+"""The visible content of an output folder, without the hidden folder that holds the tool's own records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which surveys a batch has, which of them it refuses before anything starts, and each one's share of the machine."""
+"""The surveys of a batch: those that are refused before anything starts, and the others' shares of the machine."""
 
 from __future__ import annotations
 

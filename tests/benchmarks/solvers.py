@@ -81,7 +81,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one process measured; times in seconds."""
+    """The measurements of one process; times in seconds."""
 
     iteration: float
     build: float

@@ -1,4 +1,4 @@
-"""What ``rangesfm doctor`` and every result report about the installation."""
+"""The report of ``rangesfm doctor`` and of every result about the installation."""
 
 from __future__ import annotations
 

@@ -197,7 +197,7 @@ def test_no_ranges_are_no_blocks(
 def test_the_tag_hangs_on_the_rig_frame_whichever_cameras_the_rig_has(
     adjuster_of: AdjusterOf, pose_block: PoseBlock
 ) -> None:
-    """With three cameras in a rig and the scale 4 % off, ranges from the rig frame put the scale right."""
+    """Ranges from the rig frame correct a scale that is 4 % off, with three cameras in the rig."""
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=1, num_cameras_per_rig=3, num_frames_per_rig=8, num_points3D=80, track_length=8

@@ -1,4 +1,4 @@
-"""What a user sees while a batch runs."""
+"""The display of a running batch."""
 
 from __future__ import annotations
 

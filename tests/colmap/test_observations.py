@@ -1,4 +1,4 @@
-"""Which points the photos of a model see, and at which pixels."""
+"""The points that the photos of a model see, and their pixels."""
 
 from __future__ import annotations
 

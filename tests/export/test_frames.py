@@ -236,7 +236,7 @@ def test_the_map_itself_is_not_touched(on_earth: MetricMap, tmp_path: Path) -> N
 
 
 def test_photos_that_do_not_lean_to_either_side_of_a_flat_path_do_not_say_which_is_up(map_: MetricMap) -> None:
-    """For photos straight down, rounding would decide which side of the path is up."""
+    """Rounding would decide which side of the path is up if all photos point straight down."""
     down = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     path = map_.trajectory
     headings = Rotation.from_rotvec(np.arange(len(path))[:, None] * [0.0, 0.0, 0.3]).as_matrix()

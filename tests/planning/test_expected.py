@@ -1,4 +1,4 @@
-"""What a plan expects agrees with what runs of such surveys state."""
+"""A plan's expectations agree with what runs of such surveys state."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def test_the_ranges_determine_no_more_than_there_is(chain: SyntheticModel) -> No
 
 
 def test_neighbours_of_one_place_have_no_scale_of_their_own(chain: SyntheticModel) -> None:
-    """When a camera turns on a tripod, its centres differ only by rounding."""
+    """The centres of a camera that turns on a tripod differ only by rounding."""
     truth, rays = poses_and_rays(chain)
     still = Poses(truth.world_from_rig, truth.centers.copy())
     still.centers[:12] = truth.centers[0]

@@ -15,7 +15,7 @@ SIZE_MULTIPLE = 16
 
 @dataclass(frozen=True)
 class Material:
-    """What a surface is made of, seen from its front; row 0 is the upper edge.
+    """The appearance of a surface, seen from its front; row 0 is the upper edge.
 
     Attributes:
         albedo: (3, h, w) linear reflectance in [0, 1].

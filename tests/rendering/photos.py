@@ -34,7 +34,7 @@ class PhotoCamera:
 
     @property
     def params(self) -> tuple[float, float, float, float]:
-        """In COLMAP's order: f, cx, cy, k."""
+        """Parameters in COLMAP's order: f, cx, cy, k."""
         return (self.focal_px, self.width_px / 2, self.height_px / 2, self.distortion)
 
     def project(self, points_in_cam: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -22,7 +22,7 @@ GEOREFERENCE = {"lat_deg": 47.4, "lon_deg": 8.5, "height_m": 430.0, "crs": "EPSG
 
 
 def test_published_schema_is_that_of_the_model() -> None:
-    """If this fails, run ``python -m rangesfm.result.summary > examples/result.schema.json``."""
+    """The command ``python -m rangesfm.result.summary > examples/result.schema.json`` writes the schema anew."""
     assert SCHEMA_PATH.read_text(encoding="utf-8") == schema()
 
 

@@ -163,7 +163,7 @@ def test_formal_stddev_is_the_scatter_of_estimates(rng: np.random.Generator) -> 
 
 
 def test_what_nothing_determines_is_not_certain(rng: np.random.Generator) -> None:
-    """Without motion the scale is open, and the formal stddev is large."""
+    """The scale is open without motion, and its formal stddev is large."""
     truth = replace(random_state(rng), metric_from_model=IDENTITY)
     problem = replace(random_problem(rng, truth), centers=np.zeros((NUM_RANGES, 3)), frame_is_free=False)
     assert solve(problem, truth).log_scale_stddev > 1e3

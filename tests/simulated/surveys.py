@@ -36,7 +36,7 @@ _KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
 
 @dataclass(frozen=True)
 class Measured:
-    """What a surveyor brings home."""
+    """The data of a surveyed plan, and the true similarity."""
 
     observations: RangeObservations
     trajectory: Trajectory

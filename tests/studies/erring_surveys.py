@@ -100,7 +100,7 @@ SITES = (
 
 @dataclass
 class Given:
-    """What a surveyor hands over, right or wrong, and the truth; times in seconds of the camera's clock.
+    """A survey as it is handed over, right or wrong, and the truth; times in seconds of the camera's clock.
 
     ``needs_search`` is set if the truth is not a valid start for the solution of the scale.
     """

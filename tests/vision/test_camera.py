@@ -1,4 +1,4 @@
-"""Which photos share a camera, and how given parameters apply to photos of several sizes."""
+"""Photos that share a camera, and given parameters where photos have several sizes."""
 
 from __future__ import annotations
 

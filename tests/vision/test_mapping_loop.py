@@ -125,7 +125,7 @@ def test_what_an_adjustment_leaves_to_colmap_gives_colmaps_models(
 
 
 def test_threads_do_not_change_the_map(tmp_path: Path, options: pycolmap.IncrementalPipelineOptions) -> None:
-    """With several threads, pycolmap's own mapping of such a walk begins with one of seven pairs of photos."""
+    """The mapping of pycolmap itself, with several threads, begins with one of seven pairs of photos."""
     database = write_matches(tmp_path / "database.db", walk(28, max_track_length=7))
     (expected,) = mapped(database, options, None)
     assert expected.num_reg_images() == 28

@@ -1,4 +1,4 @@
-"""Which pairs of photos are matched."""
+"""The pairs of photos that are matched."""
 
 from __future__ import annotations
 

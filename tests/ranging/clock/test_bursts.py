@@ -1,4 +1,4 @@
-"""What a pairing of bursts of ranges with photos must show before it is used."""
+"""A pairing of bursts of ranges with photos is used only if it passes certain tests."""
 
 from __future__ import annotations
 

@@ -382,7 +382,7 @@ def test_motion_that_does_not_determine_the_offset_is_refused(
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_an_offset_that_the_motion_tells_but_loosely_is_given_with_its_stddev(seed: int) -> None:
-    """On a third of an even walk around an ellipse, a later time looks nearly the same as a place further round."""
+    """A later time looks nearly the same as a place further round, on a third of an even walk around an ellipse."""
 
     def center(times: Array) -> Array:
         turn = 2 * np.pi * times / 33

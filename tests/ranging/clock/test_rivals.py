@@ -1,4 +1,4 @@
-"""Which time offsets of the clocks are likely."""
+"""The time offsets of the clocks that are likely."""
 
 from __future__ import annotations
 

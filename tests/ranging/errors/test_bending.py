@@ -1,4 +1,4 @@
-"""How ranges respond to the bending of a map, compared with small moves of its poses."""
+"""The response of ranges to the bending of a map, compared with small moves of its poses."""
 
 from __future__ import annotations
 

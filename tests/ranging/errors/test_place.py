@@ -65,7 +65,7 @@ def test_the_formal_variance_holds_for_independent_errors() -> None:
 
 
 def test_rounding_does_not_part_a_place_on_round_coordinates() -> None:
-    """On a level path at 1.6 m in whole decimetres, every other coordinate lies on the edge of a grid cell."""
+    """Every other coordinate lies on the edge of a grid cell, on a level path at 1.6 m in whole decimetres."""
     rng = np.random.default_rng(0)
     tags = np.column_stack([0.1 * rng.integers(-50, 50, (400, 2)), np.full(400, 1.6)])
     index = np.zeros(400, dtype=np.int64)
