@@ -30,6 +30,8 @@ METRES_PER_UNIT = 2.3
 LASTING_S, DRIFT_S, PLACE_M, LOBE = 3.0, 60.0, 0.5, 0.1
 NUM_WAVES = 300
 BENDING_M = 0.007
+# Unevenness of real error curves, which the estimates have no component for.
+UNEVEN_M = 0.009
 # Knots of an uneven curve over the logarithm of distance.
 _KNOTS = np.linspace(np.log(0.05), np.log(300.0), 400)
 
@@ -103,7 +105,7 @@ def errors_of_radio(
     errors = stddevs["white"] * rng.standard_normal(len(distance)) + stddevs["common_bias"] * rng.standard_normal()
     errors += stddevs["short"] * rng.standard_normal() * np.exp(-distance)
     errors += stddevs["slope"] * rng.standard_normal() * distance
-    errors += (stddevs["curve"] * error_curve(distance, rng)) + stddevs["rough_curve"] * _uneven(distance, rng)
+    errors += (stddevs["curve"] * error_curve(distance, rng)) + UNEVEN_M * _uneven(distance, rng)
     if curve_stddev_m is not None:
         errors += curve_stddev_m * error_curve(distance, rng)
     errors += stddevs["drift"] * lasting(times, DRIFT_S, rng)

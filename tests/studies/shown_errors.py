@@ -30,8 +30,8 @@ from rangesfm.scale.uncertainty import errors_to_expect
 START = {"white": 0.05, "time": 0.04, "drift": 0.01, "place": 0.03, "view": 0.035, "bias": 0.045, "common_bias": 0.2}
 START |= {
     "short": 0.2,
+    "tag_bias": 0.03,
     "curve": 0.04,
-    "rough_curve": 0.02,
     "slope": 0.004,
     "antenna": 0.05,
     "off_axis": 0.05,

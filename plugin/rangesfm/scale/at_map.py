@@ -11,8 +11,8 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.errors.bending import MapBending
-from rangesfm.ranging.errors.components import REWEIGHTING
+from rangesfm.ranging.errors.bending import BendingOfCells, MapBending
+from rangesfm.ranging.errors.cells import Cells
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
@@ -21,12 +21,12 @@ from rangesfm.scale.initialize import camera_velocities, model_from_cam
 from rangesfm.scale.problem import ScaleProblem, first_camera_from
 from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
 from rangesfm.scale.solution import Solution, weighted
-from rangesfm.scale.uncertainty import AsWeighed, bending_of_cells, learned_errors, uncertainty_as_weighed
+from rangesfm.scale.uncertainty import KnownMap, bending_of_cells, known_refined_map, learned_errors
 from rangesfm.scale.verdict import judge
 
 # What is learnt of the errors changes by less than a twentieth with twice as many (hall and laps of
 # ``tests.studies.drifting_maps``), and each costs a solution of the photos' normal equations.
-MAX_NUM_CELLS = 200
+MAX_NUM_CELLS = 450
 
 
 @dataclass(frozen=True)
@@ -96,18 +96,17 @@ class MapWithRanges:
 
     def bending_factor(self, learned: LearnedErrors) -> float:
         """By how much more than its photos' residuals let expect the map was bent; 1 where nobody looked at them."""
-        formal_m2 = self._formal_bending_m2(learned)
-        mean_m = float(np.sqrt(np.trace(formal_m2) / len(formal_m2)))
+        bending = self._bending_of(learned.cells)
+        mean_m = 0.0 if bending is None else float(np.sqrt(np.trace(bending.formal_m2) / len(learned.cells)))
         return learned.stddev_of_component["bending"] / mean_m if mean_m > 0 else 1.0
 
-    def known(self, learned: LearnedErrors) -> AsWeighed:
+    def known(self, learned: LearnedErrors) -> KnownMap:
         """How far off the map as a whole may be."""
-        return uncertainty_as_weighed(self.posed, self.solution, learned, self._formal_bending_m2(learned))
+        return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.cells))
 
-    def _formal_bending_m2(self, learned: LearnedErrors) -> Array:
+    def _bending_of(self, cells: Cells) -> BendingOfCells | None:
         state = self.solution.fit.state
-        bent = bending_of_cells(self.bending, learned.cells, self.posed, state, self.observations, self._rotations)
-        return np.zeros_like(learned.covariance_m2) if bent is None else bent.formal_m2
+        return bending_of_cells(self.bending, cells, self.posed, state, self.observations, self._rotations)
 
 
 def estimate_at(
@@ -145,5 +144,4 @@ def estimate_at(
 
 def _about(start: ScaleEstimate, value: float) -> ScaleUncertainty:
     """What is known of a scale, as seen from another value of it."""
-    lean = start.uncertainty.lean + float(np.log(start.value / value))
-    return replace(start.uncertainty, components={**start.uncertainty.components, REWEIGHTING: abs(lean)}, lean=lean)
+    return replace(start.uncertainty, lean=start.uncertainty.lean + float(np.log(start.value / value)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.components import REWEIGHTING
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.lengths import LengthScale
@@ -28,7 +27,7 @@ class ScaleUncertainty:
     Attributes:
         formal: from the Jacobian, as if every range erred on its own (Cramer-Rao).
         components: what each component of the ranges' errors does, by its name.
-        lean: towards which side, and how far, the truth is likelier: of the scale's logarithm.
+        lean: how far the middle of the interval is from the estimate: of the scale's logarithm.
     """
 
     formal: float
@@ -38,10 +37,7 @@ class ScaleUncertainty:
     @property
     def empirical(self) -> float:
         """The honest one: all components together, and never less than the formal one."""
-        return self._together(self.components)
-
-    def _together(self, names: Iterable[str]) -> float:
-        return max(float(np.linalg.norm([self.components[name] for name in names])), self.formal)
+        return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
 
     def beside(self, name: str, stddev: float) -> ScaleUncertainty:
         """With more of a component."""
@@ -51,19 +47,13 @@ class ScaleUncertainty:
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Between which the logarithm of the true scale over the estimate is.
-
-        It is as wide about where the estimate leans to as about the estimate, and holds both, as what makes it lean
-        need not be true.
-        """
-        reach = NORMAL_95 * self._together(name for name in self.components if name != REWEIGHTING)
-        return min(self.lean, 0.0) - reach, max(self.lean, 0.0) + reach
+        """Return the ends of the interval that holds the logarithm of the true scale over the estimate."""
+        return self.lean - self.half_width_95, self.lean + self.half_width_95
 
     @property
     def half_width_95(self) -> float:
-        """Of that interval."""
-        low, high = self.interval_95
-        return (high - low) / 2
+        """Return half the width of that interval."""
+        return NORMAL_95 * self.empirical
 
 
 @dataclass(frozen=True)

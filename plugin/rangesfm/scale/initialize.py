@@ -28,7 +28,7 @@ from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.sensitivity import cutoff_test, scale_sensitivity
 from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import learned_errors, parameter_covariance, scale_uncertainty
+from rangesfm.scale.uncertainty import known_map, learned_errors, parameter_covariance
 from rangesfm.scale.verdict import judge, judge_lengths, levelled_places
 
 
@@ -88,7 +88,8 @@ def initialize_scale(
         lambda: (scale_per_anchor(solution, observations.log.anchor_ids), cutoff_test(solution)),
     )
     posed = problem if lengths is None else _bent(problem, lengths)
-    uncertainty = scale_uncertainty(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
+    known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
+    uncertainty = known.uncertainty
     covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
@@ -178,7 +179,7 @@ def _by_ranges(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) 
     problem = _without_lengths(solution.problem)
     alone = replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
     value = alone.fit.state.metric_from_model.scale
-    return ScaleByKind(value, value * scale_uncertainty(posed, alone, learned).empirical)
+    return ScaleByKind(value, value * known_map(posed, alone, learned).uncertainty.empirical)
 
 
 def _without_lengths(problem: RangeProblem) -> RangeProblem:

@@ -33,8 +33,6 @@ from rangesfm.scale.solution import Solution
 
 # Where ranges have no times: a path of so many metres is walked in a second.
 _WALKING_M_PER_S = 1.0
-# In stddevs, as Huber's.
-_MAX_CHANCE = 1.345
 
 
 def learned_errors(
@@ -90,32 +88,18 @@ def bending_of_cells(
     return bending.of_cells(of_ranges, slopes, frame_is_free=problem.frame_is_free)
 
 
-@dataclass(frozen=True)
-class _Linear:
-    """The map alone about a solution, as biases are among the errors here.
-
-    Attributes:
-        off_m: (n,) measured minus predicted without any bias.
-        design: (n, p) by how much each predicted range grows with the unknowns, the logarithm of the scale first.
-        prior_off, prior_design: (r,), (r, p) the same of what is known of these beforehand, in stddevs.
-    """
-
-    off_m: Array
-    design: Array
-    prior_off: Array
-    prior_design: Array
-
-
-def _linear(posed: ScaleProblem, solution: Solution) -> _Linear:
+def _linear(posed: ScaleProblem, solution: Solution) -> LinearMap:
+    """Return what each of the ranges says about a solution; biases are among the errors here."""
     given, state = posed.ranges, solution.fit.state
     unbiased = replace(state, bias_m=given.bias_mean_m)
     only_map = replace(given, bias_stddev_m=np.zeros(given.num_anchors), stddev_m=np.ones(len(given.range_m)))
     columns = columns_of([only_map])[0]
-    return _Linear(
+    return LinearMap(
         given.range_m - predicted_ranges(given, unbiased),
         range_jacobian(only_map, columns, state, state),
         -prior_residuals(only_map, columns, state),
         prior_jacobian(only_map, columns, state, state),
+        columns,
     )
 
 
@@ -192,46 +176,13 @@ def times_of_ranges(posed: ScaleProblem, solution: Solution, observations: Range
     return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
 
-def scale_uncertainty(
-    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
-) -> ScaleUncertainty:
-    """Relative stddevs of the scale.
-
-    Its robust weights do not make the most of what is learnt of the errors. The best ones do (Gauss-Markov): the truth
-    is where they find it, give or take their stddev, as far as the errors are what they are taken for. By how much the
-    best weights change the scale says whether they are (Hausman, "Specification tests in econometrics", 1978): its
-    variance is that by which theirs is less. What is more than chance of it speaks against them, not against the scale.
-
-    Args:
-        posed: measured lengths in it as uncertain as the map's bending makes them.
-        bending_of_lengths: as of ``expected_scale_uncertainty``.
-    """
-    linear = _linear(posed, solution)
-    design, off_m = learned.cells.mean(linear.design), learned.cells.mean(linear.off_m)
-    _, weights, of_given = best_estimate(learned.covariance_m2, design, linear.prior_design)
-    of_cells, of_priors = weights[0], of_given[0]
-    components = learned.stddev_of_cells(of_cells)
-    if (given := float(np.linalg.norm(of_priors))) > 0:
-        components[GIVEN] = given
-    summed = expected_scale_uncertainty(solution, learned, bending_of_lengths).components
-    best, of_sum = (float(np.linalg.norm(list(each.values()))) for each in (components, summed))
-    lean = believable(float(of_cells @ off_m + of_priors @ linear.prior_off), best, of_sum)
-    components[REWEIGHTING] = abs(lean)
-    return ScaleUncertainty(solution.fit.log_scale_stddev, components, lean)
-
-
-def believable(change: float, best: float, other: float) -> float:
-    """As much of a change between the best estimate and another, of these stddevs, as may be chance."""
-    chance = float(np.sqrt(max(other**2 - best**2, 0.0)))
-    return float(np.clip(change, -_MAX_CHANCE * chance, _MAX_CHANCE * chance))
-
-
 @dataclass(frozen=True)
-class AsWeighed:
-    """What is known of a map that photos and ranges hold together, each by the weight it was given.
+class KnownMap:
+    """How far off a map as a whole may be, and the anchors with it.
 
     Attributes:
-        uncertainty: of the scale. covariance: (p, p) of the map as a whole and of the anchors, as of ``columns``.
+        uncertainty: of the scale.
+        covariance: (p, p) of the scale's logarithm, the map's turn and shift, and the anchors, as ``columns`` has them.
     """
 
     uncertainty: ScaleUncertainty
@@ -239,31 +190,90 @@ class AsWeighed:
     columns: Columns
 
 
-def uncertainty_as_weighed(
-    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, formal_bending_m2: Array
-) -> AsWeighed:
-    """Of a map that was bent to the ranges, at that map: its weights, and errors that are what they were learnt to be.
+@dataclass(frozen=True)
+class LinearMap:
+    """What c cells of ranges and r priors say of p unknowns of a map, linear about where the map is.
+
+    Attributes:
+        off_m: (c,) measured minus predicted, without any bias.
+        design: (c, p) by how much each predicted range grows with the unknowns.
+        prior_off, prior_design: (r,), (r, p) the same of the priors, in stddevs.
+        columns: which unknown is which.
+    """
+
+    off_m: Array
+    design: Array
+    prior_off: Array
+    prior_design: Array
+    columns: Columns
+
+    def known(
+        self, learned: LearnedErrors, formal: float, variance_by_others: Array, change_by_others: Array | None = None
+    ) -> KnownMap:
+        """Return what is known of the map, by the best weights for the errors and by the weights of another estimate.
+
+        Best weights (Gauss-Markov) are as good as the model of the errors, which real radios do not always keep to;
+        robust weights depend less on it. The truth is taken to be as likely where the one estimate has it as where the
+        other has it, which moves the middle of the interval by half of their difference and widens it by as much. The
+        variance of their difference is the difference of their variances (Hausman, "Specification tests in
+        econometrics", 1978): more than one stddev of that speaks against the model and is not followed.
+
+        Args:
+            formal: relative stddev of the scale, as if every range erred on its own.
+            variance_by_others: (p,) variances of the unknowns by the other weights.
+            change_by_others: (p,) how the other weights would change a map that is where the best ones have it; None:
+                the map is where the other weights have it.
+        """
+        best, of_cells, of_priors = best_estimate(learned.covariance_m2, self.design, self.prior_design)
+        change = of_cells @ self.off_m + of_priors @ self.prior_off if change_by_others is None else change_by_others
+        chance = np.sqrt(np.maximum(variance_by_others - np.diag(best), 0.0))
+        half = np.clip(change, -chance, chance) / 2
+        components = learned.stddev_of_cells(of_cells[0])
+        if (given := float(np.linalg.norm(of_priors[0]))) > 0:
+            components[GIVEN] = given
+        components[REWEIGHTING] = abs(float(half[0]))
+        uncertainty = ScaleUncertainty(formal, components, float(half[0]))
+        return KnownMap(uncertainty, best + np.outer(half, half), self.columns)
+
+
+def known_map(
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
+) -> KnownMap:
+    """Return what is known of a map that was scaled as one piece, by robust weights.
 
     Args:
-        solution: weighted as the map was.
-        formal_bending_m2: (c, c) of the cells, with what the photos were given.
+        posed: measured lengths in it as uncertain as the map's bending makes them.
+        bending_of_lengths: relative, of the scale by measured lengths.
     """
-    linear, errors, cells = _linear(posed, solution), solution.errors, learned.cells
-    robust = solution.fit.weights / errors.stddev_m**2
-    alone = np.diag(1 / np.maximum(cells.total(robust), 1e-12)) + formal_bending_m2
-    given, index = posed.ranges, cells.anchor_index
+    linear = _of_cells(_linear(posed, solution), learned.cells)
+    variances = np.diag(parameter_covariance(solution, learned))[: linear.columns.num].copy()
+    variances[linear.columns.scale] += (_say_of_lengths(solution) * bending_of_lengths) ** 2
+    return linear.known(learned, solution.fit.log_scale_stddev, variances)
+
+
+def known_refined_map(
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending: BendingOfCells | None
+) -> KnownMap:
+    """Return what is known of a map that was refined, at that map.
+
+    Args:
+        solution: weighted as the refinement was. bending: of the map, as its cells see it.
+    """
+    errors, cells, given = solution.errors, learned.cells, posed.ranges
+    linear = _of_cells(_linear(posed, solution), cells)
+    robust, index = solution.fit.weights / errors.stddev_m**2, cells.anchor_index
+    bent_m2 = np.zeros_like(learned.covariance_m2) if bending is None else bending.formal_m2
     of_biases = given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
-    weighed = np.diag(1 / np.maximum(cells.total(errors.weight * robust), 1e-12)) + formal_bending_m2 + of_biases
-    design = cells.mean(linear.design)
-    formal, _, _ = best_estimate(alone, design, linear.prior_design)
-    _, of_cells, of_priors = best_estimate(weighed, design, linear.prior_design)
-    components = learned.stddev_of_cells(of_cells[0])
-    if (by_given := float(np.linalg.norm(of_priors[0]))) > 0:
-        components[GIVEN] = by_given
-    covariance = of_cells @ learned.covariance_m2 @ of_cells.T + of_priors @ of_priors.T
-    only_map = replace(given, bias_stddev_m=np.zeros(given.num_anchors))
-    uncertainty = ScaleUncertainty(float(np.sqrt(formal[0, 0])), components)
-    return AsWeighed(uncertainty, covariance, columns_of([only_map])[0])
+    alone, weighed = (np.diag(1 / np.maximum(cells.total(w), 1e-12)) for w in (robust, errors.weight * robust))
+    formal, _, _ = best_estimate(alone + bent_m2, linear.design, linear.prior_design)
+    _, of_cells, of_priors = best_estimate(weighed + bent_m2 + of_biases, linear.design, linear.prior_design)
+    variances = np.einsum("pi,ij,pj->p", of_cells, learned.covariance_m2, of_cells) + np.sum(of_priors**2, axis=1)
+    at_optimum = linear if bending is None else replace(linear, off_m=linear.off_m - bending.shift_m)
+    return at_optimum.known(learned, float(np.sqrt(formal[0, 0])), variances)
+
+
+def _of_cells(linear: LinearMap, cells: Cells) -> LinearMap:
+    return replace(linear, off_m=cells.mean(linear.off_m), design=cells.mean(linear.design))
 
 
 def best_estimate(covariance: Array, design: Array, prior_design: Array) -> tuple[Array, Array, Array]:

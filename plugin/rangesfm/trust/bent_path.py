@@ -11,12 +11,12 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import rmse
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.errors.bending import WalkBending
-from rangesfm.ranging.errors.components import BENDS, GIVEN, REWEIGHTING
+from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.observations import status_by_weight
-from rangesfm.scale.estimate import ScaleEstimate, ScaleUncertainty
+from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import state_after
-from rangesfm.scale.uncertainty import believable, best_estimate
+from rangesfm.scale.uncertainty import KnownMap, LinearMap, best_estimate
 from rangesfm.scale.verdict import judge
 from rangesfm.trust.linearized import Linearized, RangesOnMap, linearized, slopes_by_poses
 from rangesfm.trust.testing import Factorization
@@ -64,7 +64,8 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     problem, drift_m = learnt_at(on_map), rmse(bent_by_m[:, None])
     if drift_m < problem.scatter_m:
         return estimate
-    uncertainty, covariance = _known(problem, posed, estimate.uncertainty.formal)
+    known = _known(problem, posed, estimate.uncertainty.formal)
+    uncertainty, covariance = known.uncertainty, known.covariance
     fit = replace(solution.fit, state=on_map.state, weights=problem.cells.weight)
     judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, (), options)
     columns = problem.columns
@@ -88,20 +89,16 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     )
 
 
-def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> tuple[ScaleUncertainty, Array]:
-    """Of the best estimate, which the map is at; its interval holds, too, what simple weights would have found."""
+def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
+    """Return what is known of a path that is where the best weights have it, beside simple weights."""
     errors, given, index = problem.errors, posed.ranges, problem.cells.anchor_index
-    covariance, of_cells, of_priors = best_estimate(errors.covariance_m2, problem.design, problem.prior_design)
-    components = errors.stddev_of_cells(of_cells[0])
-    components[GIVEN] = float(np.linalg.norm(of_priors[0]))
     simple = errors.without(*(set(errors.names) - {"white", *BENDS})).covariance_m2
     simple += given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
-    _, by_cells, by_priors = best_estimate(simple, problem.design, problem.prior_design)
-    of_simple = errors.stddev_of_cells(by_cells[0])
-    change = -float(by_cells[0] @ problem.residual_m + by_priors[0] @ problem.prior_residual)
-    best, other = (float(np.linalg.norm(list(each.values()))) for each in (components, of_simple))
-    lean = believable(change, best, other)
-    return ScaleUncertainty(formal, {**components, REWEIGHTING: abs(lean)}, lean), covariance
+    _, of_cells, of_priors = best_estimate(simple, problem.design, problem.prior_design)
+    variances = np.einsum("pi,ij,pj->p", of_cells, errors.covariance_m2, of_cells) + np.sum(of_priors**2, axis=1)
+    off_m, prior_off = -problem.residual_m, -problem.prior_residual
+    linear = LinearMap(off_m, problem.design, prior_off, problem.prior_design, problem.columns)
+    return linear.known(errors, formal, variances, of_cells @ off_m + of_priors @ prior_off)
 
 
 def learnt_at(on_map: RangesOnMap) -> Linearized:

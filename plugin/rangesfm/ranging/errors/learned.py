@@ -152,7 +152,9 @@ class ExpectedErrors:
         bending: BendingOfCells | None = None,
     ) -> ExpectedErrors:
         """As of ``learn_errors``."""
-        components = tuple(component for component in COMPONENTS if component.name not in ruled_out)
+        # One tag's own bias is that of all ranges.
+        left_out = {*ruled_out, *(() if np.ptp(cells.tag_index) else ("tag_bias",))}
+        components = tuple(component for component in COMPONENTS if component.name not in left_out)
         components += () if bending is None else bending.components
         of_anchor = np.outer(cells.noisiness, cells.noisiness)
         of_components = [c.correlation(cells) * (of_anchor if c.is_of_anchor else 1.0) for c in components]
