@@ -455,7 +455,7 @@ def test_format_that_cannot_be_written_costs_neither_the_result_nor_the_others(
     first, second, written = done.stderr.splitlines()
     assert "2 of 3 formats could not be written: undistorted: the format 'undistorted' needs the photos" in first
     assert "kml: the format 'kml' needs a georeferenced map" in second
-    assert written == "  written all the same: ply"
+    assert written == "  these were written: ply"
     names = set(names_in(own_survey.folder / "out"))
     assert {"result.json", "report.html", "points.ply"} <= names
 

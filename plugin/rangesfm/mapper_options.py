@@ -17,13 +17,13 @@ _LIKE_OURS = 0.85
 
 
 class MapperOptions(Options, table="mapper"):
-    """How COLMAP makes an unscaled model of the photos. Other keys are passed to pycolmap, like keys of pipeline."""
+    """Mapping of the photos to an unscaled model by COLMAP. Other keys are passed to pycolmap as in pipeline."""
 
     method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
     """COLMAP's mapper. incremental: photo by photo; global: all photos at once; hierarchical: photo by photo in
     clusters, which are then merged."""
     matching: Literal["sequential", "exhaustive", "spatial", "vocabtree", "auto"] = "auto"
-    """Which pairs of photos are matched. sequential: neighbours in time; exhaustive: all pairs; spatial: neighbours by
+    """Pairs of photos that are matched. sequential: neighbours in time; exhaustive: all pairs; spatial: neighbours by
     EXIF position; vocabtree: photos that look alike; auto: exhaustive up to 60 keyframes, sequential above."""
     vocab_tree_path: Annotated[Path | None, Told(metavar="TREE", role="file")] = None
     """File with COLMAP's vocabulary tree, which finds photos that look alike. vocabtree matching needs it, and so does
@@ -48,8 +48,8 @@ class MapperOptions(Options, table="mapper"):
     """Passed through to the options of pycolmap's mapper: IncrementalPipelineOptions, GlobalPipelineOptions or
     HierarchicalPipelineOptions."""
     ranges_in_mapping: bool = False
-    """Whether each global bundle adjustment during mapping uses the ranges, once they determine the scale. This takes
-    much longer, and the refinement at the end usually finds the same map without it."""
+    """Use the ranges in each global bundle adjustment during mapping, once they determine the scale. This takes much
+    longer, and the refinement at the end usually finds the same map without it."""
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)], Told(expected="1 or more up to 4096, or -1 for all cores")
     ] = -1

@@ -71,7 +71,7 @@ def _span(times: tuple[float, ...]) -> tuple[float, ...]:
 
 
 class KeyframeOptions(Options, table="images"):
-    """Which photos become keyframes. Where several keys are given, all of them apply."""
+    """Choice of the photos that become keyframes. All keys that are given apply together."""
 
     every_nth: _Count = 1
     """Use every n-th photo, in order of time."""
@@ -111,7 +111,7 @@ class CameraOptions(Options, table="camera"):
     """Photos that this table is about, where there are several [[camera]] tables: a folder, or a pattern of names such
     as left*.jpg. One table may leave it out, for all other photos."""
     mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], Told(flag="camera_mode")] = "auto"
-    """Which photos of one size share a camera. auto: those with the same make, model, serial number and focal length in
+    """Photos of one size that share a camera. auto: those with the same make, model, serial number and focal length in
     EXIF, or all without EXIF; single: all; per_folder: those of one folder; per_image: none."""
     model: Annotated[str | None, Told(flag="camera_model")] = None
     """COLMAP camera model, such as OPENCV (default: COLMAP chooses one)."""
@@ -123,8 +123,8 @@ class CameraOptions(Options, table="camera"):
     Mapping and refinement adjust the given parameters within it. 0 keeps them all exactly as given (default: 0.5 % of
     the focal length)."""
     refine_intrinsics: bool | None = None
-    """Whether mapping and refinement adjust the camera parameters (default: mapping does, given ones only once the map
-    is complete; the refinement adjusts given ones within their stddev and keeps all others)."""
+    """Adjust the camera parameters in mapping and refinement (default: mapping does, given ones only once the map is
+    complete; the refinement adjusts given ones within their stddev and keeps all others)."""
 
     others: Annotated[tuple[CameraOptions, ...], Told(is_key=False)] = ()
     """Further [[camera]] tables, each with its pattern. This table is for photos that match none of them."""
@@ -215,12 +215,13 @@ class LogOptions(Options, table="ranges"):
 
 
 class AssociationOptions(Options, table="ranges"):
-    """How each range gets its place on the camera's path."""
+    """Placing of each range on the camera's path."""
 
     max_interpolation_gap_s: _Duration = 2.0
     """Longest time between two keyframes between which poses are interpolated."""
     max_time_difference_s: _Duration = 0.02
-    """Where no pose can be interpolated, a range this close in time to a keyframe counts as taken there."""
+    """Largest time between a range and a keyframe at which the range counts as taken at the keyframe, where no pose can
+    be interpolated."""
 
 
 class CheckOptions(Options, table="ranges"):
@@ -289,7 +290,7 @@ class TagOptions(Options, table="tag"):
 
 
 class ScaleOptions(Options, table="scale"):
-    """How the scale is estimated, and distances taped on the site."""
+    """The estimate of the scale, and distances taped on the site."""
 
     method: Annotated[Literal["robust", "two-candidate"], Told(flag="scale_method")] = "robust"
     """Method of the scale estimate. robust: a robust fit of all ranges; two-candidate: that of the 2018 paper."""
@@ -304,8 +305,8 @@ class ScaleOptions(Options, table="scale"):
     camera_side: Literal["above", "below"] | None = None
     """Side of the anchors' plane on which the camera moved, for surveyed anchors that are all in one plane."""
     adopt: bool = False
-    """Whether to run again with the likeliest mistake corrected, where the tests find one: an anchor taken as unknown,
-    the lever arm that fits, labels swapped, some of the ranges left out. The result says what was changed."""
+    """Run again with the likeliest mistake corrected, where the tests find one: an anchor taken as unknown, the lever
+    arm that fits, labels swapped, some of the ranges left out. The result says what was changed."""
     distances: Annotated[Path | None, Told(role="file")] = None
     """CSV from,to,distance_m[,stddev_m,kind] with taped distances."""
     markers: Annotated[Path | None, Told(role="file")] = None
@@ -342,7 +343,7 @@ class RefineOptions(Options, table="refine"):
     """Bundle adjustment with the ranges."""
 
     enabled: Annotated[bool, Told(flag="refine")] = True
-    """Whether the map is refined after it is scaled."""
+    """Refine the map after it is scaled."""
     max_num_iterations: Annotated[int, Field(ge=0, le=1_000_000)] = 200
     """Largest number of iterations of the solver."""
     range_loss_scale: Annotated[float, Field(ge=1e-3, le=1e9)] = 3.46
@@ -356,8 +357,8 @@ class RefineOptions(Options, table="refine"):
     """Standard deviation of an error of short ranges that all anchors share and that decays with a length of 1 m. It is
     refined unless this is 0; with 0, short ranges get less weight instead."""
     covariance: bool = True
-    """Whether to compute the covariance of poses, anchors and scale. It is not computed for more than 1500 photos that
-    see much of the same; along a path it can be for some thousands."""
+    """Compute the covariance of poses, anchors and scale. It is not computed for more than 1500 photos that see much of
+    the same; along a path it can be computed for some thousands."""
     bundle_adjustment: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's BundleAdjustmentOptions."""
 
@@ -396,7 +397,7 @@ class ReportOptions(Options, table="report"):
     reference: Annotated[Path | None, Told(metavar="FILE", role="file")] = None
     """File with true positions of the camera, for comparison: CSV or TUM."""
     enabled: Annotated[bool, Told(flag="report")] = True
-    """Whether report.html is written."""
+    """Write report.html."""
 
 
 class OutputOptions(Options, table="output"):

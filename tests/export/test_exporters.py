@@ -185,7 +185,7 @@ def test_formats_after_one_that_fails_are_written_and_all_failures_told(
         export_model(model, ["transform", "tum", "opf", "ply"], tmp_path)
     failed, written = error.value.advice
     assert failed.startswith("opf: the format 'opf' needs the stddev")
-    assert written == "written all the same: tum, ply"
+    assert written == "these were written: tum, ply"
     assert names_in(tmp_path) == ["points.ply", "trajectory.tum"]
 
 

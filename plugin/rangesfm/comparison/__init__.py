@@ -1,1 +1,1 @@
-"""Models against a reference and against each other."""
+"""Comparison of models with a reference and with each other."""

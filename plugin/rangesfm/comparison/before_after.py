@@ -1,4 +1,4 @@
-"""What the refinement changed: a model before it against the same model after it."""
+"""Comparison of a model before the refinement with the same model after it."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _Pair = tuple[float, ...]
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """Two models of the same photos in the same world; pairs are (before, after).
+    """Comparison of two models of the same photos in the same world. All pairs are (before, after).
 
     Attributes:
         reprojection_rms_px: None where one of the two is only a path.
-        range_rms_m, range_median_abs_m: of the given range residuals; None without.
-        displacements_m: (n,) of the camera centres of the keyframes in both.
+        range_rms_m, range_median_abs_m: RMS and median size of the given range residuals; None without any.
+        displacements_m: (n,) distance between both positions of each keyframe that both models have.
         distances: between a few keyframes spread over the path.
     """
 
@@ -63,10 +63,12 @@ def compare_models(
     *,
     range_residuals_m: tuple[Array, Array] | None = None,
 ) -> ModelComparison:
-    """What changed from one model to another of the same photos, both metric and in one world.
+    """Compare two metric models of the same photos in the same world.
 
     Args:
-        range_residuals_m: predicted minus measured, of the ranges used, before and after.
+        before: model or path before the change.
+        after: model or path after it.
+        range_residuals_m: predicted minus measured ranges, (k,) each, before and after; None without ranges.
 
     Raises:
         InputError: they have no photo in common.
@@ -88,11 +90,11 @@ def compare_models(
 
 @dataclass(frozen=True)
 class FolderComparison:
-    """What a finished run can be compared with.
+    """Comparisons of a finished run.
 
     Attributes:
-        rows: the paper's table; empty without a reference.
-        models: scaled against refined; None where the run did not refine.
+        rows: comparison with the reference, as in the 2018 paper; empty without a reference.
+        models: comparison of the scaled with the refined model; None where the run did not refine.
     """
 
     rows: tuple[ComparisonRow, ...]
@@ -103,11 +105,11 @@ class FolderComparison:
 
 
 def compare_folder(output_path: Path, reference_path: Path | None = None) -> FolderComparison:
-    """Compare the models in a run's output folder, with a reference file if there is one.
+    """Compare the models in the output folder of a run with each other and, if there is one, with a reference file.
 
     Raises:
-        InputError: the folder is not a result, it holds nothing to compare, or the
-            reference cannot be read or knows none of its photos.
+        InputError: the folder is not a result or has nothing to compare, or the reference cannot be read or has none of
+            its photos.
     """
     result = read_result_folder(output_path)
     scaled, refined = result.read_model("sparse_scaled"), result.read_model("sparse_metric")

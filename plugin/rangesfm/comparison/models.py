@@ -1,4 +1,4 @@
-"""Any number of models of the same photos against the first of them: what is where, how long, how well it fits."""
+"""Comparison of any number of models of the same photos with the first: positions, lengths and residuals."""
 
 from __future__ import annotations
 
@@ -28,18 +28,19 @@ from rangesfm.result.model_path import path_of_model
 from rangesfm.result.summary import ResultSummary
 
 Length = tuple[str, str, tuple[float, ...]]
-"""Between two photos: their names, and the length in each model's unit."""
+"""A distance between two photos: their names, and the length in each model, in the unit of that model."""
 
 
 @dataclass(frozen=True)
 class NamedModel:
-    """One of the models.
+    """One of the models to compare.
 
     Attributes:
-        path: the keyframes in the model's own world.
+        name: path from which it was read.
+        path: keyframes in the world of the model.
         model: None where only positions are known.
-        result: the result folder it comes from; None where it does not.
-        has_orientations: whether the path's rotations are the cameras'.
+        result: result folder from which the model comes; None where it does not come from one.
+        has_orientations: whether the rotations of the path are known; otherwise they are the identity.
     """
 
     name: str
@@ -51,16 +52,18 @@ class NamedModel:
 
 @dataclass(frozen=True)
 class ModelRow:
-    """One model against the first.
+    """Comparison of one model with the first model.
 
     Attributes:
-        base_from_model: the similarity that carries it onto the first; None with fewer than three common photos.
-        common_names: the photos in both, in the first's order.
-        moved, moved_aligned: (n,) distance of each of these cameras from where the first has it, as it is and after
-            that similarity, in the first's unit; the latter None without one.
-        reprojection_rms_px: None of a file of positions, NaN without points.
-        range_rms_m: of the ranges given, else of those that the first result folder used: of the cameras as they are,
-            and carried by a similarity onto the path that the ranges themselves have placed; None without ranges.
+        name: of the model.
+        num_photos: number of its photos.
+        base_from_model: best similarity from this model to the first; None with fewer than three common photos.
+        common_names: names of the photos in both, in the order of the first model.
+        moved, moved_aligned: (n,) distance of each common camera from its position in the first model, before and after
+            that similarity, in the unit of the first model; ``moved_aligned`` is None without a similarity.
+        reprojection_rms_px: None for a file of positions, NaN for a model without points.
+        range_rms_m: RMS of range residuals, with the cameras as they are, and with the cameras moved by the similarity
+            that brings them closest to ``ModelRanges.metric_path``; None without ranges.
     """
 
     name: str
@@ -74,7 +77,7 @@ class ModelRow:
 
     @property
     def rotation_deg(self) -> float | None:
-        """Angle by which the similarity turns."""
+        """Return the rotation angle of the similarity in degrees; None without a similarity."""
         if self.base_from_model is None:
             return None
         return float(np.rad2deg(Rotation.from_matrix(self.base_from_model.rotation).magnitude()))
@@ -82,11 +85,13 @@ class ModelRow:
 
 @dataclass(frozen=True)
 class TapedRow:
-    """One taped distance.
+    """One taped distance, and its length in each model.
 
     Attributes:
-        lengths: in each model, in its own unit; None where there is only a path.
-        lengths_m: the same, with the scale that carries the model onto the placed path; None without ranges.
+        ends: names of both ends.
+        measured_m: taped length.
+        lengths: length in each model, in the unit of that model; None for a model that is only a path.
+        lengths_m: the same with the scale that brings the model onto ``ModelRanges.metric_path``; None without ranges.
     """
 
     ends: tuple[str, str]
@@ -97,13 +102,13 @@ class TapedRow:
 
 @dataclass(frozen=True)
 class ModelsComparison:
-    """Models of the same photos.
+    """Comparison of models of the same photos with the first of them.
 
     Attributes:
-        models: as given; the first is what the others are compared with.
-        rows: one for each.
-        distances: of a few pairs of photos that all models have.
-        taped: taped distances; empty without.
+        models: as given; all are compared with the first.
+        rows: one for each model.
+        distances: between a few pairs of photos that all models have.
+        taped: taped distances; empty if none are given.
     """
 
     models: tuple[NamedModel, ...]
@@ -113,7 +118,7 @@ class ModelsComparison:
 
     @property
     def tables(self) -> tuple[Table, ...]:
-        """All that is to be read; of what there is none, without rows."""
+        """Return the tables of the comparison. A table without data has no rows."""
         cells, names = [_cells(row) for row in self.rows], [model.name for model in self.models]
         of_row = [f"{name} after Sim(3)" for name in names] if self.taped and self.taped[0].lengths_m else []
         distances = [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in self.distances]
@@ -138,10 +143,10 @@ class ModelsComparison:
 
 
 def read_models(paths: Sequence[Path]) -> tuple[NamedModel, ...]:
-    """Read COLMAP models, result folders (their final model) and files of camera positions (CSV or TUM).
+    """Read COLMAP models, final models of result folders, and files of camera positions (CSV or TUM).
 
     Raises:
-        InputError: one of them is none of these; or the first is a file, which says too little.
+        InputError: one of them is none of these, or the first is a file of positions.
     """
     if paths[0].is_file():
         raise InputError("the first must be a model or a result folder, the others may be files of positions", paths[0])
@@ -157,11 +162,12 @@ def compare_many(
     """Compare models with the first of them.
 
     Args:
-        ranges: to hold the models against; None: those of the first result folder among them, if there is one.
-        tape: taped distances to look up in each model.
+        models: to compare.
+        ranges: with which to compare the models; None: those of the first result folder among the models, if any.
+        tape: taped distances to measure in each model; None for none.
 
     Raises:
-        InputError: one has no photo in common with the first, or lacks the end of a taped distance.
+        InputError: a model has no photo in common with the first, or lacks an end of a taped distance.
     """
     if ranges is None:
         of_results = (ranges_of_result(one.result, one.path) for one in models if one.result is not None)
@@ -216,7 +222,7 @@ def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None, onto_r
 
 
 def common_photos(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...], Array, Array]:
-    """Names of the photos in both, and their centres in each."""
+    """Return the names of the n photos in both paths, and their camera centres (n, 3) in each path."""
     index = {name: i for i, name in enumerate(second.image_names)}
     rows = [(i, index[name]) for i, name in enumerate(first.image_names) if name in index]
     ours, theirs = np.array(rows, dtype=np.int64).reshape(-1, 2).T
@@ -224,13 +230,13 @@ def common_photos(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...
 
 
 def _onto(goal: Trajectory, path: Trajectory) -> Similarity | None:
-    """What carries a path onto another of the same photos."""
+    """Estimate the similarity that brings a path onto another one of the same photos."""
     _, target, source = common_photos(goal, path)
     return similarity_onto(source, target)
 
 
 def _range_rms(ranges: ModelRanges, model: NamedModel, onto_ranges: Similarity) -> tuple[float, float] | None:
-    """RMS of the residuals with a model's cameras, as they are and carried."""
+    """Return the RMS of range residuals with the cameras of a model as they are, and after the similarity."""
     if not model.has_orientations:
         return None
     own, carried = (rms(ranges.residuals_m(path)) for path in (model.path, carried_by(onto_ranges, model.path)))
@@ -238,7 +244,7 @@ def _range_rms(ranges: ModelRanges, model: NamedModel, onto_ranges: Similarity) 
 
 
 def carried_by(similarity: Similarity | None, path: Trajectory) -> Trajectory:
-    """The path in another world; as it is without a similarity."""
+    """Return a path transformed by a similarity, or unchanged where that is None."""
     if similarity is None:
         return path
     return path.transformed(similarity.scale, similarity.rotation, similarity.translation)
@@ -260,7 +266,11 @@ def _taped(
 def _taped_lengths(
     model: NamedModel, tape: Tape, onto_ranges: Similarity | None, anchors_m: Mapping[str, Array]
 ) -> list[tuple[float | None, float | None]]:
-    """Of each distance, in the model's unit and carried onto the placed path."""
+    """Return each taped distance in a model, in the unit of the model and in metres by ``onto_ranges``.
+
+    Raises:
+        InputError: an end of a distance is not in the model.
+    """
     unknown = [None] * len(tape.distances)
     if model.model is None:
         return list(zip(unknown, unknown))
@@ -274,7 +284,7 @@ def _taped_lengths(
 
 
 def lengths_along(paths: Sequence[Trajectory]) -> tuple[Length, ...]:
-    """Between photos spread over the path that all have: all of it, its halves, its middle and its end quarters."""
+    """Return distances between photos that all paths have: over the whole path, its halves and some of its quarters."""
     places = [dict(zip(path.image_names, path.centers)) for path in paths]
     names = [name for name in paths[0].image_names if all(name in place for place in places)]
     quarters = [(len(names) - 1) * share // 4 for share in range(5)]
@@ -284,7 +294,7 @@ def lengths_along(paths: Sequence[Trajectory]) -> tuple[Length, ...]:
 
 
 def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
-    """Root of the mean squared distance between observed and projected points; NaN for none."""
+    """Return the root mean square distance between observed and projected points in pixels; NaN without points."""
     errors = [np.zeros((0, 2))]
     for image in reconstruction.images.values():
         observed = list(image.get_observation_points2D()) if image.has_pose else []
@@ -296,18 +306,19 @@ def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
 
 
 _NOTE = (
-    "Scale and turn carry a model onto the first. Moved: RMS distance of the cameras from where the first has "
-    "them, as they are and after that similarity, in the first's unit. Range RMS: of the ranges used, with the "
-    "cameras as they are, and carried onto the path that the ranges themselves have placed."
+    "Scale and turn: the best similarity from the model to the first model. Moved: RMS distance of the cameras from "
+    "their positions in the first model, before and after that similarity, in the unit of the first model. Range RMS: "
+    "of the residuals of the ranges used, with the cameras as they are, and after the best similarity onto the path "
+    "that the ranges were placed on."
 )
 _TAPED_NOTE = (
-    "Each model's length in its own unit; after Sim(3): with the scale that carries its cameras onto those of the "
-    "first model that the ranges have placed."
+    "Lengths are in the unit of each model. After Sim(3): in metres, with the scale that brings the cameras of the "
+    "model onto the path that the ranges were placed on."
 )
 
 
 def _cells(row: ModelRow) -> list[tuple[str, str]]:
-    """Each with what its column is called."""
+    """Return name and text of each cell of a row; the name is that of the column."""
     similarity, aligned, range_rms_m = row.base_from_model, row.moved_aligned, row.range_rms_m or (None, None)
     return [
         ("model", row.name),

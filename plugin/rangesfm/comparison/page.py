@@ -1,4 +1,4 @@
-"""A comparison of models as one self-contained page, in the report's style."""
+"""A comparison of models as one self-contained page, in the style of the report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ COLORS = ("after", "before", "third", "fourth")
 
 
 def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
-    """Write ``comparison.html`` into a folder; everything drawn is carried onto the first model, in its unit.
+    """Write ``comparison.html`` into a folder and return its path.
+
+    All models are drawn after the best similarity to the first model, in the unit of the first model.
 
     Raises:
         InputError: the folder cannot be written to, or a run is writing there.
@@ -37,7 +39,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
             view=view_of(_scene(comparison, aligned, frame)),
             sections=[
                 Section("models", "Models", tables=[similarity]),
-                Section("moved-section", "What moved where", figures),
+                Section("moved-section", "Differences of the cameras", figures),
                 Section("distances", "Distances", tables=lengths),
             ],
         )
@@ -50,7 +52,7 @@ def _color(index: int) -> str:
 
 
 def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> Scene:
-    """The first model's map with all paths; the first path comes last, as what is clicked on."""
+    """Return the scene with the first model's map and all paths. Its own path is last: on that, cameras are chosen."""
     base = comparison.models[0]
     assert base.model is not None
     points_m, points_rgb = points_of(base.model)
@@ -68,7 +70,7 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) 
 
 
 def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
-    """How far each camera is from where the first model has it, along the path."""
+    """Return the figure of each camera's distance from its position in the first model; empty without any."""
     number = {name: i for i, name in enumerate(comparison.models[0].path.image_names)}
     series = []
     for i, row in enumerate(comparison.rows[1:], start=1):
@@ -79,8 +81,9 @@ def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
         return []
     moved = figure_of(
         "moved",
-        "How far each camera is from where the first model has it, after the similarity, in the first's unit.",
-        "Distance of each camera from where the first model has it",
+        "Distance of each camera from its position in the first model, after the best similarity, in the unit of the "
+        "first model.",
+        "Distance of each camera from its position in the first model",
         ("photo", "moved"),
         series,
         y_range=from_zero(series),
@@ -98,5 +101,5 @@ def _path_figure(comparison: ModelsComparison, aligned: list[Trajectory], frame:
         ]
         limits = equal_view(np.concatenate([line.points for line in lines]))
         panels.append(view.panel("all paths", "", lines, limits))
-    caption = "All paths, carried onto the first, in its frame and unit."
+    caption = "All paths after the best similarity to the first, in the frame and the unit of the first model."
     return Figure("paths", caption, tuple(panels), layout="views")

@@ -1,4 +1,4 @@
-"""Ranges that any model of the same photos can be held against."""
+"""Ranges with which any model of the same photos can be compared."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from rangesfm.survey.settings import Survey
 
 @dataclass(frozen=True)
 class ModelRanges:
-    """n ranges, and the metric world in which their anchors stand.
+    """Ranges, and the metric world of their anchors.
 
     Attributes:
-        log: the ranges, at times of the camera's clock or by photo.
-        tags_in_cam_m: (3,) lever arm by tag id.
-        anchors_m: (3,) position by anchor id, in the metric world.
-        biases_m: what its ranges read too long, by anchor id.
-        image_times_s: of the photos by name; None where the log names them.
-        metric_path: a path in the metric world, onto which others can be carried.
-        association: how ranges are put on a path.
+        log: ranges with times of the camera's clock, or with names of photos.
+        tags_in_cam_m: lever arm (3,) of each tag by id.
+        anchors_m: position (3,) of each anchor by id, in the metric world.
+        biases_m: range bias of each anchor by id, positive where its ranges are too long.
+        image_times_s: times of the photos by name; None where the log names photos.
+        metric_path: a path in the metric world, to which other paths can be aligned.
+        association: options for placing ranges on a path.
     """
 
     log: RangeLog
@@ -47,7 +47,7 @@ class ModelRanges:
     association: AssociationOptions
 
     def residuals_m(self, path: Trajectory) -> Array:
-        """(k,) predicted minus measured, of the ranges that have a place on a path in the metric world."""
+        """Return predicted minus measured ranges, (k,) metres, of the k ranges with a place on a metric path."""
         timed = path if self.image_times_s is None else path.timed(self.image_times_s)
         tags = np.array([self.tags_in_cam_m[id_] for id_ in self.log.tag_ids]).reshape(-1, 3)
         anchors = np.array([self.anchors_m[id_] for id_ in self.log.anchor_ids]).reshape(-1, 3)
@@ -61,17 +61,18 @@ class ModelRanges:
 
 
 def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRanges | None:
-    """The ranges that a run used, its anchors and their biases; None where it left none.
+    """Return the ranges that a run used, its anchors and their biases; None for a result without ranges.
 
     Args:
-        metric_path: of the run's final model.
+        result: of the run.
+        metric_path: path of the final model of the run.
     """
     ranges, anchors = result.read(RangesAsUsed), result.anchor_positions_m
     if ranges is None:
         return None
     before, after, has_place = ranges.places_on(metric_path.image_names)
     rows = np.flatnonzero(ranges.is_used & has_place & np.isin(np.array(ranges.anchor_id, dtype=str), list(anchors)))
-    # When the camera was there by its own clock; the photos' names where they have no times.
+    # Times of the ranges by the clock of the camera, or names of photos where these have no times.
     times = names = None
     if metric_path.timestamps_s is None:
         names = [metric_path.image_names[row] for row in before[rows]]
@@ -101,17 +102,17 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
 def ranges_of_survey(
     survey: Survey, inputs: RangingInputs, model: pycolmap.Reconstruction, model_path: Path
 ) -> ModelRanges:
-    """Ranges of a log, placed by a model: those that its scale estimate believes, and the anchors as it has them.
+    """Return the ranges of a log, placed on a model: those that the estimate of its scale uses, and its anchors.
 
     Args:
-        survey: the log, the anchors, the tag and the photos' times.
-        inputs: the same, as read.
-        model: in any unit; metric or not, it is scaled by the ranges.
-        model_path: where it was read from.
+        survey: settings of log, anchors, tag and photo times.
+        inputs: what was read from the files of the survey.
+        model: in any unit; it is scaled by the ranges in any case.
+        model_path: folder from which the model was read.
 
     Raises:
-        InputError: the photos have no times, or no range has a place.
-        GeometryError: the ranges do not determine the time offset or the model's scale.
+        InputError: the photos have no times, or no range has a place on the path.
+        GeometryError: the ranges do not determine the time offset or the scale of the model.
     """
     times = None if inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
     path = trajectory_from_reconstruction(model, times)
@@ -126,7 +127,7 @@ def ranges_of_survey(
         log = replace(log, timestamp_s=log.timestamp_s + offset_s)
     observations = associate(log, path, inputs.tag_in_cam_m, options=survey.ranges)
     if not observations.has_place.any():
-        raise InputError("no range is at a photo of the model: are --images and the time offset theirs?", log.source)
+        raise InputError("no range was taken near a photo: are --images and the time offset of this model?", log.source)
     estimate = initialize_scale(
         observations,
         path,

@@ -1,4 +1,4 @@
-"""How far paths are from a reference."""
+"""Comparison of paths with a reference."""
 
 from __future__ import annotations
 
@@ -18,26 +18,30 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.entries import ComparisonRow
 
 MIN_NUM_ALIGNED = 3
-"""Poses from which an alignment says something: two points always fit after Sim(3)."""
+"""Smallest number of keyframes for an alignment: two points always fit exactly after Sim(3)."""
 
 
 @with_one_blas_thread
 def compare(
     paths: Mapping[str, Trajectory], reference: Reference, *, frame: str | None = "site"
 ) -> tuple[ComparisonRow, ...]:
-    """One row for each path, by its name.
+    """Compare each path with a reference.
 
-    On a straight path the best alignment is not unique (any turn about the line fits),
-    but its scale and its error are.
+    On a straight path the best alignment is not unique, because any turn about the line fits; its scale and its error
+    are unique.
 
     Args:
-        frame: what world the paths are in. ``"site"``: the reference's own, compared as
-            it is. ``"first_camera"``: the reference is carried into it by its pose at the
-            first keyframe, which needs its orientations (the camera's, as COLMAP has
-            them); without them ``rmse_m`` is None. None: any world; ``rmse_m`` is None.
+        paths: by name.
+        reference: true positions, perhaps with orientations.
+        frame: world of the paths. ``"site"``: the world of the reference. ``"first_camera"``: the reference is moved
+            into it by its pose at the first known keyframe. This needs camera orientations in the reference (COLMAP's
+            convention); without them ``rmse_m`` is None. None: an unknown world; ``rmse_m`` is None.
+
+    Returns:
+        One row for each path.
 
     Raises:
-        InputError: the reference knows no keyframe of a path.
+        InputError: the reference has no keyframe of a path.
     """
     return tuple(_compare_path(name, path, reference, frame) for name, path in paths.items())
 
@@ -45,18 +49,22 @@ def compare(
 def papers_table(
     scaled: Trajectory, refined: Trajectory | None, reference: Reference, *, frame: str = "site"
 ) -> tuple[ComparisonRow, ...]:
-    """The paper's table: the true scale, the estimated scale, and the refined path if there is one.
+    """Return the table of the 2018 paper: with the true scale, with the estimated scale and, if there is one, refined.
 
-    Args: as in ``compare``; the paths are metric and in ``frame``.
+    Args:
+        scaled: metric path before the refinement.
+        refined: metric path after it; None without one.
+        reference: as in ``compare``.
+        frame: as in ``compare``.
     """
     paths = {"true scale": with_true_scale(scaled, reference, frame=frame), "estimated scale": scaled}
     return compare(paths if refined is None else {**paths, "refined": refined}, reference, frame=frame)
 
 
 def with_true_scale(path: Trajectory, reference: Reference, *, frame: str = "site") -> Trajectory:
-    """The path with the scale that fits the reference best, otherwise placed as it is (see Trajectory.resized).
+    """Return the path with the scale that fits the reference best; see Trajectory.resized.
 
-    A path whose scale the reference does not tell comes back unchanged.
+    The path is returned unchanged if the reference does not determine its scale.
     """
     known, positions, _ = known_keyframes(path, reference)
     found = similarity_onto(path.centers[known], positions)
@@ -64,10 +72,11 @@ def with_true_scale(path: Trajectory, reference: Reference, *, frame: str = "sit
 
 
 def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str | None = "site") -> Reference | None:
-    """The reference at the path's keyframes, by photo, in the path's own world and without fitting it.
+    """Return the reference positions of a path's keyframes by photo, in the world of the path, without fitting.
 
     Returns:
-        None where it knows none of them, or the frames cannot be tied (see ``compare``).
+        None where the reference has no keyframe of the path, or its relation to the frame of the path is unknown (see
+        ``compare``).
     """
     known, target, world_from_cam = known_keyframes(path, reference)
     positions = _in_frame(path, known, target, world_from_cam, frame)
@@ -77,7 +86,7 @@ def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str | N
 
 
 def known_keyframes(path: Trajectory, reference: Reference) -> tuple[npt.NDArray[np.int64], Array, Array | None]:
-    """Rows of the k keyframes that the reference knows, their (k, 3) positions, and (k, 3, 3) rotations or None."""
+    """Return the k keyframes that the reference has: indices, positions (k, 3), and rotations (k, 3, 3) or None."""
     positions, world_from_cam = reference.positions_at(path)
     known = np.flatnonzero(np.isfinite(positions).all(axis=1))
     return known, positions[known], None if world_from_cam is None else world_from_cam[known]
@@ -90,7 +99,7 @@ def _in_frame(
     world_from_cam: Array | None,
     frame: str | None,
 ) -> Array | None:
-    """Positions of ``known_keyframes`` in the path's world; None if it cannot be tied."""
+    """Return the positions (k, 3) of ``known_keyframes`` in the world of the path; None if its relation is unknown."""
     if frame == "site":
         return positions
     if frame != "first_camera" or world_from_cam is None or len(known) == 0:
@@ -121,12 +130,12 @@ def _compare_path(name: str, path: Trajectory, reference: Reference, frame: str 
 
 
 def similarity_onto(source: Array, target: Array) -> Similarity | None:
-    """From source to target; None where there is none, or too few points for it to say anything."""
+    """Return the best similarity from source to target, (n, 3) each; None if it is not determined or n is below 3."""
     return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
 
 
 def format_table(rows: tuple[ComparisonRow, ...]) -> str:
-    """The rows as aligned plain text, lengths in metres."""
+    """Return the rows as a table in plain text, lengths in metres."""
     header = ("trajectory", "keyframes", "RMSE m", "after SE(3)", "after Sim(3)", "scale error")
     cells = [
         (
@@ -141,5 +150,5 @@ def format_table(rows: tuple[ComparisonRow, ...]) -> str:
 
 
 def text_or_dash(value: float | None, spec: str, unit: str = "") -> str:
-    """A number in a table of plain text."""
+    """Return a number as text with its unit, or "-" where it is unknown, for a table in plain text."""
     return "-" if value is None or math.isnan(value) else f"{value:{spec}}{unit}"

@@ -1,4 +1,4 @@
-"""The metric map in other programs' formats: one file per format, one registry."""
+"""Export of the metric map to the formats of other programs. ``EXPORTERS`` lists all formats."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ EXPORTERS: dict[str, Exporter] = {
     "opensfm": lambda map_, folder: write_opensfm(map_, folder / "reconstruction.json"),
     "opf": lambda map_, folder: write_opf(map_, folder / "opf"),
 }
-"""Each writes one format of a map into a folder and returns what it wrote."""
+"""Functions by name of the format. Each writes a map into a folder and returns the paths of what it wrote."""
 
 EXPORTED_NAMES: dict[str, tuple[str, ...]] = {
     "colmap": ("colmap",),
@@ -87,7 +87,7 @@ EXPORTED_NAMES: dict[str, tuple[str, ...]] = {
     "opensfm": ("reconstruction.json",),
     "opf": ("opf",),
 }
-"""Names in the folder that each format writes."""
+"""Names of the files and folders that each format writes into the folder."""
 
 
 def export_model(
@@ -99,27 +99,30 @@ def export_model(
     anchors_m: Mapping[str, Array] | None = None,
     metric_from_sfm: Similarity | None = None,
 ) -> tuple[Path, ...]:
-    """Write a metric model in each of the formats (names as in EXPORTERS) under ``output_path``.
+    """Write a metric model in several formats.
 
     Args:
-        timestamps_s: camera-clock time of each photo by name, for trajectories.
-        anchors_m: (3,) position by anchor id, in the model's world.
-        metric_from_sfm: from the unscaled model's world to this one's.
+        reconstruction: model in metres.
+        formats: names of formats, as in ``EXPORTERS``.
+        output_path: folder to write into; it is made if needed.
+        timestamps_s: time of each photo on the camera's clock, by name, for trajectories.
+        anchors_m: position (3,) of each anchor by id, in the world of the model.
+        metric_from_sfm: similarity from the world of the unscaled model to that of this model.
 
     Returns:
-        The files or folders written, in the order of the formats.
+        Paths of the files or folders written, in the order of the formats.
 
     Raises:
-        InputError: a format is not known or needs what is not given, or the folder cannot be written to.
+        InputError: a format is unknown or needs something that is not given, or the folder cannot be written to.
     """
     map_ = MetricMap(reconstruction, timestamps_s, anchors_m, metric_from_sfm)
     return export_map(map_, output_path, ExportOptions(formats=tuple(formats)))
 
 
 def export_map(map_: MetricMap, output_path: Path, options: ExportOptions) -> tuple[Path, ...]:
-    """The same of a map with all that is known of it, in the frame that the options ask for.
+    """Write a map in the formats and the frame of the options. Otherwise as ``export_model``.
 
-    One format that cannot be written does not stop those after it; which could not, the error says at the end.
+    A format that cannot be written does not stop those after it; the error at the end names all that failed.
     """
     chosen = list(dict.fromkeys(options.formats))
     check_formats(chosen)
@@ -139,21 +142,25 @@ def export_map(map_: MetricMap, output_path: Path, options: ExportOptions) -> tu
 
 
 def _not_all(failures: Mapping[str, Exception], written: Collection[str], num_chosen: int) -> Exception:
-    """One error for those of all formats: each has its line, and the formats that were written have one."""
+    """Return one error for all formats that failed: a line for each, and a line with the formats that were written."""
     if num_chosen == 1:
         return next(iter(failures.values()))
     told = [failure_of(error) for error in failures.values()]
     lines = [f"{name}: {failure.message}" for name, failure in zip(failures, told)]
     error = InputError(
         f"{len(failures)} of {num_chosen} formats could not be written: {lines[0]}",
-        advice=[*lines[1:], *(["written all the same: " + ", ".join(written)] if written else [])],
+        advice=[*lines[1:], *(["these were written: " + ", ".join(written)] if written else [])],
     )
     error.exit_status = max(failure.exit_status for failure in told)
     return error
 
 
 def check_formats(formats: Iterable[str]) -> None:
-    """Raise InputError for the first format that is not known."""
+    """Check that all formats are known.
+
+    Raises:
+        InputError: one is not; the text lists all formats.
+    """
     for name in formats:
         if name not in EXPORTERS:
             raise InputError(f"unknown export format {name!r}, expected one of: {', '.join(EXPORTERS)}")

@@ -1,7 +1,7 @@
-"""The metric similarity, applied to what other programs made from the unscaled model.
+"""Transformation of files that other programs made from the unscaled model, into the metric world.
 
-Meshes and clouds (PLY, OBJ), camera files (nerfstudio's ``transforms.json``, the ``cameras.json`` of Gaussian
-splatting) and COLMAP models.
+These are meshes and point clouds (PLY, OBJ), camera files (``transforms.json`` of nerfstudio, ``cameras.json`` of
+Gaussian splatting) and COLMAP models.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ Json = Any
 
 
 def best_similarity(sfm: pycolmap.Reconstruction, metric: pycolmap.Reconstruction) -> tuple[Similarity, float]:
-    """The similarity that brings an unscaled model's cameras closest to those of a refined one.
+    """Estimate the similarity that brings the cameras of an unscaled model closest to those of a refined model.
 
     Returns:
-        metric_from_sfm, and the root mean square distance in metres that is left, for the refinement has bent the map.
+        The similarity metric_from_sfm, and the root mean square distance of the cameras in metres that is left. It is
+        not zero, because the refinement has bent the map.
 
     Raises:
         InputError: fewer than three photos are in both.
@@ -46,16 +47,16 @@ def best_similarity(sfm: pycolmap.Reconstruction, metric: pycolmap.Reconstructio
 
 
 def apply_to(paths: list[Path], metric_from_sfm: Similarity, folder: Path) -> tuple[Path, ...]:
-    """Write each file (or model folder) into ``folder`` under its own name, carried into the metric world.
+    """Write each file or model folder, transformed into the metric world, into ``folder`` under its own name.
 
     Raises:
-        InputError: a file is none of those that this module knows, or would be overwritten.
+        InputError: a file has none of the known formats, or would be overwritten.
     """
     chosen = [(path, _transformer_of(path)) for path in paths]
     for path in paths:
         require_apart(paths, folder / path.name)
     if len({path.name for path in paths}) < len(paths):
-        raise InputError("two of the files to carry over have the same name")
+        raise InputError("two of the files to transform have the same name, expected different names")
     make_output_folder(folder)
     return tuple(transform(path, metric_from_sfm, folder / path.name) for path, transform in chosen)
 
@@ -70,12 +71,12 @@ def _transformer_of(path: Path) -> Transform:
         raise InputError("there is no such file", path)
     known: dict[str, Transform] = {".ply": transform_ply, ".obj": _transform_obj, ".json": _transform_json}
     if path.suffix.lower() not in known:
-        raise InputError(f"cannot be carried over, expected {', '.join(known)} or the folder of a COLMAP model", path)
+        raise InputError(f"cannot be transformed, expected {', '.join(known)} or the folder of a COLMAP model", path)
     return known[path.suffix.lower()]
 
 
 def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
-    """Vertices and normals move; faces, colours and the rest stay as they are written."""
+    """Transform vertices and normals of an OBJ file; faces, colours and all else are copied unchanged."""
     lines = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
@@ -87,7 +88,7 @@ def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Pat
                 if not np.isfinite(moved).all():
                     raise ValueError("infinite")
             except (ValueError, FloatingPointError):
-                raise InputError(f"'{line[:60]}' is no vertex, expected three numbers", path, number) from None
+                raise InputError(f"'{line[:60]}' is not a vertex, expected three numbers", path, number) from None
             line = " ".join([words[0], *(f"{value:.10g}" for value in moved), *words[4:]])
         lines.append(line)
     write_text("\n".join(lines) + "\n", target)
@@ -104,7 +105,7 @@ def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Pa
                 _move_splatting(content, metric_from_sfm)
             else:
                 expected = "expected nerfstudio's transforms.json or a splatting cameras.json"
-                raise InputError(f"holds no cameras, {expected}", path)
+                raise InputError(f"has no cameras, {expected}", path)
     except (ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"a camera is not as expected ({error!r})", path) from error
     write_json(content, target)
@@ -112,7 +113,11 @@ def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Pa
 
 
 def _move_nerfstudio(content: Json, metric_from_sfm: Similarity) -> None:
-    """Poses are in a world that ``applied_transform`` has turned away from COLMAP's; the metric one needs none."""
+    """Transform the poses of a ``transforms.json`` in place.
+
+    They are in a world that ``applied_transform`` has turned away from that of COLMAP. This turn is undone first, so
+    that the result needs no ``applied_transform``.
+    """
     applied = np.eye(4)
     if "applied_transform" in content:
         applied[:3] = np.array(content["applied_transform"], dtype=np.float64).reshape(-1, 4)[:3]
@@ -125,7 +130,7 @@ def _move_nerfstudio(content: Json, metric_from_sfm: Similarity) -> None:
         frame["transform_matrix"] = pose.tolist()
     if "applied_transform" in content:
         content["applied_transform"] = np.eye(4)[:3].tolist()
-    # Of the file as it was, and wrong from now on.
+    # nerfstudio wrote this scale for the old poses; it would be wrong for the new ones.
     content.pop("applied_scale", None)
 
 

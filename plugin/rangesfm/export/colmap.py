@@ -1,4 +1,4 @@
-"""What COLMAP itself reads, and what reads its models: with undistorted photos, dense reconstruction and splatting."""
+"""Export for COLMAP, and for programs that read COLMAP models, such as dense reconstruction and splatting."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from rangesfm.geometry.similarity import Similarity
 
 
 def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text: bool = False) -> Path:
-    """Write the model as the folder ``path``, whole or not at all; an older one is replaced.
+    """Write the model as the folder ``path`` and replace an older one. If that fails, nothing is changed.
 
     Raises:
-        InputError: as text, a photo's name holds white space, at which COLMAP would split it.
+        InputError: with ``as_text``, the name of a photo has white space, where COLMAP would split it.
     """
     if as_text:
         _require_names_without_blanks(reconstruction, "colmap_text")
@@ -37,30 +37,31 @@ def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text:
 
 
 def write_project(map_: MetricMap, path: Path, *, as_text: bool = False) -> Path:
-    """Write the model, and where the photos are known a ``project.ini`` beside it, which COLMAP's GUI looks for.
+    """Write the model and, where the folder of the photos is known, a ``project.ini`` for COLMAP's GUI.
 
-    COLMAP takes no project whose folder of photos is not there; the database need not be.
+    COLMAP refuses a project whose folder of photos does not exist; its database need not exist.
     """
     write_model(map_.reconstruction, path, as_text=as_text)
     if map_.images_path is not None and map_.images_path.is_dir():
         database_path = map_.database_path or path / "database.db"
         text = f"database_path={database_path.resolve()}\nimage_path={map_.images_path.resolve()}\n"
-        if "#" not in text:  # which begins a comment there
+        if "#" not in text:  # a # would begin a comment in project.ini
             write_text(text, path / "project.ini")
     return path
 
 
 def write_transform(metric_from_sfm: Similarity | None, folder: Path) -> tuple[Path, Path]:
-    """Write metric_from_sfm for ``model_transformer``, losing no digit, in the two forms that COLMAP has had.
+    """Write metric_from_sfm for COLMAP's ``model_transformer``, with all digits, in both forms that COLMAP has had.
 
-    ``transform_colmap_4.txt``: ``scale qw qx qy qz tx ty tz`` on one line, which it reads since 3.9;
-    ``transform_colmap_3.8.txt``: a matrix of 4 x 4. Each takes the other's file without a word, and moves by anything.
+    ``transform_colmap_4.txt`` has ``scale qw qx qy qz tx ty tz`` on one line, for COLMAP from 3.9 on;
+    ``transform_colmap_3.8.txt`` has a 4 x 4 matrix. Each version also reads the other's file without an error, but then
+    transforms the model wrongly.
 
     Raises:
         InputError: the similarity is not known.
     """
     if metric_from_sfm is None:
-        raise InputError("the format 'transform' needs metric_from_sfm, which is not known of this model")
+        raise InputError("the format 'transform' needs metric_from_sfm, which is not known for this model")
     qx, qy, qz, qw = Rotation.from_matrix(metric_from_sfm.rotation).as_quat()
     numbers = np.array([metric_from_sfm.scale, qw, qx, qy, qz, *metric_from_sfm.translation])
     matrix = np.eye(4)
@@ -72,10 +73,10 @@ def write_transform(metric_from_sfm: Similarity | None, folder: Path) -> tuple[P
 
 
 def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
-    """Write metric camera positions, ``image_name x y z`` for each registered photo, in order of the names.
+    """Write the camera positions in metres, ``image_name x y z`` for each registered photo, in order of the names.
 
     Raises:
-        InputError: a photo's name holds white space, at which COLMAP would split it.
+        InputError: the name of a photo has white space, where COLMAP would split it.
     """
     _require_names_without_blanks(reconstruction, "model_aligner")
     lines = [
@@ -93,11 +94,11 @@ def _require_names_without_blanks(reconstruction: pycolmap.Reconstruction, name:
 
 
 def write_undistorted(map_: MetricMap, folder: Path) -> Path:
-    """Write ``images/`` (pinhole) and ``sparse/0`` into ``folder``.
+    """Write undistorted photos (``images/``) and a model of them with pinhole cameras (``sparse/0``) into ``folder``.
 
     Raises:
-        InputError: the photos are not where the map says, or nobody said where they are.
-        OSError: the disk has no room for them.
+        InputError: the folder of the photos is not known, or a photo is not in it.
+        OSError: the disk is too full for the photos.
     """
     images_path = map_.images_path
     if images_path is None:
@@ -105,12 +106,12 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
     names = [image.name for image in registered_images(map_.reconstruction)]
     for name in names:
         if not stays_inside(name):
-            raise InputError(f"the photo {name} would be written outside of it, expected names inside a folder", folder)
+            raise InputError(f"the photo {name} would be written outside of it, expected a name inside it", folder)
         if not os.path.isfile(images_path / name):
-            raise InputError(f"there is no photo {name}, which the map needs, in this folder", images_path)
+            raise InputError(f"the photo {name} of the map is not in this folder", images_path)
     with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:
         write_binary_model(map_.reconstruction, Path(model_path))
-        # On a full disk the library that writes the photos ends the whole process, without a word of ours.
+        # On a full disk, the library that writes the photos ends the whole process without an error message.
         if shutil.disk_usage(temporary).free < sum(os.path.getsize(images_path / name) for name in names):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(temporary))
         with colmap_log(temporary / "undistortion.log"):
@@ -120,7 +121,7 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
 
 
 def _into_sparse_0(folder: Path) -> None:
-    """The model to where everybody looks for it; COLMAP's scripts for MVS and its log stay out."""
+    """Move the model to ``sparse/0``, where programs look for it, and delete COLMAP's scripts for MVS and its log."""
     files = list((folder / "sparse").iterdir())
     (folder / "sparse" / "0").mkdir()
     for path in files:

@@ -1,4 +1,4 @@
-"""What GIS programs read: points as LAZ; cameras and anchors as GeoPackage, GeoJSON and KML, through GDAL."""
+"""Export for GIS programs: points as LAZ; cameras and anchors as GeoPackage, GeoJSON and KML, through GDAL."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ _STEP_M = 1e-4
 _STEP_DEG = 1e-9
 _POINT_FORMAT_WITH_COLOR = 7
 _WKB_POINT_Z = 1001
-# Nine decimals of a degree are a tenth of a millimetre.
+# The ninth decimal of a degree is a tenth of a millimetre.
 _OPTIONS = {"GeoJSON": {"COORDINATE_PRECISION": "9"}}
 
 
 def write_laz(map_: MetricMap, path: Path) -> Path:
-    """Write the 3-D points with their colours, in tenths of a millimetre.
+    """Write the 3-D points with their colours, rounded to a tenth of a millimetre.
 
     Raises:
-        InputError: laspy, or what it compresses with, is not installed.
+        InputError: laspy, or the package with which it compresses, is not installed.
     """
     try:
         import laspy
     except ImportError:
         raise InputError("the format 'laz' needs laspy: pip install 'rangesfm[geo]'") from None
     if not laspy.LazBackend.detect_available():
-        raise InputError("the format 'laz' needs lazrs beside laspy: pip install 'rangesfm[geo]'")
+        raise InputError("the format 'laz' needs lazrs besides laspy: pip install 'rangesfm[geo]'")
     places, colors = points_of(map_.reconstruction)
     xyz, steps = _coordinates(map_, places)
     header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT_WITH_COLOR)
@@ -44,14 +44,14 @@ def write_laz(map_: MetricMap, path: Path) -> Path:
         header.add_crs(pyproj.CRS.from_user_input(map_.georeference.crs))
     las = laspy.LasData(header)
     las.x, las.y, las.z = xyz.T
-    las.red, las.green, las.blue = colors.T * np.uint16(257)  # LAS counts colours to 65535
+    las.red, las.green, las.blue = colors.T * np.uint16(257)  # colours of LAS go up to 65535 = 257 * 255
     with new_file(path) as temporary:
         las.write(str(temporary))
     return path
 
 
 def _coordinates(map_: MetricMap, xyz: Array) -> tuple[Array, Array]:
-    """Coordinates to write and the step in which they are counted."""
+    """Return the coordinates to write, (n, 3), and the step of each axis to which they are rounded, (3,)."""
     if map_.georeference is None:
         return xyz, np.full(3, _STEP_M)
     step = _STEP_DEG if is_geographic(map_.georeference.crs) else _STEP_M
@@ -61,7 +61,7 @@ def _coordinates(map_: MetricMap, xyz: Array) -> tuple[Array, Array]:
 def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
     """Write one point for each photo and each anchor, with ``kind``, ``name`` and the photo's ``timestamp_s``.
 
-    A GeoPackage is in the map's coordinate system, the other two have longitude and latitude by their definition.
+    A GeoPackage has the coordinate reference system of the map; the other formats always have longitude and latitude.
 
     Raises:
         InputError: the map is not georeferenced, or pyogrio is not installed.

@@ -1,4 +1,4 @@
-"""The metric map with all that exporters may need, and the frame in which it leaves."""
+"""The metric map with everything that exporters may need, and its transformation into the frame of the export."""
 
 from __future__ import annotations
 
@@ -19,30 +19,31 @@ from rangesfm.geometry.similarity import Similarity, path_shape
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import ExportOptions
 
-# Extent of a path across its plane, in its second extent: above this there is no plane to speak of.
+# Largest ratio of the path's extent perpendicular to its plane to its second largest extent; above, it has no plane.
 _MAX_ROUGHNESS = 0.3
-# Mean of the photos' up directions: of photos that agree it has length 1.
+# Smallest length of the mean of the photos' upward unit vectors; it is 1 where all photos agree.
 _MIN_AGREEMENT = 0.3
+# Horizontal part of a unit viewing direction below which the direction counts as vertical.
 _NEARLY_VERTICAL = 0.1
-# Of the same mean along the normal of the path's plane: photos straight down, or of a wall, have none.
+# Smallest part of that mean along the normal of the path's plane. It is 0 if the photos look straight along the normal.
 _MIN_LEAN = 0.01
 
 
 @dataclass(frozen=True)
 class MetricMap:
-    """A metric model with what a COLMAP model does not hold.
+    """A metric model, and what a COLMAP model cannot hold.
 
     Attributes:
-        reconstruction: in metres.
-        timestamps_s: camera-clock time of each photo by name; None if unknown.
-        anchors_m: (3,) position by anchor id, in the model's world.
-        metric_from_sfm: from the unscaled model's world to this one's; None if unknown.
-        relative_scale_stddev: of every length in the map, by the scale alone; None if unknown.
+        reconstruction: model in metres.
+        timestamps_s: time of each photo on the camera's clock, by name; None if unknown.
+        anchors_m: position (3,) of each anchor by id, in the world of the model; None if unknown.
+        metric_from_sfm: similarity from the world of the unscaled model to that of this model; None if unknown.
+        relative_scale_stddev: relative stddev that the scale gives every length in the map; None if unknown.
         images_path: folder of the photos; None if unknown.
-        database_path: COLMAP's database of them; None if unknown.
-        center_covariance_m2: (3, 3) of each keyframe's projection centre, by its photo; None if unknown.
-        is_site: whether the model's world is the anchors' site frame, in which z is up by custom.
-        georeference: where the model's world lies on the Earth; None if unknown.
+        database_path: COLMAP's database of the photos; None if unknown.
+        is_site: whether the world of the model is the site frame of the anchors, where z is up by convention.
+        georeference: place of the model's world on the Earth; None if unknown.
+        center_covariance_m2: covariance (3, 3) of each keyframe's projection centre by photo; None if unknown.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -61,7 +62,14 @@ class MetricMap:
         return trajectory_from_reconstruction(self.reconstruction, self.timestamps_s)
 
     def georeference_for(self, need: str) -> Georeference:
-        """The georeference, or InputError with what needs it and how the map comes by one."""
+        """Return the georeference.
+
+        Args:
+            need: what needs it, for the message.
+
+        Raises:
+            InputError: the map has none; the text says how to give one.
+        """
         if self.georeference is None:
             how = "anchors with [anchors] crs, or origin_anchor, origin_lat_lon_height and heading_deg"
             raise InputError(f"{need}: {how}")
@@ -69,22 +77,22 @@ class MetricMap:
 
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """Those that have a pose, by their names."""
+    """Return the images of a model that have a pose, in order of their names."""
     return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
 
 
 def points_of(model: pycolmap.Reconstruction) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """(n, 3) positions and (n, 3) colours of the 3-D points, in order of their ids."""
+    """Return positions (n, 3) and colours (n, 3) of the 3-D points of a model, in order of their ids."""
     points = [model.point3D(point_id) for point_id in sorted(model.point3D_ids())]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
 def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:
-    """The map in the frame that the options ask for, georeferenced as far as they and the map say.
+    """Return the map in the frame of the options, with a georeference if the options or the map give one.
 
     Raises:
-        InputError: the frame is not determined, with what is missing.
+        InputError: the frame is not determined; the text says what is missing.
     """
     map_ = _georeferenced(map_, options)
     if options.frame == "result":
@@ -95,7 +103,7 @@ def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:
 
 
 def moved(map_: MetricMap, new_from_old: Similarity) -> MetricMap:
-    """The same map in another world."""
+    """Return the same map in another world."""
     georeference = map_.georeference
     if georeference is not None:
         georeference = replace(georeference, enu_from_world=georeference.enu_from_world @ new_from_old.inverse())
@@ -134,32 +142,36 @@ def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
 
 
 def up_in_world(trajectory: Trajectory, up: str, *, is_site: bool = False) -> Array:
-    """(3,) unit vector against gravity, by the rule ``up`` of ExportOptions.
+    """Return the upward unit vector (3,) by the rule ``up`` of ExportOptions.
 
     Raises:
-        InputError: the photos disagree about it or are all level with the path's plane, the path is not flat, or it is
-            no direction.
+        InputError: the photos disagree, or do not say which side of the path's plane is up; the path is not in a plane;
+            or ``up`` is not valid.
     """
     if up == "auto" and is_site:
         return np.array([0.0, 0.0, 1.0])
     photos_up = -trajectory.world_from_cam[:, :, 1].mean(axis=0)
     if up in ("auto", "cameras"):
         if np.linalg.norm(photos_up) < _MIN_AGREEMENT:
-            raise InputError("the photos do not agree what is up: say it (--up path, or --up X,Y,Z)")
+            raise InputError("the photos do not agree on what is up: give it (--up path, or --up X,Y,Z)")
         return _unit(photos_up)
     if up == "path":
         shape = path_shape(trajectory.centers)
         if shape.stddevs[2] > _MAX_ROUGHNESS * shape.stddevs[1]:
-            raise InputError("the path does not lie in a plane: say what is up (--up cameras, or --up X,Y,Z)")
+            raise InputError("the path does not lie in a plane: give what is up (--up cameras, or --up X,Y,Z)")
         normal = shape.axes[:, 2]
         if abs(normal @ photos_up) < _MIN_LEAN:
-            raise InputError("the photos do not say which side of the path's plane is up: say it (--up X,Y,Z)")
+            raise InputError("the photos do not say which side of the path's plane is up: give it (--up X,Y,Z)")
         return _unit(normal if normal @ photos_up > 0 else -normal)
     return _unit(np.array(direction(up)))
 
 
 def direction(text: str) -> tuple[float, float, float]:
-    """Three numbers that are not all 0; InputError for anything else."""
+    """Read a direction X,Y,Z from text.
+
+    Raises:
+        InputError: it is not three numbers, or all are 0.
+    """
     try:
         numbers = tuple(float(part) for part in text.replace(",", " ").split())
     except ValueError:
@@ -175,7 +187,10 @@ def _unit(vector: Array) -> Array:
 
 
 def _level_from_world(map_: MetricMap, up: str) -> Array:
-    """(3, 3) rotation: z up, y as the first camera looks (its upper edge, where it looks down)."""
+    """Return the rotation (3, 3) into a level frame: z up, y along the view of the first camera.
+
+    Where the first camera looks almost straight up or down, y is along the upper edge of its image instead.
+    """
     vertical = up_in_world(map_.trajectory, up, is_site=map_.is_site)
     first = map_.trajectory.world_from_cam[0]
     for ahead in (first[:, 2], -first[:, 1]):

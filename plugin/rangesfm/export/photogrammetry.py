@@ -1,4 +1,4 @@
-"""Cameras and map as other photogrammetry programs have them: nerfstudio, OpenSfM, the Open Photogrammetry Format."""
+"""Export of cameras and map to nerfstudio, OpenSfM and the Open Photogrammetry Format (OPF)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rangesfm.files.records import write_json
 
 _POINTS_NAME = "transforms_points.ply"
 _FLIP_Y_AND_Z = np.diag([1.0, -1.0, -1.0, 1.0])
-# COLMAP's camera models that the programs know, and what they call them.
+# The camera models of COLMAP that each program supports, with the program's own name for each.
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 _NERFSTUDIO = dict.fromkeys(_PERSPECTIVE, "OPENCV") | dict.fromkeys(_FISHEYE, "OPENCV_FISHEYE")
@@ -29,39 +29,42 @@ _OPENSFM = dict.fromkeys(_PERSPECTIVE, "brown") | {"OPENCV_FISHEYE": "fisheye_op
 _ALL_OF_OPENSFM = {"brown": ("k1", "k2", "k3", "p1", "p2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
 _NUM_CONSTRAINTS = 10
 _MIN_TRACK_LENGTH = 3
-# Of marks that a feature detector made; a person's click is of 1.
+# OPF's accuracy of a mark. Marks of a feature detector get the value of a mark that a person clicked, 1.
 _MARK_ACCURACY = 1.0
 
 
 def _distortion(camera: pycolmap.Camera, program: str, known: Mapping[str, str]) -> tuple[str, dict[str, float]]:
-    """What a program calls a camera's model, and the camera's distortion by the parameters' names."""
+    """Return a program's name of the camera model, and the distortion coefficients by the program's parameter names.
+
+    Raises:
+        InputError: the program does not support the camera model.
+    """
     name = camera.model.name
     if name not in known:
         raise InputError(f"{program} does not know the camera model {name}, expected one of: {', '.join(known)}")
-    # A model with one coefficient calls it k.
+    # COLMAP's models with a single coefficient call it k.
     names = ["k1" if parameter == "k" else parameter for parameter in camera.params_info.split(", ")]
     distortion = {names[index]: float(camera.params[index]) for index in camera.extra_params_idxs()}
     return known[name], distortion
 
 
 def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
-    """Write ``transforms.json`` and its points; photos are referred to as ``images/NAME``.
+    """Write ``transforms.json`` and its points. Photos are referred to as ``images/NAME``.
 
-    nerfstudio looks for the camera model at the top level alone and takes a missing one for perspective; what else is
-    there holds for all photos, so that of several cameras each photo says its own.
+    nerfstudio reads the camera model at the top level only, and takes a missing one for perspective. Other camera
+    parameters at the top level hold for all photos; so with several cameras, each photo has its own parameters.
 
-    nerfstudio's cameras look along their -z with y up, and its worlds have z up. Its own loader centres and shrinks
-    what it reads unless it is told not to (``--auto-scale-poses False --center-method none
-    --orientation-method none``).
+    Cameras of nerfstudio look along their -z axis with y up, and z is up in its world. Its loader centres and rescales
+    the poses unless it is told not to (``--auto-scale-poses False --center-method none --orientation-method none``).
 
     Raises:
-        InputError: a camera model that nerfstudio does not know, or photos of which some are fisheyes and some not.
+        InputError: nerfstudio does not support a camera model, or some photos are from fisheye cameras and some not.
     """
     model, images = map_.reconstruction, registered_images(map_.reconstruction)
     cameras = {i: _intrinsics(model.cameras[i]) for i in sorted({image.camera_id for image in images})}
     kinds = {camera.pop("camera_model") for camera in cameras.values()}
     if len(kinds) > 1:
-        raise InputError("nerfstudio has one camera model for all photos, and some of these are fisheyes and some not")
+        raise InputError("nerfstudio has one camera model for all photos, but only some of these are fisheye photos")
     common = next(iter(cameras.values())) if len(cameras) == 1 else {}
     content = {
         **({"camera_model": kinds.pop()} if kinds else {}),
@@ -94,13 +97,13 @@ def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
 
 
 def write_opensfm(map_: MetricMap, path: Path) -> Path:
-    """Write one reconstruction with its cameras, shots and points; ``reference_lla`` where the map is georeferenced.
+    """Write one reconstruction with its cameras, shots and points, and ``reference_lla`` if the map is georeferenced.
 
-    OpenSfM (and so OpenDroneMap) measures in photos in units of their longer side, from the photo's middle, and turns
-    by rotation vectors.
+    The image coordinates of OpenSfM (and OpenDroneMap) have their origin in the middle of a photo, and the longer side
+    of the photo as unit. Its rotations are rotation vectors.
 
     Raises:
-        InputError: a camera model that OpenSfM does not know.
+        InputError: OpenSfM does not support a camera model.
     """
     model, origin = map_.reconstruction, map_.georeference
     images, (places, colors) = registered_images(model), points_of(model)
@@ -150,15 +153,15 @@ def _shot(image: pycolmap.Image, map_: MetricMap) -> dict[str, Any]:
 def write_opf(map_: MetricMap, folder: Path) -> Path:
     """Write ``project.opf`` and its ``camera_list.json``, ``input_control_points.json`` and ``constraints.json``.
 
-    Pairs of well-seen points are manual tie points with their marks, and each pair's distance is a scale constraint
-    with the uncertainty of the scale: a program that maps the same photos then gets our scale.
+    Pairs of points that many photos see become manual tie points with their marks. The distance of each pair becomes a
+    scale constraint with the uncertainty of the scale, so that a program that maps the same photos gets this scale.
 
     Raises:
-        InputError: the map has no two points that three photos see, or its scale's stddev is not known.
+        InputError: the map has no two points that three photos see, or the stddev of its scale is not known.
     """
     model, stddev = map_.reconstruction, map_.relative_scale_stddev
     if stddev is None:
-        raise InputError("the format 'opf' needs the stddev of the scale, which is not known of this model")
+        raise InputError("the format 'opf' needs the stddev of the scale, which is not known for this model")
     names = sorted(image.name for image in model.images.values())
     pairs = _distant_pairs(model)
     point_ids = [point_id for pair in pairs for point_id in pair]
@@ -181,7 +184,7 @@ def write_opf(map_: MetricMap, folder: Path) -> Path:
 
 
 def _project(files: Mapping[str, Any]) -> dict[str, Any]:
-    """What lists the other files; its ids follow from what they hold."""
+    """Return the content of the file that lists the other files. Its ids are hashes of their content."""
     items = []
     for name, content in files.items():
         kind, resource = name.removesuffix(".json"), {"format": content["format"], "uri": name}
@@ -196,7 +199,7 @@ def _file(kind: str, **content: Any) -> dict[str, Any]:
 
 
 def _distant_pairs(model: pycolmap.Reconstruction) -> list[tuple[int, int]]:
-    """Pairs of points that many photos see, far from each other; each point in one pair only."""
+    """Return up to 10 pairs of ids of points that many photos see and that are far apart; no point is in two pairs."""
     seen = sorted(
         (i for i, point in model.points3D.items() if point.track.length() >= _MIN_TRACK_LENGTH),
         key=lambda i: (-model.point3D(i).track.length(), i),
@@ -216,7 +219,7 @@ def _distant_pairs(model: pycolmap.Reconstruction) -> list[tuple[int, int]]:
 
 
 def _uid(name: str) -> int:
-    """64 bits that depend on the photo's name alone."""
+    """Return a 64 bit number that depends only on the name of the photo."""
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 

@@ -1,4 +1,4 @@
-"""PLY: points, cameras and anchors written; whatever else is in such a file carried into another world."""
+"""PLY files: writing points, cameras and anchors, and transforming the vertices of any such file."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Vertices = npt.NDArray[np.void]
 _CODES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _CODES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
 _CODES |= {"uint32": "u4", "float32": "f4", "float64": "f8"}
-_MAX_NUM_DIGITS = 18  # larger numbers are not for a machine's word
+_MAX_NUM_DIGITS = 18  # a number of vertices with more digits does not fit into 64 bits
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _MAX_HEADER_BYTES = 1 << 16
-# Further from the origin, single precision is coarser than a millimetre.
+# In metres. Further from the origin than this, single precision is coarser than a millimetre.
 _MAX_SINGLE = 8192.0
 
 
@@ -44,7 +44,7 @@ def write_cameras(trajectory: Trajectory, path: Path) -> Path:
 
 
 def write_anchors(anchors_m: Mapping[str, Array], path: Path) -> Path:
-    """Write one vertex for each anchor, in the mapping's order; a comment names them."""
+    """Write one vertex for each anchor, in the order of the mapping; a comment in the file names them in this order."""
     xyz = np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3)
     names = " ".join(anchor_id.encode("ascii", "backslashreplace").decode() for anchor_id in anchors_m)
     return _write_vertices(path, xyz, ANCHOR_COLOR, comment=f"anchors {' '.join(names.split())}")
@@ -53,7 +53,10 @@ def write_anchors(anchors_m: Mapping[str, Array], path: Path) -> Path:
 def _write_vertices(
     path: Path, xyz: Array, colors: npt.ArrayLike, normals: Array | None = None, comment: str | None = None
 ) -> Path:
-    """Positions as doubles, so that coordinates far from the origin keep their millimetres; (n, 3) colours or one."""
+    """Write vertices with positions (n, 3), colours (n, 3) or one for all, and perhaps normals (n, 3).
+
+    Positions are written in double precision, because single precision loses millimetres far from the origin.
+    """
     columns: dict[str, npt.NDArray[Any]] = dict(zip("xyz", xyz.T.astype("<f8")))
     if normals is not None:
         columns |= zip(("nx", "ny", "nz"), normals.T.astype("<f4"))
@@ -71,7 +74,15 @@ def _write_vertices(
 
 @dataclass(frozen=True)
 class _Header:
-    """What a PLY file says of itself, with end_header; the encoding is a key of _ORDERS, columns those of vertices."""
+    """Header of a PLY file.
+
+    Attributes:
+        lines: of the header, "end_header" included.
+        num_bytes: length of the header.
+        encoding: a key of ``_ORDERS``.
+        num_vertices: number of vertices.
+        columns: numpy type code of each property of a vertex, by name.
+    """
 
     lines: list[str]
     num_bytes: int
@@ -81,22 +92,26 @@ class _Header:
 
 
 def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
-    """Write the file with its vertices (x, y, z) moved and its normals (nx, ny, nz) turned; the rest stays.
+    """Write a copy of a PLY file with transformed vertices (x, y, z) and turned normals (nx, ny, nz).
+
+    All else is copied unchanged.
 
     Raises:
-        InputError: not a PLY file that begins with vertices, or one of Gaussian splats, whose colours would have to
-            turn as well.
+        InputError: it is not a PLY file that begins with vertices, or it has Gaussian splats, whose colours depend on
+            direction and would have to be turned, too.
     """
     content = path.read_bytes()
     header = _read_header(path, content)
     if "rot_0" in header.columns:
-        raise InputError("Gaussian splats cannot be carried over: train them anew on the metric model", path)
+        raise InputError("Gaussian splats cannot be transformed: train them again on the metric model", path)
     vertices, rest = _split(path, content, header)
     try:
         with overflow_raised():
             written = _moved(vertices, new_from_old)
     except FloatingPointError:
-        raise InputError("the vertices hold infinite numbers, or too large ones", path) from None
+        raise InputError(
+            "some coordinates of vertices are infinite or too large, expected finite numbers", path
+        ) from None
     text = "\n".join(header.lines) + "\n"
     if written.dtype != vertices.dtype:
         text = re.sub(r"^[ \t]*property[ \t].*[ \t]([xyz])[ \t]*$", r"property double \1", text, flags=re.MULTILINE)
@@ -106,7 +121,7 @@ def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
 
 
 def _moved(vertices: Vertices, new_from_old: Similarity) -> Vertices:
-    """Moved and turned; far from the origin in double precision."""
+    """Return transformed vertices. Their coordinates become double precision if they are far from the origin."""
     moved = new_from_old.apply(_vectors(vertices, ("x", "y", "z")))
     is_far, order = np.abs(moved).max(initial=0.0) > _MAX_SINGLE, vertices.dtype[0].byteorder
     names = vertices.dtype.names or ()
@@ -148,7 +163,7 @@ def _read_header(path: Path, content: bytes) -> _Header:
 
 
 def _split(path: Path, content: bytes, header: _Header) -> tuple[Vertices, bytes]:
-    """The vertices, and the bytes of all other elements."""
+    """Return the vertices, and the bytes of all elements after them."""
     kind = np.dtype([(name, _ORDERS[header.encoding] + code) for name, code in header.columns.items()])
     body = content[header.num_bytes :]
     if header.encoding != "ascii":
@@ -171,7 +186,11 @@ def _split(path: Path, content: bytes, header: _Header) -> tuple[Vertices, bytes
 
 
 def _vectors(vertices: Vertices, names: tuple[str, str, str]) -> Array:
-    """(n, 3); NaN stands for no point, infinity for nothing."""
+    """Return three columns of the vertices as (n, 3).
+
+    Raises:
+        FloatingPointError: a number is infinite. NaN is allowed, because programs write it for missing points.
+    """
     values: Array = np.column_stack([vertices[name] for name in names]).astype(np.float64).reshape(-1, 3)
     if np.isinf(values).any():
         raise FloatingPointError("infinite")

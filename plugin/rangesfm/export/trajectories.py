@@ -1,7 +1,7 @@
-"""Trajectories as the TUM RGB-D and the KITTI odometry benchmarks have them, and the covariances of their centres.
+"""Trajectories in the formats of the TUM RGB-D and KITTI odometry benchmarks, and covariances of camera centres.
 
-TUM: ``timestamp tx ty tz qx qy qz qw``; KITTI: the first three rows of world_from_cam, 12 numbers a line. Programs
-refuse lines with more numbers, so the covariances are a table of their own, with a row for each pose.
+A line of TUM is ``timestamp tx ty tz qx qy qz qw``. A line of KITTI has the first three rows of world_from_cam, 12
+numbers. Programs refuse lines with more numbers, so the covariances are in a table of their own, a row for each pose.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from rangesfm.files.atomic import new_file
 from rangesfm.files.tables import write_table
 from rangesfm.geometry.trajectory import Trajectory
 
-# Formats that cannot do without covariances.
+# Formats that need covariances.
 COVARIANCE_FORMATS = ("tum_covariance", "kitti_covariance")
 _TUM_HEADER = "# world_from_cam: timestamp tx ty tz qx qy qz qw (seconds, metres)"
 
 
 def write_trajectory(trajectory: Trajectory, path: Path) -> Path:
-    """Write the poses (world from camera, metres) as TUM's, one line each.
+    """Write the poses (world from camera, metres) in the format of TUM, one line each.
 
-    Without times the first column counts the keyframes from 0, and a comment says so.
+    Where the photos have no times, the first column is the number of the keyframe from 0, and a comment says so.
     """
     header, timestamps_s = _TUM_HEADER, trajectory.timestamps_s
     if timestamps_s is None:
-        header += "\n# the photos have no times: the first column is the keyframe's index, in order of its name"
+        header += "\n# the photos have no times: the first column is the number of the keyframe, in order of its name"
         timestamps_s = np.arange(len(trajectory), dtype=np.float64)
     quaternions = Rotation.from_matrix(trajectory.world_from_cam).as_quat() if len(trajectory) else np.empty((0, 4))
     rows = np.hstack([timestamps_s[:, None], trajectory.centers, quaternions])
@@ -38,7 +38,7 @@ def write_trajectory(trajectory: Trajectory, path: Path) -> Path:
 
 
 def write_kitti(trajectory: Trajectory, path: Path) -> Path:
-    """Write one pose a line (metres), in the order of time; the format has no place for times and names."""
+    """Write one pose per line (metres), in order of time; the format has no room for times or names."""
     poses = np.concatenate([trajectory.world_from_cam, trajectory.centers[:, :, None]], axis=2)
     return _write_numbers(poses.reshape(-1, 12), path)
 
@@ -50,16 +50,16 @@ def _write_numbers(rows: Array, path: Path, formats: str | list[str] = "%.17g", 
 
 
 def write_covariances(map_: MetricMap, path: Path) -> Path:
-    """Write ``image_name,cov_xx_m2,...,cov_zz_m2`` of each projection centre, in the world and order of the poses.
+    """Write ``image_name,cov_xx_m2,...,cov_zz_m2`` of each projection centre, in the world and the order of the poses.
 
     Raises:
-        InputError: the map comes without covariances.
+        InputError: the map has no covariances.
     """
     known, names = map_.center_covariance_m2 or {}, map_.trajectory.image_names
     missing = [name for name in names if name not in known]
     if missing:
         raise InputError(
-            f"there is no pose covariance of {missing[0]}: it takes a refinement, with [refine] covariance"
+            f"there is no pose covariance of {missing[0]}: it needs a refinement with [refine] covariance = true"
         )
     upper = np.array([known[name] for name in names]).reshape(-1, 3, 3)[(slice(None), *np.triu_indices(3))]
     header = ["image_name", *(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))]

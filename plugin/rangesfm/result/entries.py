@@ -265,7 +265,7 @@ def median(values: Array) -> float:
 
 
 class PlaceEntry(Record):
-    """How well the place of the map in the site frame is known; see Place."""
+    """Uncertainty of the map's place in the site frame, with a verdict; see Place."""
 
     verdict: Literal["good", "doubtful"]
     reasons: tuple[Text, ...]
@@ -275,7 +275,7 @@ class PlaceEntry(Record):
 
 
 class RefineEntry(Record):
-    """What the refinement did; see RefineSummary. What was not estimated is null.
+    """Summary of the refinement; see RefineSummary. What was not estimated is null.
 
     Attributes:
         kept: whether the final map is the refined one. Otherwise it is the scaled one.
