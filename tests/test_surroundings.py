@@ -168,7 +168,7 @@ def test_working_folder_that_was_deleted_is_one_line(tmp_path: Path) -> None:
     program = f'rmdir "$PWD"; exec "{sys.executable}" -m rangesfm ranges a'
     done = subprocess.run(["bash", "-c", program], cwd=gone, capture_output=True, check=False)
     assert done.returncode == 2
-    assert done.stderr == b"rangesfm: error: the working folder has been deleted: change to one that is there\n"
+    assert done.stderr == b"rangesfm: error: the working folder has been deleted: change to one that exists\n"
 
 
 def test_too_little_memory_to_begin_with_is_one_line(

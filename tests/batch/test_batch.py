@@ -203,8 +203,8 @@ def test_two_surveys_with_one_folder_are_refused_before_anything_starts(
     ("flags", "said"),
     [
         (["--num_workers", "0"], "argument --num_workers: 0 is less than 1"),
-        (["--memory_limit", "8"], "argument --memory_limit: '8' is no size, expected one as 8GB or 500MB"),
-        (["--scheduler", "tcp://head:8786", "--num_workers", "2"], "--num_workers is of this machine"),
+        (["--memory_limit", "8"], "argument --memory_limit: '8' is not a size, expected one such as 8GB or 500MB"),
+        (["--scheduler", "tcp://head:8786", "--num_workers", "2"], "--num_workers is for this machine"),
         (
             ["--scheduler", "nowhere"],
             "no Dask scheduler answers at 'nowhere' (expected an address like tcp://head:8786)",

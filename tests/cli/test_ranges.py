@@ -18,7 +18,7 @@ def test_faults_and_noise_of_a_log_are_said(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "uwb.csv").write_text("\n".join(["timestamp_s,anchor_id,range_m", *rows]))
     assert main(["ranges", str(tmp_path / "uwb.csv")]) == 0
     text = capsys.readouterr().out
-    assert "1 ranges stand in the log twice" in text
+    assert "1 ranges are in the log twice" in text
     assert "1 ranges are earlier than the one before them" in text
     assert "all ranges are multiples of 0.01 m" in text
     noise_m = float(text.splitlines()[-1].split()[5])

@@ -113,7 +113,7 @@ class TestPlacesInAPlane:
         row = next(number for number, line in enumerate(lines) if line.startswith("A1"))
         heights = sorted([float(lines[row].split()[6]), float(lines[row + 1].split()[3])])
         np.testing.assert_allclose(heights, [-2.5, 4.5], atol=0.01)
-        assert "say which by --side" in lines[row + 1]
+        assert "choose with --side" in lines[row + 1]
         assert positions_in(folder / "a.csv") == {"A1": None, "A2": None}
 
     @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ class TestRefusal:
             (("--time_offset", "nan"), "'nan' is not a time in seconds, expected at most 1e+10 of them"),
             (("--max_interpolation_gap_s", "1e300"), "'1e300' is not a time in seconds"),
             (("--tag_in_cam", "0.1,0,0"), "a lever arm needs the rotations"),
-            (("--side", "left"), "'left' is no side, expected one of above, below"),
+            (("--side", "left"), "'left' is not a side, expected one of above, below"),
             (("--side", "A7=above"), "--side: anchor 'A7' is not in the log (A1, A2)"),
             (("--height", "high"), "'high' is not a height in metres"),
             (("--height", "A1=inf"), "'inf' is not a height in metres"),

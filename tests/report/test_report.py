@@ -424,7 +424,7 @@ def test_photos_of_another_folder_are_on_the_page_only_if_the_reader_says_so(
     summary["settings"]["images"]["path"] = str(mine)
     (folder / "result.json").write_text(json.dumps(summary))
     said = rangesfm_command("report", folder, cwd=tmp_path).stdout
-    assert said.splitlines()[1].startswith(f"without photos: the run had them in {mine}, and not in the folder around")
+    assert said.splitlines()[1].startswith(f"without photos: those of the run are in {mine}, not in the folder around")
     page = folder / "report.html"
     assert "data:image/jpeg" not in page.read_text()
     said = rangesfm_command("report", folder, "--images", mine, cwd=tmp_path).stdout

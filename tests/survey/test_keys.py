@@ -134,7 +134,7 @@ def test_flags_have_values_of_their_keys_type(flags: list[str], key: str, value:
 
 def test_a_flag_for_options_of_colmap_that_is_no_table_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--features", "max_image_size"]) == 2
-    assert "is no table of TOML, expected as max_image_size=1200" in capsys.readouterr().err
+    assert "is not a list of options, expected as max_image_size=1200" in capsys.readouterr().err
 
 
 def test_options_are_checked_wherever_they_are_made() -> None:

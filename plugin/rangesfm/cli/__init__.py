@@ -1,4 +1,4 @@
-"""The command line: the only place that prints, and the one place where errors end."""
+"""The command line. It alone prints, and it turns all errors into messages and exit statuses."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from rangesfm.cli.terminal import terminal_progress
 from rangesfm.errors import INTERNAL_ERROR, InputError, failure_of, one_line
 from rangesfm.processes.threads import settle_num_threads
 
-_BROKEN_PIPE = 141  # as shells have it
+_BROKEN_PIPE = 141  # exit status after a broken pipe, the one that shells use
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return its exit status. Only this function turns errors into messages."""
-    # numpy's and scipy's matrices are small here: threads make them slower, and many times so beside other work.
+    """Run one command and return its exit status. Only this function turns errors into messages."""
+    # The matrices that numpy and scipy get here are small. Threads make them slower, much slower beside other work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # COLMAP's log would go to the terminal and to files in the system's temporary folder. Where it is wanted, it is
-    # turned on for so long (rangesfm.colmap.log); what fails is told by whoever called COLMAP.
+    # COLMAP's log would go to the terminal and to files in the temporary folder of the system. Where it is wanted, it
+    # is turned on for a while (rangesfm.colmap.log). Code that calls COLMAP reports its failures itself.
     os.environ.setdefault("GLOG_minloglevel", "3")
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # whatever the locale, a name that it cannot spell is no failure
+        if isinstance(stream, io.TextIOWrapper):  # a name that the locale cannot encode must not be an error
             stream.reconfigure(errors="backslashreplace")
     try:
         try:
             os.getcwd()
         except FileNotFoundError:
-            raise InputError("the working folder has been deleted: change to one that is there") from None
+            raise InputError("the working folder has been deleted: change to one that exists") from None
         settle_num_threads()
         try:
             args = parse(normalize(sys.argv[1:] if argv is None else argv))
-        except SystemExit as ended:  # --help, which is printed, and --version, which is not
+        except SystemExit as ended:  # by --help, which has printed its text, or by --version, which has not
             _print([ended.code] if isinstance(ended.code, str) else [])
             return 0
-        if args.command != "doctor":  # which says more
+        if args.command != "doctor":  # doctor reports on the versions in more detail
             from rangesfm.installed_versions import check_versions
 
             check_versions()
-        # There is no sys.stderr where the shell closed it.
+        # sys.stderr is None where the shell has closed it.
         with _sigterm_as_ctrl_c(), terminal_progress(sys.stderr or io.StringIO(), quiet=args.quiet) as progress:
             outcome: Outcome = args.execute(args, progress)
         _print(outcome.lines)
         return outcome.status
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it exits
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # otherwise Python complains when it exits
         return _BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
         failure = failure_of(error)
@@ -62,23 +62,23 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _print(texts: Sequence[str]) -> None:
-    """Texts of one or several lines, as a table is, behind whatever else was printed."""
+    """Print texts, each of one line or several, on standard output."""
     try:
         print("".join(f"{one_line(line)}\n" for text in texts for line in text.split("\n")), end="", flush=True)
     except BrokenPipeError:
         raise
     except OSError as error:
         error.filename = "standard output"
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python tries again when it exits, and complains
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # otherwise Python tries again when it exits, and complains
         raise
 
 
 @contextmanager
 def _sigterm_as_ctrl_c() -> Iterator[None]:
-    """Have SIGTERM end what is done inside the block as Ctrl-C does.
+    """Make SIGTERM end the work inside the block as Ctrl-C does.
 
-    pycolmap and pyceres, once they are imported, take it for a crash and print a stack trace. So it is blocked, which
-    keeps it from any handler; a thread waits for it and calls Python's.
+    Once pycolmap and pyceres are imported, they treat SIGTERM as a crash and print a stack trace. So the signal is
+    blocked, which keeps it from all handlers. A thread waits for it and calls Python's own handler.
     """
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield

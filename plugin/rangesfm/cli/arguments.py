@@ -1,4 +1,4 @@
-"""How arguments are read: the parser of all commands, and names in either spelling."""
+"""Reading of arguments: the parser of all commands, and option names in both spellings."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from typing import Any, NoReturn
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
-# In the order of the help.
+# Modules with commands, in the order in which the help lists the commands.
 _MODULES = ("begin", "stages", "batch", "planning", "results", "ranges", "doctor")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command ends with: lines to print, and its exit status."""
+    """End of a command: lines to print, and the exit status."""
 
     lines: Sequence[str]
     status: int = 0
@@ -30,11 +30,16 @@ Execute = Callable[[argparse.Namespace, Progress], Outcome]
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises InputError where argparse would print its usage and exit; has some arguments only once it reads."""
+    """Parser that raises InputError where argparse would print its usage and exit.
+
+    Attributes:
+        later: functions that add arguments to this parser when it is first used. The parsers of all commands are made
+            on each run, but only one is used, and some arguments are slow to make.
+    """
 
     def __init__(self, **options: Any):
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options)
-        self.later: list[Callable[[Parser], None]] = []  # what adds arguments when this parser is the one that reads
+        self.later: list[Callable[[Parser], None]] = []
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         while self.later:
@@ -45,15 +50,16 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message} (see {self.prog} --help)")
 
     def nearest_option(self, name: str) -> str | None:
-        """The known long option that is spelt most like ``name``."""
+        """Return the known long option that is spelt most like ``name``; None if none is similar."""
         return next(iter(difflib.get_close_matches(name, self._option_string_actions, 1)), None)
 
 
 class Commands:
-    """All commands, each described by the file that does it, and the parser of the whole command line.
+    """All commands, each described by its own module, and the parser of the whole command line.
 
     Attributes:
-        by_name: the parser of each, in the order of the help.
+        parser: of the whole command line.
+        by_name: parser of each command, in the order of the help.
     """
 
     def __init__(self) -> None:
@@ -61,7 +67,7 @@ class Commands:
             prog="rangesfm",
             description="Metric COLMAP models from photos and ultra-wideband ranges.",
             epilog="example:\n  rangesfm demo\n\n"
-            "rangesfm COMMAND --help explains each; options may be spelt with _ or -.",
+            "rangesfm COMMAND --help explains a command. Options may be spelt with _ or -.",
         )
         self.parser.add_argument("--version", action=_PrintVersion)
         self._subparsers = self.parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
@@ -70,7 +76,13 @@ class Commands:
             import_module(f"rangesfm.cli.{module}").add_commands(self)
 
     def add(self, name: str, execute: Execute, help: str) -> Parser:
-        """A new command, with the options that all of them have. What it does, and an example, says its docstring."""
+        """Add a command and return its parser, with the options that all commands have.
+
+        Args:
+            name: of the command; it may have two words.
+            execute: function that runs it. Its docstring is the description and the example in the help.
+            help: one line for the list of commands.
+        """
         description, _, example = inspect.cleandoc(execute.__doc__ or "").partition("\n\nexample:")
         parser: Parser = self._subparsers.add_parser(
             name,
@@ -85,9 +97,9 @@ class Commands:
 
 
 def normalize(argv: Sequence[str]) -> list[str]:
-    """Option names in snake case, and values that begin with a minus sign joined to their option.
+    """Return arguments with option names in snake case, and values with a minus sign joined to their option.
 
-    ``--tag-in-cam -0.1,0,0`` becomes ``--tag_in_cam=-0.1,0,0``, which argparse cannot take for an option.
+    ``--tag-in-cam -0.1,0,0`` becomes ``--tag_in_cam=-0.1,0,0``, because argparse would take the value for an option.
     """
     arguments: list[str] = []
     for position, argument in enumerate(argv):
@@ -107,12 +119,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     """Read normalised arguments.
 
     Raises:
-        InputError: an unknown command or option, naming the nearest known one, or a bad value.
-        SystemExit: after ``--help``; for ``--version`` with what is to be printed.
+        InputError: an unknown command or option (the text names the nearest known one), or a bad value.
+        SystemExit: after ``--help``, which has printed its text; for ``--version``, with the text to print.
     """
     commands = Commands()
     args: argparse.Namespace
-    two = " ".join(argv[:2])  # a command of two words is one to argparse
+    two = " ".join(argv[:2])  # argparse needs a command of two words as one argument
     args, unknown = commands.parser.parse_known_args([two, *argv[2:]] if two in commands.by_name else list(argv))
     if not hasattr(args, "command"):
         commands.parser.error("a command is missing, expected one of " + ", ".join(commands.by_name))

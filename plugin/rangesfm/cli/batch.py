@@ -1,4 +1,4 @@
-"""``rangesfm batch``: many surveys, on the cores of this machine or on a cluster, and what is seen of them."""
+"""The command ``batch``: many surveys, on this machine or on a cluster, and their progress on the terminal."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rangesfm.batch.course import Course, SurveyState
 
 
-# Each survey has its own photos and output; threads are what the workers share.
+# Keys without a flag here: each survey has its own photos and output, and the workers share the threads.
 _OF_A_SURVEY = ("images.path", "images.times", "mapper.num_threads", "output.path")
 _BYTES_PER_UNIT = {"mb": 10**6, "gb": 10**9, "mib": 1 << 20, "gib": 1 << 30}
 _INTERVAL_S = 0.2
@@ -29,37 +29,43 @@ _MAX_NUM_LINES = 20
 
 
 def add_commands(commands: Commands) -> None:
-    parser = commands.add("batch", execute, "many surveys at once, on this machine or on a cluster")
+    parser = commands.add("batch", execute, "run many surveys at once, on this machine or on a cluster")
     parser.add_argument(
         "surveys", nargs="+", metavar="SURVEY.toml", help="survey files, each with its own [output] path"
     )
-    parser.add_argument("--output_path", default="batch", metavar="FOLDER", help="of the table (default: batch)")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a Dask scheduler, as tcp://head:8786")
     parser.add_argument(
-        "--num_workers", type=_at_least_1, metavar="N", help="surveys at once (default: by cores and memory)"
+        "--output_path", default="batch", metavar="FOLDER", help="folder of the tables and the page (default: batch)"
+    )
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, such as tcp://head:8786")
+    parser.add_argument(
+        "--num_workers", type=_at_least_1, metavar="N", help="surveys run at once (default: by cores and memory)"
     )
     parser.add_argument(
-        "--num_threads", type=_at_least_1, metavar="N", help="of each survey (default: the cores over the workers)"
+        "--num_threads", type=_at_least_1, metavar="N", help="threads per survey (default: cores divided by workers)"
     )
     parser.add_argument(
-        "--memory_limit", type=_bytes, metavar="SIZE", help="of each survey, as 8GB (default: its share)"
+        "--memory_limit",
+        type=_bytes,
+        metavar="SIZE",
+        help="memory per survey, such as 8GB (default: memory divided by workers)",
     )
     add_restart_argument(parser)
     add_flags(parser, without=_OF_A_SURVEY)
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Run many surveys, each as rangesfm run would. One that fails does not stop the others. What became of
+    """Run many surveys, each as rangesfm run does. A survey that fails does not stop the others. The outcome of
     each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.
 
-    Without --scheduler the workers are processes of this machine, which share its cores and memory. With
-    it they are those of a Dask scheduler; they must have this version of rangesfm installed and see the
-    surveys' files under the same paths. Each should do one survey at a time:
+    Without --scheduler, the workers are processes of this machine, which share its cores and memory. With it,
+    they are the workers of a Dask scheduler. These must have this version of rangesfm installed, and find the
+    files of the surveys under the same paths. Each worker should run one survey at a time:
       dask scheduler --host HEAD
       dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard       # on each machine
-    On Slurm, PBS and the like dask-jobqueue starts them, on Kubernetes dask-kubernetes: see examples/many_surveys.md.
+    dask-jobqueue starts workers on Slurm, PBS and similar, dask-kubernetes on Kubernetes: see
+    examples/many_surveys.md.
 
-    Exit status: 0 all done; otherwise the largest of the statuses that rangesfm run would have had.
+    Exit status: 0 if all are done; otherwise the largest exit status of rangesfm run among the surveys.
 
     example:
       rangesfm batch surveys/*.toml --output_path batch
@@ -67,7 +73,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm batch surveys/*.toml --scheduler tcp://head:8786 --num_threads 8
     """
     if args.scheduler is not None and args.num_workers is not None:
-        raise InputError("--num_workers is of this machine: with --scheduler, those that run there count")
+        raise InputError("--num_workers is for this machine only: leave it out with --scheduler")
     try:
         import distributed  # noqa: F401
     except ImportError:
@@ -100,12 +106,12 @@ def _at_least_1(text: str) -> int:
 def _bytes(text: str) -> int:
     found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([MG]i?B)", text, re.IGNORECASE)
     if found is None or float(found[1]) == 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is no size, expected one as 8GB or 500MB")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a size, expected one such as 8GB or 500MB")
     return int(float(found[1]) * _BYTES_PER_UNIT[found[2].lower()])
 
 
 class BatchTerminal:
-    """Writes the course of a batch to ``stream``."""
+    """Listener that writes the progress of a batch to ``stream``."""
 
     def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
         self._screen = Screen(stream, quiet=quiet)
@@ -115,7 +121,7 @@ class BatchTerminal:
         self._num_over = 0
 
     def show(self, course: Course) -> None:
-        """Say what is new, and on a terminal draw again what is going on."""
+        """Print what is new, and on a terminal draw the running surveys again."""
         new = self._news(course)
         now = self._clock()
         if new or course.is_over:
@@ -128,7 +134,7 @@ class BatchTerminal:
         self._screen.say([text])
 
     def _news(self, course: Course) -> list[str]:
-        """Lines on the surveys of which there is something to say that has not been said."""
+        """Return new lines about surveys: each survey that has ended, and off a terminal also each stage."""
         lines = []
         for index, state in enumerate(course.states):
             line = _ended(state) if state.row.status.is_final else "" if self._screen.is_terminal else _stage(state)

@@ -1,4 +1,4 @@
-"""The commands before a first run: ``init`` and ``check``."""
+"""The commands that come before a first run: ``init`` and ``check``."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    init = commands.add("init", _init, "a survey file from folders of photos and logs")
-    init.add_argument("folders", nargs="+", metavar="FOLDER", help="where photos, log, anchors, ... are")
+    init = commands.add("init", _init, "write a survey file from folders of photos and logs")
+    init.add_argument("folders", nargs="+", metavar="FOLDER", help="folders with photos, log, anchors, ...")
     init.add_argument("--output_path", metavar="PATH", help="survey file, or its folder (default: the first FOLDER)")
     add_flags(init, without=("output.path",))
-    check = commands.add("check", _check, "what a run would work with, and what is wrong with it, in seconds")
+    check = commands.add("check", _check, "say in seconds what a run would read, and what is wrong with it")
     add_survey_arguments(check)
 
 
 def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Look into folders for photos, the radio's log, anchors, times, calibration and truth (each file by what it
-    holds), and write a survey file that runs, with comments. Says what was understood, assumed and what is missing;
-    flags say what it cannot find. An existing file is left as it is.
+    """Look into folders for photos, the radio's log, anchors, times, calibration and true positions, and write a
+    survey file with comments that can be run. Files are recognised by their content. Prints what was understood,
+    what is assumed and what is missing. Flags give what the folders do not hold. An existing file is not changed.
 
     example:
       rangesfm init my_survey --tag_in_cam 0.03,-0.12,-0.05
@@ -52,7 +52,7 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     if os.path.lexists(path):
         raise InputError("is there already and is left as it is; --output_path PATH writes another", path)
     understood = understand(folders, overrides_from_arguments(args))
-    understood.survey()  # refuses values that are none, before anything is written
+    understood.survey()  # raises an error about bad values before anything is written
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
     write_text(survey_text({**understood.values, "output.path": free_output(folder)}, folder), path)
@@ -64,8 +64,8 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _check(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Read all that a run would read and say what it is, what is assumed and what is wrong: photos or model, times,
-    ranges, anchors, camera, reference. Takes seconds and writes nothing.
+    """Read everything that a run would read (photos or model, times, ranges, anchors, camera, reference), and print
+    what it is, what is assumed and what is wrong. Takes seconds and writes nothing.
 
     example:
       rangesfm check survey.toml
@@ -77,7 +77,7 @@ def _check(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def told(checked: CheckedSurvey, *, fault: str) -> list[str]:
-    """A line for each finding; faults are called as the command has it."""
+    """Return a line for each finding. ``fault`` is the word with which lines about faults begin."""
     return [
         *checked.understood(),
         *(f"warning: {text}" for text in checked.warnings),

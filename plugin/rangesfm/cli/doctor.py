@@ -1,4 +1,4 @@
-"""``rangesfm doctor``: do the parts fit together."""
+"""The command ``doctor``, which checks that all parts of the installation fit together."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from rangesfm.progress import Progress
 
 
 def add_commands(commands: Commands) -> None:
-    commands.add("doctor", execute, "versions, and whether the compiled part fits them")
+    commands.add("doctor", execute, "check the installation: versions, and whether the compiled part fits them")
 
 
 def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Check versions, threads, and that the compiled part shares its types with pycolmap and pyceres.
+    """Check versions and threads, and that the compiled part shares its types with pycolmap and pyceres.
 
     example:
       rangesfm doctor

@@ -1,4 +1,4 @@
-"""The command before going out: ``plan``."""
+"""The command ``plan``, for the time before a survey."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from rangesfm.progress import Progress
 
 
 def add_commands(commands: Commands) -> None:
-    plan = commands.add("plan", _plan, "before going out: what a survey will know, and what to change")
-    plan.add_argument("plan", nargs="?", metavar="PLAN.toml", help="anchors, path and radio")
-    plan.add_argument("--from", dest="result", metavar="RESULT", help="the same for another survey like a finished one")
-    plan.add_argument("--output_path", metavar="FOLDER", help="write plan.json and plan.html there")
+    plan = commands.add("plan", _plan, "say before a survey how accurate it will be, and what to change")
+    plan.add_argument("plan", nargs="?", metavar="PLAN.toml", help="file with anchors, path and radio")
+    plan.add_argument("--from", dest="result", metavar="RESULT", help="plan another survey like this finished one")
+    plan.add_argument("--output_path", metavar="FOLDER", help="write plan.json and plan.html into this folder")
 
 
 def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """What a run of a survey would state before a range is measured: how well the scale and the place of the map
-    will be known, which mistakes would be found, and which change of anchors, path or radio would gain most.
+    """Compute what a run of a survey would say, before any range is measured: how accurately the scale and the place
+    of the map will be known, which mistakes would be found, and which change of anchors, path or radio would help
+    most.
 
     example:
       rangesfm plan plan.toml --output_path plan
       rangesfm plan --from out
     """
     if (args.plan is None) == (args.result is None):
-        raise InputError("expected either a plan's file or --from RESULT")
+        raise InputError("expected either the file of a plan or --from RESULT")
     from rangesfm.files.atomic import require_apart
     from rangesfm.planning.placement import place_anchors
     from rangesfm.planning.settings import read_plan

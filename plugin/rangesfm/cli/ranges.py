@@ -1,4 +1,4 @@
-"""The commands about a radio's log alone: ``ranges``, ``ranges calibrate`` and ``trilaterate``."""
+"""The commands about a radio log alone: ``ranges``, ``ranges calibrate`` and ``trilaterate``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _Value = TypeVar("_Value")
 
-# As of the times in a survey file.
+# Largest time in seconds, the same as for times in a survey file.
 _MAX_TIME_S = 1e10
 
 _LOG_KEYS = (
@@ -45,51 +45,56 @@ _TOWARD = {
 
 
 def add_commands(commands: Commands) -> None:
-    ranges = commands.add("ranges", _ranges, "what is in a radio log; writes it as canonical CSV")
+    ranges = commands.add("ranges", _ranges, "print what is in a radio log, and write it as canonical CSV")
     _add_log_arguments(ranges)
-    ranges.add_argument("--anchors", metavar="CSV", help="who is an anchor, to tell ranges between two of them")
-    ranges.add_argument("--output_path", metavar="CSV", help="write the ranges there")
-    ranges.add_argument("--plot", metavar="FILE", help="draw the ranges over time there (PNG or SVG)")
+    ranges.add_argument("--anchors", metavar="CSV", help="file of anchors, by which ranges between anchors are known")
+    ranges.add_argument("--output_path", metavar="CSV", help="write the ranges to this file")
+    ranges.add_argument("--plot", metavar="FILE", help="draw the ranges over time into this file (PNG or SVG)")
     calibrate = commands.add(
-        "ranges calibrate", _calibrate, "the error curve of a radio, from a log with known tag positions"
+        "ranges calibrate", _calibrate, "learn the error curve of a radio from a log with known tag positions"
     )
     _add_log_arguments(calibrate)
-    calibrate.add_argument("--anchors", required=True, metavar="CSV", help="anchor_id,x_m,y_m,z_m: surveyed")
+    calibrate.add_argument("--anchors", required=True, metavar="CSV", help="surveyed anchors: anchor_id,x_m,y_m,z_m")
     _add_position_arguments(calibrate, max_interpolation_gap_s=0.2)
-    calibrate.add_argument("--output_path", required=True, metavar="CSV", help="write the curve there")
-    calibrate.add_argument("--plot", metavar="FILE", help="draw the curve and the ranges' errors there (PNG or SVG)")
-    trilaterate = commands.add("trilaterate", _trilaterate, "anchor positions from ranges at known tag positions")
+    calibrate.add_argument("--output_path", required=True, metavar="CSV", help="write the curve to this file")
+    calibrate.add_argument(
+        "--plot", metavar="FILE", help="draw the curve and the errors of the ranges into this file (PNG or SVG)"
+    )
+    trilaterate = commands.add("trilaterate", _trilaterate, "find anchor positions from ranges at known tag positions")
     _add_log_arguments(trilaterate)
     _add_position_arguments(trilaterate, max_interpolation_gap_s=0.5)
     _add_estimate_arguments(trilaterate)
     trilaterate.add_argument(
-        "--output_path", metavar="CSV", help="write the anchors there, for --anchors of other commands"
+        "--output_path", metavar="CSV", help="write the anchors to this file, for --anchors of other commands"
     )
 
 
 def _add_log_arguments(parser: Parser) -> None:
-    """The log and how it is written."""
+    """Add the arguments that name a log and its format."""
     parser.add_argument(
-        "log", nargs="+", metavar="LOG", help="the radio's log; a folder or several files: one an anchor"
+        "log",
+        nargs="+",
+        metavar="LOG",
+        help="the radio's log: a file, or a folder or several files, one for each anchor",
     )
     add_flags(parser, *_LOG_KEYS, by_own_names=True)
 
 
 def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -> None:
-    """The file of known positions of the tag and how it belongs to the log."""
+    """Add the arguments about the known positions of the tag and how they belong to the log."""
     parser.add_argument(
         "--positions",
         required=True,
         metavar="FILE",
-        help="where the tag was, in the anchors' frame: CSV timestamp_s (or image_name, with ranges by name),"
-        "x_m,y_m,z_m[,qx,qy,qz,qw], or a TUM trajectory",
+        help="known positions of the tag in the frame of the anchors: CSV timestamp_s (or image_name, where the log "
+        "names photos),x_m,y_m,z_m[,qx,qy,qz,qw], or a TUM trajectory",
     )
     parser.add_argument(
         "--tag_in_cam",
         type=position,
         default=(0.0, 0.0, 0.0),
         metavar="X,Y,Z",
-        help="the antenna in the frame whose poses are given, metres (default: they are the antenna's)",
+        help="position of the tag's antenna in the frame whose poses are given, metres (default: 0,0,0)",
     )
     parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
     parser.add_argument(
@@ -100,7 +105,8 @@ def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -
         type=_seconds,
         default=max_interpolation_gap_s,
         metavar="S",
-        help=f"between known positions further apart none is interpolated (default: {max_interpolation_gap_s:g})",
+        help="longest time between known positions between which positions are interpolated "
+        f"(default: {max_interpolation_gap_s:g})",
     )
 
 
@@ -110,26 +116,28 @@ def _add_estimate_arguments(parser: Parser) -> None:
         type=_side,
         default={},
         metavar="WORD|ID=WORD,..",
-        help=f"of two possible places the one that lies {', '.join(_TOWARD)}; for all anchors or for each",
+        help=f"which of two possible places is right: {', '.join(_TOWARD)}; for all anchors or for each",
     )
     parser.add_argument(
         "--height",
         type=_heights,
         default={},
         metavar="M|ID=M,..",
-        help="z of all anchors or of each, where it is known: then the positions may lie in a level plane",
+        help="known z of all anchors or of each; with it, the positions may be in a level plane",
     )
     add = parser.add_argument_group("estimate").add_argument
-    add("--range_stddev_m", type=_positive, metavar="M", help="noise of a range (default: estimated)")
-    add("--range_bias_m", type=float, default=0.0, metavar="M", help="what ranges read too long")
-    uncertain = "how uncertain that is; 0 fixes it (default: 0.25)"
+    add("--range_stddev_m", type=_positive, metavar="M", help="standard deviation of a range (default: estimated)")
+    add(
+        "--range_bias_m", type=float, default=0.0, metavar="M", help="bias of the ranges, positive if they are too long"
+    )
+    uncertain = "standard deviation of the bias; 0 fixes it (default: 0.25)"
     add("--range_bias_stddev_m", type=_not_negative, default=0.25, metavar="M", help=uncertain)
-    refused = "an anchor less certain than this in any direction is refused (default: 1)"
+    refused = "largest accepted standard deviation of an anchor's position in any direction (default: 1)"
     add("--max_position_stddev_m", type=_positive, default=1.0, metavar="M", help=refused)
 
 
 def _by_anchor(text: str) -> dict[str, str]:
-    """Words by anchor; by the empty id the word for all others."""
+    """Return the words of a flag by anchor id; the empty id has the word for all other anchors."""
     return {anchor_id: word for anchor_id, _, word in (part.strip().rpartition("=") for part in text.split(","))}
 
 
@@ -137,7 +145,7 @@ def _side(text: str) -> dict[str, Sequence[float]]:
     sides = _by_anchor(text)
     for word in sides.values():
         if word not in _TOWARD:
-            raise argparse.ArgumentTypeError(f"'{word}' is no side, expected one of {', '.join(_TOWARD)}")
+            raise argparse.ArgumentTypeError(f"'{word}' is not a side, expected one of {', '.join(_TOWARD)}")
     return {anchor_id: _TOWARD[word] for anchor_id, word in sides.items()}
 
 
@@ -172,7 +180,11 @@ def _number_of(text: str, is_good: Callable[[float], bool], what: str) -> float:
 
 
 def _require_apart(args: argparse.Namespace, *inputs: str | Path | None) -> None:
-    """Raise InputError if the command would write to the log or to another file that it reads."""
+    """Check that the command writes to no file that it reads.
+
+    Raises:
+        InputError: it would overwrite the log or another input.
+    """
     from rangesfm.files.atomic import require_apart
 
     read = [Path(path) for path in (*args.log, *inputs) if path is not None]
@@ -182,14 +194,14 @@ def _require_apart(args: argparse.Namespace, *inputs: str | Path | None) -> None
 
 
 def _read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> RangeLog:
-    """The log that the arguments name; ``anchor_ids`` as for ``read_ranges``."""
+    """Read the log that the arguments name; ``anchor_ids`` as in ``read_ranges``."""
     from rangesfm.survey.inputs import read_log
 
     return read_log(survey_from_arguments(args).ranges.changed(path=Path(args.log[0])), anchor_ids, files=args.log)
 
 
 def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
-    """The log, of one tag, and (n, 3) where that was at each of the ranges; NaN: not known."""
+    """Read the n ranges of one tag, and return them with the position of the tag at each, (n, 3); NaN if unknown."""
     from rangesfm.geometry.reference import read_reference
     from rangesfm.ranging.association import tag_positions
     from rangesfm.survey.inputs import of_one_tag
@@ -200,8 +212,8 @@ def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
 
 
 def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
-    r"""Print what is in a radio log, and write it as canonical CSV. The noise is how far ranges are off a smooth curve
-    through their neighbours.
+    r"""Print what is in a radio log, and write it as canonical CSV. The noise is the scatter of ranges about a smooth
+    curve through their neighbours in time.
 
     example:
       rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \
@@ -231,7 +243,7 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _notes_of(log: RangeLog) -> list[str]:
-    """What was assumed of it."""
+    """Return lines that say what was assumed when the log was read."""
     return [f"note    {note}" for note in log.notes]
 
 
@@ -243,12 +255,12 @@ def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
     for pair in summary.pairs:
         between[pair.kind.split("-")[0]] += pair.num
     notes = {
-        f"{summary.num_duplicates} ranges stand in the log twice": summary.num_duplicates,
+        f"{summary.num_duplicates} ranges are in the log twice": summary.num_duplicates,
         f"{summary.num_out_of_order} ranges are earlier than the one before them": summary.num_out_of_order,
         **{f"{num} ranges are between two {end}s": num for end, num in between.items()},
         f"all ranges are multiples of {step_m} m: rounded": step_m,
     }
-    # The noise only where there are enough ranges to tell it.
+    # The noise is known only where an anchor has enough ranges.
     has_noise = any(anchor.noise_stddev_m is not None for anchor in summary.anchors)
     rows = [["anchor", *_LENGTHS, *(["noise m"] if has_noise else []), "largest gap s"]]
     for anchor in summary.anchors:
@@ -271,7 +283,7 @@ def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
 def _places(anchors: Sequence[Anchor]) -> list[str]:
     known = [(anchor.anchor_id, anchor.position_m) for anchor in anchors if anchor.position_m is not None]
     rows = (f"  {anchor_id}  " + "  ".join(f"{value:.3f}" for value in place) for anchor_id, place in known)
-    return ["", "the log tells where anchors stand (x, y, z in metres):", *rows] if known else []
+    return ["", "positions of anchors in the log (x, y, z in metres):", *rows] if known else []
 
 
 def _time(summary: RangeSummary) -> str:
@@ -291,9 +303,9 @@ def _number(value: float | None) -> str:
 
 
 def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
-    r"""Learn by how much a radio reads long or short at each distance, from a log whose tag positions are known (a
-    total station, motion capture) and surveyed anchors. run, batch, init, check, scale, refine and compare take the
-    file that this writes as --error_curve; in a survey file it is error_curve in [ranges].
+    r"""Learn how much too long or too short a radio measures at each distance, from a log with known tag positions (by
+    total station or motion capture) and surveyed anchors. The commands run, batch, init, check, scale, refine and
+    compare take the file that this writes as --error_curve; in a survey file it is error_curve in [ranges].
 
     example:
       rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \
@@ -338,9 +350,9 @@ def _calibrated(calibration: Calibration, num_in_log: int) -> list[str]:
 
 
 def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Find where anchors stand from ranges that were taken at known positions of the tag, robustly. If these lie in a
-    plane, an anchor has two possible places, one on each side: --side says which. Where --height says how high it
-    stands, only x and y are sought, and positions in a level plane do.
+    """Estimate the positions of anchors robustly, from ranges taken at known positions of the tag. If these positions
+    are in a plane, an anchor has two possible places, one on each side of the plane; --side says which one is right.
+    If --height gives the height of an anchor, only x and y are estimated, and positions in a level plane are enough.
 
     example:
       rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv
@@ -374,7 +386,11 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _of_anchors(flag: str, given: dict[str, _Value], log: RangeLog) -> dict[str, _Value]:
-    """What was given for each anchor of the log, or for all others by the empty id."""
+    """Return what a flag gives for each anchor of the log: its own value, or that of the empty id.
+
+    Raises:
+        InputError: the flag names an anchor that is not in the log.
+    """
     for anchor_id in given:
         if anchor_id and anchor_id not in log.anchor_ids:
             raise InputError(f"{flag}: anchor '{anchor_id}' is not in the log ({', '.join(log.anchor_ids)})")
@@ -399,7 +415,7 @@ def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
         notes.append("")
         if found.mirror_position_m is not None:
             rows.append(("", "", "or", *map(_number, found.mirror_position_m), "", "", ""))
-            notes.append("  (on the other side of the tag's positions: say which by --side)")
+            notes.append("  (on the other side of the tag's positions; choose with --side)")
     num_known = sum(placement.num_ranges for placement in placements)
     return [
         f"{num_known} of {len(log)} ranges are at known positions of the tag",

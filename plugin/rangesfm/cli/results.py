@@ -1,4 +1,4 @@
-"""The commands that take what runs left: ``export``, ``compare`` and ``report``."""
+"""The commands that work on results of runs: ``export``, ``compare`` and ``report``."""
 
 from __future__ import annotations
 
@@ -20,40 +20,46 @@ _WITHOUT_LOG = ("--distances", "--markers")
 
 
 def add_commands(commands: Commands) -> None:
-    export = commands.add("export", _export, "metric model to other formats")
+    export = commands.add("export", _export, "write the metric model in other formats")
     _add_result_argument(export)
     add_flags(export, "export", by_own_names=True)
     export.add_argument(
         "--apply_to",
         nargs="+",
         metavar="FILE",
-        help="carry these, made from the unscaled model, over instead: PLY, OBJ, camera JSON, COLMAP folders",
+        help="instead, transform these files, made from the unscaled model, into the metric frame: PLY, OBJ, camera "
+        "JSON, COLMAP folders",
     )
     export.add_argument(
-        "--images", type=Path, metavar="FOLDER", help="the photos (default: the run's, beside the result)"
+        "--images",
+        type=Path,
+        metavar="FOLDER",
+        help="folder of the photos (default: that of the run, beside the result)",
     )
-    export.add_argument("--output_path", metavar="FOLDER", help="where to (default: the result folder)")
-    compare = commands.add("compare", _compare, "models with each other and with a reference")
+    export.add_argument("--output_path", metavar="FOLDER", help="folder to write to (default: the result folder)")
+    compare = commands.add("compare", _compare, "compare models with each other and with a reference")
     compare.add_argument("models", nargs="*", metavar="MODEL", help="result folders, COLMAP models, CSV or TUM files")
     compare.add_argument("--input_path", metavar="RESULT", help="one result folder (default: out)")
     compare.add_argument("--reference", type=Path, metavar="FILE", help="true positions: CSV or TUM")
-    compare.add_argument("--output_path", metavar="FOLDER", help="of two or more: write comparison.html there as well")
+    compare.add_argument(
+        "--output_path", metavar="FOLDER", help="for two models or more: also write comparison.html to this folder"
+    )
     add_flags(compare, *_COMPARE_KEYS, without=_OF_A_RUN)
-    report = commands.add("report", _report, "result folder to one self-contained HTML page")
+    report = commands.add("report", _report, "write a result folder as one self-contained HTML page")
     _add_result_argument(report)
     report.add_argument(
         "--images",
         type=Path,
         metavar="FOLDER",
-        help="the photos, for thumbnails (default: the run's, beside the result)",
+        help="folder of the photos, for thumbnails (default: that of the run, beside the result)",
     )
-    report.add_argument("--png", action="store_true", help="write the figures for a paper too, as PNG and SVG")
+    report.add_argument("--png", action="store_true", help="also write the figures as PNG and SVG files")
 
 
 def _add_result_argument(parser: Parser) -> None:
-    """The result folder, by place or as ``--input_path``."""
+    """Add the argument of the result folder, as a positional argument or as ``--input_path``."""
     parser.add_argument("result", nargs="?", metavar="RESULT", help="output folder of a run (default: out)")
-    parser.add_argument("--input_path", metavar="RESULT", help="the same")
+    parser.add_argument("--input_path", metavar="RESULT", help="the same as RESULT")
 
 
 def _result_path(args: argparse.Namespace) -> Path:
@@ -63,7 +69,7 @@ def _result_path(args: argparse.Namespace) -> Path:
 
 
 def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Write the metric model of a result folder in other formats; an unknown one lists them all.
+    """Write the metric model of a result folder in other formats. An unknown format prints the list of all.
 
     example:
       rangesfm export out --formats tum,ply,nerfstudio --frame level --output_path exported
@@ -80,31 +86,31 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
             raise InputError("--apply_to writes files in their own formats: leave out --formats")
         destination = Path(args.output_path or source / "applied")
         written, residual_m = apply_result(source, list(map(Path, args.apply_to)), destination, options=options)
-        note = f"cameras of the refined map are {residual_m:.3f} m (rms) from where the similarity puts them"
+        note = f"the similarity fits the cameras to {residual_m:.3f} m (rms): the refinement has bent the map"
         notes = [note] if residual_m else []
     return Outcome([*map(str, written), *_frame_note(options, source), *notes])
 
 
 def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
-    """Where up came from, if it was asked for: nobody can see it in the files."""
+    """Return a line that says which direction is up in the exported files, where an option asked for one."""
     if options.frame == "result" and options.origin_anchor is None:
         return []
     if options.frame == "enu" and options.origin_anchor is None:
-        return ["up is away from the ellipsoid, by the anchors' coordinates"]
+        return ["up is perpendicular to the ellipsoid, by the anchors' coordinates"]
     from rangesfm.result.folder import read_result_folder
 
     if options.up == "auto" and read_result_folder(result_folder).summary.frame == "site":
         return ["up is z of the site"]
-    photos = "the mean of what is up in the photos"
-    source = {"cameras": photos, "auto": photos, "path": "across the plane of the path"}
+    photos = "the mean upward direction of the photos"
+    source = {"cameras": photos, "auto": photos, "path": "perpendicular to the plane of the path"}
     return [f"up is {source.get(options.up, f'{options.up} in the frame of the result')}"]
 
 
 def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
-    r"""One result folder: its models with each other, and with a reference if there is one.
-    Two or more models, result folders or files of camera positions: each with the first.
-    --ranges holds them against a radio log, which the first of them places (default: the ranges that the
-    first result folder used), --distances against taped distances.
+    r"""Compare models. One result folder: its models with each other, and with a reference if there is one. Two or
+    more models, result folders or files of camera positions: each of them with the first. --ranges compares them
+    with a radio log, placed on the first model (default: the ranges that the first result folder used), and
+    --distances with taped distances.
 
     example:
       rangesfm compare out --reference reference.csv
@@ -119,7 +125,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
     if args.output_path is not None:
         raise InputError(f"one model is given, {paths[0]}; a page of comparison needs two (see rangesfm report)")
     if overrides_from_arguments(args):
-        raise InputError(f"one model is given, {paths[0]}; ranges and distances to hold models against need two")
+        raise InputError(f"one model is given, {paths[0]}; comparing models with ranges or distances needs two")
     from rangesfm.comparison.before_after import compare_folder
 
     return Outcome([str(compare_folder(paths[0], args.reference))])
@@ -158,8 +164,8 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
 def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Write report.html, one self-contained page, into a result folder.
 
-    Without --images its photos are those that the run had, if they are in the result's folder or in the folder around
-    it: whoever made a result does not choose which photos of yours are on a page that you hand on.
+    Without --images, the page shows the photos of the run if they are in the result folder or in the folder around
+    it. Photos elsewhere are not used, because a result from somebody else could name any of your folders.
 
     example:
       rangesfm report out
@@ -177,6 +183,6 @@ def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
     recorded = result.summary.settings.images.path
     if args.images is None and recorded is not None and result.images_path is None:
         written.append(
-            f"without photos: the run had them in {recorded}, and not in the folder around the result (--images)"
+            f"without photos: those of the run are in {recorded}, not in the folder around the result (use --images)"
         )
     return Outcome(written)

@@ -21,7 +21,7 @@ _SCALE_KEYS = (
     *("ranges", "anchors", "tag", "mapper.num_threads", "scale", "markers", "export", "report", "output"),
 )
 _DEMO_FOLDER = "rangesfm_demo"
-_NUM_PHOTOS = range(10, 41)  # fewer do not make a map, more are not in the package
+_NUM_PHOTOS = range(10, 41)  # fewer photos do not make a map, and the package has no more
 _JOIN_KEYS = (
     *("ranges.range_stddev_m", "ranges.range_bias_stddev_m", "ranges.common_bias_stddev_m", "anchors", "scale"),
     *("mapper.num_threads", "refine", "export", "report", "output"),
@@ -29,37 +29,39 @@ _JOIN_KEYS = (
 
 
 def add_commands(commands: Commands) -> None:
-    run = commands.add("run", _run, "photos and ranges to a metric model: the whole pipeline")
+    run = commands.add("run", _run, "make a metric model from photos and ranges: the whole pipeline")
     add_survey_arguments(run)
     add_restart_argument(run)
-    run.add_argument("--live", action="store_true", help="keep live.html, a page to watch, in the output folder")
+    run.add_argument(
+        "--live", action="store_true", help="write live.html, a page to watch the run, to the output folder"
+    )
     demo = commands.add("demo", _demo, "make a small survey and run the pipeline on it: no data needed")
     demo.add_argument(
-        "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"where to (default: {_DEMO_FOLDER})"
+        "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"folder to write to (default: {_DEMO_FOLDER})"
     )
     demo.add_argument(
-        "--num_photos", type=int, default=40, metavar="N", help="the first so many of 40 along the path (default: 40)"
+        "--num_photos", type=int, default=40, metavar="N", help="use the first N of 40 photos (default: 40)"
     )
-    demo.add_argument("--seed", type=int, default=0, metavar="N", help="of the radio and of the run (default: 0)")
-    demo.add_argument("--num_threads", type=int, metavar="N", help="-1 for all cores")
+    demo.add_argument("--seed", type=int, default=0, metavar="N", help="seed of radio and run (default: 0)")
+    demo.add_argument("--num_threads", type=int, metavar="N", help="number of threads; -1: one for each core")
     add_restart_argument(demo)
-    reconstruct = commands.add("reconstruct", _reconstruct, "photos to an unscaled COLMAP model")
+    reconstruct = commands.add("reconstruct", _reconstruct, "make an unscaled COLMAP model from photos")
     add_survey_arguments(reconstruct, "images", "camera", "mapper", "output", without=("images.model",))
     add_restart_argument(reconstruct)
-    scale = commands.add("scale", _scale, "COLMAP model and ranges to the scale, with uncertainty and verdict")
+    scale = commands.add("scale", _scale, "estimate the scale of a COLMAP model from ranges, with a verdict")
     add_survey_arguments(scale, *_SCALE_KEYS)
-    refine = commands.add("refine", _refine, "COLMAP model and ranges to a refined metric model")
+    refine = commands.add("refine", _refine, "make a refined metric model from a COLMAP model and ranges")
     add_survey_arguments(refine, *_SCALE_KEYS, "camera.refine_intrinsics", "refine")
     join = commands.add(
-        "join", _join, "several surveys of one site to one metric map, through the anchors that they share"
+        "join", _join, "join several surveys of one site to one metric map, through the anchors that they share"
     )
     join.add_argument("results", nargs="*", metavar="RESULT", help="output folders of runs, two or more")
     add_flags(join, *_JOIN_KEYS, without=("scale.up_in_first_camera", "scale.distances", "scale.markers"))
 
 
 def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Photos and ranges to a metric model. Stages that an earlier run has done are used again. Instead of a survey file
-    a folder will do, if it is clear what is what in it.
+    """Make a metric model from photos and ranges. Stages that an earlier run has finished are not done again. In place
+    of a survey file, a folder is enough if its files can be recognised (see rangesfm init).
 
     example:
       rangesfm run survey.toml --every_nth 3 --output_path out
@@ -113,7 +115,7 @@ def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Photos to an unscaled COLMAP model: keyframes, features, matching, incremental mapping.
+    """Make an unscaled COLMAP model from photos: keyframes, features, matching, mapping.
 
     example:
       rangesfm reconstruct --images photos --image_times images.csv --output_path out
@@ -126,7 +128,7 @@ def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """The scale of a COLMAP model (points are not needed) from ranges, and the rescaled model.
+    """Estimate the scale of a COLMAP model from ranges, and write the rescaled model. The model needs no points.
 
     example:
       rangesfm scale --input_path sparse/0 --ranges uwb.csv --images images.csv --output_path out
@@ -139,8 +141,8 @@ def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
-    r"""Scale a COLMAP model by ranges, then adjust it with the ranges in its bundle adjustment. If that breaks the
-    map, the scaled one is the result, and the reason is said.
+    r"""Scale a COLMAP model by ranges, then refine it by a bundle adjustment that includes the ranges. If the
+    refinement breaks the map, the scaled map is the result, and the reason is printed.
 
     example:
       rangesfm refine --input_path sparse/0 --ranges uwb.csv --anchors anchors.csv \
@@ -154,9 +156,10 @@ def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _join(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Result folders of surveys that share anchors (other days, other cameras with their own tags) to one map
-    with one set of anchors; no common photo is needed. To the first one the others are joined. Anchors that
-    nobody surveyed join them too, if each has three or more with the others that are not on a line.
+    """Join the results of surveys that share anchors to one map with one set of anchors. The surveys may be of
+    different days, or of different cameras with their own tags; they need no common photos. The map is in the frame
+    of the first one. Anchors need not be surveyed: then each survey must share three or more with the others, not
+    on a line.
 
     example:
       rangesfm join monday/out tuesday/out --output_path site

@@ -1,4 +1,4 @@
-"""Flags that stand for keys of a survey file, made from the keys themselves; shared by the commands that run stages."""
+"""Flags for the keys of a survey file. They are made from the keys, and shared by the commands that run stages."""
 
 from __future__ import annotations
 
@@ -22,32 +22,33 @@ _WORDS = {"m": "METRES", "s": "SECONDS"}
 
 
 def add_survey_arguments(parser: Parser, *keys: str, without: tuple[str, ...] = ()) -> None:
-    """The survey file, and flags for its keys, as ``add_flags`` has them."""
+    """Add the argument of the survey file, and flags for its keys as ``add_flags`` does."""
     parser.add_argument(
         "survey",
         nargs="?",
         metavar="SURVEY.toml",
-        help="survey file, or a folder in which to look for one, or for what init would write; flags override its keys",
+        help="survey file; or a folder with one, or with photos and logs as for init; flags override its keys",
     )
     parser.add_argument(
-        "--base_path", metavar="FOLDER", help="what the file's paths are relative to (default: its folder)"
+        "--base_path", metavar="FOLDER", help="folder to which paths in the file are relative (default: its own)"
     )
     add_flags(parser, *keys, without=without)
 
 
 def add_restart_argument(parser: Parser) -> None:
-    parser.add_argument("--restart", action="store_true", help="do anew what an earlier run has done")
+    parser.add_argument("--restart", action="store_true", help="do all stages again, also those done by an earlier run")
 
 
 def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_names: bool = False) -> None:
-    """Flags whose values ``overrides_from_arguments`` finds again.
+    """Add flags for keys of a survey file; ``overrides_from_arguments`` returns their values.
 
     Args:
-        keys: dotted keys of a survey file, and tables for all of their keys; none for all there are.
-        without: keys that have no flag here.
-        by_own_names: whether the flags are called as the keys, for a command that is about one table.
+        parser: of the command.
+        keys: dotted keys of a survey file, or names of tables for all of their keys; none: all keys there are.
+        without: keys that get no flag here.
+        by_own_names: whether the flags have the names of the keys, for a command that is about one table.
     """
-    # What the keys are made of takes longer to import than all else, and only the command that runs needs its flags.
+    # Importing the keys takes longer than all else, and only the flags of the command that is run are needed.
     parser.later.append(partial(_add_flags, keys=keys, without=without, by_own_names=by_own_names))
 
 
@@ -55,7 +56,7 @@ def _add_flags(parser: Parser, *, keys: tuple[str, ...], without: tuple[str, ...
     from rangesfm.survey.settings import TABLES, chosen_keys
 
     for table, model in TABLES.items():
-        # The two forms of a lever arm are one flag.
+        # Both keys for lever arms share one flag.
         left_out = (*without, "tag.lever_arms_m")
         if chosen := [item for item in chosen_keys(keys) if item.table == table and item.dotted not in left_out]:
             group = parser.add_argument_group(f"[{table}] in a survey file", model.__doc__)
@@ -82,7 +83,7 @@ def _add_flag(group: argparse._ArgumentGroup, item: Key, flag: str) -> None:
 
 
 class _Switch(argparse.Action):
-    """Takes no value: true, or false by the name that begins with ``no_``."""
+    """Flag without a value. It sets true, or false where it is given under its name with ``no_``."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, help: str):
         super().__init__(option_strings, dest, nargs=0, help=help)
@@ -104,7 +105,7 @@ def _metavar(item: Key) -> str:
 
 
 def _converter(hint: Any) -> Callable[[str], Any]:
-    """From the text of a flag to a value of a type; what it may be is for the key to say."""
+    """Return the function that converts the text of a flag to a value of a type. The key checks the value itself."""
     origin, args = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         words = [word for arg in args for word in get_args(arg) if isinstance(word, str)]
@@ -135,7 +136,11 @@ def _names(text: str) -> list[str]:
 
 
 def position(text: str) -> list[float]:
-    """Three numbers X,Y,Z; to be a type of argparse."""
+    """Read three numbers X,Y,Z, as a type for argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: the text is not three numbers.
+    """
     numbers = _numbers(text)
     if len(numbers) != 3:
         raise argparse.ArgumentTypeError(f"'{text}' has {len(numbers)} numbers, expected X,Y,Z in metres")
@@ -143,7 +148,7 @@ def position(text: str) -> list[float]:
 
 
 def _lever_arm(text: str) -> tuple[str | None, list[float]]:
-    """The tag's id, None without one, and its lever arm."""
+    """Read a tag's id (None without one) and its lever arm."""
     tag_id, colon, lever_arm = text.rpartition(":")
     if colon and not tag_id:
         raise argparse.ArgumentTypeError(f"'{text}' has no tag's id before the colon, expected X,Y,Z or ID:X,Y,Z")
@@ -163,12 +168,16 @@ def _options(text: str) -> dict[str, Any]:
     try:
         return parse_inline_table(text)
     except ValueError:
-        message = f"'{text}' is no table of TOML, expected as max_image_size=1200,sift.num_octaves=3"
+        message = f"'{text}' is not a list of options, expected as max_image_size=1200,sift.num_octaves=3"
         raise argparse.ArgumentTypeError(message) from None
 
 
 def overrides_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
-    """The values of all flags that were given, by their keys in a survey file."""
+    """Return the values of all flags that were given, by the dotted keys of a survey file.
+
+    Raises:
+        InputError: lever arms are given both with and without the id of a tag.
+    """
     overrides = {key: value for key, value in vars(args).items() if "." in key and value is not None}
     lever_arms = dict(overrides.pop("tag.tag_in_cam_m", []))
     if None in lever_arms and len(lever_arms) > 1:
@@ -183,17 +192,24 @@ def overrides_from_arguments(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def flags_given(args: argparse.Namespace, *keys: str) -> list[str]:
-    """The flags of some keys that were given, with their dashes."""
+    """Return those flags of some keys that were given, with their dashes."""
     from rangesfm.survey.settings import chosen_keys
 
     return [f"--{item.flag}" for item in chosen_keys(keys) if getattr(args, item.dotted, None) is not None]
 
 
 def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = None) -> Survey:
-    """The survey file, if any, with the flags in place of its keys; of a folder without one what is understood of it.
+    """Return the survey that the arguments describe.
+
+    It is the survey file, if there is one, with the given flags in place of its keys. For a folder without a survey
+    file, it is what ``understand`` makes of the folder.
 
     Args:
-        progress: is told what of a folder is left out.
+        args: of the command.
+        progress: is told the notes on a folder; None: they are not shown.
+
+    Raises:
+        InputError: the file cannot be read, or a key or a flag is wrong.
     """
     from rangesfm.findings.survey_file import NAME
     from rangesfm.survey.settings import read_survey, survey_from_tables

@@ -1,4 +1,4 @@
-"""Progress for people: lines that update themselves on a terminal, a few plain lines elsewhere."""
+"""Progress for users: lines that are drawn again on a terminal, and a few plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PLAIN_INTERVAL_S = 10.0
 
 
 class Screen:
-    """Lines that stay and, on a terminal, below them lines that are drawn over."""
+    """Output of lines that stay and, on a terminal, of lines below them that are drawn over."""
 
     def __init__(self, stream: TextIO, *, quiet: bool):
         self._stream = stream
@@ -28,7 +28,7 @@ class Screen:
         self.is_terminal = stream.isatty()
 
     def say(self, lines: Sequence[str]) -> None:
-        """Lines that stay, in place of what is drawn."""
+        """Print lines that stay; they replace the lines drawn below."""
         if self._live is not None:
             self._live.stop()
             self._live = None
@@ -37,7 +37,7 @@ class Screen:
             self._stream.flush()
 
     def draw(self, lines: Sequence[str]) -> None:
-        """Lines that stand until the next call, on a terminal only; each ends where that does."""
+        """Draw lines that stay until the next call, on a terminal only. Long lines are cut at its width."""
         if self._quiet or not self.is_terminal:
             return
         from rich.text import Text
@@ -62,12 +62,12 @@ def _live(stream: TextIO) -> Live:
         vertical_overflow="crop",
     )
     live.start()
-    console.show_cursor(True)  # nobody would if the process is killed
+    console.show_cursor(True)  # rich hides the cursor, and nothing would show it again if the process is killed
     return live
 
 
 class TerminalProgress:
-    """Writes the course of a run to ``stream``."""
+    """Listener that writes the progress of a run to ``stream``."""
 
     def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
         self._screen = Screen(stream, quiet=quiet)
@@ -91,7 +91,7 @@ class TerminalProgress:
         self._screen.say([text])
 
     def end_stage(self, *, failed: bool = False) -> None:
-        """The current stage, if any, has ended."""
+        """Print that the current stage, if there is one, has ended."""
         ending = "stopped after " if failed else ""
         line = f"{self._stage}: {ending}{duration(self._clock() - self._stage_start)}"
         self._screen.say([] if self._stage is None else [line])
@@ -103,7 +103,7 @@ class TerminalProgress:
 
 @contextmanager
 def terminal_progress(stream: TextIO, *, quiet: bool = False) -> Iterator[TerminalProgress]:
-    """Yield the progress of a run, whose last stage ends with the block."""
+    """Yield a listener to the progress of a run. Its last stage ends with the block."""
     progress = TerminalProgress(stream, quiet=quiet)
     try:
         yield progress
@@ -114,7 +114,7 @@ def terminal_progress(stream: TextIO, *, quiet: bool = False) -> Iterator[Termin
 
 
 def counts(num_done: int, num_total: int | None, seconds: float = 0.0) -> str:
-    """How many of how many; with the seconds it took so far, how long the rest will take."""
+    """Return "done/total, percentage" as text, with the time left if ``seconds`` is the time taken so far."""
     if num_total is None or num_total <= 0:
         return str(num_done)
     text = f"{num_done}/{num_total}, {100 * num_done // num_total} %"
