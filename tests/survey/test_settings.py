@@ -129,7 +129,7 @@ def test_several_cameras_are_one_for_all_photos_and_others_by_pattern(folder: Pa
     assert camera.of_photo("leftover/1.jpg") is camera
     wrong = refusal(write(folder, SEVERAL_CAMERAS.replace('"single"', '"singel"')))
     assert (wrong.line, str(wrong).count("[camera] mode is 'singel'")) == (9, 1)
-    assert "2 [[camera]] tables have no images" in str(refusal(write(folder, SEVERAL_CAMERAS + "[[camera]]")))
+    assert "2 [[camera]] tables have no key images" in str(refusal(write(folder, SEVERAL_CAMERAS + "[[camera]]")))
 
 
 def test_mapper_keys_that_are_not_ours_are_the_pipelines(folder: Path) -> None:

@@ -1,1 +1,1 @@
-"""What a run is told: its settings and its inputs."""
+"""Settings and inputs of a run."""

@@ -1,4 +1,4 @@
-"""What a run reads before it works: the log, the anchors, the reference; checked against each other, and hashed."""
+"""Inputs that a run reads first: log, anchors and reference. They are checked against each other, and hashed."""
 
 from __future__ import annotations
 
@@ -31,28 +31,30 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-# Beyond it a unit is wrong, or the file: no such radio reaches so far.
+# No such radio reaches further, so a longer range has a wrong unit or is not a range.
 _MAX_RANGE_M = 1e6
-# How far anchors are apart, as a share of the ranges to them (at most 1 where all is in metres), is above this in:
+# Distance between two anchors over the sum of the ranges to them. It is at most 1 where all are in metres; above each
+# of these numbers, the anchors are in that unit.
 _UNITS_OF_ANCHORS = (("millimetres", 100.0), ("centimetres", 10.0))
-# Times in coarser steps than this are worth a word.
+# Times of a log in steps at least as coarse as this get a note.
 _COARSE_STEP_S = 0.1
 
 
 @dataclass(frozen=True)
 class RangingInputs:
-    """What is measured in metres: the radio's side of a survey, and lengths.
+    """Inputs measured in metres: those of the radio, lengths, and true positions.
 
     Attributes:
-        log: ranges of the wanted tags to the wanted anchors, and those between two of a kind; empty without a radio.
-        tag_in_cam_m: (num_tags, 3) lever arms in the order of ``log.tag_ids``; NaN for a tag that ranges with
-            tags only.
-        anchors: every anchor of the log.
+        log: ranges between the chosen tags and the chosen anchors, and those between two anchors or two tags; empty
+            without a radio.
+        tag_in_cam_m: (num_tags, 3) lever arms in the order of ``log.tag_ids``; NaN for a tag that has ranges to tags
+            only.
+        anchors: all anchors of the log, and those of the file that the log does not have.
         anchor_frame: "site", "first_camera" or "unknown".
-        site: the frame of the anchors' positions.
-        tape: taped distances, if given.
-        reference: true positions, if given.
-        notes: what the user should know.
+        site: frame of the anchors' positions.
+        tape: taped distances; None if not given.
+        reference: true positions; None if not given.
+        notes: lines that the user should know.
     """
 
     log: RangeLog
@@ -66,10 +68,11 @@ class RangingInputs:
 
 
 def read_ranging_inputs(survey: Survey) -> RangingInputs:
-    """Read and check all but the photos.
+    """Read and check all inputs but the photos.
 
     Raises:
-        InputError: a file is missing or wrong, or the log has an anchor or tags that nobody explained.
+        InputError: a file is missing or wrong, or the log has an anchor that the file of anchors has not, or a tag
+            without a lever arm.
     """
     survey.require_metres()
     _check_rigs_are_metric(survey)
@@ -105,11 +108,15 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
 
 
 def _check_rigs_are_metric(survey: Survey) -> None:
-    """InputError where nothing but a rig could say how long a metre is, and it does not."""
+    """Check that a rig has lengths in metres where it is the only source of the scale.
+
+    Raises:
+        InputError: it has none.
+    """
     is_measured = survey.scale.distances or survey.markers.side_m or survey.ranges.path
     if is_measured is None and not read_rigs(survey.images.rig_config).are_metric:
         raise InputError(
-            "says of no camera how far it is from the rig's first, and there are no ranges and no lengths: expected "
+            "gives no distance between cameras of a rig, and there are no ranges and no lengths: expected "
             "cam_from_rig_translation in metres, or a radio's log (--ranges LOG)",
             survey.images.rig_config,
         )
@@ -120,8 +127,8 @@ def _check_held_out(survey: Survey, anchors: Sequence[Anchor], frame: str) -> No
     for anchor_id in survey.ranges.check_anchors:
         if anchor_id not in surveyed:
             raise InputError(
-                f"check_anchors: the position of anchor {anchor_id!r} is not known, so that its ranges can check "
-                f"nothing; expected of: {', '.join(surveyed) or 'none'}",
+                f"check_anchors: the position of anchor {anchor_id!r} is not known, so its ranges cannot be checks; "
+                f"expected anchors of: {', '.join(surveyed) or 'none'}",
                 survey.anchors.path,
             )
 
@@ -133,7 +140,17 @@ def read_log(
     *,
     files: Sequence[str] | None = None,
 ) -> RangeLog:
-    """The radio's log as a survey describes it, or other files than it names; see ``read_ranges``."""
+    """Read the radio's log as a survey describes it; see ``read_ranges``.
+
+    Args:
+        options: of the log.
+        anchor_ids: ids that are known to be anchors.
+        tag_ids: ids that are known to be tags.
+        files: to read in place of ``options.path``; None: that path.
+
+    Raises:
+        InputError: there is no log, or it cannot be read.
+    """
     if options.path is None:
         raise InputError("no ranges: give [ranges] path in a survey file, or --ranges LOG")
     return read_ranges(files or options.path, options, anchor_ids=anchor_ids, tag_ids=tag_ids)
@@ -142,14 +159,18 @@ def read_log(
 def _check_camera_is_heard(log: RangeLog) -> None:
     if not np.any(log.kind == RangeKind.TAG_ANCHOR):
         raise InputError(
-            f"none of the {len(log)} ranges is between a tag and an anchor: say who is what by anchors.csv, or by a "
-            "lever arm for each tag",
+            f"none of the {len(log)} ranges is between a tag and an anchor: list the anchors in anchors.csv, or give "
+            "each tag a lever arm",
             log.source,
         )
 
 
 def _lever_arms_of_log(log: RangeLog, survey: Survey) -> Array:
-    """(num_tags, 3) as ``RangingInputs.tag_in_cam_m``; InputError for a tag that ranges with anchors and has none."""
+    """Return ``RangingInputs.tag_in_cam_m``.
+
+    Raises:
+        InputError: a tag with ranges to anchors has no lever arm, or several tags share one.
+    """
     given = survey.tag.lever_arms_m
     heard = np.unique(log.tag_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()
     arms = np.full((len(log.tag_ids), 3), np.nan)
@@ -157,7 +178,7 @@ def _lever_arms_of_log(log: RangeLog, survey: Survey) -> Array:
         if len(heard) > 1:
             raise InputError(
                 f"the log has several tags ({', '.join(log.tag_ids[k] for k in heard)}): give each its lever arm "
-                "([tag.lever_arms_m], or --tag_in_cam ID:X,Y,Z for each), or say which is the camera's (--tag_id)",
+                "([tag.lever_arms_m], or --tag_in_cam ID:X,Y,Z for each), or choose that of the camera (--tag_id)",
                 log.source,
             )
         arms[heard] = survey.tag.tag_in_cam_m
@@ -165,7 +186,7 @@ def _lever_arms_of_log(log: RangeLog, survey: Survey) -> Array:
     for k in heard:
         if log.tag_ids[k] not in given:
             raise InputError(
-                f"tag {log.tag_ids[k]!r} has no lever arm, those given are of {', '.join(given)}: give "
+                f"tag {log.tag_ids[k]!r} has no lever arm; lever arms are given for {', '.join(given)}: give "
                 "it one ([tag.lever_arms_m], or --tag_in_cam ID:X,Y,Z), or choose a tag (--tag_id)",
                 log.source,
                 int(log.line[np.argmax(log.tag_index == k)]),
@@ -182,7 +203,13 @@ def _check_lengths(log: RangeLog) -> None:
 
 
 def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path | None) -> None:
-    """Two anchors heard one after the other are no further apart than their two ranges are long together."""
+    """Check that the positions of anchors are in metres.
+
+    The distance between two anchors is at most the sum of the ranges to them, if the camera hardly moves between these.
+
+    Raises:
+        InputError: the positions seem to be in millimetres or centimetres.
+    """
     known = {anchor.anchor_id: anchor.position_m for anchor in anchors if anchor.position_m is not None}
     nowhere = np.full(3, np.nan)
     position_m = np.array([known.get(anchor_id, nowhere) for anchor_id in log.anchor_ids]).reshape(-1, 3)
@@ -206,14 +233,14 @@ def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path 
 
 
 def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
-    """All unknown, but for those whose positions the log itself gives, as the radios were configured."""
+    """Return all anchors of a log, with unknown positions unless the log has those that the radios were given."""
     in_log = read_anchors_in_log(log.source, format=log.format) if log.source is not None else ()
     by_id = {anchor.anchor_id: anchor for anchor in in_log}
     return tuple(by_id.get(anchor_id, Anchor(anchor_id)) for anchor_id in log.anchor_ids)
 
 
 def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
-    """Times of a model's photos; the table may list others, which did not become keyframes."""
+    """Return the times of the photos of a model. The table of times may have other photos, too."""
     frames = photos_by_frame(sfm)
     if survey.images.times is not None:
         return read_image_times_csv(survey.images.times, frames=frames)
@@ -221,7 +248,15 @@ def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Pat
 
 
 def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
-    """The ranges between one tag and anchors; InputError if it is not there, or if there are several and none named."""
+    """Return the ranges between one tag and anchors.
+
+    Args:
+        log: with ranges of any kind.
+        tag_id: of the tag; None: the log has only one.
+
+    Raises:
+        InputError: the tag is not in the log, or the log has several tags and ``tag_id`` is None.
+    """
     log = _of_wanted_tag(log, tag_id)
     log = log.subset(log.kind == RangeKind.TAG_ANCHOR)
     if len(log.tag_ids) > 1:
@@ -230,7 +265,7 @@ def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
 
 
 def _of_wanted_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
-    """Without the ranges of other tags; those between anchors stay."""
+    """Return the log without the ranges of other tags. Ranges between anchors are kept."""
     if tag_id is None:
         return log
     if tag_id not in log.tag_ids:
@@ -245,7 +280,7 @@ def _of_wanted_anchors(log: RangeLog, use_anchors: Sequence[str]) -> RangeLog:
     if unheard := [anchor_id for anchor_id in use_anchors if anchor_id not in log.anchor_ids]:
         message = f"anchor {unheard[0]!r} to be used is not in the log ({', '.join(log.anchor_ids)})"
         raise InputError(message, log.source)
-    # The last entry stands for the index of no anchor.
+    # The last entry belongs to index -1, which means no anchor.
     wanted = np.array([*(anchor_id in use_anchors for anchor_id in log.anchor_ids), True])
     peer_is_wanted = wanted[np.where(log.kind == RangeKind.ANCHOR_ANCHOR, log.peer_index, -1)]
     return log.subset(wanted[log.anchor_index] & peer_is_wanted)
@@ -258,7 +293,7 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
             first = int(np.argmax((log.anchor_index == k) | ((log.tag_index < 0) & (log.peer_index == k))))
             raise InputError(
                 f"anchor_id is {anchor_id!r}, expected one of {survey.anchors.path}: {', '.join(sorted(known))} "
-                "(--use_anchors leaves others out)",
+                "(--use_anchors leaves out others)",
                 log.source,
                 int(log.line[first]),
             )
@@ -270,29 +305,28 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
     silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
     for kind, what in (
-        (RangeKind.ANCHOR_ANCHOR, "anchors: they are distances for the map to keep to"),
-        (RangeKind.TAG_TAG, "tags: they have no say"),
+        (RangeKind.ANCHOR_ANCHOR, "anchors: they are used as distances between these"),
+        (RangeKind.TAG_TAG, "tags: they are not used"),
     ):
         if num := int(np.count_nonzero(log.kind == kind)):
             notes.append(f"{num} ranges are between two {what}")
     if anchors_are_of_log and any(anchor.position_m is not None for anchor in anchors):
-        notes.append("the anchor positions are those that the log gives")
+        notes.append("the anchor positions are those in the log")
     if log.num_no_measurement:
-        notes.append(f"{log.num_no_measurement} records of the log say that there was no measurement")
+        notes.append(f"{log.num_no_measurement} records of the log have no measurement")
     if num := log.num_restarts:
         notes.append(
-            f"the log's times go back {num} times by a quarter of the whole or more: did its clock begin anew?"
+            f"the log's times go back {num} times by a quarter of its length or more: was its clock restarted?"
         )
     if (step_s := log.time_resolution_s) >= _COARSE_STEP_S:
-        notes.append(f"the log's times come in steps of {step_s:.2g} s: at walking pace that is as much in metres")
+        notes.append(f"the log's times have steps of {step_s:.2g} s: somebody who walks moves that many metres in one")
     return notes
 
 
 def input_hashes(survey: Survey) -> list[dict[str, Any]]:
-    """Path, SHA-256, bytes and what was hashed, for each input that is there.
+    """Return path, SHA-256, number of bytes and what was hashed, for each input that exists.
 
-    Of a folder of photos only the names and sizes are hashed: reading gigabytes again would take
-    longer than what is gained.
+    For a folder of photos, only names and sizes are hashed: reading gigabytes again would take too long.
     """
     entries: list[dict[str, Any]] = []
     for item in survey.input_paths():

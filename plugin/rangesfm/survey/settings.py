@@ -1,4 +1,4 @@
-"""Survey: everything a run needs to know, from a TOML file, from flags or from both."""
+"""The survey: all settings and paths of a run, from a TOML file, from flags or from both."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-# An override of the first takes the place of the other in the file.
+# A flag for the first key replaces the second key in the file, because both give lever arms.
 _INSTEAD_OF = {"tag.tag_in_cam_m": "lever_arms_m", "tag.lever_arms_m": "tag_in_cam_m"}
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where options come from, for messages; all are alike otherwise.
+    """Origin of options, for messages. Any two are equal, so that surveys are compared without it.
 
     Attributes:
-        path: the file; None if there is none.
-        text: its content.
-        overridden: dotted keys whose values came from elsewhere.
+        path: of the file; None if there is none.
+        text: content of the file.
+        overridden: dotted keys whose values came from flags or from the caller.
     """
 
     path: Path | None = field(default=None, compare=False)
@@ -57,14 +57,14 @@ class Source:
 
     @contextmanager
     def naming_lines(self) -> Iterator[None]:
-        """Say in which line of the file an option stands that is found wrong."""
+        """Turn an OptionError of the block into an InputError that names the file and the line of the option."""
         try:
             yield
         except OptionError as error:
             key = f"{error.table}.{error.key or ''}".strip(".")
             if any(f"{key}.".startswith(f"{other}.") for other in self.overridden):
                 raise InputError(str(error)) from None
-            # Keys of [mapper] that are not ours are the pipeline's; an entry of a table may stand in the table's line.
+            # Unknown keys of [mapper] were moved to its pipeline; an entry of an inline table is on the table's line.
             places = (key, key.replace("mapper.pipeline", "mapper"), key.rpartition(".")[0])
             lines = (self._line_of(place) for place in places)
             raise InputError(str(error), self.path, next(filter(None, lines), None)) from None
@@ -75,7 +75,7 @@ class Source:
             if header := re.match(r"\s*\[\[?([^\[\]]+)\]", text):
                 current = _dotted(header[1])
                 num_seen[current] += 1
-                if num_seen[current] > 1 or wanted.startswith(f"{current} "):  # one of several tables
+                if num_seen[current] > 1 or wanted.startswith(f"{current} "):  # one of several tables of this name
                     current += f" {num_seen[current]}"
                 if current == wanted:
                     return line
@@ -87,7 +87,11 @@ class Source:
 
 
 def parse_toml(path: Path) -> tuple[dict[str, Any], Source]:
-    """The content of a TOML file; InputError with the line if it is none."""
+    """Read a TOML file.
+
+    Raises:
+        InputError: it cannot be read or is not TOML; the text names the line.
+    """
     from rangesfm.files.tables import read_text
 
     text = read_text(path)
@@ -95,7 +99,7 @@ def parse_toml(path: Path) -> tuple[dict[str, Any], Source]:
         return tomllib.loads(text), Source(path, text)
     except RecursionError:
         raise InputError("not a TOML file (nested too deeply)", path) from None
-    except ValueError as error:  # TOMLDecodeError, and numbers that Python refuses
+    except ValueError as error:  # a TOMLDecodeError, or a number that Python refuses to read
         where = re.search(r" \(at (?:line (\d+), column \d+|end of document)\)$", str(error))
         message = str(error)[: where.start()] if where else str(error)
         line = None if where is None else int(where[1] or text.rstrip().count("\n") + 1)
@@ -103,7 +107,11 @@ def parse_toml(path: Path) -> tuple[dict[str, Any], Source]:
 
 
 def parse_inline_table(text: str) -> dict[str, Any]:
-    """``a = 1, b.c = "x"`` as TOML reads it; ValueError if it is no such thing."""
+    """Read text such as ``a = 1, b.c = "x"`` as the inside of an inline table of TOML.
+
+    Raises:
+        ValueError: it is not TOML.
+    """
     table: dict[str, Any] = tomllib.loads(f"table = {{{text}}}")["table"]
     return table
 
@@ -113,10 +121,10 @@ def _dotted(text: str) -> str:
 
 
 class Survey(BaseModel):
-    """Inputs, options and output of one run, by the tables of a survey file. Paths are absolute.
+    """Inputs, options and output of one run, one attribute for each table of a survey file. Paths are absolute.
 
     Attributes:
-        source: the survey file, for messages; no setting.
+        source: the survey file, for messages; it is not a setting.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -136,7 +144,11 @@ class Survey(BaseModel):
     source: Source = Field(default=Source(), exclude=True, repr=False)
 
     def changed(self, values: Mapping[str, Any]) -> Survey:
-        """The same with other values by dotted key, as ``{"scale.method": "robust"}``, which are checked."""
+        """Return a copy with other values by dotted key, such as ``{"scale.method": "robust"}``.
+
+        Raises:
+            OptionError: a value is not valid.
+        """
         tables: dict[str, Options] = {}
         for dotted_key, value in values.items():
             table, _, name = dotted_key.partition(".")
@@ -145,23 +157,35 @@ class Survey(BaseModel):
 
     @property
     def photos_path(self) -> Path:
-        """Of the folder, video or bag; InputError if none is given."""
+        """Return the path of the photos: a folder, a video or a bag.
+
+        Raises:
+            InputError: none is given.
+        """
         if self.images.path is None:
             raise InputError(
-                "no photos: give [images] path in a survey file, or --images FOLDER; a COLMAP model does as well "
+                "no photos: give [images] path in a survey file, or --images FOLDER; or give a COLMAP model "
                 "([images] model, --input_path MODEL)"
             )
         return self.images.path
 
     @property
     def given_model_path(self) -> Path:
-        """Of the model to go on from; InputError if none is given."""
+        """Return the path of the given COLMAP model.
+
+        Raises:
+            InputError: none is given.
+        """
         if self.images.model is None:
-            raise InputError("no model: give [images] model in a survey file, or --input_path MODEL, as sparse/0")
+            raise InputError("no model: give [images] model in a survey file, or --input_path MODEL, such as sparse/0")
         return self.images.model
 
     def require_metres(self) -> None:
-        """InputError where nothing says how long a metre is, or how large tags are that are to be looked for."""
+        """Check that the survey has something measured in metres.
+
+        Raises:
+            InputError: it has nothing, or only printed tags of unknown size.
+        """
         if self.scale.distances is not None or self.markers.side_m is not None:
             return
         if self.markers.dictionary is not None:
@@ -172,16 +196,16 @@ class Survey(BaseModel):
         if self.ranges.path is None and self.images.rig_config is None:
             raise InputError(
                 "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), "
-                "the size of printed tags (--marker_side_m), or where a rig's cameras sit (--rig_config_path JSON)"
+                "the size of printed tags (--marker_side_m), or a rig with known poses (--rig_config_path JSON)"
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, fit for JSON."""
+        """Return all settings as plain values that JSON can hold."""
         return self.model_dump(mode="json")
 
     def input_paths(self) -> Iterator[InputPath]:
-        """Every path that is read: what must be there, what is hashed and what no result may overwrite."""
-        from rangesfm.ranging.readers import files_of_log  # numpy, which --help needs not
+        """Yield every path that is read. It must exist, it is hashed, and no result may overwrite it."""
+        from rangesfm.ranging.readers import files_of_log  # imported here, because --help should not load numpy
 
         for dotted_key, role in _ROLE_OF_PATH.items():
             table, _, name = dotted_key.partition(".")
@@ -196,7 +220,13 @@ class Survey(BaseModel):
 
 @dataclass(frozen=True)
 class InputPath:
-    """A path that a survey reads, by its dotted key, and what stands there."""
+    """A path that a survey reads.
+
+    Attributes:
+        key: dotted key of the survey file.
+        role: kind of file or folder.
+        path: absolute.
+    """
 
     key: str
     role: PathRole
@@ -208,7 +238,7 @@ TABLES: dict[str, type[Options]] = {
     for name, field in Survey.model_fields.items()
     if isinstance(field.annotation, type) and issubclass(field.annotation, Options)
 }
-# Paths first: keys that a table takes over from a stage's options stand before its own.
+# Paths come first in each table; pydantic lists the keys of a base class before those of the table itself.
 KEYS = tuple(
     item for model in TABLES.values() for item in sorted(model.keys().values(), key=lambda item: item.role is None)
 )
@@ -216,7 +246,7 @@ _ROLE_OF_PATH: dict[str, PathRole] = {item.dotted: item.role for item in KEYS if
 
 
 def chosen_keys(chosen: Collection[str]) -> list[Key]:
-    """Of dotted keys, and tables for all of theirs; of none all there are."""
+    """Return the keys named by dotted keys, or by names of tables for all their keys; all keys if none are named."""
     return [item for item in KEYS if not chosen or item.table in chosen or item.dotted in chosen]
 
 
@@ -226,14 +256,14 @@ def read_survey(
     """Read a survey file.
 
     Args:
-        path: the TOML file.
-        base_folder: what relative paths in the file refer to; None: the file's own folder.
-        overrides: values by dotted key (``{"ranges.path": "uwb.csv"}``) that replace those of the file;
-            their paths are relative to the working directory.
+        path: of the TOML file.
+        overrides: values by dotted key (``{"ranges.path": "uwb.csv"}``) that replace those of the file. Their paths are
+            relative to the working directory.
+        base_folder: folder to which paths in the file are relative; None: the folder of the file.
 
     Raises:
-        InputError: with the line where possible, for an unknown table or key, a value of the wrong
-            type or out of bounds, and a file that does not exist.
+        InputError: an unknown table or key, a value of the wrong type or out of bounds, or a file that does not exist.
+            The text names the line where possible.
     """
     tables, source = parse_toml(Path(path))
     folder = Path(path).absolute().parent if base_folder is None else base_folder
@@ -246,7 +276,7 @@ def survey_from_tables(
     overrides: Mapping[str, object] | None = None,
     source: Source | None = None,
 ) -> Survey:
-    """The same from tables in memory, with paths relative to ``base_folder``."""
+    """Make a survey from tables in memory, otherwise as ``read_survey``; ``source`` names the file for messages."""
     folder, overrides = Path(base_folder).absolute(), overrides or {}
     source = replace(source or Source(), overridden=tuple(overrides))
     with source.naming_lines():
@@ -270,7 +300,11 @@ def survey_from_tables(
 
 
 def _with_one_camera(tables: Mapping[str, Any]) -> tuple[Mapping[str, Any], tuple[CameraOptions, ...]]:
-    """Of several [[camera]] tables the one without a pattern, and the others."""
+    """Return the tables with a single [camera], and the options of the other [[camera]] tables, which have a pattern.
+
+    Raises:
+        OptionError: a camera's options are not valid, or two have no pattern.
+    """
     cameras = tables.get("camera")
     if not isinstance(cameras, list):
         return tables, ()
@@ -284,13 +318,17 @@ def _with_one_camera(tables: Mapping[str, Any]) -> tuple[Mapping[str, Any], tupl
         except OptionError as error:
             raise OptionError(str(error), f"camera {number}", error.key) from None
     if len(rest) > 1:
-        message = f"{len(rest)} [[camera]] tables have no images, expected one at most: those of all other photos"
+        message = f"{len(rest)} [[camera]] tables have no key images, expected at most one: that for all other photos"
         raise OptionError(message, "camera")
     return {**tables, "camera": rest[0] if rest else {}}, tuple(others)
 
 
 def refuse_unknown_tables(tables: Mapping[str, Any], known: Collection[str]) -> None:
-    """OptionError for one that is not known, with the nearest that is, and for what is no table."""
+    """Check that all tables are known and are tables.
+
+    Raises:
+        OptionError: one is not; the text names the nearest known table.
+    """
     for name, table in tables.items():
         if name not in known:
             message = f"unknown table [{printable(name)}]; the nearest known one is '{nearest_known(name, known)}'"
@@ -300,7 +338,7 @@ def refuse_unknown_tables(tables: Mapping[str, Any], known: Collection[str]) -> 
 
 
 def _absolute(value: object, folder: Path) -> object:
-    """What stands for a path, as one; anything else as it is."""
+    """Return text or a path as an absolute path, and any other value unchanged."""
     return folder / path_of(str(value)) if isinstance(value, (str, Path)) and str(value) else value
 
 
