@@ -125,7 +125,7 @@ def test_times_are_the_stamps_and_without_any_the_arrivals(tmp_path: Path) -> No
     (tmp_path / "unset").mkdir()
     source = open_bag(tmp_path / "unset", [("/cam/image", IMAGE, 0.0, image)])
     assert [frame.time_s for frame in source.frames()] == [0.02]
-    assert source.clock == "when they arrived, as their headers have no stamps"
+    assert source.clock == "times of arrival, because their headers have no stamps"
 
 
 def test_of_several_topics_one_must_be_chosen(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_of_several_topics_one_must_be_chosen(tmp_path: Path) -> None:
     which = r": /left \(2\), /right \(1\); choose by \[images\] topic, or --image_topic"
     with pytest.raises(InputError, match=f"a: several topics of images{which}"):
         open_bag(tmp_path, messages)
-    with pytest.raises(InputError, match=f"a: no images of /up, but of{which}"):
+    with pytest.raises(InputError, match=f"a: no images of /up; there are images of{which}"):
         open_source(tmp_path / "a", "/up")
     assert len(list(open_source(tmp_path / "a", "/left").frames())) == 2
 
@@ -153,7 +153,7 @@ def test_the_camera_is_that_of_the_info_beside_the_images(version: int, tmp_path
     ]
     plain = open_bag(tmp_path, messages, topic="/cam/image_raw", version=version)
     assert plain.camera == ("OPENCV", (9.0, 10.0, 4.5, 3.5, 0.1, 0.0, 0.0, 0.0))
-    assert plain.notes == ("the camera is that of /cam/camera_info, where none is given",)
+    assert plain.notes == ("the camera is that of /cam/camera_info, unless one is given",)
     rectified = open_source(next(tmp_path.iterdir()), "/cam/image_rect")
     assert rectified.camera == ("PINHOLE", (4.5, 5.0, 4.5, 3.5))
 
@@ -162,8 +162,11 @@ def test_the_camera_is_that_of_the_info_beside_the_images(version: int, tmp_path
     ("info", "notes"),
     [
         (camera_info((8, 6), (0, 0, 0, 0), ()), ()),
-        (camera_info((16, 12), (9, 9, 8, 6), ()), (r"/camera_info is of 16 x 12 pixels: not taken as the camera",)),
-        (camera_info((8, 6), (9, 9, 4, 3), (1,), "odd"), (r"/camera_info is not taken.* distortion_model is 'odd'",)),
+        (
+            camera_info((16, 12), (9, 9, 8, 6), ()),
+            (r"/camera_info is for 16 x 12 pixels: it is not used for the camera",),
+        ),
+        (camera_info((8, 6), (9, 9, 4, 3), (1,), "odd"), (r"/camera_info is not used.* distortion_model is 'odd'",)),
     ],
     ids=["not calibrated", "other size", "other model"],
 )

@@ -36,14 +36,14 @@ def test_frames_have_the_times_at_which_they_are_shown(tmp_path: Path) -> None:
     np.testing.assert_allclose([frame.time_s for frame in frames], np.subtract(TIMES_S, 20.0), atol=1e-3)
     left = [int(np.asarray(frame.grey())[10, 10]) for frame in frames]
     np.testing.assert_allclose(left, [0, 20, 40, 60, 80], atol=6)
-    assert source.clock == "seconds from its first frame, as it has no creation time"
+    assert source.clock == "seconds from its first frame, because it has no creation time"
 
 
 @pytest.mark.parametrize("created", ["2026-05-04T10:00:00Z", "2026-05-04T12:00:00+02:00"])
 def test_the_creation_time_is_the_first_frames_and_not_for_sure(created: str, tmp_path: Path) -> None:
     source = open_source(write_video(tmp_path / "a.mp4", pictures(5), TIMES_S, created=created), None)
     assert next(source.frames()).time_s == START_S
-    assert "2026-05-04 10:00:00+00:00; that is in whole seconds, and with some cameras local time" in source.clock
+    assert "2026-05-04 10:00:00+00:00; that time is in whole seconds" in source.clock
     assert source.what.startswith("video, 64 x 48 pixels, 1.0")
     assert (source.num_photos(2.0), source.num_photos(100.0)) == (3, 5)
 

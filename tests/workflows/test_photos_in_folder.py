@@ -46,7 +46,7 @@ def test_photos_times_and_camera_take_the_bags_place(survey: Survey) -> None:
     assert len([*folder.glob("*.png")]) == 8
     assert journal.warnings == [
         "the photos are the sharpest of each 0.5 s of walk; their times are the stamps of their headers",
-        "the camera is that of /camera_info, where none is given",
+        "the camera is that of /camera_info, unless one is given",
     ]
     assert with_photos_in_folder(changed, journal) == changed
 

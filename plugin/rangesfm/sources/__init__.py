@@ -1,1 +1,1 @@
-"""Photos from what is no folder of photos: videos, and bags with images."""
+"""Photos taken from videos, and from ROS bags with images."""

@@ -1,6 +1,6 @@
-"""The images of a bag: one topic of them, with the stamps of their headers.
+"""Images of one topic of a ROS bag, with the time stamps of their headers.
 
-Raw pixels in the usual encodings, and whole files of JPEG or PNG.
+They are raw pixels in the usual encodings, or whole JPEG or PNG files.
 """
 
 from __future__ import annotations
@@ -28,19 +28,27 @@ if TYPE_CHECKING:
 _RAW, _COMPRESSED, _CAMERA = "Image", "CompressedImage", "CameraInfo"
 _Pixels = npt.NDArray[np.uint8]
 _BEGINS = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png"}
-# Of the neighbours that have a colour, for a pixel that has not.
+# Weights of a pixel's 3 x 3 neighbours in the interpolation of a colour that the pixel itself lacks.
 _WEIGHTS = ((1, 2, 1), (2, 4, 2), (1, 2, 1))
 
 
 def has_images(path: Path) -> bool:
-    """Whether a bag that can be read has any."""
+    """Return whether a bag can be read and has images."""
     with suppress(InputError), open_bag(path) as bag:
         return bool(_num_by_topic(bag))
     return False
 
 
 def open_images(path: Path, topic: str | None) -> Source:
-    """What the images of a bag are, by their topic if there are several; InputError as ``open_source`` has it."""
+    """Open the images of a bag as a source of photos.
+
+    Args:
+        path: of the bag.
+        topic: of the images; None: the bag has only one image topic.
+
+    Raises:
+        InputError: the bag cannot be read, has no images, or has several image topics and none is chosen.
+    """
     with open_bag(path) as bag:
         num_by_topic = _num_by_topic(bag)
         topic = _chosen(num_by_topic, topic, path)
@@ -53,14 +61,14 @@ def open_images(path: Path, topic: str | None) -> Source:
         camera, notes = _camera(bag, topic, kind, size_px, path)
         duration_s = bag.duration * 1e-9
     is_stamped = stamp_s(message) > 0
-    clock = "the stamps of their headers" if is_stamped else "when they arrived, as their headers have no stamps"
+    clock = "the stamps of their headers" if is_stamped else "times of arrival, because their headers have no stamps"
     what = f"{num_by_topic[topic]} images of {topic}, {size_px[0]} x {size_px[1]} pixels"
     frames = partial(_frames, path, topic, is_stamped)
     return Source(what, size_px, duration_s, num_by_topic[topic], clock, frames, camera, notes)
 
 
 def _num_by_topic(bag: AnyReader) -> dict[str, int]:
-    """How many images each topic has that has any."""
+    """Return the number of images of each image topic."""
     images = {item.topic for item in bag.connections if type_name(item.msgtype) in (_RAW, _COMPRESSED)}
     return {topic: bag.topics[topic].msgcount for topic in sorted(images)}
 
@@ -73,12 +81,12 @@ def _chosen(num_by_topic: dict[str, int], topic: str | None, path: Path) -> str:
         return str(topic)
     if not num_by_topic:
         raise InputError(f"no images in this bag, expected {_RAW} or {_COMPRESSED} of sensor_msgs", path)
-    which = "several topics of images" if topic is None else f"no images of {topic}, but of"
+    which = "several topics of images" if topic is None else f"no images of {topic}; there are images of"
     raise InputError(f"{which}: {several}; choose by [images] topic, or --image_topic", path)
 
 
 def _messages(bag: AnyReader, topic: str) -> Iterator[tuple[str, Any, float]]:
-    """Type, content and time of arrival of each message of a topic."""
+    """Return an iterator over type, content and time of arrival (seconds) of each message of a topic."""
     connections = [item for item in bag.connections if item.topic == topic]
     return ((type_name(kind), message, received_s) for kind, message, received_s in messages_of(bag, connections))
 
@@ -98,29 +106,32 @@ def _frames(path: Path, topic: str, is_stamped: bool) -> Iterator[Frame]:
 def _camera(
     bag: AnyReader, topic: str, kind: str, size_px: tuple[int, int], path: Path
 ) -> tuple[tuple[str, tuple[float, ...]] | None, tuple[str, ...]]:
-    """COLMAP's model and parameters by the CameraInfo beside a topic, and what is to be said of it."""
+    """Return COLMAP's camera model and parameters from the CameraInfo that belongs to an image topic, and notes on it.
+
+    The camera is None where there is no CameraInfo, or where it does not fit the images.
+    """
     infos = [item.topic for item in bag.connections if type_name(item.msgtype) == _CAMERA]
     beside = [topic.rpartition("/")[0]]
-    beside += [beside[0].rpartition("/")[0]] if kind == _COMPRESSED else []  # as of /camera/image_raw/compressed
+    beside += [beside[0].rpartition("/")[0]] if kind == _COMPRESSED else []  # for /camera/image_raw/compressed
     info_topic = next((info for place in beside for info in infos if info.rpartition("/")[0] == place), None)
     found = None if info_topic is None else next(_messages(bag, info_topic), None)
     if found is None:
         return None, ()
     info = found[1]
-    d, k, p = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "dkp")  # ROS 1 has capitals
+    d, k, p = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "dkp")  # ROS 1: D, K, P
     is_rectified = "rect" in topic.rpartition("/")[2] or "rect" in beside[0].rpartition("/")[2]
     fx, cx, fy, cy = p[[0, 2, 5, 6]] if is_rectified else k[[0, 2, 4, 5]]
     if not (fx > 0 and fy > 0):
-        return None, ()  # not calibrated
+        return None, ()  # the camera is not calibrated
     if (info.width, info.height) != size_px:
-        return None, (f"{info_topic} is of {info.width} x {info.height} pixels: not taken as the camera",)
+        return None, (f"{info_topic} is for {info.width} x {info.height} pixels: it is not used for the camera",)
     distortion = info.distortion_model if not is_rectified and any(d) else "none"
     try:
         return colmap_camera(distortion, (fx, fy, cx, cy), d, path), (
-            f"the camera is that of {info_topic}, where none is given",
+            f"the camera is that of {info_topic}, unless one is given",
         )
     except InputError as error:
-        return None, (f"{info_topic} is not taken as the camera: {error}",)
+        return None, (f"{info_topic} is not used for the camera: {error}",)
 
 
 def _grey(message: Any, path: Path) -> Image.Image:
@@ -136,7 +147,11 @@ def _write_file(content: bytes, path: Path) -> None:
 
 
 def _image_file(message: Any, path: Path) -> tuple[bytes, str]:
-    """Content and suffix of the file that a CompressedImage holds."""
+    """Return content and suffix of the image file in a CompressedImage.
+
+    Raises:
+        InputError: it is neither JPEG nor PNG.
+    """
     content = bytes(message.data)
     suffix = next((suffix for begin, suffix in _BEGINS.items() if content.startswith(begin)), None)
     if suffix is None:
@@ -145,7 +160,16 @@ def _image_file(message: Any, path: Path) -> tuple[bytes, str]:
 
 
 def _opened(content: bytes, path: Path, *, reduced_to_px: int | None = None) -> Image.Image:
-    """The picture of such a file, in grey and of about that size if one is given, as JPEG decodes it quickest."""
+    """Decode an image file.
+
+    Args:
+        content: of the file.
+        path: of the bag, for messages.
+        reduced_to_px: decode in grey and at about this size, which is much faster for JPEG; None: in full.
+
+    Raises:
+        InputError: it cannot be decoded.
+    """
     try:
         image: Image.Image = Image.open(io.BytesIO(content))
         if reduced_to_px is not None:
@@ -158,7 +182,11 @@ def _opened(content: bytes, path: Path, *, reduced_to_px: int | None = None) -> 
 
 
 def _raw_image(message: Any, path: Path) -> Image.Image:
-    """The picture of an Image, in grey or in colour; InputError for an unknown encoding or too few bytes."""
+    """Decode a raw Image in grey or colour.
+
+    Raises:
+        InputError: the encoding is unknown, or there are too few bytes.
+    """
     height, width, encoding = message.height, message.width, message.encoding
     if encoding not in _READERS:
         raise InputError(f"an image in the encoding '{encoding}', expected one of {', '.join(_READERS)}", path)
@@ -171,7 +199,15 @@ def _raw_image(message: Any, path: Path) -> Image.Image:
 
 
 def _luma_and_colours(luma: int, pixels: _Pixels) -> _Pixels:
-    """Of an even number of pixels a row, that have a luma each, and a colour together with their neighbour."""
+    """Decode YUV 4:2:2, in which each pixel has its own luma, and two neighbours share their colour.
+
+    Args:
+        luma: which of the two bytes of a pixel is its luma.
+        pixels: (h, w, 2); a last column without a partner is left out.
+
+    Returns:
+        (h, w, 3) red, green and blue.
+    """
     colours = pixels[:, : pixels.shape[1] // 2 * 2, 1 - luma]
     bands = [pixels[:, : colours.shape[1], luma], *(np.repeat(colours[:, k::2], 2, axis=1) for k in (0, 1))]
     merged = Image.merge("YCbCr", [Image.fromarray(np.ascontiguousarray(band)) for band in bands])
@@ -179,9 +215,14 @@ def _luma_and_colours(luma: int, pixels: _Pixels) -> _Pixels:
 
 
 def _colours_of_mosaic(red: tuple[int, int], pixels: _Pixels) -> _Pixels:
-    """Of pixels behind red, green and blue filters; those two colours that one lacks are of its neighbours.
+    """Decode a Bayer mosaic: each pixel has one colour, and the other two are interpolated from its neighbours.
 
-    ``red``: row and column of a red one in the first 2 x 2 pixels; blue is across from it.
+    Args:
+        red: row and column of the red pixel in the first 2 x 2 pixels; the blue one is diagonally opposite.
+        pixels: (h, w, 1).
+
+    Returns:
+        (h, w, 3) red, green and blue.
     """
     has_red, has_blue = (np.zeros(pixels.shape[:2], bool) for _ in range(2))
     has_red[red[0] :: 2, red[1] :: 2] = has_blue[1 - red[0] :: 2, 1 - red[1] :: 2] = True
@@ -193,7 +234,7 @@ def _colours_of_mosaic(red: tuple[int, int], pixels: _Pixels) -> _Pixels:
     return mixed
 
 
-# By encoding: bytes of a pixel, and how (height, width, bytes) become grey or red, green and blue.
+# For each encoding: bytes of a pixel, and the function from (height, width, bytes) to grey or to red, green and blue.
 _READERS: dict[str, tuple[int, Callable[[_Pixels], _Pixels]]] = {
     **dict.fromkeys(("mono8", "8UC1"), (1, lambda pixels: pixels[..., 0])),
     "mono16": (2, lambda pixels: pixels[..., 1]),  # the upper byte of two

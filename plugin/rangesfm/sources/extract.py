@@ -1,4 +1,4 @@
-"""Photos out of a video or a bag: the sharpest of each interval, kept in a folder until the source changes."""
+"""Extraction of photos from a video or a bag: the sharpest of each interval, kept until the source changes."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from rangesfm.sources.source import Frame, Source, open_source
 
 TIMES_NAME = "images.csv"
 RECORD_NAME = "photos.json"
-"""Of a folder of such photos: what they were taken from."""
+"""File in a folder of extracted photos that records their source."""
 _MIN_NUM_PHOTOS = 2
-_ROUNDING = 1e-6  # of an interval
+_ROUNDING = 1e-6  # tolerance, as a fraction of an interval, for times that are rounded down below its start
 _Files = dict[str, tuple[tuple[int, int, int], str]]
 
 
 class TakenPhotos(Record):
-    """What the photos in a folder were taken from.
+    """Record of the source from which the photos in a folder were extracted.
 
     Attributes:
-        files: state and SHA-256 of the source's files by name.
-        rate_hz, topic: how the photos were chosen.
-        image_names: of the photos, in the order of time.
-        camera: COLMAP's model and parameters, where the source says them.
-        notes: what the user should know, a line each.
+        files: state (see ``state_and_sha256``) and SHA-256 of each file of the source by name.
+        rate_hz, topic: the user's choice of photos.
+        image_names: names of the photos in order of time.
+        camera: COLMAP's camera model and parameters, if the source has them.
+        notes: lines that the user should know.
     """
 
     files: _Files
@@ -43,11 +43,11 @@ class TakenPhotos(Record):
 
     @property
     def choice(self) -> tuple[object, ...]:
-        """What is the same where the photos are, whatever the source's state."""
+        """Return what determines the photos: hashes of the source, rate and topic. Equal choices give equal photos."""
         return {name: sha256 for name, (_, sha256) in self.files.items()}, self.rate_hz, self.topic
 
     def are_in(self, folder: Path) -> bool:
-        """Whether nobody took one of them away."""
+        """Return whether all photos and the table of their times are still in a folder."""
         return all((folder / name).is_file() for name in (TIMES_NAME, *self.image_names))
 
 
@@ -57,10 +57,13 @@ def take_photos(
     """Write the sharpest frame of each ``1 / rate_hz`` seconds as a photo, and ``images.csv`` with their times.
 
     Args:
-        path: a video or a bag.
-        folder: is made, or changes when all is done; left as it is where it holds these photos already.
-        topic: of the images in a bag that has several such.
-        restart: whether to take them anew even so.
+        path: of a video or a bag.
+        folder: for the photos. It is made or replaced when all is done. If it has these photos already, it is not
+            changed.
+        rate_hz: photos per second.
+        topic: of the images in a bag; None: the bag has only one image topic.
+        progress: is told of the stage and of the photos.
+        restart: whether to extract the photos again even if the folder has them.
 
     Raises:
         InputError: the source cannot be read, or has fewer than two photos.
@@ -85,7 +88,10 @@ def take_photos(
 
 
 def earlier_photos(path: Path, folder: Path, *, rate_hz: float, topic: str | None) -> TakenPhotos | None:
-    """Return what an earlier run took from the same source in the same way, if all of it is in ``folder``."""
+    """Return the record of photos that an earlier run extracted from the same source with the same choice.
+
+    None where there are none, or where some are missing from ``folder``.
+    """
     try:
         earlier = TakenPhotos.read(folder / RECORD_NAME)
     except InputError:
@@ -95,7 +101,7 @@ def earlier_photos(path: Path, folder: Path, *, rate_hz: float, topic: str | Non
 
 
 def sharpest(frames: Iterable[Frame], rate_hz: float) -> Iterator[Frame]:
-    """The sharpest frame of each interval of ``1 / rate_hz`` seconds, counted from the first frame, that has any.
+    """Yield the sharpest frame of each interval of ``1 / rate_hz`` seconds that has frames, from the first frame on.
 
     Frames that are not later than all before them are left out.
     """
@@ -113,7 +119,7 @@ def _with_intervals(frames: Iterable[Frame], rate_hz: float) -> Iterator[tuple[i
 
 
 def _write(source: Source, folder: Path, rate_hz: float, progress: Progress) -> tuple[dict[str, float], int]:
-    """Photos and their table; returns the photos' times by name, and how many bytes they take."""
+    """Write the photos and the table of their times; return times (seconds) by name, and the bytes of all photos."""
     times_s: dict[str, float] = {}
     num_expected, num_bytes = source.num_photos(rate_hz), 0
     for frame in sharpest(source.frames(), rate_hz):
@@ -128,7 +134,7 @@ def _write(source: Source, folder: Path, rate_hz: float, progress: Progress) -> 
 
 
 def _files(path: Path, earlier: TakenPhotos | None) -> _Files:
-    """State and SHA-256 by name of a file, or of those in a folder."""
+    """Return state and SHA-256 by name of a file, or of all files in a folder. Hashes of unchanged files are reused."""
     files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
     known = {} if earlier is None else earlier.files
     return {file.name: state_and_sha256(file, known.get(file.name)) for file in files}

@@ -1,4 +1,4 @@
-"""What photos are taken out of: something that shows frames, one after the other."""
+"""Sources of photos: videos and bags, which yield one frame after the other."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 VIDEO_EXTENSIONS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts")
-MAX_SIDE_PX = 1000  # of a picture reduced to see how sharp it is: finer blur than of its pixels does no harm
+# Largest side of the reduced picture by which sharpness is measured. Blur below its pixels does no harm.
+MAX_SIDE_PX = 1000
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture that may become a photo; it is decoded when asked for.
+    """A frame that may become a photo. It is decoded only on demand.
 
     Attributes:
-        number: which one it is in its source, from 0.
-        time_s: when it was taken.
+        number: of the frame in its source, from 0.
+        time_s: time at which it was taken, seconds on the clock of the source.
         suffix: of the file that ``write`` writes.
-        grey: as 8-bit grey values, perhaps reduced.
-        write: as a photo to a new file.
+        grey: function that returns the picture in 8-bit grey, perhaps reduced in size.
+        write: function that writes the photo to a new file.
     """
 
     number: int
@@ -36,7 +37,7 @@ class Frame:
     write: Callable[[Path], None]
 
     def sharpness(self) -> float:
-        """Energy of the gradient, which blur lowers: mean square of the differences between neighbouring pixels."""
+        """Return the mean square difference between neighbouring pixels. Blur makes it smaller."""
         import numpy as np
 
         grey = self.grey()
@@ -49,14 +50,14 @@ class Source:
     """A video, or the images of a bag.
 
     Attributes:
-        what: it is, for people.
-        size_px: width and height of its photos.
-        duration_s: about.
-        num_frames: that it says it has; 0 where it does not say.
-        clock: what its times are, for people.
-        camera: COLMAP's model and parameters, where it says them.
-        frames: all of them, in their order.
-        notes: what else the user should know, a line each.
+        what: description for the user.
+        size_px: width and height of the photos.
+        duration_s: approximate duration.
+        num_frames: number of frames by the header of the file; 0 where it does not say.
+        clock: description of the times, for the user.
+        frames: function that yields all frames in their order.
+        camera: COLMAP's camera model and parameters, if the source has them.
+        notes: further lines that the user should know.
     """
 
     what: str
@@ -69,7 +70,7 @@ class Source:
     notes: tuple[str, ...] = ()
 
     def num_photos(self, rate_hz: float) -> int:
-        """About how many photos there will be, one in each interval of ``1 / rate_hz`` seconds."""
+        """Return about how many photos there will be, with one in each interval of ``1 / rate_hz`` seconds."""
         num = math.ceil(self.duration_s * rate_hz)
         return min(num, self.num_frames) if self.num_frames else num
 
@@ -79,15 +80,19 @@ def is_video(path: Path) -> bool:
 
 
 def is_source(path: Path) -> bool:
-    """Whether photos can be taken out of it, by its name; a folder of photos is none."""
+    """Return whether a path is a video or a bag, by its name. A folder of photos is not a source."""
     return is_video(path) or is_bag(path)
 
 
 def open_source(path: Path, topic: str | None) -> Source:
-    """What is known of it before its pictures are looked at.
+    """Open a video or a bag and read all that is known before its frames are decoded.
 
-    ``topic`` is of the images in a bag; None: it has one such. InputError if nothing tells which are meant, or the
-    source cannot be read.
+    Args:
+        path: of the source.
+        topic: of the images in a bag; None: the bag has only one image topic.
+
+    Raises:
+        InputError: the source cannot be read, or has several image topics and none is chosen.
     """
     from rangesfm.sources.bag import open_images
     from rangesfm.sources.video import open_video

@@ -1,4 +1,4 @@
-"""The frames of a video, through the optional package av."""
+"""Frames of a video, read by the optional package av."""
 
 from __future__ import annotations
 
@@ -20,14 +20,18 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 _QUALITY = 95
-_SINCE_2001_S = 978307200  # earlier ones are the zeros of clocks that were never set
-# The first is of iPhones, with the zone; the second is of the container, by its definition UTC.
+_SINCE_2001_S = 978307200  # an earlier creation time (Unix seconds) comes from a clock that was never set
+# The first key is written by iPhones, with the time zone; the second is that of the container, in UTC by definition.
 _CREATION_KEYS = ("com.apple.quicktime.creationdate", "creation_time")
 _CREATION_FORMS = ("%Y-%m-%dT%H:%M:%S%z", "%Y-%m-%dT%H:%M:%S.%f%z")
 
 
 def open_video(path: Path) -> Source:
-    """What a video is; its photos are turned as players turn it. InputError if it cannot be read, or without av."""
+    """Open a video as a source of photos. The photos are turned as players turn the video.
+
+    Raises:
+        InputError: it cannot be read, or av is not installed.
+    """
     with _reading(path) as video:
         first = next(video.decode(video=0), None)
         if first is None:
@@ -39,14 +43,14 @@ def open_video(path: Path) -> Source:
             duration_s = (video.duration or 0) * 1e-6
         start_s = _creation_time_s(video)
         size_px, num_frames = _image(first).size, stream.frames
-    clock = "seconds from its first frame, as it has no creation time"
+    clock = "seconds from its first frame, because it has no creation time"
     if start_s is not None:
         created = datetime.fromtimestamp(start_s, timezone.utc).isoformat(sep=" ", timespec="seconds")
         clock = (
-            f"those of its frames, the first one at its creation time {created}; that is in whole seconds, and with "
-            "some cameras local time, or the end of the video"
+            f"those of its frames, with the first one at its creation time {created}; that time is in whole seconds, "
+            "and with some cameras it is local time, or the end of the video"
         )
-    turned = "the photos are turned as players show the video; the lever arm refers to photos so turned"
+    turned = "the photos are turned as players show the video; the lever arm refers to the turned photos"
     return Source(
         what=f"video, {size_px[0]} x {size_px[1]} pixels, {duration_s:.1f} s",
         size_px=size_px,
@@ -89,7 +93,7 @@ def _reading(path: Path) -> Iterator[InputContainer]:
 
 
 def _creation_time_s(video: InputContainer) -> float | None:
-    """Seconds since 1970 in UTC; None where it says none."""
+    """Return the creation time of a video, seconds since 1970 in UTC; None where it has none."""
     for key, form in product(_CREATION_KEYS, _CREATION_FORMS):
         with suppress(KeyError, ValueError):
             time_s = datetime.strptime(video.metadata[key], form).timestamp()
@@ -103,7 +107,7 @@ def _grey(frame: VideoFrame) -> Image.Image:
 
 
 def _image(frame: VideoFrame) -> Image.Image:
-    """Turned as players show it: counterclockwise by a multiple of 90 degrees."""
+    """Return a frame turned as players show it, counterclockwise by a multiple of 90 degrees."""
     image = Image.fromarray(frame.to_ndarray(format="rgb24"))
     return image.rotate(90 * round(frame.rotation / 90), expand=True)
 
