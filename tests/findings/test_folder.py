@@ -79,8 +79,8 @@ def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
     assert found.paths == {}
     photos, videos = found.notes
     assert found.models == (tmp_path / "sparse",)
-    assert photos == "1 of .heic, as IMG_1.HEIC: these are not read: convert them to JPEG"
-    assert videos.startswith("2 of .insv, as walk.INSV: videos of 360 degrees are not read")
+    assert photos == ".heic files are not read (1, such as IMG_1.HEIC): convert them to JPEG"
+    assert videos.startswith(".insv files are not read (2, such as walk.INSV): extract plain photos")
 
 
 def test_a_bag_is_a_log_if_it_has_ranges(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_table_that_may_be_a_log_is_told_unless_there_is_one(tmp_path: Path) -
     (tmp_path / "unknown.csv").write_text("a,b,c\n0.1,2.5,3.5\n0.2,2.6,3.7\n0.3,2.7,3.8\n")
     (note,) = look_into([tmp_path]).notes
     assert "not known for sure" in note
-    assert f"rangesfm ranges {tmp_path / 'unknown.csv'} asks for more" in note
+    assert f"rangesfm ranges {tmp_path / 'unknown.csv'} says what is missing" in note
     (tmp_path / "uwb.csv").write_text(CONTENTS["ranges.path"])
     assert look_into([tmp_path]).notes == ()
 

@@ -45,8 +45,8 @@ def test_the_usual_name_is_meant_and_the_others_are_told(tmp_path: Path) -> None
     understood = understand([tmp_path], {})
     assert understood.values == {"images.path": tmp_path / "images", "ranges.path": tmp_path / "uwb.csv"}
     assert understood.notes == (
-        "left out, as images is there: images_small",
-        "left out, as uwb.csv is there: uwb_old.csv",
+        "images is used; left out: images_small",
+        "uwb.csv is used; left out: uwb_old.csv",
     )
 
 
@@ -76,9 +76,9 @@ def test_files_of_one_anchor_each_are_one_log(tmp_path: Path) -> None:
 
 def test_a_folder_of_nothing_is_refused_with_what_is_there(tmp_path: Path) -> None:
     (tmp_path / "walk.insv").touch()
-    with pytest.raises(InputError, match="neither photos nor a radio's log") as caught:
+    with pytest.raises(InputError, match="found no photos, no radio log") as caught:
         understand([tmp_path], {})
-    assert "videos of 360 degrees are not read" in caught.value.advice[0]
+    assert ".insv files are not read" in caught.value.advice[0]
 
 
 def test_of_several_cameras_that_of_the_photos_size_is_taken(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_a_camera_of_another_size_is_left_out_but_its_lever_arm_holds(tmp_path: 
     (tmp_path / "camera.json").write_text(json.dumps({**CAMERA, "width": 192, "height": 128}))
     understood = understand([tmp_path], {})
     assert understood.values == {"images.path": tmp_path / "images", "tag.tag_in_cam_m": (0, 0.1, 0)}
-    assert "0 of its cameras (192 x 128 pixels) fit the photos: none is taken" in understood.notes[-1]
+    assert "0 of its cameras (192 x 128 pixels) fit the photos, so none is used" in understood.notes[-1]
 
 
 def test_a_video_is_the_photos_also_in_a_folder_of_the_usual_name(tmp_path: Path) -> None:

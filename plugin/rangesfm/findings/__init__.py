@@ -1,1 +1,1 @@
-"""What lies in somebody's folders, and the survey that it makes."""
+"""Discovery of the inputs in a user's folders, and the survey that they make."""

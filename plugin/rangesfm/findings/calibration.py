@@ -1,4 +1,4 @@
-"""Calibrated cameras by the files of others: COLMAP's, Kalibr's, ROS's, and a camera as JSON."""
+"""Reading of camera calibrations: files of COLMAP, Kalibr and ROS, and JSON."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: [-+.\deE]+)+)"
 
 @dataclass(frozen=True)
 class Calibration:
-    """One camera as COLMAP has it.
+    """One calibrated camera in COLMAP's conventions.
 
     Attributes:
         model: COLMAP's name of the camera model.
-        params: in COLMAP's order and convention of pixels.
-        size_px: width and height of its photos; None: not said.
-        tag_in_cam_m: lever arm of the radio's tag; None: not said.
+        params: in COLMAP's order and pixel convention.
+        size_px: width and height of its photos; None if the file does not say.
+        tag_in_cam_m: lever arm of the radio's tag; None if the file does not say.
     """
 
     model: str
@@ -37,12 +37,16 @@ class Calibration:
 
 
 def read_calibrations(path: Path) -> tuple[Calibration, ...]:
-    """The cameras of a file, none if it is no calibration; InputError for one that lacks something or is not known."""
+    """Read the cameras of a file; none if the file is not a calibration.
+
+    Raises:
+        InputError: the calibration is not complete, or COLMAP has no such camera model.
+    """
     try:
         return tuple(_READERS[path.suffix.lower()](path)) if path.suffix.lower() in _READERS else ()
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"a camera's calibration that is not complete ({what})", path) from None
+        raise InputError(f"the calibration of a camera is not complete ({what})", path) from None
 
 
 def _read_colmap(path: Path) -> Iterator[Calibration]:

@@ -1,4 +1,4 @@
-"""What lies in folders: every file by what it holds, under the key of a survey file that takes such a one."""
+"""Discovery of inputs in folders: each file is recognised by its content and listed under its key of a survey file."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from rangesfm.vision.photos import MIN_NUM_PHOTOS
 
 PHOTOS, MODEL, LOG = "images.path", "images.model", "ranges.path"
 _NOT_READ = {
-    ".insv": "videos of 360 degrees are not read: take plain photos out of them, with their times",
-    **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "these are not read: convert them to JPEG"),
+    ".insv": "extract plain photos with their times from these 360 degree videos",
+    **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "convert them to JPEG"),
 }
 _TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
-# Of tables that may be the log, where there is none.
+# Largest number of notes on tables that may be the log, where no log was recognised.
 _MAX_NUM_UNSURE = 3
-# By the header row, once it is known that the file is no log.
+# Tables that are recognised by their header row, after it is known that the file is not a log.
 _TABLES: dict[str, Callable[[str], bool]] = {
     "scale.markers": partial(has_columns, required=MARKER_COLUMNS),
     "scale.distances": partial(has_columns, required=DISTANCE_COLUMNS),
@@ -44,13 +44,13 @@ _TABLES: dict[str, Callable[[str], bool]] = {
 
 @dataclass(frozen=True)
 class Found:
-    """What may be inputs.
+    """Possible inputs in folders.
 
     Attributes:
-        paths: folders that hold photos themselves, videos, and other files, by dotted key of a survey file.
-        calibrations: the cameras of each file that has any.
-        models: COLMAP models.
-        notes: what is there and cannot be used, a line each.
+        paths: folders of photos, videos, and other files, by dotted key of a survey file.
+        calibrations: cameras of each file with a calibration.
+        models: folders of COLMAP models.
+        notes: a line for each thing that is there and cannot be used.
     """
 
     paths: dict[str, list[Path]]
@@ -60,7 +60,11 @@ class Found:
 
 
 def look_into(folders: Sequence[Path]) -> Found:
-    """Look at all that folders hold, however deep, but for hidden files and results; InputError if one is no folder."""
+    """Find possible inputs in folders and all their subfolders. Hidden files and results of runs are left out.
+
+    Raises:
+        InputError: a path is not a folder.
+    """
     paths: dict[str, list[Path]] = defaultdict(list)
     calibrations: dict[Path, tuple[Calibration, ...]] = {}
     models: list[Path] = []
@@ -84,17 +88,21 @@ def look_into(folders: Sequence[Path]) -> Found:
                     paths[key].append(path)
         except InputError as error:
             if error.advice:
-                unsure.append(f"{error}; if it is the radio's log, rangesfm ranges {path} asks for more")
+                unsure.append(f"{error}; if it is the radio's log, rangesfm ranges {path} says what is missing")
             else:
                 notes.append(str(error))
     for suffix, those in not_read.items():
-        notes.append(f"{len(those)} of {suffix}, as {those[0].name}: {_NOT_READ[suffix]}")
+        notes.append(f"{suffix} files are not read ({len(those)}, such as {those[0].name}): {_NOT_READ[suffix]}")
     notes += [] if LOG in paths else unsure[:_MAX_NUM_UNSURE]
     return Found(dict(paths), calibrations, tuple(models), tuple(notes))
 
 
 def _key_of(path: Path) -> str | None:
-    """The key that takes such a file; None: not known. InputError: it may be a log, and is not understood."""
+    """Return the dotted key of a survey file that takes such a file, or None if it is not recognised.
+
+    Raises:
+        InputError: it may be a log, but is not understood.
+    """
     if is_bag(path):
         read_ranges(path)
         return LOG
@@ -114,7 +122,11 @@ def _key_of(path: Path) -> str | None:
 
 
 def _entries(folders: Sequence[Path]) -> Iterator[Path]:
-    """Files, bags, models and folders that hold photos; links are followed once."""
+    """Yield files, bags, models and folders of photos in folders. Links are followed once.
+
+    Raises:
+        InputError: a path is not a folder.
+    """
     for top in folders:
         if not top.is_dir():
             raise InputError("is a file, expected a folder" if top.exists() else "no such folder", top)
@@ -132,5 +144,5 @@ def _entries(folders: Sequence[Path]) -> Iterator[Path]:
 
 
 def _is_model(folder: Path) -> bool:
-    """Whether it is a COLMAP model, as text or binary."""
+    """Return whether a folder is a COLMAP model, text or binary."""
     return any((folder / f"cameras.{end}").is_file() and (folder / f"images.{end}").is_file() for end in ("bin", "txt"))

@@ -1,4 +1,4 @@
-"""A survey file with its values explained, as somebody would write it."""
+"""Writing of a survey file in which each value is explained by a comment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rangesfm.files.atomic import is_plain_name
 from rangesfm.survey.settings import KEYS
 
 NAME = "survey.toml"
-# What most surveys want sooner or later stands there as a comment where nothing is known.
+# Keys that most surveys need at some time. Where no value is known, they are written as comments with these examples.
 _OFFERED: Mapping[str, Any] = {
     "images.path": "images",
     "images.every_nth": 3,
@@ -23,15 +23,20 @@ _OFFERED: Mapping[str, Any] = {
     "tag.tag_in_cam_m": (0.0, 0.0, 0.0),
 }
 _BEGIN = """\
-# What rangesfm init understood of these folders. Paths are relative to this file.
-# rangesfm check looks at it all again, rangesfm run makes the map.
+# Made by rangesfm init from the files in these folders. Paths are relative to this file.
+# rangesfm check reads everything again and says what is wrong; rangesfm run makes the map.
 """
 
 
 def survey_text(values: Mapping[str, Any], folder: Path) -> str:
-    """A whole file of values by dotted key; InputError for the name of a path that no such file can hold.
+    """Return the text of a survey file.
 
-    Paths are absolute; those inside ``folder``, where the file will be, are written relative to it.
+    Args:
+        values: by dotted key; paths are absolute.
+        folder: in which the file will be. Paths inside it are written relative to it.
+
+    Raises:
+        InputError: the name of a path is not printable text.
     """
     lines, table = [_BEGIN], ""
     for item in KEYS:
@@ -51,7 +56,7 @@ def _toml(value: Any, folder: Path) -> str:
     if isinstance(value, Path):
         inside = os.path.relpath(value, folder) if value.is_relative_to(folder) else str(value)
         if not is_plain_name(inside):
-            raise InputError(f"the name '{inside}' is no printable UTF-8 text: rename it", folder)
+            raise InputError(f"the name '{inside}' is not printable UTF-8 text: rename it", folder)
         return json.dumps(Path(inside).as_posix(), ensure_ascii=False)
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(_toml(item, folder) for item in value)}]"

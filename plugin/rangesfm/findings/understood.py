@@ -1,4 +1,4 @@
-"""A survey as its folders tell it: of what was found one of each, or the question which."""
+"""Making of a survey from folders: the choice of one input of each kind, or a question where it is not clear."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.photos import usable_photos
 
-# Of several candidates one that is called so is meant.
+# Of several candidates for a key, one with such a name (without suffix, in lower case) is chosen.
 _USUAL_NAMES = {
     PHOTOS: ("images", "photos", "dcim", "rgb", "frames"),
     LOG: ("uwb", "ranges"),
@@ -33,29 +33,35 @@ _LEVER_ARMS = ("tag.tag_in_cam_m", "tag.lever_arms_m")
 
 @dataclass(frozen=True)
 class Understood:
-    """A survey file's values.
+    """Values of a survey file, as found in folders and given by the user.
 
     Attributes:
         values: by dotted key; paths are absolute.
-        notes: what was left out and why, a line each.
+        notes: lines that say what was left out, and why.
     """
 
     values: dict[str, Any]
     notes: tuple[str, ...]
 
     def survey(self) -> Survey:
-        """All of it as a run takes it; InputError for a value given that is none."""
+        """Return the survey for a run.
+
+        Raises:
+            InputError: a given value is not valid.
+        """
         return survey_from_tables({}, Path.cwd(), self.values)
 
 
 def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understood:
-    """Look into folders and choose what a run needs.
+    """Look into folders and choose the inputs of a run.
 
     Args:
-        given: values by dotted key that the user says; what they stand for is not looked for.
+        folders: to look into.
+        given: values by dotted key from the user; inputs of these keys are not looked for.
 
     Raises:
-        InputError: there is nothing, or several of a kind and nothing tells which is meant; its advice asks.
+        InputError: there are no inputs, or there are several of a kind and it is not clear which one to take. The
+            advice of the error asks for it.
     """
     folders = [Path(os.path.abspath(folder)) for folder in folders]
     found = look_into(folders)
@@ -75,24 +81,28 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
         values[key] = chosen
         if chosen in paths and len(paths) > 1:
             others = ", ".join(_shown(path, folders) for path in paths if path != chosen)
-            notes.append(f"left out, as {chosen.name} is there: {others}")
+            notes.append(f"{chosen.name} is used; left out: {others}")
     if questions:
         raise InputError("more than one survey could be meant", folders[0], advice=questions)
     if found.models and PHOTOS not in values:
         values.setdefault(MODEL, found.models[0])
     notes += [
-        f"{path} is a COLMAP model: rangesfm refine SURVEY --input_path {path} goes on from it"
+        f"{path} is a COLMAP model: rangesfm refine SURVEY --input_path {path} starts from it"
         for path in found.models
         if path != values.get(MODEL)
     ]
     if not {PHOTOS, LOG, "scale.distances"} & values.keys():
-        raise InputError("neither photos nor a radio's log nor lengths in there", folders[0], advice=notes)
+        raise InputError("found no photos, no radio log and no lengths in it", folders[0], advice=notes)
     _add_camera(values, found, notes)
     return Understood(values, tuple(notes))
 
 
 def _chosen(key: str, paths: Sequence[Path]) -> Path | None:
-    """The only one, or the one of the usual name, or files of one anchor each as one log; None: nobody knows."""
+    """Choose one path for a key.
+
+    It is the only one, the only one with a usual name, or (for a log) a pattern for files of one anchor each. None
+    where it is not clear.
+    """
     usual = [path for path in paths if path.stem.lower() in _USUAL_NAMES.get(key, ())]
     for candidates in (paths, usual):
         if len(candidates) == 1:
@@ -101,7 +111,10 @@ def _chosen(key: str, paths: Sequence[Path]) -> Path | None:
 
 
 def _tops(paths: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
-    """Of folders of photos the highest one inside ``folders`` that has a usual name, as photos for photos/left."""
+    """Replace folders of photos by the highest folder above them with a usual name, such as photos for photos/left.
+
+    Only folders inside ``folders`` are considered. Videos and bags are kept.
+    """
     tops = []
     for path in paths:
         if is_source(path):
@@ -113,7 +126,7 @@ def _tops(paths: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
 
 
 def _pattern(paths: Sequence[Path]) -> Path | None:
-    """A pattern for the files of one log, each of another anchor; None if they are no such files."""
+    """Return a pattern that matches exactly these files, if each is a log of another anchor; otherwise None."""
     names, folder = [path.name for path in paths], paths[0].parent
     common = os.path.commonprefix
     prefix = common(names)
@@ -129,20 +142,20 @@ def _pattern(paths: Sequence[Path]) -> Path | None:
 
 
 def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
-    """Camera and lever arm of the one calibration that there is for photos of this size."""
+    """Add camera and lever arm to ``values`` where exactly one calibration fits the size of the photos."""
     files = [*found.calibrations]
     path = _chosen("camera", files)
     if path is None:
         if files:
             several = ", ".join(file.name for file in files)
-            notes.append(f"{several}: nothing tells which of these cameras it is, none is taken; leave one there")
+            notes.append(f"{several}: it is not clear which of these is the camera, so none is used; keep only one")
         return
     cameras = found.calibrations[path]
     arms = [camera.tag_in_cam_m for camera in cameras if camera.tag_in_cam_m is not None]
     if len(arms) == 1 and not values.keys() & {*_LEVER_ARMS}:
         values["tag.tag_in_cam_m"] = arms[0]
         notes.append(f"the lever arm is that of {path.name}")
-    if {"camera.model", "camera.params", MODEL} & values.keys():  # a model has its own
+    if {"camera.model", "camera.params", MODEL} & values.keys():  # a COLMAP model has its own cameras
         return
     size_px = _size_px(values)
     fitting = [camera for camera in cameras if None in (camera.size_px, size_px) or camera.size_px == size_px]
@@ -151,15 +164,15 @@ def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
         notes.append(f"the camera is that of {path.name}")
     else:
         sizes = ", ".join(" x ".join(map(str, camera.size_px)) for camera in cameras if camera.size_px)
-        notes.append(f"{path.name}: {len(fitting)} of its cameras ({sizes} pixels) fit the photos: none is taken")
+        notes.append(f"{path.name}: {len(fitting)} of its cameras ({sizes} pixels) fit the photos, so none is used")
 
 
 def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:
-    """The most common size of the photos; None without any."""
+    """Return the most common width and height of the photos; None without photos."""
     if PHOTOS not in values:
         return None
     if is_source(values[PHOTOS]):
-        with suppress(InputError):  # for a check to tell of
+        with suppress(InputError):  # rangesfm check reports this error
             return open_source(values[PHOTOS], values.get("images.topic")).size_px
         return None
     photos = usable_photos(values[PHOTOS], list_images(values[PHOTOS]))
