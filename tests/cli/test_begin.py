@@ -78,7 +78,7 @@ def test_lengths_do_without_a_radio(folder: Path, capsys: pytest.CaptureFixture[
     (folder / "marks.csv").write_text("marker,image_name,x_px,y_px\ndoor,IMG_1.jpg,5,6\ndoor,IMG_2.jpg,5,7\n")
     assert main(["init", str(folder)]) == 0
     told = capsys.readouterr().out
-    assert "\ntaped distances: 2, which alone say how long a metre is (no ranges)\n" in told
+    assert "\ntaped distances: 2, which alone determine the scale (no ranges)\n" in told
     assert told.endswith(f"\nnext: rangesfm run '{folder}/survey.toml'\n")
     survey = read_survey(folder / "survey.toml")
     assert (survey.scale.distances, survey.scale.markers) == (folder / "tape.csv", folder / "marks.csv")

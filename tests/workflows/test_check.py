@@ -41,9 +41,9 @@ def test_a_good_survey_is_told_with_its_counts_times_and_what_is_assumed(folder:
         f"ranges from {PHONE_START_S + 5:.3f} to {PHONE_START_S + 34.5:.3f} s",
     ]
     camera, upright, clocks = checked.assumed
-    assert camera == "camera SIMPLE_RADIAL for 17 photos, f 115 pixels, a guess from the photos' size"
+    assert camera == "camera SIMPLE_RADIAL for 17 photos, f 115 pixels, guessed from the size of the photos"
     assert upright.startswith("camera SIMPLE_RADIAL for 3 photos")
-    assert "without any the ranges cover 14.0 of the 19.0 s of the photos" in clocks
+    assert "without any, the ranges cover 14.0 of the 19.0 s of the photos" in clocks
     assert any(warning.startswith("the tag's place on the camera is not given") for warning in checked.warnings)
     assert any(warning.startswith("image times are whole seconds") for warning in checked.warnings)
     assert not (folder / "out").exists()
@@ -55,10 +55,10 @@ def test_a_given_lever_arm_offset_and_camera_are_facts_and_unknown_anchors_assum
     checked = check_survey(survey_of(folder, **given, **camera))
     assert "camera: PINHOLE for 17 photos, f 90 pixels, as given" in checked.facts
     assert "lever arm: the tag is at 0, -0.1, 0 m in the camera frame (right, down, forward)" in checked.facts
-    assert "clocks: with the offset of 3 s the ranges cover 11.0 of the 19.0 s of the photos" in checked.facts
+    assert "clocks: with the time offset of 3 s, the ranges cover 11.0 of the 19.0 s of the photos" in checked.facts
     assert checked.assumed == [
-        "camera PINHOLE for 3 photos, f 115 pixels, a guess from the photos' size",
-        "no anchor's position is known: all are estimated, and the map is in the first camera's frame",
+        "camera PINHOLE for 3 photos, f 115 pixels, guessed from the size of the photos",
+        "no position of an anchor is known: all are estimated, and the map is in the first camera's frame",
     ]
 
 

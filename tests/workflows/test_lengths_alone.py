@@ -171,7 +171,7 @@ def test_check_tells_what_a_survey_without_a_radio_has(room: Room, tmp_path: Pat
     distances = room.taped(tmp_path, PAIRS)
     checked = check_survey(room.survey(tmp_path, scale__distances=distances, markers__dictionary=DICTIONARY))
     assert not checked.faults
-    assert "taped distances: 4, which alone say how long a metre is (no ranges)" in checked.facts
+    assert "taped distances: 4, which alone determine the scale (no ranges)" in checked.facts
     assert f"tags: those of {DICTIONARY} will be looked for in the photos" in checked.facts
     assert not [fact for fact in checked.understood() if "anchor" in fact]
 

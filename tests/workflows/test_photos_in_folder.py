@@ -58,7 +58,7 @@ def test_a_camera_that_is_given_stays(survey: Survey) -> None:
 
 
 def test_other_times_beside_those_of_a_bag_are_refused(survey: Survey) -> None:
-    with pytest.raises(InputError, match="walk: its images have their times"):
+    with pytest.raises(InputError, match="walk: its images have their own times"):
         with_photos_in_folder(survey.changed({"images.times": survey.ranges.path}), Journal(SilentProgress()))
 
 

@@ -96,7 +96,7 @@ def test_drift_is_bent_back(survey: Survey, model: pycolmap.Reconstruction, walk
     adjust = adjustment(survey)
     assert adjust.adjust(model)
     assert distortion_m(model, walked_survey) < 0.5 * drift_m
-    assert adjust.note() == "ranges took part in 1 of 1 global adjustments of the map while it grew"
+    assert adjust.note() == "ranges were used in 1 of 1 global adjustments of the map while it grew"
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_a_map_whose_scale_is_open_is_left_to_colmap_as_it_is(
     adjust = adjustment(survey.changed({"scale.max_relative_stddev": max_relative_stddev}))
     assert not adjust.adjust(model)
     assert np.array_equal(centers(model), before)
-    assert adjust.note() == "ranges took part in 0 of 1 global adjustments of the map while it grew"
+    assert adjust.note() == "ranges were used in 0 of 1 global adjustments of the map while it grew"
 
 
 def test_anchors_in_the_first_camera_serve_as_unknown_ones_until_it_is_there(
@@ -184,7 +184,7 @@ def test_a_run_maps_with_ranges_where_it_is_asked_to(photo_run: PhotoRun, tmp_pa
     result = run_survey(read_survey(photo_run.survey.survey_path, asked), progress=SilentProgress()).summary
     assert set(result.seconds) >= {"mapping", "scale", "refinement"}
     assert "matching" not in result.seconds
-    (note,) = [warning for warning in result.warnings if warning.startswith("ranges took part in")]
+    (note,) = [warning for warning in result.warnings if warning.startswith("ranges were used in")]
     num_with, num = (int(word) for word in note.split() if word.isdigit())
     assert 0 < num_with < num
     assert result.comparison[-1].rmse_m < 1.2 * before["comparison"][-1]["rmse_m"]

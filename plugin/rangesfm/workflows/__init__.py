@@ -1,1 +1,1 @@
-"""The method from end to end: a run, a model refined, surveys joined."""
+"""The method from end to end: complete runs, runs that start from a model, and joining of surveys."""

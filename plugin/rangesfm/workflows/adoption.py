@@ -1,4 +1,4 @@
-"""Adaptation: a survey run again as if the likeliest cause of what does not fit were so."""
+"""Adoption of the likeliest mistake: the survey is solved again with this mistake corrected."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from rangesfm.workflows.metric_map import metric_map, ranges_on_path
 def with_likeliest_cause(
     survey: Survey, inputs: RangingInputs, path: PathOfModel, metric: MetricResult, journal: Journal
 ) -> tuple[RangingInputs, MetricResult]:
-    """The map again from corrected inputs, with what changed as a reason to doubt it; the same if nothing was found.
+    """Correct the likeliest mistake and make the map again; return the inputs and the map unchanged if none was found.
 
-    What is told apart no better than by the likelier of two is adopted all the same: who asks for it has been told.
+    The verdict on the new map is doubtful, with the change as a reason. Of two mistakes that the ranges hardly tell
+    apart the likelier one is corrected, too; the user has asked for it and is told.
     """
     if metric.trust is None or not metric.trust.causes:
         return inputs, metric
     if metric.models:
-        journal.warn("nothing is adopted: the map is joined from several models")
+        journal.warn("no mistake is corrected: the map is joined from several models")
         return inputs, metric
     cause = metric.trust.causes[0]
     corrected = _corrected_inputs(inputs, cause.correction, metric.trust.rows)
@@ -38,7 +39,7 @@ def with_likeliest_cause(
         is_refined = metric.refined is not None
         adopted = metric_map(survey, corrected, moved, metric.time_offset, journal, refine=is_refined)
     except GeometryError as error:
-        journal.warn(f"nothing is adopted, as with that {error}")
+        journal.warn(f"no mistake is corrected, because the corrected survey fails: {error}")
         return inputs, metric
     change = 100 * (adopted.estimate.value / metric.estimate.value - 1)
     said = f"adopted: {cause.words}; the scale changed by {change:+.2f} %, from {metric.estimate.value:.6g}"
@@ -47,7 +48,13 @@ def with_likeliest_cause(
 
 
 def _corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indices) -> RangingInputs:
-    """Anchors, lever arms and ranges as they would be; the correction is of some rows of the log."""
+    """Return the inputs with corrected anchors, lever arms and ranges.
+
+    Args:
+        inputs: of the survey.
+        correction: of the mistake; its arrays are for k ranges.
+        rows: (k,) numbers of these ranges in the log.
+    """
     known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
     anchors = tuple(replace(anchor, position_m=known[anchor.anchor_id]) for anchor in inputs.anchors)
     moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in inputs.log.tag_ids]).reshape(-1, 3)
@@ -60,7 +67,7 @@ def _corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indic
 def _observations(
     survey: Survey, inputs: RangingInputs, path: PathOfModel, metric: MetricResult, trust: TrustVerdict
 ) -> RangeObservations:
-    """On the path anew; what is left out counts as held out."""
+    """Return the corrected ranges on the path. Ranges that the correction leaves out get the status of check ranges."""
     correction, rows = trust.causes[0].correction, trust.rows
     offset, times, known_s = metric.time_offset, inputs.log.timestamp_s, metric.time_offset_s or 0.0
     shift_s = _spread(np.broadcast_to(correction.time_shift_s, len(rows)), rows, len(inputs.log))
@@ -74,6 +81,7 @@ def _observations(
 
 
 def _spread(values: Array, rows: Indices, num: int) -> Array:
+    """Return an array (num,) with the values (k,) at the given rows (k,), and 0 elsewhere."""
     spread = np.zeros(num)
     spread[rows] = values
     return spread

@@ -1,4 +1,4 @@
-"""What a survey is, and all that can be known to be wrong with it, before any long work."""
+"""Check of a survey before any long work: what its inputs are, and what can already be known to be wrong."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.photos import checked_keyframes, read_inputs, read_registered
 
-# More than these nobody reads.
+# Largest number of photo sizes and of cameras that are listed.
 _MAX_NUM_SIZES = 4
 
 
 @dataclass
 class CheckedSurvey:
-    """What was found, in words.
+    """Findings of a check, in words for the user.
 
     Attributes:
-        facts: what a run will work with.
-        assumed: what it will take for true, as nobody said otherwise.
-        warnings: what a run would warn of before its long work.
-        faults: why it would not come so far.
+        facts: inputs that a run will use.
+        assumed: assumptions that it will make because the survey does not say otherwise.
+        warnings: warnings that it would give before the long work.
+        faults: errors with which it would stop before the long work.
     """
 
     facts: list[str] = field(default_factory=list)
@@ -51,7 +51,7 @@ class CheckedSurvey:
         return self.faults[0].exit_status if self.faults else 0
 
     def understood(self) -> list[str]:
-        """What a run works with, known or assumed."""
+        """Return lines on facts and assumptions."""
         return [*self.facts, *(f"assumed: {text}" for text in self.assumed)]
 
     @contextmanager
@@ -64,7 +64,7 @@ class CheckedSurvey:
 
 
 def check_survey(survey: Survey) -> CheckedSurvey:
-    """Read all inputs of a run as the run does, and tell what they are."""
+    """Read all inputs of a run as the run does, and return what they are and what is wrong with them."""
     checked = CheckedSurvey()
     journal = Journal(SilentProgress(), warnings=checked.warnings)
     model = survey.images.model
@@ -95,14 +95,14 @@ def check_survey(survey: Survey) -> CheckedSurvey:
 
 
 def _check_photos(survey: Survey, checked: CheckedSurvey) -> Photos | None:
-    """The photos; None where they are still in a video or a bag."""
+    """Check the photos and return them; None where they are still in a video or a bag."""
     folder = survey.photos_path
     if is_source(folder):
         _check_source(survey, folder, checked)
         return None
     photos = usable_photos(folder, list_images(folder))
     sizes = [f"{num} of {width} x {height} pixels" for (width, height), num in Counter(photos.sizes).most_common()]
-    more = [f"{len(sizes) - _MAX_NUM_SIZES} sizes more"] if len(sizes) > _MAX_NUM_SIZES else []
+    more = [f"{len(sizes) - _MAX_NUM_SIZES} more sizes"] if len(sizes) > _MAX_NUM_SIZES else []
     checked.facts.append(f"photos in {folder.name}: {', '.join(sizes[:_MAX_NUM_SIZES] + more)}")
     if photos.left_out:
         name, why = next(iter(photos.left_out.items()))
@@ -117,7 +117,7 @@ def _check_photos(survey: Survey, checked: CheckedSurvey) -> Photos | None:
         if survey.camera.of_photo(first).params is not None and first not in found.guessed:
             checked.facts.append(f"camera: {what}, as given")
         else:
-            seen = "by EXIF" if camera.has_prior_focal_length else "a guess from the photos' size"
+            seen = "by EXIF" if camera.has_prior_focal_length else "guessed from the size of the photos"
             checked.assumed.append(f"camera {what}, {seen}")
     return photos
 
@@ -135,10 +135,10 @@ def _check_mapper(survey: Survey, photos: Photos, checked: CheckedSurvey) -> Non
 
 
 def _check_source(survey: Survey, path: Path, checked: CheckedSurvey) -> None:
-    """What is known of a video or a bag before its photos are taken out."""
+    """Add the facts about a video or a bag that are known before its photos are extracted."""
     source, rate_hz = open_source(path, survey.images.topic), survey.images.rate_hz
     num = f"about {source.num_photos(rate_hz)} photos at {rate_hz:g} Hz"
-    checked.facts.append(f"photos of {path.name}: {source.what}; {num}, taken out when a run begins")
+    checked.facts.append(f"photos of {path.name}: {source.what}; {num}, extracted when a run begins")
     checked.facts += [*source.notes]
     checked.assumed.append(f"the photos' times are {source.clock}")
     with survey.source.naming_lines():
@@ -161,7 +161,7 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
         )
     else:
         checked.assumed.append(
-            "no anchor's position is known: all are estimated, and the map is in the first camera's frame"
+            "no position of an anchor is known: all are estimated, and the map is in the first camera's frame"
         )
     if {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
         arms = (f"{', '.join(f'{x:g}' for x in arm)} m" for arm in inputs.tag_in_cam_m.tolist() if not np.isnan(arm[0]))
@@ -170,14 +170,14 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
 
 def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     if inputs.tape is not None:
-        only = "" if len(inputs.log) else ", which alone say how long a metre is (no ranges)"
+        only = "" if len(inputs.log) else ", which alone determine the scale (no ranges)"
         yield f"taped distances: {len(inputs.tape.distances)}{only}"
     if survey.markers.dictionary is not None:
         side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
         yield f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos"
     if inputs.reference is not None:
         name = "" if survey.report.reference is None else f" in {survey.report.reference.name}"
-        yield f"reference: {len(inputs.reference)} positions{name}, only to compare with"
+        yield f"reference: {len(inputs.reference)} positions{name}, only for comparison"
 
 
 def _tell_of_times(
@@ -197,9 +197,9 @@ def _tell_of_times(
     shared_s = max(min(at_s.max(), photos_s[-1]) - max(at_s.min(), photos_s[0]), 0.0)
     overlap = f"the ranges cover {shared_s:.1f} of the {photos_s[-1] - photos_s[0]:.1f} s of the photos"
     if offset_s is not None:
-        checked.facts.append(f"clocks: with the offset of {offset_s:g} s {overlap}")
+        checked.facts.append(f"clocks: with the time offset of {offset_s:g} s, {overlap}")
     else:
-        checked.assumed.append(f"the clocks differ by an offset, which is searched for; without any {overlap}")
+        checked.assumed.append(f"the clocks differ by a time offset, which is searched for; without any, {overlap}")
 
 
 def _counted(ids: Sequence[str], what: str) -> str:

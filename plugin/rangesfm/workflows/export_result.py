@@ -1,4 +1,4 @@
-"""What a run left, in other programs' formats, and what was made from its unscaled model carried into metres."""
+"""Export of a result to the formats of other programs, and transformation of files made from its unscaled model."""
 
 from __future__ import annotations
 
@@ -25,15 +25,21 @@ def export_result(
     options: ExportOptions | None = None,
     images_path: Path | None = None,
 ) -> tuple[Path, ...]:
-    """Export the best metric model of a run's output folder: the refined one, else the scaled one.
+    """Export the final metric model of a result folder: the refined one, else the scaled one.
 
     Args:
-        options: all but the formats.
-        images_path: folder of the photos; None: those of the run, if they are beside the result.
+        output_path: result folder of a run.
+        formats: names of export formats.
+        destination: folder to write to.
+        options: all options but the formats; None: the defaults.
+        images_path: folder of the photos; None: that of the run, if it is beside the result.
+
+    Returns:
+        Paths of the files or folders written.
 
     Raises:
-        InputError: as ``export_model``, the folder is not a result with a metric model, or a run is writing to the
-            destination.
+        InputError: as in ``export_model``; or the folder is not a result with a metric model; or a run is writing to
+            the destination.
     """
     options = (options or ExportOptions()).changed(formats=tuple(formats))
     check_formats(options.formats)
@@ -45,18 +51,20 @@ def export_result(
 def apply_result(
     output_path: Path, paths: Iterable[Path], destination: Path, *, options: ExportOptions | None = None
 ) -> tuple[tuple[Path, ...], float]:
-    """Carry what was made from a run's unscaled model into the frame of its metric one.
+    """Transform files that were made from the unscaled model of a run into the frame of its metric model.
 
     Args:
-        paths: meshes and clouds (PLY, OBJ), camera files (JSON), folders of COLMAP models.
-        options: of the frame.
+        output_path: result folder of the run.
+        paths: meshes and point clouds (PLY, OBJ), camera files (JSON), folders of COLMAP models.
+        destination: folder to write to.
+        options: of the frame; None: the defaults.
 
     Returns:
-        The files written, and by how much the refined cameras are off what any similarity gives (root mean square,
-        metres): a refinement bends the map, and a mesh cannot follow.
+        Paths of the files written, and the root mean square distance in metres between the refined cameras and those of
+        the best similarity. It is not zero, because the refinement has bent the map, which a similarity cannot do.
 
     Raises:
-        InputError: a file cannot be carried over, or the result lacks its models.
+        InputError: a file cannot be transformed, or the result lacks its models.
     """
     result = read_result_folder(output_path)
     map_ = _read_map(result, None)
@@ -67,7 +75,7 @@ def apply_result(
         map_ = replace(map_, metric_from_sfm=similarity)
     similarity_in_frame = in_frame(map_, options or ExportOptions()).metric_from_sfm
     if similarity_in_frame is None:
-        raise InputError("the result does not say how its metric model follows from the unscaled one", output_path)
+        raise InputError("the result has no similarity from the unscaled model to the metric one", output_path)
     with sole_writer(destination):
         return apply_to(list(paths), similarity_in_frame, destination), residual_m
 
@@ -76,7 +84,7 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
     reconstruction, summary = result.read_metric_model(), result.summary
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
-    path_of_model(reconstruction, result)  # or nobody would be told of trajectories without poses
+    path_of_model(reconstruction, result)  # raises an error where no photo has a time: the trajectory would be empty
     covariances = result.read(CenterCovariances)
     return MetricMap(
         reconstruction,

@@ -1,4 +1,4 @@
-"""Surveys of one site, each mapped on its own, become one map through the anchors that they share."""
+"""Joining of surveys of one site, each mapped on its own, to one map through the anchors that they share."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ from rangesfm.survey.settings import Survey
 from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import map_in_metres
 
-# Two surveys' files may give a place with other digits.
+# In metres. The files of two surveys may round the position of the same anchor differently.
 _SAME_PLACE_M = 1e-3
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What one run left.
+    """Result of one run that is to be joined with others.
 
     Attributes:
-        name: unlike that of any other survey here.
-        result: its folder.
-        model: unscaled; its photos have names of their own among all surveys.
-        path: of the model.
-        ranges: as it used them.
-        own_name: of each photo, as its survey calls it, the name that it has here.
-        tag_ids: of each tag, as its survey calls it, the id that it has here.
+        name: of the survey, different from all others.
+        result: folder of the result.
+        model: unscaled model. The names of its photos are different from those of all other surveys.
+        path: camera's path in the model.
+        ranges: as the run used them.
+        own_name: name of each photo here, by its name in the survey.
+        tag_ids: id of each tag here, by its id in the survey.
     """
 
     name: str
@@ -60,16 +60,17 @@ class FinishedRun:
 
     @property
     def tags_in_cam_m(self) -> dict[str, Array]:
-        """(3,) lever arm by the id that a tag has here."""
+        """Return the lever arms (3,) by the ids that the tags have here, metres in the camera frame."""
         arms = self.result.lever_arms_m(list(self.tag_ids))
         return dict(zip(self.tag_ids.values(), arms, strict=True))
 
 
 def read_finished_runs(folders: Sequence[Path]) -> list[FinishedRun]:
-    """Read result folders. Photos and tags that bear the same name in two of them are called after their survey too.
+    """Read result folders. Where photos or tags of two surveys have the same name, the name of the survey is added.
 
     Raises:
-        InputError: fewer than two folders, one of them twice, one without ranges, models or times as the others have.
+        InputError: there are fewer than two folders, one is given twice, one has no ranges or models, or only some have
+            times.
     """
     if len(folders) < 2:
         raise InputError(f"{len(folders)} result folder is given, expected two or more to join")
@@ -78,12 +79,12 @@ def read_finished_runs(folders: Sequence[Path]) -> list[FinishedRun]:
     timed = [survey for survey in surveys if survey.path.timestamps_s is not None]
     if timed and len(timed) < len(surveys):
         bare = next(survey for survey in surveys if survey.path.timestamps_s is None)
-        raise InputError(f"its photos have no times, those of {timed[0].name} have", bare.result.path)
+        raise InputError(f"its photos have no times, but those of {timed[0].name} have", bare.result.path)
     return _with_names_of_their_own(_with_tags_of_their_own(surveys))
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """The part of each path that tells them apart: the last one, if that will do."""
+    """Return the part of each path that makes them distinct: the last part, if that is enough."""
     paths = [folder.resolve() for folder in folders]
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
@@ -113,7 +114,7 @@ def _read(name: str, result: ResultFolder) -> FinishedRun:
 
 
 def _unscaled_model(result: ResultFolder) -> pycolmap.Reconstruction:
-    """``sparse/0``; where that is not all of what was scaled, the scaled model, which is as good."""
+    """Return ``sparse/0``, or the scaled model where ``sparse/0`` has other photos; its scale does not matter here."""
     scaled = result.read_model("sparse_scaled")
     if scaled is None:
         raise InputError("there is no sparse_scaled/0, expected the output_path of a run", result.path)
@@ -140,7 +141,7 @@ def _renamed(survey: FinishedRun) -> FinishedRun:
 
 
 def _with_tags_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]:
-    """A tag that has the same id and the same lever arm in two surveys is the same one."""
+    """Give tags new ids where two surveys use one id with different lever arms; otherwise it is the same tag."""
     arms: dict[str, list[Array]] = {}
     for survey in surveys:
         for tag_id, arm in survey.tags_in_cam_m.items():
@@ -156,13 +157,14 @@ def _with_tags_of_their_own(surveys: Sequence[FinishedRun]) -> list[FinishedRun]
 
 
 def joined_log(surveys: Sequence[FinishedRun], use_anchors: Sequence[str]) -> tuple[RangeLog, Indices, Mask]:
-    """All their ranges: on the cameras' clocks, or by photo.
+    """Join the ranges of all surveys in one log, with times on the cameras' clocks or names of photos.
 
     Args:
-        use_anchors: ids; empty: all.
+        surveys: all with times, or all without.
+        use_anchors: ids of the anchors to use; empty: all.
 
     Returns:
-        the log; (n,) the survey of each range; (n,) whether it was held out as a check.
+        The log; (n,) number of the survey of each range; (n,) whether the range was held out as a check.
 
     Raises:
         InputError: an anchor to be used is in none of the logs.
@@ -191,13 +193,17 @@ def _own(names: dict[str, str], name: str) -> str:
 
 
 def _rows_to_join(ranges: RangesAsUsed, use_anchors: Sequence[str]) -> list[int]:
-    """Of the wanted anchors; ranges between two tags have no say, and no anchor."""
+    """Return the numbers of the ranges to the chosen anchors, without ranges between two tags, which are not used."""
     is_wanted = [not use_anchors or id_ in use_anchors for id_ in ranges.anchor_id]
     return [k for k, wanted in enumerate(is_wanted) if wanted and ranges.status[k] != RangeStatus.TAG_TAG.label]
 
 
 def _camera_times_s(survey: FinishedRun) -> Array:
-    """(n,) when each range was taken, by the photos around it; of those without a place, by the clocks' offset."""
+    """Return the time of each range on the camera's clock, (n,) seconds.
+
+    It is interpolated between the times of the photos around the range. For ranges without a place on the path, it
+    follows from the time offset.
+    """
     ranges, times = survey.ranges, survey.result.timestamps_s
     if times is None:
         return np.full(len(ranges.range_m), np.nan)
@@ -213,7 +219,10 @@ def _camera_times_s(survey: FinishedRun) -> Array:
 def paths_of_surveys(
     surveys: Sequence[FinishedRun], log: RangeLog, number: Indices, is_check: Mask, tags_in_cam_m: Array
 ) -> list[PathOfModel]:
-    """Each survey's model with its own ranges on its path, as the survey put them there; checks stay checks."""
+    """Return each survey's model with its own ranges on its path, placed with the survey's own options.
+
+    Ranges that a survey held out stay held out; ranges of other surveys count as outside the path.
+    """
     paths = []
     for k, survey in enumerate(surveys):
         placed = associate(log, survey.path, tags_in_cam_m, options=survey.result.summary.settings.ranges.association)
@@ -225,14 +234,15 @@ def paths_of_surveys(
 
 @with_one_blas_thread
 def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress) -> RunResult:
-    """One map of several surveys, from what their runs left.
+    """Make one map of several surveys from the results of their runs.
 
     Args:
-        survey: options, the anchors if they are not those of the surveys, and the output; the rest is the surveys'.
-        folders: of results; to the first one the others are joined, or left out.
+        survey: options, output and, if they are not those of the surveys, the anchors. All else comes from the results.
+        folders: of results. The others are joined to the first one, or left out.
+        progress: is told of stages and warnings.
 
     Raises:
-        InputError: a folder is not what a run writes, or the surveys' anchors contradict each other.
+        InputError: a folder is not a result, or the anchors of two surveys contradict each other.
         GeometryError: none of the others can be joined to the first one.
     """
     journal = Journal(progress)
@@ -260,7 +270,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress)
 
 
 def _anchors(survey: Survey, finished: Sequence[FinishedRun], log: RangeLog) -> tuple[tuple[Anchor, ...], str]:
-    """What is known of the anchors, and the frame of their positions."""
+    """Return the anchors with what is known of them, and the frame of their positions."""
     if survey.anchors.path is not None:
         given = read_anchors(survey.anchors.path)
     elif survey.anchors.frame == "unknown":
@@ -276,7 +286,11 @@ def _anchors(survey: Survey, finished: Sequence[FinishedRun], log: RangeLog) -> 
 
 
 def _anchors_of_surveys(finished: Sequence[FinishedRun]) -> tuple[Anchor, ...]:
-    """As the surveys' own files have them."""
+    """Return the anchors in the files of the surveys.
+
+    Raises:
+        InputError: two surveys have different positions of an anchor.
+    """
     by_id: dict[str, Anchor] = {}
     for one in finished:
         for anchor in _anchors_of(one):
@@ -287,8 +301,8 @@ def _anchors_of_surveys(finished: Sequence[FinishedRun]) -> tuple[Anchor, ...]:
                 off_m = float(np.linalg.norm(before.position_m - anchor.position_m))
                 if off_m > _SAME_PLACE_M:
                     raise InputError(
-                        f"anchor {anchor.anchor_id!r} is {off_m:.3f} m from where another survey's file has it: give "
-                        "--anchors CSV for all of them",
+                        f"anchor {anchor.anchor_id!r} is {off_m:.3f} m from its position in another survey's file: "
+                        "give --anchors CSV for all of them",
                         one.result.path,
                     )
     return tuple(by_id.values())
@@ -301,23 +315,23 @@ def _anchors_of(one: FinishedRun) -> tuple[Anchor, ...]:
         return ()
     if frame == "first_camera":
         raise InputError(
-            "its anchors are given in the frame of its own first photo, which others do not share: give --anchors CSV "
-            "in a frame of the site, or --anchor_frame unknown",
+            "its anchors are in the frame of its own first photo, which other surveys do not share: give --anchors CSV "
+            "in a site frame, or --anchor_frame unknown",
             one.result.path,
         )
     if not path.is_file():
-        raise InputError(f"its anchors' file is gone, {path}: give --anchors CSV", one.result.path)
+        raise InputError(f"its file of anchors does not exist any more, {path}: give --anchors CSV", one.result.path)
     return read_anchors(path)
 
 
 def _common(settings: Iterable[str | None]) -> str | None:
-    """What all surveys have alike; None if they do not."""
+    """Return the value that all surveys have; None if they have different values."""
     values = set(settings)
     return values.pop() if len(values) == 1 else None
 
 
 def _images_path(finished: Sequence[FinishedRun]) -> Path | None:
-    """The folder of all photos, where there is one and they have kept their names."""
+    """Return the folder of all photos; None if they are in several folders, or have new names here."""
     paths = {one.result.images_path for one in finished}
     is_renamed = any(name != own for one in finished for own, name in one.own_name.items())
     return None if is_renamed or len(paths) > 1 else paths.pop()

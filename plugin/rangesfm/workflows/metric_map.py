@@ -1,4 +1,4 @@
-"""From unscaled models and ranges to the metric map, by a survey's options: ranges on paths, scale, refinement."""
+"""Making of the metric map from unscaled models and ranges by the options of a survey: scale, refinement, judgement."""
 
 from __future__ import annotations
 
@@ -40,16 +40,17 @@ from rangesfm.trust.linearized import RangesOnMap, ranges_on_map
 from rangesfm.trust.verdict import TrustVerdict, sentence, trust_in
 from rangesfm.vision.image_times import ImageTimes
 
-# Scales of two clock offsets further apart than this are no answer, unless the others are hardly likely together.
+# Two likely time offsets whose scales differ by more than this fraction leave the scale undetermined, ...
 _MAX_SPREAD = 0.03
+# ... unless all offsets with such different scales together have a probability of at most this.
 _HARDLY_LIKELY = 0.05
-_ANY_STDDEV = 1e3
-# Relative stddev of a scale from which nothing can be refined: that of one that may as well be nothing.
+_ANY_STDDEV = 1e3  # a relative stddev of the scale that never leads to a refusal
+# Largest relative stddev of a scale from which a refinement can start. At this value the scale may as well be zero.
 _NOTHING_KNOWN = 1.0
 
 
 def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
-    """The path of a model's photos; without their times where the log names photos."""
+    """Return the camera's path in a model, with the times of the photos unless ``times`` is None."""
     if times is None:
         return trajectory_from_reconstruction(model)
     return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
@@ -58,7 +59,11 @@ def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> T
 def path_with_times(
     survey: Survey, model: pycolmap.Reconstruction, times: ImageTimes | None, journal: Journal
 ) -> Trajectory:
-    """The path of a model's photos that have a time, if the log needs any; InputError if none has."""
+    """Return the path of a model's photos; photos without a time are left out with a warning, if times are needed.
+
+    Raises:
+        InputError: times are needed, and no photo has one.
+    """
     trajectory = path_of_model(model, times)
     if not len(trajectory):
         first = min(image.name for image in model.images.values())
@@ -72,7 +77,11 @@ def path_with_times(
 def find_time_offset(
     survey: Survey, inputs: RangingInputs, trajectory: Trajectory, journal: Journal
 ) -> TimeOffset | None:
-    """Search for the offset of the clocks where it is wanted and not given."""
+    """Search for the time offset between the clocks; None where it is given, or where the log names photos.
+
+    Raises:
+        GeometryError: the ranges do not determine it.
+    """
     if inputs.log.image_name is not None or survey.ranges.time_offset_s is not None:
         return None
     with journal.stage("time offset"):
@@ -97,10 +106,19 @@ def ranges_on_paths(
     offset: TimeOffset | None,
     journal: Journal,
 ) -> list[PathOfModel]:
-    """The models with the ranges on their paths; of photos in several of them the first model keeps them.
+    """Return the models with the ranges on their paths. A photo that several models have is kept in the first of them.
 
     Args:
-        trajectory: of the first model.
+        survey: options.
+        inputs: of the survey.
+        models: unscaled models of its photos.
+        trajectory: path of the first model.
+        times: of the photos; None where the log names photos.
+        offset: estimate of the time offset; None where it is given or not needed.
+        journal: for warnings about models that are left out.
+
+    Raises:
+        InputError: no range has a place on the first path.
     """
     given_s, radio_times_s = survey.ranges.time_offset_s or 0.0, inputs.log.timestamp_s
     offsets_s = given_s if offset is None or radio_times_s is None else offset.at(radio_times_s)
@@ -110,7 +128,7 @@ def ranges_on_paths(
         rest = without_photos(model, names)
         path = path_of_model(rest, times)
         if not len(path):
-            journal.warn(f"sparse/{k} is left out: its photos have no time, or are in other models too")
+            journal.warn(f"sparse/{k} is left out: its photos have no times, or are also in other models")
             continue
         names.update(path.image_names)
         observations = ranges_on_path(survey, inputs, path, offsets_s, may_be_none=True)
@@ -126,7 +144,18 @@ def ranges_on_path(
     *,
     may_be_none: bool = False,
 ) -> RangeObservations:
-    """Ranges on the path; refused where the clocks cannot be right."""
+    """Place the ranges on a path and hold out the check ranges.
+
+    Args:
+        survey: options.
+        inputs: of the survey.
+        trajectory: of the camera.
+        offset_s: image time minus range time, one for all ranges or (n,).
+        may_be_none: whether it is fine if no range has a place on the path.
+
+    Raises:
+        InputError: no range has a place on the path; the text says why.
+    """
     observations = associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges)
     if len(inputs.log) and not may_be_none and not observations.has_place.any():
         why = _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s)))
@@ -155,11 +184,16 @@ def refine_by_survey(
     tape: Tape | None,
     learn: Learn | None = None,
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-    """``refine_with_ranges`` by a survey's options, from what the scale stage found.
+    """Call ``refine_with_ranges`` with the options of a survey and the results of the scale stage.
 
     Args:
-        scaled: in the metric world. trajectory: of the unscaled model, as the scale stage had it.
-        tape: distances to keep to. learn: as of ``refine_with_ranges``.
+        survey: options.
+        inputs: of the survey.
+        scaled: model in the metric world.
+        trajectory: path of the unscaled model, as in the scale stage.
+        estimate: of the scale.
+        tape: measured lengths for the refinement; None without any.
+        learn: as in ``refine_with_ranges``.
     """
     return refine_with_ranges(
         scaled,
@@ -182,7 +216,21 @@ def refine_by_survey(
 def join_by_survey(
     survey: Survey, inputs: RangingInputs, paths: Sequence[PathOfModel], journal: Journal, *, must_join: bool
 ) -> tuple[PathOfModel, tuple[ModelVerdict, ...]]:
-    """All models that can be, as one."""
+    """Join the models to the first one; models that cannot be joined are left out with a warning.
+
+    Args:
+        survey: options.
+        inputs: of the survey.
+        paths: models with the ranges on their paths.
+        journal: for warnings.
+        must_join: whether it is an error if no other model can be joined.
+
+    Returns:
+        The joined model, and the verdicts on all models (none where there is only one).
+
+    Raises:
+        GeometryError: no other model can be joined, and ``must_join`` is true.
+    """
     if len(paths) == 1:
         return paths[0], ()
     joined = join_models(paths, survey, inputs)
@@ -204,10 +252,11 @@ def metric_map(
     *,
     refine: bool,
 ) -> MetricResult:
-    """A map in metres, refined or not, judged as it is in the end.
+    """Scale a map, refine it if asked for, and judge the final map.
 
     Raises:
-        GeometryError: its scale is not determined, or not as well as asked for.
+        GeometryError: the scale is not determined, or is less certain than asked for.
+        SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
     with journal.stage("scale"):
         metric = scale_by_survey(survey, inputs, path, offset, journal, is_a_start=refine)
@@ -227,10 +276,18 @@ def scale_by_survey(
     *,
     is_a_start: bool,
 ) -> MetricResult:
-    """The map rescaled.
+    """Estimate the scale and return the rescaled map.
 
     Args:
-        is_a_start: whether a refinement follows, by which it is judged then.
+        survey: options.
+        inputs: of the survey.
+        path: model with the ranges on its path.
+        offset: estimate of the time offset; None where it is given or not needed.
+        journal: unused where there is nothing to warn of.
+        is_a_start: whether a refinement follows. Then the refined map is judged, and not this one.
+
+    Raises:
+        GeometryError: the scale is not determined.
     """
     if offset is not None and offset.offset_matters:
         path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
@@ -266,14 +323,14 @@ def scale_by_survey(
 
 
 def bending_by_survey(survey: Survey, path: PathOfModel) -> MapBending:
-    """Of an unscaled model, as its photos hold it together, or as maps drift that have no points."""
+    """Return how an unscaled model may be bent: by the bundle adjustment of its photos, or as a path without points."""
     return bending_of_model(path.sfm, path.trajectory, survey.camera, survey.refine, survey.mapper.num_threads)
 
 
 def _refused_with_cause(
     error: GeometryError, survey: Survey, inputs: RangingInputs, path: PathOfModel
 ) -> GeometryError:
-    """A refusal with the mistake that the ranges show on the map all the same, if they show one."""
+    """Return the refusal, with the likeliest mistake added if the ranges show one on a map with any uncertainty."""
     lenient, bending = survey.changed({"scale.max_relative_stddev": _ANY_STDDEV}), bending_by_survey(survey, path)
     try:
         estimate = estimate_scale(lenient, inputs, path, bending)
@@ -293,7 +350,7 @@ def _with_cause(error: GeometryError, survey: Survey, on_map: RangesOnMap | None
 def _ranges_on_scaled(
     estimate: ScaleEstimate, trajectory: Trajectory, bending: MapBending | None
 ) -> RangesOnMap | None:
-    """Where they have a path of poses alone; None where there are none."""
+    """Return the ranges on the scaled map; a path without points is bent to the ranges. None without ranges."""
     if estimate.problem is None or estimate.solution is None:
         return None
     bending = bending or WalkBending(in_first_camera(trajectory))
@@ -308,18 +365,22 @@ def _trust_in(survey: Survey, on_map: RangesOnMap | None) -> TrustVerdict | None
 def scale_by_rivals(
     survey: Survey, inputs: RangingInputs, path: PathOfModel, offset: TimeOffset, scale: float
 ) -> Rivals:
-    """Solve the scale for every rival of an offset.
+    """Estimate the scale for every other likely time offset.
 
     Args:
-        scale: at the offset, metres per SfM unit.
+        survey: options.
+        inputs: of the survey; their log has times.
+        path: model with the ranges on its path.
+        offset: estimate of the time offset, with its rivals.
+        scale: at this offset, metres per SfM unit.
 
     Returns:
-        doubts in words, and the relative stddev of the scale by the choice: that of all the offsets by their
-        probabilities, and no less than what makes a 95 % interval of it hold the scales of all; without those that are
-        far apart, which are hardly likely then.
+        Doubts in words, and the relative stddev of the scale that comes from the choice among the offsets: the larger
+        of their stddev by their probabilities, and that whose 95 % interval holds the scales of all. Offsets with very
+        different scales are left out of it; they are hardly likely, or there is an error.
 
     Raises:
-        GeometryError: the offset is not certain, and another scale follows from a rival.
+        GeometryError: a very different scale follows from other offsets, and they are not unlikely.
     """
     assert inputs.log.timestamp_s is not None, "clocks belong to a log with times"
     doubts, far_apart = [], []
@@ -343,7 +404,7 @@ def scale_by_rivals(
             variance, farthest = variance + rival.probability * apart**2, max(farthest, apart)
     if far_probability > _HARDLY_LIKELY:
         raise GeometryError(
-            "the motion leaves the time offset open, and the scale with it: "
+            "the motion does not determine the time offset, nor the scale that depends on it: "
             f"{offset.value_s:+.2f} s ({offset.probability:.0%}) gives {scale:.6g} m per unit, "
             f"{', '.join(far_apart)}: {REMEDY}"
         )
@@ -351,16 +412,17 @@ def scale_by_rivals(
 
 
 def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> MetricResult:
-    """The map refined with its ranges; the scaled one stays the result where the refined one is no map.
+    """Refine a scaled map with its ranges. Where the refinement breaks the map, the scaled map stays the result.
 
     Raises:
-        SolverError: the scaled one is no map either.
+        SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
     offset = metric.time_offset
     if offset is not None and not offset.is_certain and not survey.refine.time_offset_stddev_s:
         survey = survey.changed({"refine.time_offset_stddev_s": offset.stddev_s})
     tape = metric.tape or Tape()
-    if inputs.anchor_frame == "site" and metric.estimate.frame != "site":  # their positions could not be used
+    if inputs.anchor_frame == "site" and metric.estimate.frame != "site":
+        # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
     at_rest: list[MapWithRanges] = []
 
@@ -376,13 +438,13 @@ def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, jour
         survey, inputs, metric.scaled, metric.trajectory, estimate, tape, learn if has_ranges else None
     )
     if survey.refine.covariance and summary.covariance is None:
-        journal.warn("no covariance of the poses: too many keyframes, or photos and ranges leave some of it open")
+        journal.warn("no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses")
     broken = why_broken(metric.scaled, refined, metric.trajectory, estimate, summary, survey.refine.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
         raise SolverError(
-            f"the refinement broke the map: {'; '.join(broken)}; nor do the points of the model that it began with fit "
-            "the photos: check that model, photos and the camera's parameters belong together (rangesfm scale gives "
-            "the path alone)"
+            f"the refinement broke the map: {'; '.join(broken)}; nor do the points of the model before it fit the "
+            "photos: check that model, photos and camera parameters belong together (rangesfm scale gives the path "
+            "alone)"
         )
     return replace(
         metric,
@@ -412,11 +474,12 @@ def _at_rest(metric: MetricResult, rest: AtRest) -> MapWithRanges:
 
 
 def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResult:
-    """The finished map with all that is known of it, with all that speaks against it, which is told, and with the
-    verdict on its place.
+    """Judge the final map: add the final estimate of the scale, the tests of mistakes, all doubts and the place.
+
+    The doubts also go to the journal as warnings.
 
     Raises:
-        GeometryError: its scale is less certain than asked for.
+        GeometryError: the scale is less certain than asked for.
     """
     metric, on_map = _estimated(survey, metric)
     trust = trust_in_lengths(metric.estimate, metric.tape)
@@ -424,12 +487,12 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
         if (of_ranges := _trust_in(survey, on_map)) is not None:
             trust = of_ranges.with_more(trust)
     except np.linalg.LinAlgError as error:
-        journal.warn(f"mistakes were not looked for, as the ranges determine too little: {error}")
+        journal.warn(f"mistakes were not tested, because the ranges determine too little: {error}")
     journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *trust.reasons)
     log, by_rivals = metric.observations.log, () if metric.rivals is None else metric.rivals.doubts
     doubts = []
     if metric.why_broken:
-        reason = f"the refinement broke the map, which is left as scaled: {'; '.join(metric.why_broken)}"
+        reason = f"the refinement broke the map, so the scaled map is the result: {'; '.join(metric.why_broken)}"
         doubts.append(Doubt(reason, "check the model's points and cameras, clocks, lever arm and anchors"))
     doubts += doubts_of_map(
         metric.estimate,
@@ -447,7 +510,11 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
-    """With the scale of the final map, and the ranges on it."""
+    """Return the result with the estimate of the final map's scale, and the ranges on the final map.
+
+    Raises:
+        GeometryError: the scale is less certain than asked for.
+    """
     start, at, learned = metric.estimate, metric.refined_with_ranges, None
     if at is not None and metric.kept_refinement is not None:
         learned = metric.kept_refinement.errors.learned

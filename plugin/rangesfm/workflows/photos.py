@@ -1,4 +1,4 @@
-"""Photos to unscaled models by a survey: all checked before the long work begins, and ranges in the mapping."""
+"""Mapping of photos to unscaled models by the options of a survey: checks before the long work, mapping with ranges."""
 
 from __future__ import annotations
 
@@ -38,14 +38,18 @@ from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
 from rangesfm.workflows.metric_map import path_of_model, ranges_on_path, refine_by_survey
 
-# Fewer have no shape by which ranges could tell a scale.
+# A path of fewer keyframes has too little shape for ranges to determine its scale.
 _MIN_NUM_KEYFRAMES = 5
-# By which factor the path must have grown for the clocks' offset to be looked for again.
+# Factor by which the path must have grown before the time offset is searched for again.
 _GROWTH = 1.5
 
 
 def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
-    """Everything that can be wrong is found before the long work begins."""
+    """Read and check all inputs but the photos, so that errors are found before the long work begins.
+
+    Raises:
+        InputError: a format, an option or a file is wrong.
+    """
     check_formats(survey.export.formats)
     with survey.source.naming_lines():
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
@@ -58,7 +62,11 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
 def checked_keyframes(
     survey: Survey, inputs: RangingInputs, journal: Journal
 ) -> tuple[tuple[str, ...], ImageTimes | None]:
-    """The photos to reconstruct and their times, which have to do with those of the inputs."""
+    """Return the keyframes and their times, after checking that these fit those of ranges and reference.
+
+    Raises:
+        InputError: they do not.
+    """
     keyframes, times = find_keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
     n, timestamps_s = len(keyframes), None if times is None else times.timestamps_s
     nowhere = Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
@@ -68,7 +76,11 @@ def checked_keyframes(
 
 
 def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
-    """Refuse a reference and ranges that have nothing to do with these photos; where they were does not matter."""
+    """Check that reference and ranges belong to the photos of a path, by names or times. Its positions do not matter.
+
+    Raises:
+        InputError: the reference has none of the photos, or no range has a place on the path.
+    """
     reference, offset_s = inputs.reference, survey.ranges.time_offset_s
     if reference is not None and not np.isfinite(reference.positions_at(path)[0]).any():
         raise InputError(
@@ -79,7 +91,7 @@ def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None
 
 
 def tell_of_times(survey: Survey, inputs: RangingInputs, times: ImageTimes | None, journal: Journal) -> None:
-    """What is odd about the photos' times, and about two clocks whose offset nobody gave."""
+    """Warn of oddities in the times of the photos, and in both clocks if no time offset is given."""
     if times is None or inputs.log.timestamp_s is None:
         return
     journal.warn(*notes_on_gaps(times.timestamps_s, survey.ranges.max_interpolation_gap_s))
@@ -88,7 +100,11 @@ def tell_of_times(survey: Survey, inputs: RangingInputs, times: ImageTimes | Non
 
 
 def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
-    """A model that was brought along; what is wrong with it by itself is told."""
+    """Read a given COLMAP model and warn of what is wrong with it.
+
+    Raises:
+        InputError: it cannot be read, or has no registered images.
+    """
     model = read_model(path)
     if not model.num_reg_images():
         raise InputError("the model has no registered images", path)
@@ -97,15 +113,19 @@ def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
 
 
 def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = False) -> Survey:
-    """The survey, with the photos of a video or a bag taken out into the output folder, and with the camera it tells.
+    """Extract the photos of a video or a bag into the output folder, and return the survey with these photos.
 
-    Photos that an earlier run took are used again, unless it is to ``restart``.
+    If the bag has a camera calibration and the survey has none, that is used. Photos that an earlier run extracted are
+    used again unless ``restart`` is true. A survey of a folder of photos is returned unchanged.
+
+    Raises:
+        InputError: the source cannot be read, or times are given for it.
     """
     path = survey.images.path
     if path is None or not is_source(path):
         return survey
     if survey.images.times is not None:
-        raise InputError("its images have their times: expected no other ones ([images] times)", path)
+        raise InputError("its images have their own times, expected no [images] times", path)
     rate_hz, topic = survey.images.rate_hz, survey.images.topic
     places = places_for_photos(survey.output.path)
     with journal.timed("photos"):
@@ -123,12 +143,18 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
 def find_keyframes(
     survey: Survey, journal: Journal, *, log_names_photos: bool | None = None
 ) -> tuple[tuple[str, ...], ImageTimes | None]:
-    """The photos to reconstruct and their times; without times, where none are needed, in the order of their names.
+    """Return the keyframes and their times; None in place of times, and order by name, where times are not needed.
 
-    Of photos that a rig took at once only the one that stands for them.
+    Of the photos that a rig took at the same time, only the one of the reference camera is returned.
 
     Args:
-        log_names_photos: then no photo is left out for want of a time; None: there is no log.
+        survey: options.
+        journal: for warnings about times.
+        log_names_photos: whether the log names photos in place of times; then photos without a time are kept. None:
+            there is no log.
+
+    Raises:
+        InputError: times are needed and cannot be found.
     """
     folder = survey.photos_path
     with journal.timed("keyframes"):
@@ -145,7 +171,11 @@ def find_keyframes(
 
 
 def with_tags(survey: Survey, inputs: RangingInputs, names: Sequence[str], journal: Journal) -> RangingInputs:
-    """The inputs with the printed tags in photos, if any are to be looked for."""
+    """Return the inputs with the printed tags found in photos, if tags are to be looked for.
+
+    Raises:
+        InputError: no tags were found, and nothing else is measured in metres.
+    """
     wanted = survey.markers
     if wanted.dictionary is None:
         return inputs
@@ -173,10 +203,15 @@ def map_keyframes(
     *,
     deferred: bool,
 ) -> tuple[pycolmap.Reconstruction, ...]:
-    """Map the keyframes into ``sparse``; returns ``sparse/0``, ``sparse/1``, ...
+    """Map the keyframes into ``sparse`` and return the models ``sparse/0``, ``sparse/1``, ...
 
     Args:
-        deferred: leave an earlier reconstruction where it is until there is a result of the new one.
+        survey: options.
+        keyframes: names of the photos.
+        journal: for stages, times and warnings.
+        restart: whether to do all steps again.
+        adjustment: global bundle adjustment in place of COLMAP's own; None: COLMAP's.
+        deferred: whether to keep an earlier reconstruction in its place until the new result is complete.
     """
     rigs = read_rigs(survey.images.rig_config)
     frames = rigs.frames(list_images(survey.photos_path))
@@ -204,17 +239,21 @@ def map_keyframes(
 
 @dataclass
 class AdjustmentWithRanges:
-    """Scale, clocks and refinement of whatever there is of a map, by the options of a survey.
+    """Global bundle adjustment with ranges of a map that is still growing, by the options of a survey.
 
-    Each time all is estimated anew but the clocks' offset: a map in the making has no anchors, scale or weights that
-    are worth keeping. Taped distances wait for the whole map, where their ends are.
+    Each time, time offset, scale and refinement are estimated for the present map. Only the time offset is kept for
+    some time; anchors, scale and weights of a growing map are not worth keeping. Taped distances are not used, because
+    their ends may not be in the map yet.
 
     Attributes:
-        measured: all that is in metres.
-        first_keyframe: the photo to whose frame anchors of the frame "first_camera" refer.
-        times: of the photos; None: the log names them.
-        num_with_ranges, num_without: adjustments so far, and those left to COLMAP.
-        found_offset_s: of the clocks, where that is searched for, from a path of so many keyframes.
+        survey: options.
+        measured: inputs measured in metres.
+        first_keyframe: photo that defines the frame "first_camera" of anchors.
+        times: of the photos; None where the log names photos.
+        num_with_ranges: number of adjustments with ranges so far.
+        num_without: number of adjustments that were left to COLMAP.
+        found_offset_s: time offset of the last search, if it is searched for.
+        num_with_offset: number of keyframes at the last search.
     """
 
     survey: Survey
@@ -228,7 +267,7 @@ class AdjustmentWithRanges:
 
     @property
     def inputs(self) -> list[Any]:
-        """All settings that it may look at, and its files by their content."""
+        """Return everything that the adjustment depends on: settings, and hashes of files."""
         survey = self.survey
         settings = survey.model_dump(
             mode="json",
@@ -241,7 +280,7 @@ class AdjustmentWithRanges:
         return [settings, self.measured.anchor_frame, self.first_keyframe, contents]
 
     def adjust(self, model: pycolmap.Reconstruction) -> bool:
-        """Adjust a model in place; False, and it is as it was, while the ranges do not determine its scale."""
+        """Adjust a model in place. Return false and leave it unchanged while the ranges do not determine its scale."""
         path = path_of_model(model, self.times)
         try:
             if len(path) < _MIN_NUM_KEYFRAMES:
@@ -255,15 +294,15 @@ class AdjustmentWithRanges:
         return True
 
     def note(self) -> str | None:
-        """What became of the ranges, for the user; None where there was nothing to adjust."""
+        """Return a line for the user that says how often ranges were used; None if there was nothing to adjust."""
         num = self.num_with_ranges + self.num_without
         if not num:
             return None
-        return f"ranges took part in {self.num_with_ranges} of {num} global adjustments of the map while it grew"
+        return f"ranges were used in {self.num_with_ranges} of {num} global adjustments of the map while it grew"
 
     def _adjusted(self, model: pycolmap.Reconstruction, path: Trajectory) -> pycolmap.Reconstruction:
         survey, inputs = self.survey, replace(self.measured, tape=None)
-        # Positions in the first camera's frame are of no use before that photo is part of the map.
+        # Anchor positions in the frame of the first camera cannot be used before that photo is part of the map.
         if inputs.anchor_frame == "first_camera" and path.image_names[0] != self.first_keyframe:
             inputs = replace(inputs, anchor_frame="unknown")
         estimate = estimate_scale(survey, inputs, PathOfModel("", model, path, self._observations(path)))

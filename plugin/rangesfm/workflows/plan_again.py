@@ -1,4 +1,4 @@
-"""A finished survey as a plan: what another one like it would know, and what to change next time."""
+"""A finished survey as the plan of another one like it: what that would determine, and what to change next time."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ from rangesfm.result.model_path import path_of_model
 from rangesfm.result.tables import RangesAsUsed
 from rangesfm.scale.verdict import CALIBRATE
 
-# Of photos without times.
+# Assumed rate of photos without times.
 _PHOTO_RATE_HZ = 2.0
 
 
 def plan_of_result(path: str | Path) -> PlannedSurvey:
-    """The same path and anchors, as the run's map has them, and as many ranges as it used.
+    """Return the plan of a survey with the path, the anchors and the number of ranges of a finished one.
 
-    What a map in the first camera's frame calls up is what is up in its photos. The radio errs as the run has learnt.
+    Path and anchors are those of the result's map, and the errors of the radio are those that the run has learnt. For a
+    map in the frame of the first camera, up is the mean upward direction of the photos.
 
     Raises:
-        InputError: no result folder, one without a metric model or without used ranges.
+        InputError: the folder is not a result, or has no metric model or no used ranges.
     """
     folder = read_result_folder(Path(path))
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
@@ -56,10 +57,11 @@ def plan_of_result(path: str | Path) -> PlannedSurvey:
 
 
 def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
-    """The same told what to change next time, where its scale or its place is doubtful.
+    """Add advice on what to change next time, where the scale or the place is doubtful.
 
     Args:
-        tag_in_cam_m: (num_tags, 3).
+        metric: the result.
+        tag_in_cam_m: (num_tags, 3) lever arms.
     """
     doubtful = metric.estimate.verdict == "doubtful", metric.place is not None and metric.place.verdict == "doubtful"
     observations = metric.observations
@@ -81,7 +83,7 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
         stddevs = {} if learned is None else learned.stddev_of_component
         planned = _planned(trajectory, anchors, frame, arm, int(used.sum()), stddevs)
         expected = expect(planned)
-    except (InputError, GeometryError):  # nothing says what is up, or a run like it would not come about
+    except (InputError, GeometryError):  # the upward direction is unknown, or a survey like this one would be refused
         return metric
     words = best_words(advise(expected), for_scale=doubtful[0], for_place=doubtful[1])
     is_computed = any(each.startswith(CALIBRATE) for each in words)
@@ -97,7 +99,7 @@ def _planned(
     num_ranges: int,
     component_stddevs: Mapping[str, float],
 ) -> PlannedSurvey:
-    """Upright, and with times where none are known."""
+    """Return the plan with z up, and with assumed times where the photos have none."""
     up = up_in_world(trajectory, "auto", is_site=frame == "site")
     level = Rotation.align_vectors(UP_IN_SITE[None], up[None])[0].as_matrix()
     times = np.arange(len(trajectory)) / _PHOTO_RATE_HZ if trajectory.timestamps_s is None else trajectory.timestamps_s

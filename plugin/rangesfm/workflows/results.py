@@ -1,4 +1,4 @@
-"""What a finished run hands over: all files of the result folder, the report on them, and a summary."""
+"""Results of a finished run: all files of the result folder, the report, and a summary for the terminal."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from rangesfm.vision.steps import DATABASE_NAME
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run hands back; ``read_result_folder`` reads what it left.
+    """Outcome of a run. Its files are read by ``read_result_folder``.
 
     Attributes:
-        output_path: its folder.
-        summary: ``result.json``.
-        lines: a summary for people.
+        output_path: folder of the result.
+        summary: content of ``result.json``.
+        lines: summary for the user.
     """
 
     output_path: Path
@@ -49,11 +49,11 @@ class RunResult:
 
 
 def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> RunResult:
-    """All files of the result, ``result.json`` after all others, and the report on them.
+    """Write all files of the result, with ``result.json`` last, and the report.
 
     Raises:
-        InputError: a format of [export] cannot be written; all else has been. Or a file of somebody else's is in the
-            place of one of the result's; then nothing has been written.
+        InputError: a format of [export] cannot be written, but everything else has been; or a file that a result would
+            replace was not written by this tool, and nothing has been written.
     """
     if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
@@ -67,7 +67,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     with new_result(folder, survey.images.path) as staged:
         with journal.stage("results"):
             comparison = _comparison(survey, inputs, metric, staged)
-            # Of the final map: that of the anchors, if the map could be carried to them.
+            # The georeference of the anchors is that of the map, if the map is in their frame.
             georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
             not_exported = write_models_and_tables(
                 metric,
@@ -101,7 +101,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
 
 
 def _distances(metric: MetricResult) -> list[DistanceRow]:
-    """The table of control and check distances in the final map."""
+    """Return the table of control and check distances in the final map; empty without measured lengths."""
     if metric.tape is None:
         return []
     located = locate_distances(metric.tape, metric.final, [anchor.anchor_id for anchor in metric.anchors])
@@ -110,7 +110,7 @@ def _distances(metric: MetricResult) -> list[DistanceRow]:
 
 
 def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
-    """The paper's table; empty without a reference, which is left beside the result in its frame."""
+    """Return the comparison with the reference, empty without one; write the reference in the frame of the map."""
     if inputs.reference is None:
         return ()
     frame = metric.estimate.frame

@@ -1,7 +1,7 @@
 """The method, stage by stage: photos, scale, rescaling, refinement, comparison, results.
 
-Lee, Zhu, Giorgi and Günther, "Fusion of Monocular Vision and Radio-based Ranging for Global
-Scale Estimation and Drift Mitigation", 2018, with other means where real radios ask for them.
+It follows Lee, Zhu, Giorgi and Günther, "Fusion of Monocular Vision and Radio-based Ranging for Global Scale Estimation
+and Drift Mitigation", 2018, with other estimators where real radios need them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from rangesfm.workflows.results import RunResult, write_results
 
 
 def metric_map_of(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
-    """A survey to its metric model: from photos, or from the unscaled model that it begins with."""
+    """Make the metric model of a survey, from its photos or from the unscaled model that it gives."""
     if survey.images.model is None:
         return run_survey(survey, progress=progress, restart=restart)
     return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
@@ -58,7 +58,19 @@ def metric_map_of(survey: Survey, *, progress: Progress, restart: bool = False) 
 
 @with_one_blas_thread
 def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
-    """Photos and ranges to a metric model. Steps of the reconstruction that are done are reused."""
+    """Make a metric model from photos and ranges, and write the result folder.
+
+    Args:
+        survey: settings and inputs.
+        progress: is told of stages and warnings.
+        restart: whether to do all steps again; otherwise finished steps of an earlier run are reused.
+
+    Raises:
+        InputError: an input is wrong.
+        GeometryError: the scale is not determined.
+        ReconstructionError: the photos give no model.
+        SolverError: the refinement failed.
+    """
     journal = Journal(progress)
     inputs = read_inputs(survey, journal)
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
@@ -68,7 +80,7 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         inputs = with_tags(survey, inputs, keyframes, journal)
         adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
         with_ranges = survey.mapper.ranges_in_mapping and len(inputs.log) > 0
-        # An earlier result stays with its reconstruction until there is a new one.
+        # An earlier result keeps its reconstruction until the new result is complete.
         deferred = (output.path / ResultSummary.NAME).exists()
         models = map_keyframes(
             survey, keyframes, journal, restart, adjustment if with_ranges else None, deferred=deferred
@@ -79,10 +91,10 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
-    """Photos to an unscaled model; returns a summary for people."""
+    """Make an unscaled model from photos, and return a summary for the user."""
     journal = Journal(progress)
     if survey.mapper.ranges_in_mapping:
-        journal.warn("ranges_in_mapping: nothing has been said of ranges here, they take part in a whole run")
+        journal.warn("ranges_in_mapping has no effect here: ranges are used in a whole run only")
     refuse_to_overwrite(survey)
     with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         survey = with_photos_in_folder(survey, journal, restart=restart)
@@ -93,12 +105,12 @@ def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = Fa
 
 
 def refine_model(survey: Survey, *, progress: Progress) -> RunResult:
-    """An existing model and ranges to the refined metric model."""
+    """Make a refined metric model from an existing model and ranges, and write the result folder."""
     return _from_model(survey, progress, refine=True)
 
 
 def scale_model(survey: Survey, *, progress: Progress) -> RunResult:
-    """An existing model, or only its trajectory, and ranges to the scaled model."""
+    """Scale an existing model, or a model with poses only, by ranges, and write the result folder."""
     return _from_model(survey, progress, refine=False)
 
 
@@ -130,10 +142,10 @@ def to_metric(
     *,
     refine: bool,
 ) -> RunResult:
-    """From the unscaled models on: the same for photos just mapped and for a model brought along."""
+    """Do all stages after the unscaled models, which were just mapped or were given."""
     trajectory = path_with_times(survey, models[0], times, journal)
     check_times(survey, inputs, trajectory)
-    # Clocks: where on the path each range was taken.
+    # Time offset between the clocks, and with it the place of each range on the path.
     offset = find_time_offset(survey, inputs, trajectory, journal)
     paths = ranges_on_paths(survey, inputs, models, trajectory, times, offset, journal)
     return map_in_metres(survey, inputs, paths, offset, journal, refine=refine)
@@ -149,11 +161,15 @@ def map_in_metres(
     refine: bool,
     must_join: bool = False,
 ) -> RunResult:
-    """From the models and the ranges on their paths on: scale, refinement and results of all of them as one map.
+    """Join models with ranges to one map, scale and refine it, and write the results.
 
     Args:
-        paths: of the log in ``inputs``; to the first one the others are joined, or left out.
-        offset: of the clocks, if it was estimated.
+        survey: options.
+        inputs: of the survey.
+        paths: models with the ranges of ``inputs.log`` on their paths. The others are joined to the first, or left out.
+        offset: estimate of the time offset; None where it is given or not needed.
+        journal: for stages and warnings.
+        refine: whether to refine the map after scaling it.
         must_join: whether it is an error if all others are left out.
     """
     with journal.timed("scale"):
@@ -162,7 +178,7 @@ def map_in_metres(
             read_rigs(survey.images.rig_config).baselines(path.sfm, survey.images.baseline_stddev_m)
         )
         inputs = replace(inputs, tape=locatable(tape, path.sfm) if tape.distances else None)
-    # Scale, global refinement of photos and ranges together, and what is known of the map in the end.
+    # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(survey, inputs, path, offset, journal, refine=refine), models=verdicts)
     if survey.scale.adopt:
         inputs, made = with_likeliest_cause(survey, inputs, path, made, journal)
