@@ -53,5 +53,5 @@ def test_anchors_that_stand_where_they_do_are_left_there() -> None:
 def test_a_path_with_hardly_any_range_is_refused_wherever_anchors_stand() -> None:
     short = path_through([(0.0, 0.0, 1.6), (0.5, 0.0, 1.6)], speed_m_per_s=0.5, photo_rate_hz=2.0)
     survey = planned([LOW, HIGH], "site", short, rate_hz=1.0, allowed_m=places_in_box(LOW, HIGH), is_placed=False)
-    with pytest.raises(GeometryError, match="no place that is allowed"):
+    with pytest.raises(GeometryError, match="no allowed places of the anchors"):
         place_anchors(survey)

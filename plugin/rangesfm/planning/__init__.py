@@ -1,1 +1,1 @@
-"""Before going out: what a survey will know, and what would make it know more."""
+"""Planning of surveys: the expected uncertainty of a planned survey, and changes that would reduce it."""

@@ -1,4 +1,4 @@
-"""What to change before going out: each change is made in the plan, and what it gains is computed."""
+"""Advice on a plan: each possible change is made in the plan, and its gain is computed."""
 
 from __future__ import annotations
 
@@ -19,32 +19,43 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import BENDS, COMPONENTS
 from rangesfm.scale.verdict import CALIBRATE
 
+# Changes of an anchor's height that are tried, metres.
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)
+# Amplitude in metres and number of the waves of a path that goes up and down.
 _UP_AND_DOWN_M, _NUM_WAVES = 0.5, 3
+# Factor by which a path or the anchors are spread out.
 _WIDER = 1.5
+# Standard deviation of the radio's error curve after a calibration, metres.
 _LEARNT_CURVE_M = 0.02
+# A taped length and its standard deviation, metres.
 _TAPED_M = (5.0, 0.005)
+# Standard deviation of the coordinates of surveyed anchors, metres.
 _SURVEYED_M = 0.02
-# Of the nearest other anchor: nearer, a new one says the same.
+# Smallest distance of a new anchor from the others, metres; a nearer one adds almost no information.
 _NEAR_M = 1.0
+# Number of changes that a result recommends.
 _NUM_BEST = 3
-# Of all that are allowed.
+# Number of places, of all allowed ones, that are tried for an anchor.
 _NUM_PLACES = 8
-# Of a stddev: what changes less is not worth the way.
+# Smallest relative reduction of a standard deviation for which a change is reported.
 _LEAST_GAIN = 0.02
-# Of those, after a survey: another 20 % of certainty.
+# The same in the warnings after a survey: the standard deviation is divided by 1.2 or more.
 _WORTH_SAYING = 1 - 1 / 1.2
 
 
 @dataclass(frozen=True)
 class Advice:
-    """One change of a plan, and what would be stated then.
+    """One change of a plan, and the uncertainty that a run would then state.
 
     Attributes:
-        kind: which sort of change. subject: what it is made to; an anchor's id, or nothing.
-        words: what to do. planned: with the change made.
-        scale_stddev: relative. place_stddev_m: of the keyframe known least; inf: open; NaN: no place in a site.
-        scale_gain, place_gain: by which share these are less than before; 0 without a place.
+        kind: kind of change.
+        subject: id of the anchor that is changed, or empty.
+        words: what to do, for the user.
+        planned: the plan with the change.
+        scale_stddev: relative standard deviation of the scale.
+        place_stddev_m: standard deviation of the position of the least certain keyframe; inf if the position is not
+            determined, NaN if the result is not in a site frame.
+        scale_gain, place_gain: relative reduction of these; 0 for the position if there is none.
     """
 
     kind: str
@@ -62,7 +73,10 @@ _Change = tuple[str, str, str, PlannedSurvey]
 
 
 def advise(expected: Expected) -> tuple[Advice, ...]:
-    """All changes of a plan that gain something, in no order; a map bends as it did before."""
+    """Return all changes of a plan that gain something, in no particular order.
+
+    The bending of the map is assumed to be the same with each change.
+    """
     bending = {name: stddev for name, stddev in expected.learned.stddev_of_component.items() if name in BENDS}
     before = _compared(expected.planned, bending)
     afters = ((change, _compared(change[3], bending)) for change in _changes(expected.planned))
@@ -75,7 +89,7 @@ def _compared(planned: PlannedSurvey, bending: dict[str, float]) -> Expected | N
 
 
 def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
-    """The changes that gain most for the scale, then for the place, as far as wanted, with what each gains."""
+    """Return lines with the changes that gain most for the scale, then for the position, with the gain of each."""
     gains: dict[str, list[str]] = {}
     for what, is_wanted in (("scale", for_scale), ("place", for_place)):
         gain = attrgetter(f"{what}_gain")
@@ -87,7 +101,7 @@ def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) ->
 
 
 def ranked(advice: Sequence[Advice], gain: Callable[[Advice], float]) -> list[Advice]:
-    """What gains most first, of each kind and subject the best; nothing that gains hardly anything."""
+    """Return the best change of each kind and subject, the largest gain first, without changes that hardly gain."""
     worthwhile = sorted((each for each in advice if gain(each) > _LEAST_GAIN), key=gain, reverse=True)
     best: dict[tuple[str, str], Advice] = {}
     for each in worthwhile:
@@ -96,15 +110,20 @@ def ranked(advice: Sequence[Advice], gain: Callable[[Advice], float]) -> list[Ad
 
 
 def _advice(change: _Change, after: Expected, before: Expected, stated: Expected) -> Advice:
-    """The stated numbers, changed by the ratios of the others."""
+    """Return the advice for a change: the stated standard deviations times the ratios of the two quick computations.
+
+    Args:
+        after, before: quick computations with and without the change.
+        stated: the full computation without the change.
+    """
     scale_ratio = after.uncertainty.empirical / before.uncertainty.empirical
     place_after_m, place_before_m = after.worst_keyframe_m, before.worst_keyframe_m
     is_open = np.isinf(place_before_m) or np.isinf(place_after_m)
-    # What is open is still on the site.
+    # A position that is not determined is still known to be on the site.
     size_m = float(np.linalg.norm(np.ptp(stated.planned.places_m, axis=0)))
     place_ratio = min(place_after_m, size_m) / min(place_before_m, size_m)
     if not is_open:
-        # What the map bends comes on top of its place as a whole.
+        # The quick computations are of a rigid map, so the ratio does not apply to the part from the map's bending.
         worst_m, bend_m = stated.worst_keyframe_m, float(stated.bends_m[int(np.argmax(stated.keyframe_stddevs_m))])
         place_after_m = float(np.hypot(place_ratio * np.sqrt(max(worst_m**2 - bend_m**2, 0.0)), bend_m))
         place_ratio = place_after_m / worst_m
@@ -145,7 +164,7 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
 
 
 def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
-    """What was known of the errors that a calibration takes away is of no use then."""
+    """Return the plan with a calibrated radio, without the given values of error components that this changes."""
     taken = {component.name for component in COMPONENTS if component.calibrated_median is not None}
     left = {name: stddev for name, stddev in planned.component_stddevs.items() if name not in taken}
     return replace(planned, curve_stddev_m=_LEARNT_CURVE_M, component_stddevs=left)
@@ -157,7 +176,7 @@ def _with_wider_anchors(planned: PlannedSurvey) -> PlannedSurvey:
 
 
 def _farther_out(path: Trajectory, places_m: Array) -> Array:
-    """(n, 3) from the middle of the path, at the same heights."""
+    """Return places (n, 3) moved horizontally away from the mean of the path, by the factor _WIDER."""
     middle = path.centers.mean(axis=0)
     return np.asarray(middle + (places_m - middle) * [_WIDER, _WIDER, 1.0])
 
@@ -174,7 +193,7 @@ def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
 
 
 def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
-    """To where somebody allowed it."""
+    """Yield the plan with each anchor moved to each of some allowed places."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
         for place in _free_places(planned):
             words = f"move anchor {anchor.anchor_id} to {_told(place)}"
@@ -192,7 +211,11 @@ def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
 
 
 def _free_places(planned: PlannedSurvey) -> list[Array]:
-    """Those allowed that are farthest apart; else round the box around all, as high as the anchors mostly are."""
+    """Return places for an anchor that are not near another one.
+
+    They are the allowed places farthest apart. If none are given, they are eight points on the outline of the box
+    around path and anchors, at the anchors' median height.
+    """
     if planned.allowed_m is not None:
         spread = spread_places(min(_NUM_PLACES, len(planned.allowed_m)), planned.allowed_m)
     else:
@@ -214,7 +237,7 @@ def _up_and_down(path: Trajectory) -> Trajectory:
 
 
 def _bent(path: Trajectory) -> tuple[Trajectory, float]:
-    """To one side, level, in an arc a quarter as high as it is long."""
+    """Return a path bent to one side, horizontally, in an arc a quarter as high as it is long; also that height (m)."""
     shape = path_shape(path.centers)
     along = (path.centers - shape.centroid) @ shape.axes[:, 0]
     length_m = float(np.ptp(along))
@@ -225,7 +248,7 @@ def _bent(path: Trajectory) -> tuple[Trajectory, float]:
 
 
 def _wider(path: Trajectory) -> Trajectory:
-    """About its middle, at the same speed; photos as far apart in time as they were."""
+    """Return a path spread out around its mean, walked at the same speed, with as many photos."""
     times = path.timestamps_s
     assert times is not None
     out = _farther_out(path, path.centers)

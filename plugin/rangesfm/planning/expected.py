@@ -1,4 +1,4 @@
-"""What a run of a planned survey will state, before a range is measured: its own formulas, at the true map."""
+"""Expected result of a planned survey: the uncertainty that a run will state, by the run's formulas at the true map."""
 
 from __future__ import annotations
 
@@ -37,12 +37,14 @@ from rangesfm.scale.uncertainty import (
 from rangesfm.scale.verdict import Verdict, judge
 from rangesfm.trust.finished_map import by_similarity
 
+# Rounds in which the noise that the run will see and the weights of its ranges are made consistent.
 _NUM_NOISE_ROUNDS = 2
+# Numbers of ranges and of cells in the quick computation that compares plans.
 _NUM_COMPARED_RANGES, _NUM_COMPARED_CELLS = 600, 120
-# Of the largest information: less is none.
+# A parameter's information below this fraction of the largest counts as this fraction.
 _ROUNDING = 1e-20
 OPEN = 1e3
-"""Metres, or radians: a number this uncertain is one that nothing determines."""
+"""Standard deviation, in metres or radians, from which on a number counts as not determined."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +52,16 @@ class Expected:
     """The estimate that a run will make.
 
     Attributes:
-        observations: simulated ranges. posed: the problem. solution: the fit, at the truth.
-        learned: what the ranges will get wrong.
-        uncertainty: of the scale.
-        placement: (7, 7) as of a ScaleEstimate; None without a place in the site.
-        by_ranges: (7, 7) the same by the ranges alone, whatever the map bends; of the scale where the frame is the
-            first camera's.
-        bends_m: (n,) what the map's bend adds to the stddev of each keyframe; 0 of a map that is rigid.
+        planned: the planned survey.
+        observations: simulated ranges without errors.
+        posed: the scale problem.
+        solution: its solution, at the true values.
+        learned: error model of the ranges.
+        uncertainty: uncertainty of the scale.
+        placement: (7, 7) covariance of the map's placement like that of a ScaleEstimate; None if the map is not placed
+            in the site.
+        by_ranges: (7, 7) the same without the map's bending; of the scale alone if the frame is the first camera's.
+        bends_m: (n,) part of each keyframe's standard deviation from the map's bending, metres; 0 for a rigid map.
     """
 
     planned: PlannedSurvey
@@ -71,22 +76,25 @@ class Expected:
 
     @property
     def verdict(self) -> Verdict:
-        """As the run will judge.
+        """Verdict of the run.
 
         Raises:
-            GeometryError: it will refuse the scale.
+            GeometryError: the run will refuse the scale.
         """
         return judge(self.posed, self.solution, self.uncertainty, {}, (), (), ScaleOptions())
 
     def mirror_image(self) -> str | None:
-        """Why the run will leave the place open: the mirror image in the anchors' plane fits as well; None if not."""
+        """Return why the run will leave the position open, or None if it will not.
+
+        The position is open if the map's mirror image in the anchors' plane fits as well.
+        """
         problem, fit = self.solution.problem, self.solution.fit
         mirrored = mirrored_map(problem, fit.state) if problem.frame_is_free else None
         if mirrored is None:
             return None
         counted = replace(problem, share=fit.pulls)
         try:
-            # Of a path in that plane nothing determines the height, which the solver meets as 0 / 0.
+            # For a path in that plane the height is not determined, and the solver divides 0 by 0.
             with np.errstate(invalid="ignore", divide="ignore"):
                 refuse_ambiguity(replace(self.solution, problem=counted), [mirrored], None)
         except GeometryError as error:
@@ -95,27 +103,28 @@ class Expected:
 
     @property
     def map_stddevs(self) -> Array | None:
-        """(7,) of the map about its middle; inf where they are open, None without a place."""
+        """Standard deviations (7,) of the map's similarity about its mean; inf: not determined, None: not placed."""
         if self.placement is None:
             return None
         return _stddevs(np.diag(by_similarity(self.placement, self.planned.trajectory.centers)[0]))
 
     @property
     def keyframe_stddevs_m(self) -> Array:
-        """(n,) of each keyframe's place, as ``stddevs_at``, with the map's bend."""
+        """Standard deviation of each keyframe's position (n,), metres, like ``stddevs_at``, with the map's bending."""
         return np.hypot(self.stddevs_at(self.planned.trajectory.centers), self.bends_m)
 
     def stddevs_at(self, places_m: Array) -> Array:
-        """(n,) of (n, 3) places in the map as a whole, in the result's frame: all coordinates together; inf where open.
+        """Return the standard deviations (n,) of points (n, 3) of a rigid map, metres; inf if not determined.
 
-        Without a place in the site they are as far off as the scale makes them, seen from the first camera.
+        Each is the root of the summed variances of the three coordinates in the result's frame. If the map is not
+        placed in the site, only the scale contributes, with the first camera fixed.
         """
         motions = similarity_motions(places_m - self.planned.trajectory.centers[0])
         return _stddevs(np.einsum("nij,jk,nik->n", motions, self.by_ranges, motions))
 
     @property
     def worst_keyframe_m(self) -> float:
-        """Stddev of the place that is known least; NaN without a place."""
+        """Standard deviation of the position of the least certain keyframe, metres; NaN if the map is not placed."""
         return float("nan") if self.placement is None else float(self.keyframe_stddevs_m.max())
 
 
@@ -125,8 +134,10 @@ def _stddevs(variances: Array) -> Array:
 
 
 def compare(planned: PlannedSurvey) -> Expected | None:
-    """``expect`` in a tenth of the time, good to tell plans apart, of a rigid map; None where a run will find too few
-    ranges."""
+    """Compute ``expect`` for a rigid map with fewer ranges and cells, in a tenth of the time, to compare plans.
+
+    None if a run will find too few ranges.
+    """
     try:
         return expect(replace(planned, photos=None, max_num_ranges=_NUM_COMPARED_RANGES), _NUM_COMPARED_CELLS)
     except GeometryError:
@@ -134,10 +145,10 @@ def compare(planned: PlannedSurvey) -> Expected | None:
 
 
 def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expected:
-    """Find the noise that the run will see, and with its weights what it will state.
+    """Compute the noise that the run will see, and with the resulting weights the uncertainty that it will state.
 
     Args:
-        max_num_cells: in which how ranges err together is computed, as a run has it or coarser.
+        max_num_cells: largest number of cells in which common errors of ranges are computed; fewer are coarser.
 
     Raises:
         GeometryError: the run will find too few ranges on the path.
@@ -173,14 +184,17 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
 
 
 def _at_the_truth(posed: ScaleProblem, errors: RangeErrors, state: RangeState, num_alike: int) -> Solution:
-    """Of ranges that stand for several each."""
+    """Return the solution at the true state; each simulated range stands for ``num_alike`` ranges."""
     problem = weighted(posed.ranges, errors)
     weights = np.full(len(posed.rows), float(num_alike))
     return Solution(problem, fit_at(problem, state, weights), errors, errors.noise_m)
 
 
 def _undetermined(fit: RangeFit) -> Array:
-    """(p, p) variances without limit in the directions that nothing determines, which least squares leave alone."""
+    """Return a covariance (p, p) with huge variances in the directions of parameters that the fit does not determine.
+
+    Least squares leave these directions unchanged, so that their uncertainty would be missing.
+    """
     of_each = np.diag(fit.information)
     sizes = np.sqrt(np.maximum(of_each, _ROUNDING * of_each.max()))
     values, vectors = np.linalg.eigh(fit.information / np.outer(sizes, sizes))
@@ -191,9 +205,10 @@ def _undetermined(fit: RangeFit) -> Array:
 
 
 def _as_seen(solution: Solution, learned: LearnedErrors) -> RangeErrors:
-    """As ``RangeErrors.seen_by_rigid_map`` and ``inflated`` will find it, in the mean over all surveys like this one.
+    """Return the range errors that ``RangeErrors.seen_by_rigid_map`` and ``inflated`` will find, on average.
 
-    Of the cells' covariance the fit takes its part; what single ranges scatter by about their cell comes on top.
+    The residuals of a cell have the cells' covariance without the part that the fit absorbs. The scatter of single
+    ranges about the mean of their cell is added.
     """
     errors, problem, cells = solution.errors, solution.problem, learned.cells
     ones = replace(problem, stddev_m=np.ones_like(problem.stddev_m))

@@ -1,4 +1,4 @@
-"""Paths that a camera is to go: through waypoints, round a floor, along a trajectory, or as in an earlier model."""
+"""Planned camera paths: through waypoints, around a floor, along a recorded trajectory, or from an earlier model."""
 
 from __future__ import annotations
 
@@ -13,19 +13,24 @@ from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 _MAX_NUM_KEYFRAMES = 20_000
+# Size of a loop relative to its floor.
 _LOOP_SHARE = 2 / 3
+# Distance between waypoints of a loop, and number of its waves up and down.
 _LOOP_STEP_M, _NUM_WAVES = 0.25, 3
-# A camera whose way is this steep looks level all the same.
+# Below this ratio of its horizontal part to its length a direction counts as vertical.
 _STEEP = 1e-6
 
 
 def path_through(
     waypoints: Sequence[Sequence[float]], speed_m_per_s: float, photo_rate_hz: float, num_rounds: int = 1
 ) -> Trajectory:
-    """A walk at constant speed from each waypoint straight to the next, looking ahead, upright.
+    """Return a walk at constant speed along straight lines between waypoints, with an upright camera that looks ahead.
 
     Args:
-        waypoints: (3,) each, metres, z up. num_rounds: how often they are walked.
+        waypoints: points (3,), metres, z up.
+        speed_m_per_s: speed of the walk.
+        photo_rate_hz: keyframes per second.
+        num_rounds: number of times that the waypoints are walked.
     """
     corners = np.array(waypoints, dtype=np.float64).reshape(-1, 3)
     if len(corners):
@@ -45,20 +50,23 @@ def path_through(
 
 
 def way_along(corners: Array) -> Array:
-    """(n,) how far it is from the first of n corners to each, from one straight to the next."""
+    """Return the distances (n,) from the first of n corners to each, along the straight lines between them."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)))
 
 
 def places_on_way(at: Array, way: Array, corners: Array) -> Array:
-    """(k, d) so far along the (n, d) corners, to which ``way`` is the way."""
+    """Return the points (k, d) at distances ``at`` (k,) along corners (n, d), whose own distances are ``way`` (n,)."""
     return np.column_stack([np.interp(at, way, column) for column in corners.T])
 
 
 def loop_inside(corners_m: Sequence[Sequence[float]], heights_m: tuple[float, float]) -> list[tuple[float, ...]]:
-    """Waypoints round a floor, drawn in towards its middle, three times up and down between two heights.
+    """Return waypoints of a loop inside a floor, which goes up and down three times between two heights.
+
+    The loop is the floor's outline, shrunk towards the outline's centroid.
 
     Args:
-        corners_m: (2,) each, in turn.
+        corners_m: corners (2,) of the floor, in order.
+        heights_m: lowest and highest height, metres.
     """
     corners = np.array(corners_m, dtype=np.float64)
     closed = np.vstack([corners, corners[:1]])
@@ -73,10 +81,10 @@ def loop_inside(corners_m: Sequence[Sequence[float]], heights_m: tuple[float, fl
 
 
 def path_from_file(path: Path, photo_rate_hz: float) -> Trajectory:
-    """As recorded, thinned to a rate of photos.
+    """Read a recorded trajectory, thinned to a rate of keyframes.
 
     Raises:
-        InputError: no times or no rotations, or whatever else is wrong with the file.
+        InputError: the file has no times or no rotations, or is not valid.
     """
     recorded = read_reference(path)
     if recorded.timestamps_s is None or recorded.world_from_cam is None:
@@ -90,7 +98,7 @@ def path_from_file(path: Path, photo_rate_hz: float) -> Trajectory:
 
 
 def path_from_model(path: Path, photo_rate_hz: float) -> Trajectory:
-    """The keyframes of a metric model in the site's frame, in the order of their names, evenly in time."""
+    """Return the keyframes of a metric model in the site frame, in the order of their names, evenly spaced in time."""
     from rangesfm.colmap.model_files import read_model
 
     found = trajectory_from_reconstruction(read_model(path))
@@ -111,7 +119,7 @@ def _trajectory(times: Array, centers: Array, world_from_cam: Array) -> Trajecto
 
 
 def _looking(ahead: Array) -> Array:
-    """(n, 3, 3) world_from_cam of level cameras, x right, y down, z along the (n, 3) directions as seen from above."""
+    """Return world_from_cam (n, 3, 3) of level cameras that look along the horizontal parts of directions (n, 3)."""
     forward = ahead * [1.0, 1.0, 0.0]
     level = np.linalg.norm(forward, axis=1) > _STEEP * np.linalg.norm(ahead, axis=1)
     forward = np.where(level[:, None], forward, [1.0, 0.0, 0.0])

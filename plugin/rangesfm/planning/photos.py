@@ -1,7 +1,7 @@
-"""What the photos of a planned survey will know: how far its map bends, before and after the ranges straighten it.
+"""Photos of a planned survey: how far the map will bend, before and after the ranges straighten it.
 
-Points are scattered before the camera, and from then on it is the refinement's own keyframe graph: the points are
-eliminated, and what is left binds neighbouring keyframes.
+Points are scattered in front of the camera. They go into the keyframe graph of the refinement, where the points are
+eliminated and the remaining information connects neighbouring keyframes.
 """
 
 from __future__ import annotations
@@ -29,17 +29,18 @@ from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 
 MAX_NUM_PHOTOS = 2000
-"""More would take minutes, and a coarser path bends alike."""
+"""Largest number of photos; more would take minutes, and with fewer photos the path bends in the same way."""
 # Height of a photo over its width.
 _HEIGHT = 2 / 3
-# So many points are computed with, of more each is as good as several; of a photo so many at least. A new one that no
-# other photo sees is drawn again so often.
+# Number of points in the computation, where each may stand for several; smallest number per photo; number of times that
+# a point which no other photo sees is drawn again.
 _NUM_COMPUTED, _LEAST_COMPUTED, _NUM_ROUNDS = 20_000, 40, 5
-# Seen from farther aside, or at another distance, a point looks different, and later on is not found again.
+# A point is found again later if it is seen from a direction within 30 degrees, at a distance within a factor of 2.
 _SAME_LOOK, _SAME_SIZE = np.cos(np.deg2rad(30.0)), 2.0
-# Keyframes: between them a bend is smooth.
+# Number of keyframes for which the bending is computed; it is interpolated between them.
 _NUM_BENT = 40
-# Of the largest: about a straight path no turn is seen.
+# Motions with a singular value below this fraction of the largest do not move the keyframes, like the rotation about a
+# straight path.
 _NO_MOTION = 1e-6
 
 
@@ -53,37 +54,38 @@ _Distance = Annotated[float, Field(ge=0.01, le=1e4)]
 
 
 class PlannedPhotos(Options, table="photos"):
-    """What the camera sees, and how well; without this table the map is taken to be rigid."""
+    """Field of view and features of the camera; without this table the map is assumed to be rigid."""
 
     field_of_view_deg: Annotated[float, Field(ge=5, le=170)] = 65.0
-    """From the left edge of a photo to the right one."""
+    """Horizontal field of view."""
     seen_m: Annotated[
         Annotated[tuple[_Distance, _Distance], Field(strict=False), AfterValidator(ascending)],
         Told(expected="a list of 2 distances, the larger one last"),
     ] = (1.5, 8.0)
-    """Nearest and farthest of what it sees."""
+    """Distances of the nearest and the farthest points that the camera sees, in metres."""
     num_points: Annotated[int, Field(ge=8, le=100_000)] = 200
-    """Of the map in each photo."""
+    """Number of points of the map in each photo."""
     num_photos_of_point: Annotated[int, Field(ge=2, le=1000)] = 8
-    """In a row, at most, in which a point is found."""
+    """Largest number of successive photos in which a point is found."""
     closes_loops: bool = False
-    """Whether a point is found again later, from about the same side and distance."""
+    """Whether a point is found again later, from about the same direction and distance."""
     feature_stddev: Annotated[float, Field(ge=1e-6, le=0.1)] = 0.0005
-    """Of each coordinate of a feature, as a share of a photo's width."""
+    """Standard deviation of each coordinate of a feature, as a fraction of a photo's width."""
 
     @property
     def _half_width(self) -> float:
-        """At a depth of 1."""
+        """Half the width of what a photo shows, at a depth of 1."""
         return float(np.tan(np.deg2rad(self.field_of_view_deg / 2)))
 
     def information(self, path: Trajectory) -> VisionInformation:
-        """What they say of a path."""
+        """Return the information of the photos about the keyframes' poses, given the path."""
         return vision_information(self.observations(path), Poses(path.world_from_cam, path.centers))
 
     def observations(self, path: Trajectory) -> Observations:
-        """Of points that fill each photo of a path, evenly over it and over the logarithm of depth.
+        """Simulate observations, without errors, of points that fill each photo of a path.
 
-        They are so few that each stands for several, and exact.
+        The points are uniform over the photo and over the logarithm of depth. They are few, so that each may stand for
+        several.
         """
         rng = np.random.default_rng(0)
         num = min(self.num_points, max(_NUM_COMPUTED // len(path), _LEAST_COMPUTED))
@@ -111,7 +113,7 @@ class PlannedPhotos(Options, table="photos"):
         return np.asarray(path.centers[frame] + in_cam @ path.world_from_cam[frame].T)
 
     def _photos_of(self, path: Trajectory, frame: int, points: Array) -> Iterator[Indices]:
-        """Of (k, 3) points first seen in a photo, those that find them, in order."""
+        """Yield, for each of the points (k, 3) first seen in photo ``frame``, the photos that find it, in order."""
         photos = np.arange(frame, len(path) if self.closes_loops else min(frame + self.num_photos_of_point, len(path)))
         off = points[:, None] - path.centers[photos]
         in_cam = np.einsum("nji,knj->kni", path.world_from_cam[photos], off)
@@ -144,7 +146,7 @@ class PlannedPhotos(Options, table="photos"):
 
 
 def _in_runs(found: npt.NDArray[np.bool_], longest: int) -> npt.NDArray[np.bool_]:
-    """The first of each run of photos in a row."""
+    """Return which photos are among the first ``longest`` of an uninterrupted run of photos that find a point."""
     index = np.arange(len(found))
     since = index - np.maximum.accumulate(np.where(found, -1, index))
     return since <= longest
@@ -152,11 +154,14 @@ def _in_runs(found: npt.NDArray[np.bool_], longest: int) -> npt.NDArray[np.bool_
 
 @dataclass(frozen=True)
 class PlannedMap:
-    """The map that the photos will make, and that the ranges will straighten, at the truth.
+    """The map that photos and ranges will determine, linearized at the true values.
 
     Attributes:
-        path: of the n keyframes, in the site. vision: what the photos say of it.
-        posed, observations: what the run will know, and its ranges. tag_in_cam_m: (3,) lever arm.
+        path: path of the n keyframes in the site frame.
+        vision: information of the photos about the path.
+        posed: the scale problem of the run.
+        observations: its ranges.
+        tag_in_cam_m: (3,) lever arm of the tag.
     """
 
     path: Trajectory
@@ -166,51 +171,59 @@ class PlannedMap:
     tag_in_cam_m: tuple[float, float, float]
 
     def bend_m(self, solution: Solution) -> float:
-        """Stddev of each coordinate of a keyframe, away from the similarity that fits best, before any refinement."""
+        """Return the standard deviation by which the map bends before the refinement, metres.
+
+        It is that of each coordinate of a keyframe, relative to the best-fitting similarity.
+        """
         by_photos, _ = linear_functions(replace(self._graph(solution, 0.0), held_frame=None), self._gradients)
         bent = _without(self._motions)
         return float(np.sqrt(np.trace(bent @ by_photos @ bent) / len(by_photos)))
 
     def bends_m(self, solution: Solution, learned: LearnedErrors, num_alike: float) -> Array:
-        """(n,) stddevs of keyframes after the refinement, beside what the ranges get wrong of the map as a whole.
+        """Return the standard deviations of the keyframes' positions (n,) after the refinement, metres.
 
-        By the run's own covariance, (J^T W J)^-1 J^T W S W J (J^T W J)^-1, with the ranges' errors S: all that the
-        photos get wrong, and of what the ranges do how they bend the map.
+        Errors of the ranges that move or scale the map as a whole are left out. The covariance is that of the run,
+        (J^T W J)^-1 J^T W S W J (J^T W J)^-1, with the covariance S of the ranges. It contains all errors of the
+        photos, and the errors of the ranges as far as they bend the map.
 
         Args:
-            solution: with the ranges' errors as a map shows them that bends. learned: of these.
-            num_alike: how many ranges each stands for.
+            solution: solution with the range errors that a bending map sees.
+            learned: error model of the ranges.
+            num_alike: number of ranges that each simulated one stands for.
         """
         graph = self._graph(solution, num_alike)
         by_photos, by_metre = linear_functions(graph, self._gradients)
         by_cell = np.stack([learned.cells.total(column) for column in by_metre.T], axis=1)
         by_ranges = by_cell.T @ learned.covariance_m2 @ by_cell
-        # In the frame of the first camera the map as a whole can only grow.
+        # In the first camera's frame, the map as a whole can only change its scale.
         bent = _without(self._motions if graph.held_frame is None else self._motions[:, :, :1])
         variances = np.diag(by_photos + bent @ by_ranges @ bent).reshape(-1, 3).sum(axis=1)
         return np.asarray(np.interp(np.arange(len(self.path)), self._some, np.sqrt(np.maximum(variances, 0.0))))
 
     @property
     def _some(self) -> Indices:
-        """Of the k keyframes that are computed."""
+        """Indices of the k keyframes for which the bending is computed."""
         some: Indices = np.unique(np.linspace(0, len(self.path) - 1, _NUM_BENT).round().astype(np.int64))
         return some
 
     @property
     def _motions(self) -> Array:
-        """(k, 3, 7) of their centres about the first camera."""
+        """Derivatives (k, 3, 7) of these keyframes' centres by a similarity about the first camera."""
         return similarity_motions(self.path.centers[self._some] - self.path.centers[0])
 
     @property
     def _gradients(self) -> Array:
-        """(6 n, 3 k) of their centres."""
+        """Derivatives (6 n, 3 k) of these keyframes' centres by all n poses."""
         gradients = np.zeros((len(self.path), 6, len(self._some), 3))
         for column, frame in enumerate(self._some):
             gradients[frame, 3:, column] = np.eye(3)
         return gradients.reshape(6 * len(self.path), -1)
 
     def _graph(self, solution: Solution, num_alike: float) -> KeyframeGraph:
-        """In the site's frame; of the first camera's, only what is held there is different."""
+        """Return the keyframe graph of the refinement in the site frame.
+
+        If the result is in the first camera's frame, only the held keyframe differs.
+        """
         posed, ranges, log = self.posed, self.posed.ranges, self.observations.log
         in_site = (solution.fit.state.metric_from_model @ posed.first_camera_from_sfm).inverse()
         anchors = tuple(
@@ -236,7 +249,7 @@ class PlannedMap:
 
 
 def _without(motions: Array) -> Array:
-    """(3 k, 3 k) projector on what (k, 3, m) motions do not explain."""
+    """Return the projector (3 k, 3 k) onto the displacements that the motions (k, 3, m) do not explain."""
     left, sizes, _ = np.linalg.svd(motions.reshape(-1, motions.shape[2]), full_matrices=False)
     basis = left[:, sizes > _NO_MOTION * sizes.max()]
     return np.asarray(np.eye(len(basis)) - basis @ basis.T)

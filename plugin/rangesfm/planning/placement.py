@@ -1,4 +1,4 @@
-"""Where to put anchors: places exchanged one by one, among those allowed, as long as scale and place gain by it."""
+"""Placement of anchors: anchors are moved one at a time to the allowed place that most improves scale and position."""
 
 from __future__ import annotations
 
@@ -14,23 +14,32 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 
-# Along x, y and z of a box.
+# Numbers of places along x, y and z of a box.
 _GRID = (4, 4, 2)
-# As many along walls, at the lower and the upper height.
+# Number of places along all walls together, at each of two heights.
 _NUM_ALONG_WALLS = 16
 _MAX_NUM_ROUNDS = 4
-# Of the sum of two logarithms.
+# Smallest decrease of the sum of two logarithms for which an anchor is moved.
 _LEAST_GAIN = 0.01
 
 
 def places_in_box(low_m: Sequence[float], high_m: Sequence[float]) -> Array:
-    """(k, 3) a grid, each place once, of a box that may be flat."""
+    """Return a grid of different places (k, 3) in a box, which may be flat.
+
+    Args:
+        low_m, high_m: two opposite corners (3,), metres.
+    """
     axes = [np.unique(np.linspace(a, b, num)) for a, b, num in zip(low_m, high_m, _GRID, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def places_on_walls(walls_m: Sequence[Sequence[Sequence[float]]], heights_m: tuple[float, float]) -> Array:
-    """(k, 3) evenly along walls, each from corner to corner as seen from above, at two heights."""
+    """Return places (k, 3) evenly spaced along walls, at two heights.
+
+    Args:
+        walls_m: walls, each a list of corners (2,) as seen from above, metres.
+        heights_m: the two heights, metres.
+    """
     walls = [np.array(wall, dtype=np.float64) for wall in walls_m]
     ways = [way_along(wall) for wall in walls]
     step = sum(way[-1] for way in ways) / _NUM_ALONG_WALLS
@@ -38,13 +47,13 @@ def places_on_walls(walls_m: Sequence[Sequence[Sequence[float]]], heights_m: tup
     for wall, way in zip(walls, ways, strict=True):
         at = np.linspace(0.0, way[-1], max(round(way[-1] / step), 1) + 1)
         spots.append(places_on_way(at, way, wall))
-    # A wall that comes back to its start ends where it began.
+    # A closed wall has the same first and last place.
     distinct = np.unique(np.round(np.vstack(spots), 6), axis=0)
     return np.vstack([np.insert(distinct, 2, height, axis=1) for height in heights_m])
 
 
 def spread_places(num: int, places: Array) -> Array:
-    """(num, 3) of the places, each as far as possible from those before."""
+    """Choose places (num, 3), each as far as possible from those chosen before."""
     chosen = [0]
     while len(chosen) < num:
         distances = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
@@ -53,18 +62,19 @@ def spread_places(num: int, places: Array) -> Array:
 
 
 def spread_anchors(num: int, places: Array, stddev_m: float) -> tuple[Anchor, ...]:
-    """P1, P2, ... as far apart as the places allow."""
+    """Return anchors P1, P2, ... at places as far apart as possible."""
     return tuple(Anchor(f"P{k}", place, stddev_m) for k, place in enumerate(spread_places(num, places), 1))
 
 
 def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> PlannedSurvey:
-    """The same survey with its anchors where scale and place are known best, as far as single exchanges get.
+    """Return the survey with its anchors moved to improve scale and position; the result is a local optimum.
 
-    One anchor after the other is tried at every place that is allowed (Fedorov's exchange); what counts is the product
-    of the scale's stddev and that of the keyframe known least, or of the scale alone without a place.
+    One anchor after the other is tried at every allowed place (Fedorov's exchange). The product of the scale's relative
+    standard deviation and the least certain keyframe's standard deviation is minimized, or the first alone if the map
+    is not placed in the site.
 
     Raises:
-        GeometryError: no place of the anchors determines the scale.
+        GeometryError: no choice of places determines the scale.
     """
     progress = progress or SilentProgress()
     if planned.is_placed or planned.allowed_m is None:
@@ -86,12 +96,12 @@ def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> P
         if best == before:
             break
     if np.isinf(best):
-        raise GeometryError("no place that is allowed for the anchors determines the scale, with this path")
+        raise GeometryError("no allowed places of the anchors determine the scale with this path")
     return planned
 
 
 def _badness(planned: PlannedSurvey) -> float:
-    """Sum of logarithms; a place that is open is known to the size of the site."""
+    """Return the sum of the logarithms of both standard deviations; that of the position is at most the site's size."""
     expected = compare(planned)
     if expected is None:
         return np.inf

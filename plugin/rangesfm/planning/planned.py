@@ -1,4 +1,4 @@
-"""PlannedSurvey: where the anchors will stand, where the camera will go, and what the radio is like."""
+"""PlannedSurvey: the anchors, the camera's path and the radio of a survey that has not been made yet."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from rangesfm.ranging.observations import RangeObservations
 from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.range_equation import RangeState
 
-# Nobody puts an anchor in line with a path, or into its plane, to a decimetre; and where one that is to be found stands
-# exactly there, the linear problem does not see what is open.
+# Offset of anchors with unknown positions, metres. In practice no anchor is exactly in line with a path or in its
+# plane. In a plan it may be, and the linearized problem would then miss what is not determined.
 _OFF_LINE_M = (0.07, 0.07, 0.1)
 
 
 @dataclass(frozen=True)
 class PlannedSurvey:
-    """A survey that nobody has made yet, in the site's frame and metres.
+    """A survey that has not been made yet, in metres in the site frame.
 
     Attributes:
-        trajectory: of the keyframes, with times.
-        anchors: where they will stand, all with a position, and how well that will be known.
-        anchor_frame: as of a survey: in which frame their positions will be known, if at all.
-        rate_hz: ranges to each anchor in a second.
-        tag_in_cam_m: (3,) lever arm.
-        range_model: what a run will assume of the radio.
-        curve_stddev_m: of the radio's error curve once it has been learnt; None: nobody calibrated it.
-        component_stddevs: of components of the ranges' errors of which more is known, by name.
-        taped: distances between points of the map: pairs of a length and its stddev, metres.
-        heights_m: between which anchors may stand; None: not below the ground, which is 0 or the lowest of all.
-        path_is_level: the camera cannot go up and down, as on a rover.
-        photos: what the camera will see; None: nobody said, and the map is taken to be rigid.
-        allowed_m: (k, 3) places for anchors; None: nobody said where they may stand.
-        is_placed: whether the anchors stand where they do; else they may be put anywhere that is allowed.
-        max_num_ranges: to compute with; of more, each stands for several.
+        trajectory: path of the keyframes, with times.
+        anchors: anchors, all with a position, and with the standard deviation to which it will be known.
+        anchor_frame: frame in which their positions will be known, as in a survey file, or "unknown".
+        rate_hz: ranges to each anchor per second.
+        tag_in_cam_m: (3,) lever arm of the tag.
+        range_model: what a run will assume about the radio.
+        curve_stddev_m: standard deviation of the radio's error curve after a calibration; None: it is not calibrated.
+        component_stddevs: standard deviations of components of the range errors that are known better, by name.
+        taped: taped lengths between points of the map, as pairs of length and standard deviation.
+        heights_m: lowest and highest height for anchors; None: not below the ground, which is 0 or the lowest point.
+        path_is_level: whether the camera cannot go up and down, as on a rover.
+        photos: field of view and features of the camera; None: the map is assumed to be rigid.
+        allowed_m: (k, 3) allowed places for anchors; None: not given.
+        is_placed: whether the anchors' places are fixed; else they may be moved to any allowed place.
+        max_num_ranges: largest number of simulated ranges; if there are more, each stands for several.
     """
 
     trajectory: Trajectory
@@ -65,17 +65,17 @@ class PlannedSurvey:
 
     @property
     def anchors_m(self) -> Array:
-        """(m, 3)"""
+        """Positions of the anchors (m, 3)."""
         return np.array([anchor.position_m for anchor in self.anchors], dtype=np.float64)
 
     @property
     def _standing_m(self) -> Array:
-        """(m, 3) where the anchors are taken to stand."""
+        """Positions of the anchors in the computation (m, 3)."""
         return self.anchors_m + _OFF_LINE_M if self.anchor_frame == "unknown" else self.anchors_m
 
     @property
     def places_m(self) -> Array:
-        """(m + n, 3) of all anchors and keyframes."""
+        """Positions of all anchors and keyframes (m + n, 3)."""
         return np.vstack([self.anchors_m, self.trajectory.centers])
 
     @property
@@ -85,21 +85,21 @@ class PlannedSurvey:
 
     @property
     def num_ranges(self) -> int:
-        """That the radio will measure."""
+        """Number of ranges that the radio will measure."""
         return int(self.duration_s * self.rate_hz) * len(self.anchors)
 
     def with_anchor_at(self, k: int, place_m: Array) -> PlannedSurvey:
-        """The same with its k-th anchor elsewhere."""
+        """Return the survey with its k-th anchor at another place (3,)."""
         moved = replace(self.anchors[k], position_m=place_m)
         return replace(self, anchors=(*self.anchors[:k], moved, *self.anchors[k + 1 :]))
 
     def ranging(self, num_ranges: int) -> PlannedSurvey:
-        """The same at such a rate that so many ranges come of it."""
+        """Return the survey with the rate that gives this number of ranges."""
         return replace(self, rate_hz=(num_ranges / len(self.anchors) + 0.5) / self.duration_s)
 
     @property
     def num_alike(self) -> int:
-        """How many ranges each simulated one stands for."""
+        """Number of ranges that each simulated one stands for."""
         return -(-self.num_ranges // self.max_num_ranges) or 1
 
     @property
@@ -107,7 +107,7 @@ class PlannedSurvey:
         return Similarity(1.0, self.trajectory.world_from_cam[0], self.trajectory.centers[0])
 
     def observations(self) -> RangeObservations:
-        """Ranges without any error, on the path; of more than some thousand, each stands for several."""
+        """Simulate ranges without errors on the path; if there are many, each stands for several."""
         num_anchors = len(self.anchors)
         turn = np.arange(self.num_ranges // self.num_alike)
         first_s = 0.0 if self.trajectory.timestamps_s is None else float(self.trajectory.timestamps_s[0])
@@ -118,15 +118,15 @@ class PlannedSurvey:
         at = np.array([self._standing_m[ids.index(anchor_id)] for anchor_id in log.anchor_ids])
         distances = np.linalg.norm(places.centers + places.tag_from_center - at[log.anchor_index], axis=1)
         curve = None if self.curve_stddev_m is None else np.full(len(log), self.curve_stddev_m)
-        # One without a place has no say.
+        # A range without a position on the path is not used; it only needs a valid number.
         measured = replace(log, range_m=np.nan_to_num(distances, nan=1.0), shared_stddev_m=curve)
         return replace(places, log=measured)
 
     def posed(self, observations: RangeObservations) -> ScaleProblem:
-        """The problem that a run will pose, with what it will be told.
+        """Return the scale problem that a run will solve, with the input that it will have.
 
         Raises:
-            GeometryError: as the run will.
+            GeometryError: the run will refuse the input.
         """
         from_site = self._site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
         told = [replace(a, position_m=from_site.apply(at)) for a, at in zip(self.anchors, self.anchors_m, strict=True)]
@@ -135,7 +135,7 @@ class PlannedSurvey:
         return scale_problem(observations, self.trajectory, told, self.anchor_frame, self.range_model, taped)
 
     def state(self, posed: ScaleProblem, anchor_ids: tuple[str, ...]) -> RangeState:
-        """The truth, in the frame of the problem."""
+        """Return the true state in the frame of the problem."""
         at = {anchor.anchor_id: place for anchor, place in zip(self.anchors, self._standing_m, strict=True)}
         places, first = np.array([at[anchor_id] for anchor_id in anchor_ids]), self._site_from_first_camera
         biases = posed.ranges.bias_mean_m.copy()

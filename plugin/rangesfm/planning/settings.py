@@ -1,4 +1,4 @@
-"""The file of a plan: of each key its type, bounds and meaning; read as a survey file is."""
+"""The plan file: type, bounds and meaning of each key; it is read like a survey file."""
 
 from __future__ import annotations
 
@@ -48,73 +48,73 @@ _Corners = Annotated[tuple[_Spot, ...], Field(strict=False), AfterValidator(_goi
 
 
 class PlannedAnchorOptions(Options, table="anchors"):
-    """The anchors: where they will stand in the site, metres, z up."""
+    """Planned anchors: their places in the site, in metres, z up."""
 
     path: Annotated[Path | None, Told(role="file")] = None
-    """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], all with a position."""
+    """CSV file anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], each with a position."""
     places: Annotated[dict[str, _Place], Told(expected="a table in which each value is a list of 3 numbers")] = Field(
         default_factory=dict
     )
-    """The same by anchor id: x, y, z."""
+    """Positions x, y, z by anchor id, instead of path."""
     frame: Literal["site", "first_camera", "unknown"] = "site"
-    """As what a run will know them: surveyed in the site, known in the first camera's frame, or not at all."""
+    """How a run will know the positions: surveyed in the site, in the first camera's frame, or not at all."""
     position_stddev_m: _Stddev = 0.0
-    """How well each coordinate in places will be known."""
+    """Standard deviation to which each coordinate in places will be known."""
     num_to_place: Annotated[int, Field(ge=1, le=_MAX_NUM_ANCHORS)] | None = None
-    """So many anchors are put where they help most in the region or on the walls, instead of places and path."""
+    """Number of anchors to place where they help most, in the region or on the walls, instead of places and path."""
     region_m: Annotated[
         Annotated[tuple[_Place, _Place], Field(strict=False), AfterValidator(_corners)] | None,
         Told(expected="two places, the second one in no coordinate smaller"),
     ] = None
-    """Two corners x, y, z of the box in which anchors may stand."""
+    """Two opposite corners x, y, z of the box in which anchors may be placed."""
     walls_m: Annotated[
         Annotated[tuple[_Corners, ...], Field(strict=False)] | None,
         Told(expected="a list of walls, each a list of 2 corners x, y or more"),
     ] = None
-    """Walls on which anchors may stand instead, between heights_m: each from corner to corner, as seen from above."""
+    """Walls on which anchors may be placed instead, at heights_m: each a list of corners x, y as seen from above."""
     heights_m: Annotated[_Heights | None, _HEIGHTS] = None
-    """Between which they may stand (default: not below the ground)."""
+    """Lowest and highest height of anchors (default: not below the ground)."""
 
 
 class PlannedPathOptions(Options, table="path"):
-    """The camera's path: waypoints, a loop, a trajectory, or a model."""
+    """Planned path of the camera: waypoints, a loop, a trajectory, or a model."""
 
     waypoints: Annotated[
         Annotated[tuple[_Place, ...], Field(strict=False)] | None, Told(expected="a list of lists of 3 numbers")
     ] = None
-    """Places x, y, z that the camera passes, in the site; it looks ahead."""
+    """Points x, y, z in the site that the camera passes; it looks ahead."""
     loop_inside_m: Annotated[
         Annotated[tuple[_Spot, ...], Field(strict=False, min_length=3)] | None,
         Told(expected="a list of 3 corners x, y or more"),
     ] = None
-    """Corners of a floor instead, within which a loop is walked, two thirds as wide, up and down between heights_m."""
+    """Corners of a floor instead; a loop two thirds as wide is walked in it, up and down between heights_m."""
     heights_m: Annotated[_Heights, _HEIGHTS] = (1.2, 2.0)
-    """Of the camera on that loop."""
+    """Lowest and highest height of the camera on that loop."""
     speed_m_per_s: Annotated[float, Field(ge=0.01, le=100)] = 0.8
-    """Along the waypoints or the loop."""
+    """Speed along the waypoints or the loop."""
     num_rounds: Annotated[int, Field(ge=1, le=1000)] = 1
-    """How often they are walked; from the second round on back to the first waypoint."""
+    """Number of times that they are walked; each further round starts by going back to the first waypoint."""
     file: Annotated[Path | None, Told(role="file")] = None
-    """A trajectory instead, TUM or CSV, with rotations."""
+    """A recorded trajectory instead, TUM or CSV, with rotations."""
     model: Annotated[Path | None, Told(role="model")] = None
     """A metric COLMAP model in the site's frame instead, its photos in the order of their names."""
     photo_rate_hz: Annotated[float, Field(ge=0.5, le=100)] = 2.0
-    """Keyframes in a second."""
+    """Keyframes per second."""
     is_level: bool = False
     """Whether the camera cannot go up and down, as on a rover."""
 
 
 class PlannedRadioOptions(RangeModelOptions, table="radio"):
-    """The radio."""
+    """Planned radio."""
 
     rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)] = 5.0
-    """Ranges to each anchor in a second."""
+    """Ranges to each anchor per second."""
     like: Literal[LOGS] | None = None  # type: ignore[valid-type]
-    """The radio of a public log, which errs as it does there (default: as radios mostly do)."""
+    """Public log whose radio has the same errors as this one (default: usual errors of radios)."""
     curve_stddev_m: Annotated[float, Field(ge=1e-4, le=1)] | None = None
-    """Of the radio's error curve, where it was learnt (default: it was not)."""
+    """Standard deviation of the radio's error curve after a calibration (default: not calibrated)."""
     stddevs: dict[str, Annotated[float, Field(ge=1e-9, le=10)]] = Field(default_factory=dict)
-    """Of components of the ranges' errors by name, as in result.json (default: as the radio is like)."""
+    """Standard deviations of components of the range errors, named as in result.json (default: those of like)."""
 
 
 TABLES: dict[str, type[Options]] = {
@@ -127,11 +127,11 @@ TABLES: dict[str, type[Options]] = {
 
 
 def read_plan(path: str | Path) -> PlannedSurvey:
-    """Read a plan's file; paths in it are relative to it.
+    """Read a plan file; paths in it are relative to the file's folder.
 
     Raises:
-        InputError: with the line where possible, for an unknown table or key, a value of the wrong type or out of
-            bounds, a plan without anchors or path, and a file that does not exist.
+        InputError: a table or key is unknown, a value has the wrong type or is out of bounds, anchors or path are
+            missing, or a file does not exist. The error gives the line where possible.
     """
     tables, source = parse_toml(Path(path))
     folder = Path(path).absolute().parent
@@ -146,7 +146,7 @@ def read_plan(path: str | Path) -> PlannedSurvey:
 
 
 def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict[str, Any]:
-    """With whole paths."""
+    """Return a table with absolute paths."""
     keys = model.keys()
     return {
         name: folder / path_of(value) if name in keys and keys[name].role and isinstance(value, str) else value
@@ -210,7 +210,7 @@ def _path(path: PlannedPathOptions) -> Trajectory:
 
 
 def _allowed(options: PlannedAnchorOptions) -> Array | None:
-    """(k, 3) places where anchors may stand."""
+    """Return the places where anchors may be put (k, 3), or None if the plan gives none."""
     if options.walls_m is None:
         return None if options.region_m is None else places_in_box(*options.region_m)
     if options.region_m is not None or options.heights_m is None:
@@ -237,7 +237,7 @@ def _anchors(options: PlannedAnchorOptions, allowed_m: Array | None) -> tuple[An
         anchors = read_anchors(options.path)
     for anchor in anchors:
         if anchor.position_m is None:
-            expected = "where it will stand (what a run will know of it says [anchors] frame)"
+            expected = "its planned position (whether a run will know it is said by [anchors] frame)"
             raise InputError(f"anchor {anchor.anchor_id} has no position, expected {expected}", options.path)
     if len(anchors) > _MAX_NUM_ANCHORS:
         raise OptionError(f"[anchors] are {len(anchors)}, expected at most {_MAX_NUM_ANCHORS}", "anchors")

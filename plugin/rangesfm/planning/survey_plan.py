@@ -1,4 +1,4 @@
-"""SurveyPlan: what a survey will know, in numbers and in words."""
+"""SurveyPlan: the expected result of a planned survey, in numbers and in words."""
 
 from __future__ import annotations
 
@@ -19,18 +19,20 @@ from rangesfm.trust.linearized import linearized, ranges_on_map
 from rangesfm.trust.testing import Factorization, MistakeTest, row_of
 
 _MAX_NUM_SHOWN = 5
-# Of a mistake; what the ranges say of it is not known before they are measured.
+# Columns of a mistake's test that do not depend on the measured ranges.
 _SIZES = ("smallest_detectable", "effect_on_scale", "effect_on_place_m")
 
 
 @dataclass(frozen=True)
 class PlannedPlace:
-    """How well the map's place in the site will be known; inf where nothing determines it.
+    """Expected uncertainty of the map's placement in the site; inf where it is not determined.
 
     Attributes:
-        stddev_m: (3,) of the map's middle, in x, y, z.
-        heading_stddev_deg: of its turn about z. tilt_stddev_deg: of z against the plumb line.
-        worst_keyframe: which keyframe is known least. worst_keyframe_stddev_m: root of its summed variances.
+        stddev_m: (3,) standard deviations of x, y and z of the map's mean.
+        heading_stddev_deg: standard deviation of its rotation about z.
+        tilt_stddev_deg: standard deviation of its tilt.
+        worst_keyframe: index of the least certain keyframe.
+        worst_keyframe_stddev_m: root of the summed variances of that keyframe's position.
     """
 
     stddev_m: tuple[float, float, float]
@@ -42,21 +44,24 @@ class PlannedPlace:
 
 @dataclass(frozen=True)
 class SurveyPlan:
-    """What a run of the planned survey will state.
+    """Expected result of a planned survey, as a run will state it.
 
     Attributes:
-        num_ranges: that the radio will measure, in ``duration_s``.
-        anchors_m: where they will stand in the site, by id.
-        frame: of the result, "site" or "first_camera".
-        scale_stddev: relative. scale_stddev_formal: as if every range erred on its own.
-        scale_interval_95: relative, its ends.
-        components: what each component of the ranges' errors does to the scale, by name.
-        place: None where the frame is the first camera's.
-        keyframe_stddevs_m: (n,) of each keyframe's place in that frame.
-        verdict, reasons: on the scale, as the run will judge it; "doubtful" too where it will leave the place open.
-        mistakes: what would be found of each, and do then, those that do most first; None: without limit.
+        num_ranges: number of ranges that the radio will measure.
+        duration_s: duration of the survey.
+        anchors_m: position of each anchor in the site, by id.
+        frame: frame of the result, "site" or "first_camera".
+        scale_stddev: relative standard deviation of the scale.
+        scale_stddev_formal: the same if the errors of all ranges were independent.
+        scale_interval_95: relative ends of the scale's 95 % interval.
+        components: relative standard deviation of the scale from each component of the range errors, by name.
+        place: placement in the site; None if the frame is the first camera's.
+        keyframe_stddevs_m: (n,) standard deviation of each keyframe's position in the result's frame.
+        verdict, reasons: the run's verdict on the scale; also "doubtful" if the run will leave the position open.
+        mistakes: for each possible mistake the smallest size that would be found, and its effect, the largest effect on
+            the scale first; None means without limit.
         advice: changes that would gain something.
-        expected: the estimate that all this is of.
+        expected: the estimate from which all this is computed.
     """
 
     num_ranges: int
@@ -77,21 +82,21 @@ class SurveyPlan:
 
     @property
     def advice_for_scale(self) -> list[Advice]:
-        """What gains most for the scale first."""
+        """Changes by their gain for the scale, the largest first."""
         return ranked(self.advice, attrgetter("scale_gain"))
 
     @property
     def advice_for_place(self) -> list[Advice]:
-        """What gains most for the place of the keyframe known least first."""
+        """Changes by their gain for the position of the least certain keyframe, the largest first."""
         return ranked(self.advice, attrgetter("place_gain"))
 
     @property
     def lines(self) -> list[str]:
-        """For people."""
+        """The plan as lines of text for the user."""
         return [*_known(self), *_budget(self), *_found(self), *_advised(self)]
 
     def as_json(self) -> dict[str, Any]:
-        """What is infinite or not a number is null; advice in both orders."""
+        """Return plain values for JSON, with null for numbers that are not finite, and the advice in both orders."""
         content: dict[str, Any] = _finite(self)
         del content["advice"]
         names = ("name", "subject", "unit", *_SIZES)
@@ -104,7 +109,7 @@ class SurveyPlan:
 
 @with_one_blas_thread
 def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
-    """What a survey will know, by the formulas of a run at the true map, and which change would gain most.
+    """Compute the expected result of a survey by the formulas of a run at the true map, and the changes that gain most.
 
     Raises:
         GeometryError: a run will refuse the scale.
@@ -147,7 +152,10 @@ def _place(expected: Expected) -> PlannedPlace | None:
 
 
 def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
-    """Of every mistake that lasts for the whole survey; that it was made is not tested, as nothing was measured."""
+    """Return a row for every possible mistake that lasts for the whole survey, without test statistics.
+
+    Nothing has been measured yet, so that there is nothing to test. The sizes and effects are known all the same.
+    """
     on_map = ranges_on_map(expected.posed, expected.solution, expected.observations, expected.planned.trajectory, None)
     problem = replace(linearized(on_map, expected.learned.cells), errors=expected.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
@@ -183,14 +191,14 @@ def _budget(plan: SurveyPlan) -> Iterator[str]:
 
 
 def _found(plan: SurveyPlan) -> Iterator[str]:
-    yield "mistakes just too small to be found, and the most that they would do:"
+    yield "mistakes just too small to be found, and their largest effects:"
     of_kind: dict[str, MistakeTest] = {}
     for mistake in plan.mistakes:
         of_kind.setdefault(mistake.name, mistake)
     for mistake in list(of_kind.values())[:_MAX_NUM_SHOWN]:
         what = f"  {mistake.name} {mistake.subject}".rstrip()
         if mistake.smallest_detectable is None:
-            yield f"{what}: none is ever found"
+            yield f"{what}: never found, whatever its size"
             continue
         unit = "" if mistake.unit == "1" else f" {mistake.unit}"
         scale = "open" if mistake.effect_on_scale is None else f"{100 * mistake.effect_on_scale:.2g} %"
