@@ -121,7 +121,7 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
 
 def _distances(table: Table) -> tuple[TapedDistance, ...]:
     if not len(table):
-        raise InputError("holds no distance, expected one a line", table.path)
+        raise InputError("holds no distance, expected one per line", table.path)
     starts, ends = table.text("from"), table.text("to")
     kinds = table.text("kind", empty=CONTROL) if "kind" in table else [CONTROL] * len(table)
     for row, (start, end, kind) in enumerate(zip(starts, ends, kinds, strict=True)):

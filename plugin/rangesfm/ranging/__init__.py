@@ -1,1 +1,1 @@
-"""From a radio's log to ranges at places on the camera's path."""
+"""Ranges: range logs, their association with the camera's path, anchors, clocks and range errors."""

@@ -1,4 +1,4 @@
-"""Puts every range at its place on the camera's path, or on a known one."""
+"""Association of ranges with positions on the camera's path, or on a known path."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeObservations, RangeStatus
 
-# Early and late halves of a burst must agree to this many stddevs before the camera counts as still.
+# The early and the late half of a burst must agree to this many standard deviations for the camera to count as still.
 _MAX_STILL_DRIFT_STDDEVS = 2.0
-# A range this close in time to a keyframe was taken there: at walking pace it is a tenth of a millimetre off.
+# A range this close in time to a keyframe, in seconds, counts as taken at it. At walking pace the difference is a tenth
+# of a millimetre.
 _SAME_TIME_S = 1e-4
 
 
@@ -37,24 +38,23 @@ def associate(
 ) -> RangeObservations:
     """Find the camera pose at which each range was taken.
 
-    Between keyframes that are close in time centre and rotation move as the keyframes let
-    expect (``MotionPrior``); their stddevs say how far that, and times that are written in
-    coarse steps, can be trusted. Between keyframes further apart than
-    ``options.max_interpolation_gap_s`` a range belongs to the nearest keyframe, and only
-    if it is within ``max_time_difference_s`` or the ranges themselves show that the camera
-    stood still around its photos.
+    Between keyframes that are close in time, the camera's centre and rotation are interpolated by a motion model learnt
+    from the keyframes (``MotionPrior``). The standard deviations of the result include those of this interpolation and
+    of times that are recorded in coarse steps. Between keyframes further apart than
+    ``options.max_interpolation_gap_s``, a range belongs to the nearest keyframe, and only if it is within
+    ``max_time_difference_s`` of it, or the ranges themselves show that the camera stood still around its photos.
 
     Args:
         log: n ranges.
         trajectory: keyframes; with times, unless the log names photos.
-        tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres; (num_tags, 3) where the tags of
+        tag_in_cam_m: (3,) lever arm, the antenna in the camera (rig) frame, metres; (num_tags, 3) if the tags of
             ``log.tag_ids`` have their own.
         time_offset_s: image time = range time + offset; (n,) where the clocks drift.
-        anchor_ids: ranges to other anchors are kept with status UNKNOWN_ANCHOR; None: all are wanted.
+        anchor_ids: ranges to other anchors are kept with status UNKNOWN_ANCHOR; None: all anchors are wanted.
 
     Returns:
-        all n ranges, each with a place or a status that says why it has none; those between two anchors or two
-        tags have none.
+        All n ranges, each with a position on the path, or a status that says why it has none. Ranges between two
+        anchors or two tags have none.
 
     Raises:
         InputError: the log needs image times and there are none, or the log has more tags than lever arms.
@@ -79,7 +79,7 @@ def associate(
     placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
     before, after = np.where(placed, before, -1), np.where(placed, after, -1)
     weight = np.where(placed, weight, 0.0)
-    # The last entry stands for the index of no tag.
+    # The last row is for the tag index -1, which means no tag.
     tags_in_cam_m = np.vstack([lever_arms(log, tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
     centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
     offsets, stddev, arm_stddev_m = np.zeros((len(log), 3)), np.zeros(len(log)), np.zeros(len(log))
@@ -107,30 +107,31 @@ def tag_positions(
     time_offset_s: float = 0.0,
     max_gap_s: float,
 ) -> Array:
-    """The tag's antenna at each range, interpolated between the known positions.
+    """Return the position of the tag's antenna at each range, interpolated between known positions.
 
     Args:
-        log: n ranges, by time or by photo (or any name of a place) as the path.
+        log: n ranges, by time or by name of a photo or place, like the path.
         path: positions of the tag's antenna; or of the camera, with rotations, if ``tag_in_cam_m`` is given.
-        tag_in_cam_m: (3,) the antenna in the frame whose positions are known.
+        tag_in_cam_m: (3,) lever arm, the antenna in the frame whose positions are known, metres.
         time_offset_s: time of the path = time of the range + offset.
-        max_gap_s: between known positions further apart nothing is interpolated.
+        max_gap_s: positions are interpolated between known ones up to this far apart in time, seconds.
 
     Returns:
-        (n, 3) metres, NaN where the path does not say.
+        (n, 3) positions in metres, NaN where they are not known.
 
     Raises:
-        InputError: one is by time and the other by name, a lever arm without rotations, or nothing in common.
+        InputError: the log is by time and the path by name or the reverse, there is a lever arm but no rotations, or no
+            range is at a known position.
     """
     if (log.image_name is None) != (path.image_names is None):
         ours, theirs = ("name", "time") if path.image_names is None else ("time", "name")
-        raise InputError(f"the ranges are by {ours} and the positions by {theirs}, expected both alike", log.source)
+        raise InputError(f"the ranges are by {ours} and the positions by {theirs}, expected the same", log.source)
     times_s = None if log.timestamp_s is None else log.timestamp_s + time_offset_s
     positions, rotations = path.poses(log.image_name, times_s, max_gap_s)
     lever = np.asarray(tag_in_cam_m, dtype=np.float64)
     if np.any(lever != 0):
         if rotations is None:
-            raise InputError("a lever arm needs the rotations qx,qy,qz,qw beside the positions")
+            raise InputError("a lever arm needs the rotations qx,qy,qz,qw besides the positions")
         positions = positions + rotations @ lever
     if len(log) and not np.isfinite(positions).any():
         raise InputError(path.why_nothing_is_known("ranges", log.image_name, times_s, max_gap_s), log.source)
@@ -138,12 +139,19 @@ def tag_positions(
 
 
 def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
-    """(n,) gaps between keyframes across which no pose is interpolated; photos every 2 s are 2 s apart at any date."""
+    """Return which gaps between keyframes (n,) are too long for interpolation, with a tolerance for rounded times."""
     return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
 
 
 def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
-    """(num_tags, 3) in the order of ``log.tag_ids``, from one lever arm for all or one for each; else InputError."""
+    """Return the lever arm of each tag (num_tags, 3), in the order of ``log.tag_ids``.
+
+    Args:
+        tag_in_cam_m: (3,) one lever arm for all tags, or (num_tags, 3) one for each.
+
+    Raises:
+        InputError: it has another shape.
+    """
     given = np.asarray(tag_in_cam_m, dtype=np.float64)
     num_tags = len(log.tag_ids)
     if given.shape not in ((3,), (num_tags, 3)):
@@ -157,7 +165,10 @@ def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
 def _places_by_time(
     log: RangeLog, times: Array, keyframe_times: Array, options: AssociationOptions, status: npt.NDArray[np.int8]
 ) -> tuple[Indices, Indices, Array]:
-    """Keyframes around each time, and the weight of the later one. Sets ``status`` where there is no place."""
+    """Return the keyframes before and after each time, and the weight of the later one.
+
+    ``status`` is changed where a range has no position on the path.
+    """
     last = len(keyframe_times) - 1
     after = np.clip(np.searchsorted(keyframe_times, times), min(1, last), last)
     before = np.maximum(after - 1, 0)
@@ -169,7 +180,7 @@ def _places_by_time(
 
     at_keyframe = distance <= options.max_time_difference_s
     interpolated = inside & ~is_too_long(gap, options)
-    # Only at a keyframe with a gap on both sides can standing still matter.
+    # Standing still is tested only at keyframes with a long gap on both sides; elsewhere poses are interpolated.
     long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
     lonely = (log.kind == RangeKind.TAG_ANCHOR) & ~interpolated & (long_gap[:-1] & long_gap[1:])[nearest]
     still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
@@ -186,14 +197,14 @@ def _places_by_time(
 def _camera_is_still(
     log: RangeLog, nearest: Indices, distance: Array, times: Array, candidates: Mask, keyframe_times: Array
 ) -> Mask:
-    """(n,) whether ranges this far from an isolated photo were taken where the photo was.
+    """Return which ranges (n,) near an isolated photo were taken while the camera stood still at that photo.
 
-    A stop-and-go survey leaves bursts of ranges around each photo that do not change within
-    the burst. The early and the late half of every burst are compared by their medians; the
-    differences must not exceed what the noise within the halves explains.
+    In a stop-and-go survey, the ranges around each photo form a burst in which they do not change. The medians of the
+    early and the late half of every burst are compared. Their differences must not exceed what the noise within the
+    halves explains.
     """
     still = np.zeros(len(times), dtype=bool)
-    # Half the median gap keeps a burst on its own side of the way to the next photo.
+    # Up to half of the median gap, a range is nearer to this photo than to the next one.
     reach = 0.5 * float(np.median(np.diff(keyframe_times))) if len(keyframe_times) > 1 else np.inf
     near = np.flatnonzero(candidates & (distance <= reach))
     if len(near) < 8:
@@ -209,7 +220,7 @@ def _camera_is_still(
             noises.append(robust_stddev(np.concatenate([_deviations(early), _deviations(late)])))
     if not drifts:
         return still
-    # 1.25 is the price of a median over a mean.
+    # The standard deviation of a median is 1.25 times that of a mean.
     drift_stddev = robust_stddev(drifts)
     noise_stddev = 1.25 * max(float(np.median(noises)), 1e-3)
     still[near] = drift_stddev <= _MAX_STILL_DRIFT_STDDEVS * noise_stddev
@@ -217,14 +228,20 @@ def _camera_is_still(
 
 
 def _deviations(values: Array) -> Array:
-    """Absolute, from the median; the value that is the median says nothing of the noise, and of few that is much."""
+    """Return the sorted absolute deviations from the median, without the 0 of the value that is the median itself.
+
+    Among few values that 0 would lower the estimated noise considerably.
+    """
     return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
 
 
 def _interpolated_centers(
     trajectory: Trajectory, before: Indices, weight: Array, is_bridged: Mask
 ) -> tuple[Array, Array]:
-    """(n, 3) what the motion has beyond the line between two keyframes, and (n,) the stddev of each coordinate."""
+    """Return the offsets (n, 3) of the centres from the straight lines between keyframes, in model units.
+
+    Also returns the standard deviation (n,) of each coordinate.
+    """
     assert trajectory.timestamps_s is not None, "a motion in time needs times"
     motion = learn_motion(trajectory.timestamps_s, trajectory.centers, is_bridged)
     offsets, stddev = np.zeros((len(before), 3)), np.full(len(before), motion.noise_stddev)
@@ -236,10 +253,10 @@ def _interpolated_centers(
 def _interpolated_lever_arms(
     trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, weight: Array, is_bridged: Mask
 ) -> tuple[Array, Array]:
-    """(n, 3) lever arms in the world, and (n,) the stddev of each coordinate, metres.
+    """Return the lever arms (n, 3) in the world, and the standard deviation (n,) of each coordinate, metres.
 
-    The turns from keyframe to keyframe, laid end to end in the camera's frame, are coordinates like those of the
-    centre: between two keyframes that holds as long as one turn is small or about the axis of the next.
+    The rotation vectors from keyframe to keyframe, in the camera's frame, are summed up and treated as coordinates of a
+    motion. This is valid while successive rotations are small or have the same axis.
     """
     assert trajectory.timestamps_s is not None, "a motion in time needs times"
     to_next = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[:-1], 1, 2) @ trajectory.world_from_cam[1:])
@@ -250,9 +267,9 @@ def _interpolated_lever_arms(
     beyond, stddev[between] = motion.beyond_chord(before[between], weight[between])
     arms = tags_in_cam_m.copy()
     turns = weight[between, None] * to_next.as_rotvec()[before[between]] + beyond
-    if len(turns):  # SciPy before 1.16 makes no rotations of nothing
+    if len(turns):  # SciPy before 1.16 cannot make an empty set of rotations
         arms[between] = Rotation.from_rotvec(turns).apply(arms[between])
-    # A turn moves the end of the arm in two of three directions.
+    # A rotation moves the end of the arm in two of the three directions.
     stddev_m = np.sqrt(2 / 3) * stddev * np.linalg.norm(tags_in_cam_m, axis=1)
     return np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms), stddev_m
 
@@ -260,16 +277,16 @@ def _interpolated_lever_arms(
 def _timing_stddev(
     log: RangeLog, trajectory: Trajectory, before: Indices, after: Indices, weight: Array, options: AssociationOptions
 ) -> Array:
-    """(n,) how far the camera moves, each coordinate, within the rounding of photo and range times.
+    """Return the standard deviation (n,) of each coordinate due to rounded times of photos and ranges, in model units.
 
-    Uniform rounding to a step has the stddev step / sqrt(12), each time its own.
+    Uniform rounding to a step has the standard deviation step / sqrt(12). It is independent for each time.
     """
     times, centers = trajectory.timestamps_s, trajectory.centers
     log_stddev_s, photo_stddev_s = (each.time_resolution_s / np.sqrt(12) for each in (log, trajectory))
     if times is None or len(times) < 2 or not log_stddev_s + photo_stddev_s > 0:
         return np.zeros(len(before))
     gaps = np.diff(times)
-    # Where photos are far apart, ranges have a place only if the camera stood still.
+    # Across a long gap ranges are used only if the camera stood still.
     speeds = np.where(is_too_long(gaps, options), 0, np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps)
     around = np.concatenate([[0.0], speeds, [0.0]])
     speed = np.where(before == after, np.maximum(around[before], around[before + 1]), around[before + 1])

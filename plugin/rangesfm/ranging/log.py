@@ -1,4 +1,4 @@
-"""RangeLog: what a radio measured, as arrays that were checked once."""
+"""RangeLog: the ranges that a radio measured, as checked arrays."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.files.tables import Categories
 
 DEFAULT_TAG_ID = "tag"
-# Two ranges of one radio to another take time: if this share of them has the time of the one before, it was rounded.
+# Two ranges between the same nodes cannot have the same time. If at least this share of successive ranges has, the
+# times were rounded.
 _MIN_REPEATED_SHARE = 0.25
-# Where more steps than this share go back in time, the log is in another order than time's.
+# If more than this share of the steps goes back in time, the log is not in the order of time.
 _MOST_GOING_BACK = 0.05
 
 
 class RangeKind(IntEnum):
-    """Between which nodes a range was measured. Tags hang on the camera, anchors stand."""
+    """Kinds of the two nodes of a range; tags are on the camera, anchors are static."""
 
     TAG_ANCHOR = 0
     ANCHOR_ANCHOR = 1
@@ -31,8 +32,13 @@ class RangeKind(IntEnum):
 
 
 class PeerRanges(NamedTuple):
-    """k ranges between two anchors, or between two tags: (k,) rows of the log, and the (k, 2) two nodes of each, into
-    the log's ``anchor_ids`` or ``tag_ids``."""
+    """k ranges between two anchors, or between two tags.
+
+    Attributes:
+        rows: (k,) rows of the log.
+        ends: (k, 2) indices of the two nodes in the log's ``anchor_ids`` or ``tag_ids``.
+        end_ids: ids of the two nodes of each range.
+    """
 
     rows: Indices
     ends: Indices
@@ -41,29 +47,29 @@ class PeerRanges(NamedTuple):
 
 @dataclass(frozen=True)
 class RangeLog:
-    """n ranges between moving tags and static anchors, in the order of the log; some between two of a kind.
+    """n ranges in the order of the log, between moving tags and static anchors; some may be between two of a kind.
 
-    Either ``timestamp_s`` or ``image_name`` says when: the other is None.
+    The time of a range is given by either ``timestamp_s`` or ``image_name``; the other is None.
 
     Attributes:
-        anchor_ids: the distinct anchors, as people count (A2 before A10), so that the log's order has no say.
-        anchor_index: (n,) int, into ``anchor_ids``; -1 for a range between two tags.
-        range_m: (n,) metres, finite and positive.
+        anchor_ids: the distinct anchors in natural order (A2 before A10), which does not depend on the log's order.
+        anchor_index: (n,) int, index in ``anchor_ids``; -1 for a range between two tags.
+        range_m: (n,) ranges in metres, finite and positive.
         timestamp_s: (n,) seconds on the radio's clock, in any order; or None.
-        image_name: n names of the photos at which each range was taken; or None.
-        range_stddev_m: (n,) metres, NaN where the log does not say.
-        tag_ids: the distinct tags, in the same order.
-        tag_index: (n,) int, into ``tag_ids``; -1 for a range between two anchors.
-        peer_index: (n,) int, the other end of a range between two anchors (into ``anchor_ids``) or two tags (into
-            ``tag_ids``); -1 for one between a tag and an anchor.
-        los: (n,) int8: 1 line of sight, 0 none, -1 not said.
+        image_name: names of the n photos at which the ranges were taken; or None.
+        range_stddev_m: (n,) standard deviation in metres, NaN where the log does not give it.
+        tag_ids: the distinct tags in natural order.
+        tag_index: (n,) int, index in ``tag_ids``; -1 for a range between two anchors.
+        peer_index: (n,) int, the other end of a range between two anchors (index in ``anchor_ids``) or two tags (index
+            in ``tag_ids``); -1 for a range between a tag and an anchor.
+        los: (n,) int8: 1 line of sight, 0 no line of sight, -1 not given.
         line: (n,) int, 1-based line (or record) in the source.
-        source: the file it came from, for messages; None if made in memory.
-        format: name of the reader, for the record.
-        num_no_measurement: how many records said that there was no measurement.
-        notes: what was assumed of the file in reading it.
-        shared_stddev_m: (n,) stddev of what all ranges of about this length are off together, once the radio's
-            error curve has been taken off them; None: it has not.
+        source: the file that the ranges come from, for messages; None if made in memory.
+        format: name of the reader.
+        num_no_measurement: number of records that contain no measurement.
+        notes: assumptions made in reading the file, as lines for the user.
+        shared_stddev_m: (n,) standard deviation of the error that all ranges of about this length share after the
+            radio's error curve has been subtracted; None if it has not been.
     """
 
     anchor_ids: tuple[str, ...]
@@ -103,7 +109,7 @@ class RangeLog:
 
     @property
     def kind(self) -> npt.NDArray[np.int8]:
-        """(n,) RangeKind."""
+        """RangeKind of each range (n,)."""
         kind = np.full(len(self), RangeKind.TAG_ANCHOR, dtype=np.int8)
         kind[self.tag_index < 0] = RangeKind.ANCHOR_ANCHOR
         kind[self.anchor_index < 0] = RangeKind.TAG_TAG
@@ -111,16 +117,19 @@ class RangeLog:
 
     @property
     def own_order(self) -> Indices:
-        """(n,) the rows by anchor, time, tag and range: the log's order has no say then, be it by draws or rounding."""
+        """Rows (n,) sorted by anchor, time, tag and range.
+
+        Results computed in this order do not depend on the order of the log, neither by random draws nor by rounding.
+        """
         names = np.array(self.image_name or (), dtype=str)
         when = np.unique(names, return_inverse=True)[1] if self.timestamp_s is None else self.timestamp_s
         return np.lexsort((self.range_m, self.peer_index, self.tag_index, when, self.anchor_index))
 
     @property
     def time_resolution_s(self) -> float:
-        """The step of the times, of a host's whole seconds or of lines in batches; 0 if none is seen.
+        """Step to which the times are rounded, for example whole seconds or batches of lines; 0 if none is found.
 
-        Any step is seen that is longer than the ranges between one tag and one anchor are apart.
+        A step is found if it is longer than the time between two ranges of one tag and one anchor.
         """
         times = self.timestamp_s
         if times is None or len(self) < 2:
@@ -133,7 +142,7 @@ class RangeLog:
 
     @property
     def num_restarts(self) -> int:
-        """How often times between one tag and one anchor jump back by a quarter of the log; 0 of a log in no order."""
+        """Number of times that the clock jumps back by a quarter of the log or more; 0 if the log is unordered."""
         if self.timestamp_s is None or len(self) < 2:
             return 0
         steps = self._steps_of_links(self.timestamp_s, np.arange(len(self)))
@@ -142,13 +151,13 @@ class RangeLog:
         return int(np.count_nonzero(steps < -0.25 * np.ptp(self.timestamp_s)))
 
     def _steps_of_links(self, times: Array, order: Indices) -> Array:
-        """From each range to the next one between the same tag and anchor, as the rows come in ``order``."""
+        """Return the time steps between successive ranges of the same tag and anchor, with the rows in ``order``."""
         link = self.tag_index * len(self.anchor_ids) + self.anchor_index
         order = order[np.argsort(link[order], kind="stable")]
         return np.asarray(np.diff(times[order])[np.diff(link[order]) == 0])
 
     def peer_ranges(self, kind: RangeKind) -> PeerRanges:
-        """The ranges between two anchors, distances that do not depend on the camera; or those between two tags."""
+        """Return the ranges between two anchors, which do not depend on the camera, or those between two tags."""
         rows = np.flatnonzero(self.kind == kind)
         ids, first, second = self._ends()
         ends = np.column_stack([first[rows], second[rows]])
@@ -156,20 +165,20 @@ class RangeLog:
         return PeerRanges(rows, ends - first_node, tuple((ids[one], ids[other]) for one, other in ends.tolist()))
 
     def end_ids(self) -> tuple[list[str], list[str]]:
-        """The ids of each range's two ends: n tags (or peers, where there is none) and n anchors (or peers)."""
+        """Return the ids of the two ends of each range: n tags (or peers if none) and n anchors (or peers)."""
         ids, first, second = self._ends()
         texts = np.array(ids, dtype=object)
         return texts[first].tolist(), texts[second].tolist()
 
     def _ends(self) -> tuple[list[str], Indices, Indices]:
-        """Ids of all anchors and then all tags, and (n,) and (n,) into them: both ends of each range."""
+        """Return the ids of all nodes, anchors first, and the indices (n,) of both ends of each range in them."""
         num_anchors = len(self.anchor_ids)
         first = np.where(self.tag_index < 0, self.peer_index, num_anchors + self.tag_index)
         second = np.where(self.anchor_index < 0, num_anchors + self.peer_index, self.anchor_index)
         return [*self.anchor_ids, *self.tag_ids], first, second
 
     def with_anchors(self, anchor_ids: Collection[str]) -> RangeLog:
-        """The same ranges if nodes of these ids are anchors and all others tags; an id stands for one node."""
+        """Return the log with nodes of these ids as anchors and all others as tags; equal ids are one node."""
         ids, first, second = self._ends()
         node_of = {node_id: node for node, node_id in enumerate(dict.fromkeys(ids))}
         node = np.array([node_of[node_id] for node_id in ids], dtype=np.int64)
@@ -177,7 +186,13 @@ class RangeLog:
         return self._between(list(node_of), is_anchor, node[first], node[second])
 
     def _between(self, ids: list[str], is_anchor: Mask, first: Indices, second: Indices) -> RangeLog:
-        """The same ranges between other nodes; those without ranges are forgotten."""
+        """Return the ranges between nodes of a new list; nodes without ranges are dropped.
+
+        Args:
+            ids: ids of the nodes.
+            is_anchor: for each node, whether it is an anchor.
+            first, second: (n,) indices of both ends in ``ids``.
+        """
         swapped = is_anchor[first] & ~is_anchor[second]
         first, second = np.where(swapped, second, first), np.where(swapped, first, second)
         peer = np.where(is_anchor[first], first, np.where(is_anchor[second], -1, second))
@@ -185,7 +200,7 @@ class RangeLog:
         in_order = sorted(with_ranges, key=lambda node: _as_people_count(ids[node]))
         anchors = [node for node in in_order if is_anchor[node]]
         tags = [node for node in in_order if not is_anchor[node]]
-        # The last entry stands for no node.
+        # The last entry is for the index -1, which means no node.
         index = np.full(len(ids) + 1, -1)
         index[anchors], index[tags] = np.arange(len(anchors)), np.arange(len(tags))
         return replace(
@@ -198,7 +213,7 @@ class RangeLog:
         )
 
     def subset(self, rows: Indices | Mask) -> RangeLog:
-        """The same log with some of its ranges; anchors and tags that are left without any are forgotten."""
+        """Return the log with some of its ranges; anchors and tags without ranges are dropped."""
         rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
         columns: dict[str, Any] = {
             name: values[rows] for name, values in vars(self).items() if isinstance(values, np.ndarray)
@@ -225,7 +240,8 @@ class RangeLog:
     ) -> RangeLog:
         """Build a log from one value (or one string) per range; optional columns may be left out.
 
-        Each range is between the tag and the anchor of its row; ``with_anchors`` tells those between two of a kind.
+        Each range is between the tag and the anchor of its row. ``with_anchors`` afterwards finds the ranges between
+        two anchors or two tags.
 
         Args:
             of_log: ``source``, ``format``, ``num_no_measurement`` and ``notes``.
@@ -256,6 +272,6 @@ def _categories(ids: Sequence[str] | npt.NDArray[np.str_] | Categories) -> Categ
 
 
 def _as_people_count(name: str) -> tuple[list[tuple[str, int, str]], str]:
-    """A key that sorts A2 before A10."""
+    """Return a key for natural order, which sorts A2 before A10."""
     parts = [(text, digits.lstrip("0")) for text, digits in re.findall("([^0-9]*)([0-9]*)", name)]
     return [(text, len(number), number) for text, number in parts], name

@@ -1,4 +1,4 @@
-"""RangeObservations: every range of a log with its place on the path, or the reason why it has none."""
+"""RangeObservations: every range of a log with its position on the path, or the reason why it has none."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rangesfm.ranging.log import RangeLog
 
 
 class RangeStatus(IntEnum):
-    """What became of a range. Everything but the first two is left out of every estimate."""
+    """Status of a range; only ranges with the first two take part in a result."""
 
     USED = 0
     DOWN_WEIGHTED = 1
@@ -38,7 +38,7 @@ class RangeStatus(IntEnum):
 
 @dataclass(frozen=True)
 class OnPath:
-    """Where on a path of keyframes n ranges were taken: ``(1 - weight) * before + weight * after``."""
+    """Positions of n ranges on a path of keyframes: ``(1 - weight) * before + weight * after``."""
 
     before: Indices
     after: Indices
@@ -49,25 +49,24 @@ class OnPath:
 class RangeObservations:
     """n ranges (all of the log, in its order) on the path of one model.
 
-    The antenna of range i is at ``centers[i] + tag_from_center[i]``, both turned with the
-    model's world; centers are in the world's unit, the lever arm is metric, so that a
-    similarity scales the first and never the second. Centers are interpolated between the
-    keyframes ``before`` and ``after``:
-    ``(1 - weight) * c_before + weight * c_after + center_offsets``; the offset is what a
-    curved path has beyond the straight line.
+    The antenna of range i is at ``centers[i] + tag_from_center[i]``, with both vectors in the axes of the model's
+    world. The centres are in the world's unit, and the lever arm is in metres, so that a similarity scales the centres
+    and never the lever arm. Centres are interpolated between the keyframes ``before`` and ``after``:
+    ``(1 - weight) * c_before + weight * c_after + center_offsets``. The offset is the deviation of a curved path from
+    the straight line.
 
     Attributes:
         log: the ranges.
         status: (n,) RangeStatus.
-        before, after: (n,) int, keyframes in the trajectory; -1 without a place.
-        weight: (n,) in [0, 1].
-        centers: (n, 3) camera centres, model units; NaN without a place.
-        center_offsets: (n, 3) model units.
-        tag_from_center: (n, 3) lever arm turned into the world, metres.
-        center_stddev: (n,) of the interpolated centre, each coordinate, model units; at a keyframe whose time is exact
-            the keyframes' own error, as far as keyframes that are close in time show one.
-        arm_stddev_m: (n,) of the turned lever arm, each coordinate, metres.
-        time_offset_stddev_s: of the clocks' offset by which they were put there.
+        before, after: (n,) int, indices of keyframes in the trajectory; -1 without a position on the path.
+        weight: (n,) weight of the later keyframe, in [0, 1].
+        centers: (n, 3) camera centres in model units; NaN without a position.
+        center_offsets: (n, 3) deviation from the straight line, in model units.
+        tag_from_center: (n, 3) lever arm in the axes of the world, metres.
+        center_stddev: (n,) standard deviation of each coordinate of the interpolated centre, model units. At a keyframe
+            with an exact time it is the keyframes' own error, as far as keyframes close in time show one.
+        arm_stddev_m: (n,) standard deviation of each coordinate of the lever arm, metres.
+        time_offset_stddev_s: standard deviation of the clocks' offset that was used.
     """
 
     log: RangeLog
@@ -84,44 +83,45 @@ class RangeObservations:
 
     @property
     def has_place(self) -> Mask:
-        """(n,) ranges that estimates may use: on the path, of a wanted anchor, not held out."""
+        """Ranges that estimates may use (n,): on the path, to a wanted anchor, not held out."""
         return np.asarray(self.status <= RangeStatus.OUTLIER)
 
     def placing_stddev_m(self, metres_per_unit: float) -> Array:
-        """Return the stddev (n,) of each coordinate of the antenna's place, metres, in a map of this scale."""
+        """Return the standard deviation (n,) of the antenna's coordinates in a map of this scale, metres."""
         return np.hypot(metres_per_unit * self.center_stddev, self.arm_stddev_m)
 
     @property
     def nearest(self) -> Indices:
-        """(n,) keyframe; -1 without a place."""
+        """Index of the nearest keyframe (n,); -1 without a position on the path."""
         return np.where(self.weight < 0.5, self.before, self.after)
 
     def on_path(self, rows: Indices) -> OnPath:
-        """Of some that have a place."""
+        """Return the positions on the path of these rows, which must have one."""
         return OnPath(self.before[rows], self.after[rows], self.weight[rows])
 
     @property
     def placed_rows(self) -> Indices:
-        """(k,) rows of those that have a place, in ``log.own_order``."""
+        """Rows (k,) of the ranges that estimates may use, in ``log.own_order``."""
         order = self.log.own_order
         return np.asarray(order[self.has_place[order]])
 
 
 def hold_out(observations: RangeObservations, checks: CheckOptions, seed: int) -> RangeObservations:
-    """Set usable ranges aside as checks: of some anchors, of a stretch of time, and a random share of the rest.
+    """Hold out ranges as checks: those of some anchors, those of an interval of time, and a random share of the rest.
 
-    InputError for an anchor that is not in the log, or a stretch of time that holds no range.
+    Raises:
+        InputError: an anchor is not in the log, or no range is in the interval.
     """
     log, status = observations.log, observations.status.copy()
     chosen = np.zeros(len(log), dtype=bool)
     for anchor_id in checks.check_anchors:
         if anchor_id not in log.anchor_ids:
-            raise InputError(f"anchor {anchor_id!r} to be held out is not in the log ({', '.join(log.anchor_ids)})")
+            raise InputError(f"the check anchor {anchor_id!r} is not in the log ({', '.join(log.anchor_ids)})")
         chosen |= log.anchor_index == log.anchor_ids.index(anchor_id)
     if checks.check_times_s:
         chosen |= _in_time(log, checks.check_times_s)
     status[chosen & observations.has_place] = RangeStatus.CHECK
-    # Drawn from the whole log, so that the same ranges are checks whatever there is of the path.
+    # Checks are drawn from the whole log, so that the same ranges are checks whichever part of the path is known.
     drawn = np.zeros(len(log), dtype=bool)
     drawn[log.own_order] = np.random.default_rng(seed).permutation(len(log)) < round(checks.check_share * len(log))
     status[drawn & (status <= RangeStatus.OUTLIER)] = RangeStatus.CHECK
@@ -135,19 +135,19 @@ def _in_time(log: RangeLog, times_s: tuple[float, ...]) -> Mask:
     inside: Mask = (log.timestamp_s >= first) & (log.timestamp_s <= last)
     if not inside.any():
         start, end = log.timestamp_s.min(), log.timestamp_s.max()
-        # Twelve digits: times may be seconds since 1970.
+        # Twelve digits are printed, because times may be seconds since 1970.
         found, expected = f"{first:.12g} to {last:.12g} s", f"{start:.12g} to {end:.12g} s"
         raise InputError(f"no range from {found}, expected within {expected}", log.source)
     return inside
 
 
-# Robust weights below which a range counts as down-weighted, or has no say to speak of.
+# Robust weights below which a range counts as down-weighted, or as an outlier.
 DOWN_WEIGHTED_BELOW = 0.5
 OUTLIER_BELOW = 0.1
 
 
 def status_by_weight(weights: Array) -> npt.NDArray[np.int8]:
-    """(n,) status of ranges that took part in an estimate, by their final robust weight in [0, 1]."""
+    """Return the status (n,) of ranges that took part in an estimate, by their final robust weights in [0, 1]."""
     status = np.full(len(weights), RangeStatus.USED, dtype=np.int8)
     status[weights < DOWN_WEIGHTED_BELOW] = RangeStatus.DOWN_WEIGHTED
     status[weights < OUTLIER_BELOW] = RangeStatus.OUTLIER
@@ -155,7 +155,7 @@ def status_by_weight(weights: Array) -> npt.NDArray[np.int8]:
 
 
 def each_on_one_path(parts: Sequence[RangeObservations]) -> list[RangeObservations]:
-    """The same, but a range that has a place on a path has none on those after it."""
+    """Return the observations of several paths, with each range on the first path only that it has a position on."""
     taken = np.zeros(len(parts[0].log), dtype=bool)
     exclusive = []
     for part in parts:
@@ -169,14 +169,17 @@ def each_on_one_path(parts: Sequence[RangeObservations]) -> list[RangeObservatio
 def joined_observations(
     parts: Sequence[RangeObservations], joined_from_part: Sequence[Similarity], keyframes: Sequence[Indices]
 ) -> RangeObservations:
-    """All ranges on the joined path, each with a place on one path at most.
+    """Join observations on several paths into observations on the joined path.
 
-    ``joined_from_part``: from the world of each path; ``keyframes``: where those of each path are in the joined one.
+    Args:
+        parts: observations of one log; each range has a position on one path at most.
+        joined_from_part: transformation from the world of each path to that of the joined one.
+        keyframes: for each path, the indices of its keyframes in the joined path.
     """
     is_free = np.ones(len(parts[0].log), dtype=bool)
     joined: dict[str, Any] = {"status": np.min([part.status for part in parts], axis=0)}
     for part, similarity, keyframe in zip(parts, joined_from_part, keyframes, strict=True):
-        # With a place that counts, be it only as a check.
+        # Ranges with a position that is used by an estimate or a check.
         rows = is_free & (part.before >= 0) & (part.has_place | (part.status == RangeStatus.CHECK))
         is_free &= ~rows
         moved: dict[str, npt.NDArray[Any]] = {

@@ -1,4 +1,4 @@
-"""The distance from an anchor to the tag, and by how much it grows with whatever moves either."""
+"""Distance from an anchor to the tag, and its derivatives by everything that moves either of them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ _TINY_DISTANCE_M = 1e-9
 
 @dataclass(frozen=True)
 class RangeGradient:
-    """Of n distances ``|| tag - anchor ||`` in the metric world; a range's bias adds to it as it is, so with slope 1.
+    """Derivatives of n distances ``|| tag - anchor ||`` in the metric world.
+
+    The derivative by a range bias is 1, because the bias is added to the distance.
 
     Attributes:
-        distance_m: (n,).
-        by_tag: (n, 3) by the tag's place: the unit vector from anchor to tag; zero where one lies on the other and the
-            distance has no derivative, which keeps steps finite.
+        distance_m: (n,) distances.
+        by_tag: (n, 3) derivative by the tag's position, the unit vector from anchor to tag. It is zero where both
+            coincide and the distance has no derivative, which keeps the steps of a solver finite.
     """
 
     distance_m: Array
@@ -26,29 +28,37 @@ class RangeGradient:
 
     @classmethod
     def of(cls, from_anchor_m: Array) -> RangeGradient:
-        """Of vectors (n, 3) from anchor to tag."""
+        """Compute distances and derivatives from the vectors (n, 3) from anchor to tag, metres."""
         distance = np.sqrt(np.einsum("ni,ni->n", from_anchor_m, from_anchor_m))
         return cls(distance, from_anchor_m / np.maximum(distance, _TINY_DISTANCE_M)[:, None])
 
     @property
     def by_anchor(self) -> Array:
-        """(n, 3) by the anchor's place."""
+        """Derivative by the anchor's position (n, 3)."""
         return -self.by_tag
 
     def by_log_scale(self, scaled_m: Array) -> Array:
-        """(n,) by the logarithm of a scale, of which (n, 3) is what it has scaled of the tags' places."""
+        """Return the derivative (n,) by a scale's logarithm, given the scaled part (n, 3) of the tags' positions."""
         slopes: Array = np.einsum("ni,ni->n", self.by_tag, scaled_m)
         return slopes
 
     def by_turn_of_world(self, arms_m: Array) -> Array:
-        """(n, 3) by a rotation vector from the left, about an origin from which the tags are at (n, 3)."""
+        """Return the derivative (n, 3) by a rotation of the world about a point, with the tags at ``arms_m`` from it.
+
+        The rotation vector is applied from the left.
+        """
         return np.cross(arms_m, self.by_tag)
 
     def by_tag_in_cam(self, world_from_cam: Array) -> Array:
-        """(n, 3) by the lever arm, of cameras with rotations (n, 3, 3)."""
+        """Return the derivative (n, 3) by the lever arm, given the cameras' rotations (n, 3, 3)."""
         slopes: Array = np.einsum("nji,nj->ni", world_from_cam, self.by_tag)
         return slopes
 
     def by_turn_of_cam(self, tag_in_cam_m: Array, world_from_cam: Array) -> Array:
-        """(n, 3) by a rotation vector of the camera in its own frame, its centre kept; lever arms (n, 3)."""
+        """Return the derivative (n, 3) by a rotation vector of the camera in its own frame, about its centre.
+
+        Args:
+            tag_in_cam_m: (n, 3) lever arms.
+            world_from_cam: (n, 3, 3) rotations.
+        """
         return np.cross(tag_in_cam_m, self.by_tag_in_cam(world_from_cam))

@@ -1,4 +1,4 @@
-"""What is in a radio log, in a few numbers."""
+"""Summary of a range log in a few numbers."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from rangesfm.ranging.log import RangeKind, RangeLog
 
 @dataclass(frozen=True)
 class LinkSummary:
-    """The ranges of tags to one anchor, between two anchors, or between two tags.
+    """Summary of the ranges from tags to one anchor, between two anchors, or between two tags.
 
     Attributes:
         kind: "tag-anchor", "anchor-anchor" or "tag-tag".
         ids: the anchor, or both ends.
-        num, min_m, median_m, max_m: of the ranges.
-        largest_gap_s: longest time without any; None without times or between two of a kind, like the next.
-        noise_stddev_m: estimated from the log itself, at least that of its rounding; None of too few ranges, too.
+        num: number of ranges.
+        min_m, median_m, max_m: shortest, median and longest range.
+        largest_gap_s: longest time without such a range; None without times, or if the kind is not "tag-anchor".
+        noise_stddev_m: standard deviation of the noise, estimated from the log itself, at least that of its rounding;
+            None in the same cases, and with too few ranges.
     """
 
     kind: str
@@ -36,18 +38,21 @@ class LinkSummary:
 
 @dataclass(frozen=True)
 class RangeSummary:
-    """A log as a whole; times are None where it has image names instead.
+    """Summary of a whole log; times are None if it has image names instead.
 
     Attributes:
-        num_no_measurement: records that said that there was none.
-        num_duplicates: ranges that stand in the log already: same time, tag, anchor and range.
+        format: name of the reader.
+        num: number of ranges.
+        num_no_measurement: number of records that contain no measurement.
+        num_duplicates: ranges that repeat an earlier one, with the same time, tag, anchor and range.
         num_out_of_order: ranges that are earlier than the one before them.
-        quantization_m: suspected step of all ranges; None if there is none.
+        quantization_m: step to which all ranges seem to be rounded; None if there is none.
+        tag_ids: ids of the tags.
         start_s, end_s: first and last time on the radio's clock.
-        rate_hz: ranges a second over the whole span.
+        rate_hz: ranges per second over the whole time.
         largest_gap_s: longest time without a range to any anchor.
-        anchors: those that tags range with, in the order of the log's ``anchor_ids``.
-        pairs: of anchors and of tags.
+        anchors: the anchors that tags range with, in the order of the log's ``anchor_ids``.
+        pairs: the pairs of anchors, then the pairs of tags, that range with each other.
     """
 
     format: str
@@ -66,7 +71,7 @@ class RangeSummary:
 
 
 def summarize_ranges(log: RangeLog) -> RangeSummary:
-    """Count and measure what a log holds."""
+    """Compute the summary of a log."""
     start = end = rate = None
     if log.timestamp_s is not None and len(log):
         start, end = float(log.timestamp_s.min()), float(log.timestamp_s.max())
@@ -96,7 +101,7 @@ def summarize_ranges(log: RangeLog) -> RangeSummary:
 
 
 def _summarize_pairs(log: RangeLog, name: str, kind: RangeKind) -> Iterator[LinkSummary]:
-    """Whichever of the two asked."""
+    """Yield the summary of each pair of nodes, with the ranges of both directions."""
     ranges = log.peer_ranges(kind)
     rows: dict[frozenset[str], list[int]] = {}
     for row, ids in enumerate(ranges.end_ids):
@@ -117,7 +122,10 @@ def _lengths(range_m: Array) -> tuple[int, float, float, float]:
 
 
 def _noise(log: RangeLog, mine: Mask, quantization_m: float | None) -> float | None:
-    """Of the tag with the most ranges to this anchor: each tag moves by itself."""
+    """Return the noise of the ranges between one anchor and the tag with the most ranges to it.
+
+    Only one tag is used, because each tag has a path of its own.
+    """
     if log.timestamp_s is None:
         return None
     mine = mine & (log.tag_index == np.argmax(np.bincount(log.tag_index[mine])))

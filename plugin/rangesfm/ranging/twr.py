@@ -1,7 +1,7 @@
 """Ranges from the time stamps of two-way ranging.
 
-An initiator A and a responder B each stamp what they send (tx) and receive (rx) by their own clocks,
-which run at slightly different rates and wrap around.
+An initiator A and a responder B each record when they send (tx) and receive (rx) a message, by their own clocks, which
+run at slightly different rates and wrap around.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ VACUUM_M_PER_S = 299_792_458.0
 AIR_M_PER_S = 299_702_547.0  # refractive index 1.0003, as radio firmware assumes
 DW1000_TICK_S = 1 / (499.2e6 * 128)
 _UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ticks": DW1000_TICK_S}
-_MAX_RATE_DIFFERENCE = 1e-3  # fifty times what crystals of 20 ppm can do
+_MAX_RATE_DIFFERENCE = 1e-3  # relative difference of two clocks' rates; fifty times that of a crystal of 20 ppm
 
 
 @dataclass(frozen=True)
 class StampOptions:
-    """How stamps become metres.
+    """Conversion of time stamps to ranges.
 
     Attributes:
         unit_s: seconds in one unit of the stamps.
-        wrap_s: where the counter starts anew. A divisor of it does as well if all intervals are shorter:
-            the 32-bit default also serves DW1000's 40 bits, up to 67 ms.
-        propagation_speed_m_per_s: of the signal.
-        t_off_s: what all delays of both devices together add to a round trip.
+        wrap_s: time after which the counter starts anew. A fraction 1/k of it, with k an integer, works as well if all
+            intervals are shorter: the 32-bit default also serves the 40 bits of a DW1000, for intervals up to 67 ms.
+        propagation_speed_m_per_s: speed of the signal.
+        t_off_s: time that the delays of both devices together add to a round trip.
     """
 
     unit_s: float = 1e-9
@@ -51,7 +51,7 @@ class StampOptions:
         )
 
     def interval_s(self, later: npt.ArrayLike, earlier: npt.ArrayLike) -> Array:
-        """Seconds from ``earlier`` to ``later`` on one clock, in [0, wrap_s)."""
+        """Return the seconds from ``earlier`` to ``later`` on one clock, in [0, wrap_s)."""
         wrap = self.wrap_s / self.unit_s
         interval = np.mod(np.asarray(later, np.float64) - np.asarray(earlier, np.float64), wrap)
         return np.asarray(interval * self.unit_s, np.float64)
@@ -66,9 +66,10 @@ def single_sided_range(
     *,
     rate_of_a: npt.ArrayLike = 1.0,
 ) -> Array:
-    """Range from A's poll (tx1, rx1) and B's answer (tx2, rx2), (n,) metres.
+    """Compute ranges (n,) in metres from A's poll (tx1, rx1) and B's answer (tx2, rx2).
 
-    ``rate_of_a``: how fast A's clock runs, in B's seconds; its error times B's delay goes into the range.
+    Args:
+        rate_of_a: rate of A's clock relative to B's. Its error, times B's delay, enters the range.
     """
     round_trip_s = options.interval_s(rx2, tx1) - np.asarray(rate_of_a) * options.interval_s(tx2, rx1)
     return _range(round_trip_s, options)
@@ -83,14 +84,14 @@ def double_sided_range(
     rx3: npt.ArrayLike,
     options: StampOptions,
 ) -> Array:
-    """Range from A's poll, B's answer and a third message, free of the clocks' different rates, (n,) metres.
+    """Compute ranges (n,) in metres from A's poll, B's answer and a third message, free of the clocks' different rates.
 
-    The third message tells the rates apart, whoever sent it; the stamps themselves show who that was.
-    From B it measures the rate of A's clock by B's: (rx3 - rx2) / (tx3 - tx2). From A it closes a second
-    round trip: time of flight = (Ra Rb - Da Db) / (Ra + Rb + Da + Db) (Neirynck, Luk and McLaughlin 2016).
+    Either A or B may send the third message, and the stamps show which. If B sent it, it gives the rate of A's clock
+    relative to B's: (rx3 - rx2) / (tx3 - tx2). If A sent it, it closes a second round trip:
+    time of flight = (Ra Rb - Da Db) / (Ra + Rb + Da + Db) (Neirynck, Luk and McLaughlin 2016).
 
     Raises:
-        InputError: the stamps fit neither: their unit or wrap is another.
+        InputError: the stamps fit neither case, because they have another unit or wrap.
     """
     from_b_by_a, from_b_by_b = options.interval_s(rx3, rx2), options.interval_s(tx3, tx2)
     delay_a, round_b = options.interval_s(tx3, rx2), options.interval_s(rx3, tx2)
@@ -103,13 +104,13 @@ def double_sided_range(
         round_trip_s = 2 * (round_a * round_b - delay_a * delay_b) / np.where(total > 0, total, np.nan)
         return _range(round_trip_s, options)
     raise InputError(
-        "the time stamps tx3, rx3 fit no third message: their unit or the wrap of the counter is another than "
-        f"{options.unit_s:g} s and {options.wrap_s:g} s"
+        "the time stamps tx3, rx3 fit no third message: their unit is not "
+        f"{options.unit_s:g} s, or the counter does not wrap at {options.wrap_s:g} s"
     )
 
 
 def _same_duration(one_s: Array, other_s: Array) -> bool:
-    """Whether most intervals are the same on both clocks, as far as crystals agree."""
+    """Whether most intervals are the same on both clocks, up to the difference of their rates."""
     both = np.isfinite(one_s) & np.isfinite(other_s) & (other_s > 0)
     if not np.any(both):
         return False
@@ -117,9 +118,9 @@ def _same_duration(one_s: Array, other_s: Array) -> bool:
 
 
 def _range(round_trip_s: Array, options: StampOptions) -> Array:
-    """d = c/2 (round-trip time - t_off), Lee et al. 2018.
+    """Return the distance d = c/2 (round-trip time - t_off), Lee et al. 2018, in metres.
 
-    A round trip is far shorter than the wrap: what seems almost a whole wrap is a little less than nothing.
+    A round trip is far shorter than the wrap. A time of almost a whole wrap is therefore a slightly negative time.
     """
     signed_s = np.mod(round_trip_s + options.wrap_s / 2, options.wrap_s) - options.wrap_s / 2
     return np.asarray(options.propagation_speed_m_per_s / 2 * (signed_s - options.t_off_s), np.float64)

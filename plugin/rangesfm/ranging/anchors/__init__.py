@@ -1,1 +1,1 @@
-"""Anchors: where they stand, in a file, in a site, or from ranges."""
+"""Anchors: their file, their site frame, and their positions from ranges."""

@@ -1,4 +1,4 @@
-"""Anchor: a static radio node, with what is known of it, and the file that says where they stand."""
+"""Anchor: a static radio node with what is known of it, and the anchor file."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Anchor:
     """A static UWB node.
 
     Attributes:
-        anchor_id: as in the log.
-        position_m: (3,) antenna in the anchors' frame, metres; None if nobody measured it.
-        position_stddev_m: of each coordinate; 0 means exact.
-        range_bias_m: prior mean of what its ranges read too long (antenna delay).
-        range_bias_stddev_m: prior stddev of that bias; None means the option's default.
+        anchor_id: id in the log.
+        position_m: (3,) antenna in the anchors' frame, metres; None if unknown.
+        position_stddev_m: standard deviation of each coordinate; 0 means exact.
+        range_bias_m: prior mean of the bias of its ranges, positive if they are too long (antenna delay).
+        range_bias_stddev_m: prior standard deviation of that bias; None means the option's default.
     """
 
     anchor_id: str
@@ -39,16 +39,19 @@ class Anchor:
 
 @dataclass(frozen=True)
 class AnchorEstimate:
-    """An anchor in the metric frame of a result, and what was known of it there.
+    """Estimate of an anchor in the metric frame of a result, with its prior.
 
     Attributes:
-        position_m: (3,); NaN for an unknown one with too few ranges.
-        position_stddev_m: of each coordinate, root of their mean variance; 0 for one that was held fixed.
-        prior_position_m, prior_position_stddev_m: as surveyed, in the same frame; None and inf if unknown.
-        range_bias_m: what its ranges read too long.
-        prior_bias_m, prior_bias_stddev_m: of the bias, but for what all anchors share; stddev 0 fixes it.
-        mirror_position_m: the other place that fits as well; None if there is none.
-        position_covariance_m2: (3, 3) by the ranges alone, before any refinement; None if not known.
+        anchor_id: id in the log.
+        position_m: (3,) position; NaN for an unknown anchor with too few ranges.
+        position_stddev_m: root of the mean variance of the three coordinates; 0 for an anchor that was held fixed.
+        prior_position_m, prior_position_stddev_m: surveyed position in the same frame and the standard deviation of
+            each coordinate; None and inf if unknown.
+        range_bias_m: bias of its ranges, positive if they are too long.
+        prior_bias_m, prior_bias_stddev_m: prior of the bias, without the part that all anchors share; a standard
+            deviation of 0 fixes it.
+        mirror_position_m: mirror image that fits as well; None if there is none.
+        position_covariance_m2: (3, 3) covariance by the ranges alone, before any refinement; None if unknown.
     """
 
     anchor_id: str
@@ -66,15 +69,16 @@ class AnchorEstimate:
 def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
     """Read ``anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m]``.
 
-    Empty coordinates are those of an anchor that nobody measured; the other cells may be empty as well.
-    Columns named x, y, z and an unnamed column of ids are understood.
+    Coordinates are empty for an anchor of unknown position. The optional cells may be empty as well. Columns named
+    x, y, z and an unnamed column of ids are understood.
 
     Raises:
-        InputError: with the line, for an anchor named twice, an incomplete position, or what is not a number.
+        InputError: an anchor appears twice, a position is incomplete, or a cell is not a number. The error gives the
+            line.
     """
     table = read_table(path, ANCHOR_COLUMNS, _OPTIONAL, aliases=ANCHOR_ALIASES, separator=None)
     if not len(table):
-        raise InputError("names no anchor, expected one a line", path)
+        raise InputError("names no anchor, expected one per line", path)
     anchor_ids = table.text("anchor_id")
     if again := repeated(anchor_ids):
         row, first = again
@@ -98,7 +102,11 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
 
 
 def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
-    """Write anchors so that ``read_anchors`` reads them, with empty cells for what is not known; or InputError."""
+    """Write an anchor file that ``read_anchors`` reads, with empty cells for unknown values.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     rows = []
     for anchor in anchors:
         place = 4 * [None] if anchor.position_m is None else [*anchor.position_m, anchor.position_stddev_m]
@@ -108,12 +116,12 @@ def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
 
 
 def default_anchor_frame(anchors: Sequence[Anchor]) -> str:
-    """The frame of anchors of which the user said none: "site" if any position is known, else "unknown"."""
+    """Return the frame of anchors for which the user gave none: "site" if any position is known, else "unknown"."""
     return "site" if any(anchor.position_m is not None for anchor in anchors) else "unknown"
 
 
 def _positions(table: Table) -> Array:
-    """(n, 3) metres, a row of NaN where all three cells are empty."""
+    """Return the positions (n, 3) in metres, with NaN for a row in which all three cells are empty."""
     positions = np.column_stack(
         [table.numbers(name, empty=np.nan, expected="a number of metres") for name in _COORDINATES]
     )

@@ -1,8 +1,8 @@
-"""Robust least squares for a point and a range bias, also without a first guess, and how wrong they may be.
+"""Robust least squares for the position of a point and a range bias, without a first guess, with their uncertainty.
 
     predicted = || p - a || + b
 
-p: known position of the tag; a: the point that is sought, an anchor's antenna; b: range bias.
+p: known position of the tag; a: unknown position of the point, an anchor's antenna; b: range bias.
 """
 
 from __future__ import annotations
@@ -22,42 +22,49 @@ from rangesfm.ranging.errors.noise import inlier_noise, robust_stddevs
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 
+# Rounds of reweighting in the linear solution.
 _NUM_ROUNDS = 12
-# On the diagonal of normal equations, whose columns have length 1 before weights: where outliers take all weight.
+# Added to the diagonal of normal equations, whose columns have length 1 before weighting. It keeps them regular where
+# outliers have lost all their weight.
 _RIDGE = 1e-16
+# Relative tolerance of a solver at which a fit has converged.
 _CONVERGED = 1e-13
-# Of a search: as many ranges and directions of starts, widths of the loss in units, and how far apart places are two.
+# The search for a start uses at most this many ranges, this many directions of starting points around the tag, losses
+# of these widths (in units of the noise) and this tolerance. Points at least _DISTINCT_M apart are different minima.
 _MAX_NUM_RANGES = 300
 _NUM_DIRECTIONS = 20
 _WIDTHS = (30.0, 10.0, 3.0, 1.0, 0.3)
 _NEARLY_CONVERGED = 1e-5
 _DISTINCT_M = 0.01
+# Unknowns of a point: three coordinates and the bias.
 _NUM_UNKNOWNS = 4
+# Rounds in which the noise and the fit are made consistent.
 _NUM_NOISE_ROUNDS = 4
-# What the noise is taken for before residuals say so, and the number of ranges that this counts as.
+# Prior of the noise, and the number of ranges that it counts as.
 _USUAL_NOISE_M = 0.1
 _USUAL_NOISE_COUNTS = 2.0
+# Smallest share of ranges without a large shared error for which the noise is estimated from these alone.
 _MIN_ORDINARY = 0.3
-# Of the errors that are learnt: each anchor's bias is estimated with a prior of its own, and the path is known.
+# Error components that are not learnt here, because each anchor's bias is estimated with a prior of its own.
 _NOT_HERE = ("bias", "common_bias")
 
 
 def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
-    """A point from its distances to known positions, robustly, without a start.
+    """Locate a point by its distances to known positions, by a robust linear method that needs no start.
 
-    rho^2 = |p|^2 - 2 a.p + |a|^2 is linear in (a, |a|^2). Where the positions lie in a plane,
-    the height above it follows from |a|^2; its sign is arbitrary.
+    rho^2 = |p|^2 - 2 a.p + |a|^2 is linear in (a, |a|^2). Where the positions lie in a plane, the height above it
+    follows from |a|^2, with an arbitrary sign.
 
     Args:
-        positions: (..., n, 3), of one point or of many at once.
-        ranges: (n,) or (..., n).
+        positions: (..., n, 3) known positions, metres, for one point or for many at once.
+        ranges: (n,) or (..., n) distances, metres.
 
     Returns:
-        the point (..., 3), and (..., n) residuals in metres (of the linear model).
+        The point (..., 3), and the residuals (..., n) of the linear model, metres.
     """
     shape = path_shape(positions)
     local = (positions - shape.centroid[..., None, :]) @ shape.axes
-    # Noise of about a decimetre decides which directions the ranges see at all.
+    # In directions of smaller extent than this, ranges with noise of about a decimetre carry no information.
     seen = shape.stddevs > np.maximum(0.02 * shape.stddevs[..., :1], 1e-9)
     squared = ranges**2 - np.sum(local**2, axis=-1)
     design = np.concatenate([-2 * local * seen[..., None, :], np.ones_like(local[..., :1])], axis=-1)
@@ -81,15 +88,17 @@ def multilaterate(positions: Array, ranges: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class PointProblem:
-    """n ranges to one point. Its unknowns are x = (a, b), four numbers; a near the origin, or digits are lost.
+    """n ranges to one point with the unknowns x = (a, b), four numbers.
+
+    The point must be near the origin, because large coordinates lose digits.
 
     Attributes:
-        positions_m: (n, 3) of the tag.
-        range_m: (n,) measured.
-        stddev_m: (n,).
-        shared_stddev_m: (n,) the part of it that ranges of about this length have in common.
-        prior_mean: (4,).
-        prior: (k, 4) what is known of x: ``prior @ (x - prior_mean)`` is as large as a standard normal number.
+        positions_m: (n, 3) positions of the tag.
+        range_m: (n,) measured ranges.
+        stddev_m: (n,) their standard deviations.
+        shared_stddev_m: (n,) part of the standard deviation that ranges of about the same length share.
+        prior_mean: (4,) prior mean of x.
+        prior: (k, 4) square root of the prior information: ``prior @ (x - prior_mean)`` is standard normal.
     """
 
     positions_m: Array
@@ -100,22 +109,22 @@ class PointProblem:
     prior: Array
 
     def subset(self, rows: Indices) -> PointProblem:
-        """The same problem with some of its ranges."""
+        """Return the problem with some of its ranges."""
         names = ("positions_m", "range_m", "stddev_m", "shared_stddev_m")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def residuals_m(self, x: Array) -> Array:
-        """(n,) predicted minus measured."""
+        """Return predicted minus measured ranges (n,), metres."""
         residuals: Array = self._gradient(x).distance_m + x[3] - self.range_m
         return residuals
 
     def slopes(self, x: Array) -> Array:
-        """(n, 4) derivatives of the residuals in metres."""
+        """Return the derivatives (n, 4) of the residuals in metres."""
         by_anchor = self._gradient(x).by_anchor
         return np.column_stack([by_anchor, np.ones(len(by_anchor))])
 
     def jacobian(self, x: Array) -> Array:
-        """(n, 4) derivatives of the residuals in stddevs."""
+        """Return the derivatives (n, 4) of the residuals in standard deviations."""
         jacobian: Array = self.slopes(x) / self.stddev_m[:, None]
         return jacobian
 
@@ -123,19 +132,19 @@ class PointProblem:
         return RangeGradient.of(self.positions_m - x[:3])
 
     def cost(self, x: Array, loss: RobustLoss = CAUCHY) -> float:
-        """Half the robust sum of squares, the prior included."""
+        """Return half the robust sum of squares, including the prior."""
         rho = loss.rho((self.residuals_m(x) / self.stddev_m) ** 2)[0]
         return float(np.sum(rho) + np.sum((self.prior @ (x - self.prior_mean)) ** 2)) / 2
 
 
 @dataclass(frozen=True)
 class PointFit:
-    """An estimate with its own noise.
+    """Estimate of a point, with the noise that was estimated with it.
 
     Attributes:
-        problem: with the final stddevs.
+        problem: the problem with the final standard deviations.
         x: (4,) position and bias.
-        own_stddev_m: (n,) noise of each range, without what it shares with others.
+        own_stddev_m: (n,) noise of each range, without the part that ranges share.
     """
 
     problem: PointProblem
@@ -144,7 +153,7 @@ class PointFit:
 
     @property
     def noise_m(self) -> float:
-        """Of a range away from all special cases."""
+        """Median noise of a range, metres."""
         return float(np.median(self.own_stddev_m))
 
     @property
@@ -153,21 +162,21 @@ class PointFit:
 
     @property
     def off_m(self) -> Array:
-        """(n,) measured minus predicted, with the bias that was expected."""
+        """Measured minus predicted ranges (n,), with the prior mean of the bias, metres."""
         return -self.problem.residuals_m(np.append(self.x[:3], self.problem.prior_mean[3]))
 
     @property
     def weights(self) -> Array:
-        """(n,) of the robust loss."""
+        """Weights of the robust loss (n,)."""
         return CAUCHY.weights(self.residuals_m / self.problem.stddev_m)
 
 
 def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
-    """The best fit; the noise is that of its residuals, and never less than what was given.
+    """Fit a point and estimate the noise from its residuals; given noise is a lower bound.
 
     Args:
-        problem: of its stddevs only the shared ones are looked at.
-        given_m: (n,) noise of each range, NaN where it is to be found.
+        problem: the problem; of its standard deviations only the shared ones are used.
+        given_m: (n,) noise of each range, NaN where it is unknown.
     """
     is_given = np.isfinite(given_m)
     unit = np.where(is_given, given_m, np.median(given_m[is_given]) if is_given.any() else _USUAL_NOISE_M)
@@ -184,14 +193,17 @@ def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
 
 
 def _noise_of(scaled: Array) -> float:
-    """Stddev of residuals in units, drawn to what is usual where there are few; four of them went into the fit."""
+    """Return the standard deviation of scaled residuals, with a prior that counts where there are few.
+
+    The degrees of freedom are reduced by the four unknowns of the fit.
+    """
     freedom = max(len(scaled) - _NUM_UNKNOWNS, 0)
     found = inlier_noise(scaled).stddev ** 2 * len(scaled)
     return float(np.sqrt((found + _USUAL_NOISE_COUNTS) / (freedom + _USUAL_NOISE_COUNTS)))
 
 
 def improve(problem: PointProblem, x: Array, tolerance: float = _CONVERGED) -> Array:
-    """(4,) the minimum of the cost near to ``x``, under a Cauchy loss that the prior is not subject to."""
+    """Return the minimum (4,) of the cost near ``x``, with a Cauchy loss on the ranges and none on the prior."""
     num = len(problem.range_m)
 
     def loss(squared: Array) -> Array:
@@ -209,10 +221,13 @@ def improve(problem: PointProblem, x: Array, tolerance: float = _CONVERGED) -> A
 
 
 def _best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
-    """The most likely unknowns (4,), whatever the outliers, and the noise there as a multiple of ``unit_m``.
+    """Return the most likely unknowns (4,) in spite of outliers, and the noise there as a multiple of ``unit_m``.
 
-    Starts all around the tag and a linear one follow the minima of a Cauchy loss while it narrows from metres to
-    centimetres; the likelihood chooses among all that they pass. ``unit_m`` (n,): how the noise of the ranges compares.
+    Starting points all around the tag, and the linear solution, follow the minima of a Cauchy loss while it narrows
+    from metres to centimetres. Of all minima on the way, the most likely one is chosen.
+
+    Args:
+        unit_m: (n,) noise of the ranges relative to each other.
     """
     rows = np.linspace(0, len(unit_m) - 1, min(len(unit_m), _MAX_NUM_RANGES)).astype(np.int64)
     part, unit_m = problem.subset(rows), unit_m[rows]
@@ -235,7 +250,7 @@ def _distinct(points: list[Array]) -> list[Array]:
 
 
 def _starts(problem: PointProblem) -> list[Array]:
-    """All around the middle of the tag's positions, and the linear solution on either side."""
+    """Return starting points around the mean of the tag's positions, and the linear solution with its mirror image."""
     bias = problem.prior_mean[3]
     ranges = problem.range_m - bias
     shape = path_shape(problem.positions_m)
@@ -247,7 +262,7 @@ def _starts(problem: PointProblem) -> list[Array]:
 
 
 def _directions() -> Array:
-    """(m, 3) unit vectors, evenly spread along a spiral from pole to pole."""
+    """Return unit vectors (m, 3), evenly spread along a spiral from pole to pole."""
     step = np.arange(_NUM_DIRECTIONS) + 0.5
     height, turn = 1 - 2 * step / _NUM_DIRECTIONS, np.pi * (1 + 5**0.5) * step
     flat = np.sqrt(1 - height**2)
@@ -256,25 +271,35 @@ def _directions() -> Array:
 
 @dataclass(frozen=True)
 class FitErrors:
-    """Of the n ranges of one anchor: (n,) the cell of each, and (c, c) the covariance of the errors of cells."""
+    """Errors of the n ranges of one anchor.
+
+    Attributes:
+        of_cell: (n,) index of each range's cell.
+        covariance_m2: (c, c) covariance of the errors of all cells.
+    """
 
     of_cell: Indices
     covariance_m2: Array
 
     def of_sums(self, influence: Array) -> Array:
-        """(k, k) covariance of (k, n) sums of the ranges' errors."""
+        """Return the covariance (k, k) of k weighted sums of the ranges' errors, with weights (k, n)."""
         of_cells = np.stack([np.bincount(self.of_cell, row, len(self.covariance_m2)) for row in influence])
         covariance: Array = of_cells @ self.covariance_m2 @ of_cells.T
         return covariance
 
     def inflation(self, fit: PointFit, change_m: Array) -> float:
-        """How much larger a stddev is than if ranges erred independently, of what changes them by (n,) ``change_m``."""
+        """Return the ratio of a parameter's standard deviation to the one for independent errors of the ranges.
+
+        Args:
+            fit: the fit.
+            change_m: (n,) change of the ranges per unit of the parameter, metres.
+        """
         weight = fit.weights * change_m / fit.problem.stddev_m**2
         formal = float(weight @ change_m)
         return float(np.sqrt(max(self.of_sums(weight[None])[0, 0] / formal, 1.0))) if formal > 0 else 1.0
 
     def inflation_of_bias(self, fit: PointFit) -> float:
-        """The same of the bias, all else adapted."""
+        """Return that ratio for the bias, with the position estimated along with it."""
         root = np.sqrt(fit.weights) / fit.problem.stddev_m
         slopes = fit.problem.slopes(fit.x)
         adapted = np.linalg.lstsq(root[:, None] * slopes[:, :3], root, rcond=None)[0]
@@ -284,9 +309,12 @@ class FitErrors:
 def errors_of_fits(
     fits: Sequence[PointFit], times_s: Sequence[Array], tags: Sequence[Indices], *, is_calibrated: bool
 ) -> list[FitErrors]:
-    """What the residuals of all fits together say of their ranges' errors; ``times_s``, ``tags``: (n_k,) of each fit.
+    """Learn the errors of the ranges from the residuals of all fits together.
 
-    ``is_calibrated``: an error curve has been taken off, whose stddev the ranges share.
+    Args:
+        fits: the fits.
+        times_s, tags: (n_k,) times and indices of tags of the ranges of each fit.
+        is_calibrated: whether an error curve has been subtracted, whose uncertainty the ranges share.
     """
     lengths = [len(fit.residuals_m) for fit in fits]
     anchor_index = np.repeat(np.arange(len(fits)), lengths)

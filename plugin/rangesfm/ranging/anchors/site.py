@@ -1,4 +1,4 @@
-"""The frame in which a site's anchors are worked with: metres around them, whatever coordinates they were given in."""
+"""Local frame of a site's anchors: metres around them, whatever coordinates they were given in."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.georeference import Georeference, georeference_at
 from rangesfm.ranging.anchors.anchor import Anchor
 
-# Anchors further from their origin are moved there: least squares lose digits to large coordinates.
+# Anchors farther from the origin than this are moved to it, because least squares lose digits with large coordinates.
 _FAR_M = 1000.0
 
 
 @dataclass(frozen=True)
 class Site:
-    """The local frame of a survey's anchors.
+    """Local frame of a survey's anchors.
 
     Attributes:
-        offset_m: (3,) what the anchors' own coordinates are larger than local ones.
-        georeference: of the local frame; None if the coordinates are those of a frame of their own.
+        offset_m: (3,) given coordinates minus local coordinates.
+        georeference: place of the local frame on the Earth; None without a coordinate system.
     """
 
     offset_m: Array
@@ -32,15 +32,17 @@ class Site:
 def local_site(
     anchors: tuple[Anchor, ...], frame: str, crs: str | None, path: Path | None = None
 ) -> tuple[Site, tuple[Anchor, ...]]:
-    """The local frame around anchors, and the anchors in it.
+    """Return a local frame for anchors, and the anchors in it.
 
     Args:
-        frame: what their positions refer to, one of ANCHOR_FRAMES; only "site" is moved.
-        crs: coordinate system of the positions, for which the local frame is east, north, up; None: metres.
-        path: of the anchors' file, for messages.
+        anchors: the anchors as given.
+        frame: frame of their positions, one of ANCHOR_FRAMES; only "site" is moved.
+        crs: coordinate system of the positions, which gives a local frame east, north, up; None: metres in any frame.
+        path: the anchor file, for messages.
 
     Raises:
-        InputError: a coordinate system without positions, for another frame, or that does not hold there.
+        InputError: there is a coordinate system but no position or another frame than "site", or the coordinate system
+            is not valid at the positions.
     """
     given = np.array([np.full(3, np.nan) if a.position_m is None else a.position_m for a in anchors]).reshape(-1, 3)
     known = np.isfinite(given).all(axis=1)
@@ -54,7 +56,7 @@ def local_site(
             raise InputError(str(error), path) from None
         return Site(np.zeros(3), georeference), _at(anchors, local)
     middle = given[known].mean(axis=0) if frame == "site" and known.any() else np.zeros(3)
-    # Whole metres, so that adding them again restores every digit.
+    # The offset is in whole metres, so that adding it again restores every digit.
     offset = np.round(middle) if np.linalg.norm(middle) > _FAR_M else np.zeros(3)
     return Site(offset), _at(anchors, given - offset)
 

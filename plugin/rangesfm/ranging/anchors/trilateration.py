@@ -1,7 +1,7 @@
-"""Trilateration: where anchors stand, from ranges taken at known positions of the tag.
+"""Trilateration: positions of anchors from ranges at known positions of the tag.
 
-The first step of Lee, Zhu, Giorgi and Günther (2018), made robust and honest about its error: every anchor is found on
-its own, and what ranges get wrong is learnt from those of all anchors together.
+This is the first step of Lee, Zhu, Giorgi and Günther (2018), with robust estimation and a realistic uncertainty. Every
+anchor is located on its own. The errors of the ranges are learnt from those of all anchors together.
 """
 
 from __future__ import annotations
@@ -30,34 +30,40 @@ from rangesfm.ranging.errors.noise import short_range_stddev
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, SAME_COST
 from rangesfm.ranging.log import RangeLog
 
-# Three numbers, and one range more to see that they fit.
+# Three ranges determine a position, and a fourth one checks it.
 MIN_NUM_RANGES = 4
-# Half of 3 stddevs squared: a rival this close in cost is not ruled out.
+# A mirror image is ruled out if its cost is larger by at least this, half the square of 3 standard deviations.
 _MIN_COST_GAP = 4.5
-# Formal stddevs beyond this share of the distance are checked against the cost itself.
+# Standard deviations above this fraction of the distance are computed from the cost itself, not from its curvature.
 _NONLINEAR = 0.05
+# Distances at which the cost is then evaluated, metres.
 _PROFILE_STEPS_M = np.geomspace(0.01, 100.0, 41)
+# Weight, relative to all ranges, of the prior that holds a point at such a distance.
 _HOLD = 100.0
+# Largest number of ranges in that computation.
 _MAX_RANGES_OF_PROFILE = 2000
+# Width over length below which the tag's positions count as lying on a line.
 _NEARLY_STRAIGHT = 0.1
+# Cosine of the angle to the normal of the tag's plane above which a direction counts as across that plane.
 _ACROSS = 0.9
-# Sine of the angle between a plane and a direction that is along it, but for rounding.
+# A direction counts as along a plane if the sine of the angle between both is below this, which is mere rounding.
 _ALONG_PLANE = 1e-6
-# Of a height that is known.
+# Standard deviation of a known height.
 _HEIGHT_STDDEV_M = 0.01
-# A bias that is known is held by a prior far stronger than any ranges.
+# A known bias is held by a prior that is far stronger than any ranges.
 _KNOWN_BIAS_STDDEV_M = 1e-6
 
 
 @dataclass(frozen=True)
 class TrilaterationOptions:
-    """How an anchor is found.
+    """Options of trilateration.
 
     Attributes:
-        range_stddev_m: noise of the ranges that do not say theirs; None: estimated from the residuals.
-        range_bias_m: prior mean of what the ranges read too long.
-        range_bias_stddev_m: stddev of that prior, by default over the radios of ``components.py``; 0: exactly known.
-        max_position_stddev_m: an anchor less certain than this in any direction is refused.
+        range_stddev_m: noise of ranges for which the log gives none; None: estimated from the residuals.
+        range_bias_m: prior mean of the bias of the ranges, positive if they are too long.
+        range_bias_stddev_m: standard deviation of that prior, by default over the radios of ``components.py``; 0: the
+            bias is exactly known.
+        max_position_stddev_m: an anchor with a larger standard deviation in any direction is refused.
     """
 
     range_stddev_m: float | None = None
@@ -68,16 +74,17 @@ class TrilaterationOptions:
 
 @dataclass(frozen=True)
 class Trilateration:
-    """An anchor's place, found from n ranges.
+    """Position of an anchor, found from n ranges.
 
     Attributes:
-        position_m: (3,) in the frame of the tag's positions.
-        covariance_m2: (3, 3) of the position.
-        mirror_position_m: (3,) the place on the other side of the tag's positions that fits as well; or None.
-        range_bias_m, range_bias_stddev_m: what the ranges read too long.
-        noise_stddev_m: of a range away from all special cases.
-        residuals_m: (n,) predicted minus measured.
-        weights: (n,) of the robust loss, 1 for a range that fits.
+        position_m: (3,) position in the frame of the tag's positions.
+        covariance_m2: (3, 3) covariance of the position.
+        mirror_position_m: (3,) mirror image in the tag's positions, if it fits as well; or None.
+        range_bias_m, range_bias_stddev_m: bias of the ranges, positive if they are too long, and its standard
+            deviation.
+        noise_stddev_m: median noise of a range.
+        residuals_m: (n,) predicted minus measured ranges.
+        weights: (n,) weights of the robust loss, 1 for a range that fits.
     """
 
     position_m: Array
@@ -91,7 +98,7 @@ class Trilateration:
 
     @property
     def position_stddev_m(self) -> float:
-        """Of each coordinate: root of their mean variance."""
+        """Root of the mean variance of the three coordinates, metres."""
         return float(np.sqrt(np.trace(self.covariance_m2) / 3))
 
 
@@ -101,14 +108,14 @@ class AnchorRanges:
 
     Attributes:
         tag_positions_m: (n, 3) positions of the tag's antenna.
-        range_m: (n,) measured distances.
-        range_stddev_m: (n,) noise of each, NaN where unknown; or None.
-        shared_stddev_m: (n,) what ranges of about this length may be off together, by the radio's error curve;
-            None: without one, short ranges weigh less.
-        timestamp_s: (n,) when they were taken; None: in their order.
-        tag_index: (n,) by which tag; None: all by the same.
-        toward: (3,) direction in which the anchor lies, seen from its mirror image; or None.
-        height_m: its z, if that is known.
+        range_m: (n,) measured ranges.
+        range_stddev_m: (n,) noise of each range, NaN where unknown; or None.
+        shared_stddev_m: (n,) standard deviation of the error that ranges of about this length share by the radio's
+            error curve; None: there is no error curve, and short ranges get a larger standard deviation.
+        timestamp_s: (n,) times of the ranges; None: they are in the order of time.
+        tag_index: (n,) index of each range's tag; None: all ranges are of one tag.
+        toward: (3,) direction from the anchor's mirror image to the anchor; or None.
+        height_m: z of the anchor, if it is known.
     """
 
     tag_positions_m: Array
@@ -122,7 +129,7 @@ class AnchorRanges:
 
     @property
     def times_s(self) -> Array:
-        """(n,); where there are none, of a tag that moves at a walking pace of 1 m/s."""
+        """Times of the ranges (n,), seconds; if there are none, those of a tag that moves at 1 m/s."""
         if self.timestamp_s is not None:
             return self.timestamp_s
         steps_m = np.linalg.norm(np.diff(self.tag_positions_m, axis=0), axis=1)
@@ -130,17 +137,17 @@ class AnchorRanges:
 
     @property
     def tags(self) -> Indices:
-        """(n,)"""
+        """Index of each range's tag (n,)."""
         return np.zeros(len(self.range_m), dtype=np.int64) if self.tag_index is None else self.tag_index
 
     @property
     def shape(self) -> PathShape:
-        """Of the tag's positions about their mean; of a level one where the height is known: only that counts."""
+        """Shape of the tag's positions about their mean; if the anchor's height is known, of their horizontal parts."""
         centred = self.tag_positions_m - self.tag_positions_m.mean(axis=0)
         return path_shape(centred if self.height_m is None else centred * [1.0, 1.0, 0.0])
 
     def fit(self, options: TrilaterationOptions) -> PointFit:
-        """The most likely place, as if the ranges erred independently."""
+        """Find the most likely position, assuming independent errors of the ranges."""
         num = len(self.range_m)
         middle = self.tag_positions_m.mean(axis=0)
         mean = np.array([0.0, 0.0, 0.0, options.range_bias_m])
@@ -156,12 +163,13 @@ class AnchorRanges:
 
 @dataclass(frozen=True)
 class _Found:
-    """A fit and how wrong it may be.
+    """A fit with the errors of its ranges.
 
     Attributes:
-        fit: its prior holds by as much more as errors that go together take from the ranges.
-        errors: of its ranges.
-        inflation: of the bias, by errors that go together.
+        fit: the fit. Its prior is strengthened by ``inflation``, to balance ranges whose common errors are not in their
+            weights.
+        errors: errors of its ranges.
+        inflation: ratio of the bias's standard deviation to the one for independent errors.
     """
 
     fit: PointFit
@@ -175,7 +183,7 @@ class _Found:
         return cls(replace(fit, problem=problem, x=improve(problem, fit.x)), errors, inflation)
 
     def judged_by(self, inflation: float) -> PointProblem:
-        """The problem with costs in which errors that go together count for what they are."""
+        """Return the problem with standard deviations that account for common errors, for comparing costs."""
         problem = self.fit.problem
         return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
 
@@ -191,17 +199,18 @@ def trilaterate(
 ) -> Trilateration:
     """Find an anchor from its ranges to known positions of the tag.
 
-    Up to about half of the ranges may be wrong by any amount. If the positions lie in a plane, the anchor's
-    mirror image in it fits as well: then both are returned, unless ``toward`` says which it is; the upper one first if
-    no range tells. Where the height is known, the same goes for positions that lie on a line, seen from above.
+    Up to about half of the ranges may be wrong by any amount. If the tag's positions lie in a plane, the anchor's
+    mirror image in that plane fits as well. Then both are returned, unless ``toward`` selects one. If both fit equally,
+    the upper one comes first. With a known height, the same applies to positions that lie on a line seen from above.
 
     Args:
         tag_positions_m, range_m, height_m: as in ``AnchorRanges``.
-        known: others of its attributes: ``range_stddev_m``, ``shared_stddev_m``, ``timestamp_s``, ``toward``.
+        known: other attributes of ``AnchorRanges``: ``range_stddev_m``, ``shared_stddev_m``, ``timestamp_s``,
+            ``toward``.
 
     Raises:
-        GeometryError: too few ranges, positions on a line or all close together, or else an anchor less
-            certain than ``options.max_position_stddev_m``.
+        GeometryError: there are too few ranges, the positions lie on a line or close together, or the anchor's standard
+            deviation exceeds ``options.max_position_stddev_m``.
     """
     positions, ranges = (np.asarray(values, dtype=np.float64) for values in (tag_positions_m, range_m))
     arrays: dict[str, Any] = {
@@ -216,11 +225,13 @@ def trilaterate(
 
 @dataclass(frozen=True)
 class AnchorPlacement:
-    """What trilateration says of one anchor.
+    """Result of trilateration for one anchor.
 
     Attributes:
-        num_ranges: its ranges at known positions of the tag.
-        found: where it stands; None if that is not determined, for the reason ``why_not``.
+        anchor_id: id in the log.
+        num_ranges: number of its ranges at known positions of the tag.
+        found: its position; None if it is not determined.
+        why_not: why it is not determined; None if it is.
     """
 
     anchor_id: str
@@ -230,7 +241,7 @@ class AnchorPlacement:
 
     @property
     def anchor(self) -> Anchor:
-        """For an anchors' file: without a position if there is none, or if there are two."""
+        """Anchor for an anchor file, without a position if none was found, or if a mirror image fits as well."""
         if self.found is None:
             return Anchor(self.anchor_id)
         bias = (self.found.range_bias_m, self.found.range_bias_stddev_m)
@@ -248,16 +259,16 @@ def trilaterate_anchors(
     height_m: Mapping[str, float] | None = None,
     options: TrilaterationOptions | None = None,
 ) -> tuple[AnchorPlacement, ...]:
-    """Place every anchor of a log; what the ranges get wrong is learnt from all of them together.
+    """Locate every anchor of a log; the errors of the ranges are learnt from all anchors together.
 
     Args:
         log: n ranges.
-        tag_positions_m: (n, 3) where the tag was at each; NaN where unknown (see ``tag_positions``).
-        toward: by anchor, the direction in which it lies of two places that fit alike (see ``trilaterate``).
-        height_m: by anchor, its z where that is known.
+        tag_positions_m: (n, 3) position of the tag at each range; NaN where unknown (see ``tag_positions``).
+        toward: by anchor, the direction from its mirror image to it, where both fit alike (see ``trilaterate``).
+        height_m: by anchor, its z if that is known.
 
     Returns:
-        one placement for each anchor, in the order of the log.
+        One placement for each anchor, in the order of the log.
     """
     known = np.isfinite(tag_positions_m).all(axis=1)
     rows = [np.flatnonzero(known & (log.anchor_index == k)) for k in range(len(log.anchor_ids))]
@@ -280,7 +291,7 @@ def trilaterate_anchors(
 def _trilaterate_together(
     anchors: Mapping[str, AnchorRanges], options: TrilaterationOptions
 ) -> tuple[AnchorPlacement, ...]:
-    """Find anchors of one radio, whose ranges err alike."""
+    """Locate anchors of one radio system, whose ranges have errors of the same kind."""
     fits = {name: anchor.fit(options) for name, anchor in anchors.items() if len(anchor.range_m) >= MIN_NUM_RANGES}
     fitted = [anchors[name] for name in fits]
     times_s, tags = [anchor.times_s for anchor in fitted], [anchor.tags for anchor in fitted]
@@ -302,14 +313,14 @@ def _trilaterate_together(
 def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions) -> Trilateration:
     covariance, shape = _covariance(found), anchor.shape
     _refuse_uncertain(covariance, shape, options)
-    # Between two places of one height lies an upright plane.
+    # With a known height, position and mirror image have the same height, and the plane between them is vertical.
     level = np.cross([0.0, 0.0, 1.0], shape.axes[:, 0])
     across = shape.axes[:, 2] if anchor.height_m is None else oriented(level[:, None])[:, 0]
     mirror = _mirror(found, covariance, shape.centroid, across)
     if mirror is not None:
         apart = (mirror - found.fit.x)[:3]
         told = None if anchor.toward is None else _unless_along_plane(anchor.toward, apart)
-        # Where no range tells the two apart, rounding would choose.
+        # If both have the same cost, the choice would depend on rounding, so the order is fixed.
         is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
         if is_free and apart @ (across if told is None else told) > 0:
             found, mirror = replace(found, fit=replace(found.fit, x=mirror)), found.fit.x
@@ -329,10 +340,11 @@ def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions
 
 
 def _covariance(found: _Found) -> Array:
-    """(4, 4) of position and bias: what the errors of the ranges do to the weighted least squares at the minimum.
+    """Return the covariance (4, 4) of position and bias, given the errors of the ranges.
 
-    Huber and Ronchetti, "Robust Statistics" (2009), section 6.3: the sandwich of the covariance of the gradient between
-    inverses of the information. The weakest direction by the cost itself.
+    It is the sandwich covariance of a robust estimate: the covariance of the gradient between two inverses of the
+    information (Huber and Ronchetti, "Robust Statistics", 2009, section 6.3). The weakest direction may instead be
+    evaluated by the cost itself.
     """
     problem, weights = found.fit.problem, found.fit.weights
     jacobian = problem.jacobian(found.fit.x)
@@ -344,7 +356,8 @@ def _covariance(found: _Found) -> Array:
 
 
 def _inverse(information: Array) -> Array:
-    # Position and bias each in a unit of its own: beside a bias that is known, in metres, no place counts at all.
+    # Position and bias are scaled to units of their own. In metres, the large information of a known bias would hide
+    # that of the position.
     strongest = np.diag(information)
     unit = 1 / np.sqrt(np.append(np.full(3, strongest[:3].max()), strongest[3]))
     values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
@@ -353,10 +366,14 @@ def _inverse(information: Array) -> Array:
 
 
 def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array:
-    """Near the plane of the tag's positions the curvature across it vanishes, but the cost rises further off."""
+    """Return the covariance with the variance of the weakest direction from the cost itself, where that is needed.
+
+    Near the plane of the tag's positions, the curvature of the cost across the plane vanishes, but the cost rises
+    farther off.
+    """
     variances, axes = np.linalg.eigh(formal[:3, :3])
     along = np.append(axes[:, 2], 0.0)
-    # The other numbers follow along as they do where the curvature holds.
+    # The other unknowns are assumed to change with this direction as the curvature says.
     tied = formal @ along / variances[2]
     inflation = found.errors.inflation(found.fit, found.fit.problem.slopes(found.fit.x) @ tied)
     if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.fit.problem.range_m)):
@@ -367,7 +384,10 @@ def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array
 
 
 def _profile_stddev(found: _Found, along: Array, inflation: float) -> float:
-    """How far the point moves ``along`` (4,) until the cost, all else adapted, has risen by that of one stddev."""
+    """Return the distance along a direction (4,) at which the cost has risen by that of one standard deviation, metres.
+
+    The other unknowns are estimated anew at each distance.
+    """
     num = len(found.fit.problem.range_m)
     rows = np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64)
     part = found.judged_by(inflation).subset(rows)
@@ -393,12 +413,12 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
     if length <= options.max_position_stddev_m / 10:
         why = f"the tag's positions lie within {length:.3g} m of each other"
     elif width < _NEARLY_STRAIGHT * length:
-        why = "the tag's positions lie on a line, about which the anchor may stand anywhere"
+        why = "the tag's positions lie on a line, and the anchor may be anywhere on a circle around that line"
     elif abs(axes[:, 2] @ shape.axes[:, 2]) > _ACROSS:
-        why = "the anchor stands near the plane in which the tag's positions lie, and how far off it is not seen"
+        why = "the anchor is near the plane of the tag's positions, and its distance from the plane is not determined"
     else:
-        why = f"the tag's positions extend over {length:.3g} by {width:.3g} m, too little or too far away"
-    # No minus sign by rounding, neither of all three nor of a zero.
+        why = f"the tag's positions extend over {length:.3g} by {width:.3g} m only, or are too far away"
+    # Signs are normalized, so that rounding cannot change them, neither of the whole vector nor of a zero.
     direction = ", ".join(f"{component:.2f}" for component in np.round(oriented(axes)[:, 2], 2) + 0.0)
     raise GeometryError(
         f"the position is not determined: {why} (stddev {min(stddev, _PROFILE_STEPS_M[-1]):.2g} m along {direction})"
@@ -406,7 +426,7 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
 
 
 def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) -> Array | None:
-    """(4,) the place on the other side of the tag's positions, if it is another one and fits as well."""
+    """Return position and bias (4,) of the mirror image in the tag's positions, if it is a different one and fits."""
     height = float((found.fit.x[:3] - centroid) @ across)
     other = improve(found.fit.problem, found.fit.x - 2 * height * np.append(across, 0.0))
     apart = (other - found.fit.x)[:3]
@@ -416,9 +436,9 @@ def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) ->
 
 
 def _gap(found: _Found, mirror: Array) -> float:
-    """How much worse the mirror image fits, beside what errors that go together do to the difference.
+    """Return the cost of the mirror image minus that of the fit, with common errors of the ranges accounted for.
 
-    By a bounded loss: outliers cost the same wherever the point is.
+    The loss is bounded, so that outliers cost the same for both.
     """
     problem = found.fit.problem
     inflation = found.errors.inflation(found.fit, problem.residuals_m(mirror) - found.fit.residuals_m)
@@ -427,6 +447,6 @@ def _gap(found: _Found, mirror: Array) -> float:
 
 
 def _unless_along_plane(direction: Array, across: Array) -> Array | None:
-    """A direction that tells two places apart; of one along the plane between them, rounding would choose the sign."""
+    """Return the direction if it selects one of two mirror images, or None if it is along the plane between them."""
     least = _ALONG_PLANE * float(np.linalg.norm(direction) * np.linalg.norm(across))
     return direction if abs(direction @ across) > least else None
