@@ -166,7 +166,7 @@ def test_exchange_that_failed_is_no_measurement(tmp_path: Path) -> None:
 def test_log_without_range_and_stamps_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text("t,node,d\n0,7,2.5\n")
-    with pytest.raises(InputError, match="no column range, nor the time stamps tx1, rx1, tx2, rx2"):
+    with pytest.raises(InputError, match="name neither range nor the time stamps tx1, rx1, tx2, rx2"):
         read_ranges(path, columns=COLUMNS)
 
 

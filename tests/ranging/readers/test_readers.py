@@ -278,7 +278,7 @@ def test_line_of_inrols_text_that_was_cut_off_is_left_out_and_a_wrong_one_refuse
 ) -> None:
     log = read_ranges(write(tmp_path, INROL[:-16]))
     assert len(log) == 3
-    assert log.notes == ("lines that are no rows of the table are left out: 1, first line 5",)
+    assert log.notes == ("1 lines that are not rows of the table are left out, the first is line 5",)
     error = refusal(write(tmp_path, INROL.replace("1.7469", "1.7x469")))
     assert error.line == 3
     assert "r is '1.7x46998299780'" in str(error)

@@ -285,7 +285,7 @@ def test_logs_that_cannot_give_ranges_are_refused_with_the_reason(tmp_path: Path
 
 
 def test_format_of_its_own_takes_no_columns(tmp_path: Path) -> None:
-    assert "a format of its own" in str(refusal(write(tmp_path, f"1 {LEC}\n"), range_unit="mm"))
+    assert "format is not a table" in str(refusal(write(tmp_path, f"1 {LEC}\n"), range_unit="mm"))
     assert "timestamp_unit is 'y'" in str(refusal(write(tmp_path, f"1 {LEC}\n"), timestamp_unit="y"))
 
 

@@ -225,7 +225,7 @@ def test_lists_in_messages_of_rostopic_are_a_row_each(tmp_path: Path) -> None:
 def test_a_value_far_above_all_others_that_comes_again_is_no_measurement(tmp_path: Path, nothing: str) -> None:
     log = read_ranges(write(tmp_path, PLAIN + f"15,A0,{nothing}\n16,A0,{nothing}\n17,A0,{nothing}\n"))
     assert (len(log), log.num_no_measurement) == (len(ROWS), 3)
-    assert any("3 times, far above all other ranges: taken for no measurement" in note for note in log.notes)
+    assert any("3 times, far above all other ranges: it is taken to mean no measurement" in note for note in log.notes)
 
 
 def test_pairs_of_columns_without_names_among_others_are_asked_with_a_command_that_reads_them(tmp_path: Path) -> None:
@@ -394,7 +394,7 @@ def test_columns_are_told_by_number_and_in_spans(tmp_path: Path) -> None:
     path = write(tmp_path, tags_side_by_side())
     log = read_ranges(path, columns={"timestamp": "1", "range:0-3:T0-T1": "2-9"})
     assert (log.anchor_ids, log.tag_ids, len(log)) == (("0", "1", "2", "3"), ("T0", "T1"), 2 * len(ROWS))
-    with pytest.raises(InputError, match="range:0-3:T0-T1 is 7 columns, expected 4 x 2"):
+    with pytest.raises(InputError, match="range:0-3:T0-T1 names 7 columns, expected 4 x 2"):
         read_ranges(path, columns={"timestamp": "1", "range:0-3:T0-T1": "2-8"})
 
 

@@ -1,4 +1,4 @@
-"""Radio logs of many formats, read into one: the range log."""
+"""Readers of radio logs in many formats, all of which give a RangeLog."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _NOTHING_SAID = ReadOptions()
 
 
 def reader_names() -> tuple[str, ...]:
-    """All log formats. A new one is a declaration beside this and a name in the tuple above."""
+    """Return the names of all log formats; a new format is a Reader in this package that is added to _READERS."""
     return tuple(reader.name for reader in _READERS)
 
 
@@ -45,22 +45,23 @@ def read_ranges(
     """Read a radio's log.
 
     Args:
-        path: a file; or several, a folder of them, or a pattern as ``uwb_*.csv``, one an anchor say.
-        options: how to take it.
-        anchor_ids, tag_ids: known anchors and tags, which tell them apart where the log does not, and ranges
-            between two of a kind from those between a tag and an anchor.
-        said: single ones of the options: ``format``, one of ``reader_names()``; ``columns``, the name in the file of
-            each of ``columns.QUANTITIES``, of a column an anchor as ``range:A1``, or ``range:A1:T0`` with the tag; and
-            all others.
+        path: a file; or several files, a folder of them, or a pattern such as ``uwb_*.csv``, for example one file per
+            anchor.
+        options: how to read the log.
+        anchor_ids, tag_ids: known anchors and tags. They tell anchors from tags where the log does not, and ranges
+            between two anchors or two tags from those between a tag and an anchor.
+        said: single options by name. ``format`` is one of ``reader_names()``. ``columns`` gives the name in the file of
+            each of ``columns.QUANTITIES``; a column with the ranges of one anchor is ``range:A1``, or ``range:A1:T0``
+            with the tag.
 
     Returns:
-        All ranges in the order of the log, those that are not positive (no measurement) counted and left out; its
-        notes say what was assumed. Where all are whole centimetres or decimetres, no stddev that the log gives is
-        less than that of the rounding.
+        All ranges in the order of the log. Those that are not positive (no measurement) are counted and left out. The
+        log's notes say what was assumed. If all ranges are whole centimetres or decimetres, the log's standard
+        deviations are at least that of the rounding.
 
     Raises:
-        InputError: with the line where there is one, for a file that is missing, empty, not understood for sure
-            (its advice says what to type), broken, or without any usable range.
+        InputError: the file is missing, empty or damaged, is not understood for sure (the advice says what to type), or
+            has no usable range. The error gives the line if there is one.
     """
     paths = _paths(path)
     table = {} if options is None else {name: getattr(options, name) for name in LogOptions.model_fields}
@@ -76,10 +77,17 @@ def read_ranges(
 
 
 def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str | None = None) -> tuple[Anchor, ...]:
-    """The anchors whose positions a log tells beside its ranges, as those of the DWM1001 do; none if it tells none.
+    """Return the anchors whose positions a log contains, as logs of the DWM1001 do; empty if it contains none.
 
-    Each is at the median of its positions, unknown where several share a place (nobody set them up). ``format`` is one
-    of ``reader_names()``; None: recognised by content. InputError for a file that is missing, empty or of no known one.
+    The position of an anchor is the median of its positions in the log. It is unknown if several anchors have the same
+    position, because then nobody has set them up.
+
+    Args:
+        path: as for ``read_ranges``.
+        format: one of ``reader_names()``; None: recognized by content.
+
+    Raises:
+        InputError: the file is missing, empty, or of no known format.
     """
     chosen = _choose_readers(_paths(path), _NOTHING_SAID, format)
     return tuple(anchor for file, reader in chosen for anchor in reader.read_anchors(file))
@@ -93,7 +101,7 @@ def _paths(path: str | Path | Sequence[str | Path]) -> list[Path]:
 
 
 def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | None) -> list[tuple[Path, Reader]]:
-    """Every file of the log with its reader; what else is in a folder is left out."""
+    """Return every file of the log with its reader; other files in a folder are left out."""
     files = [file for path in paths for file in files_of_log(path)]
     is_folder = len(paths) == 1 and len(files) > 1 and paths[0].is_dir()
     chosen: list[tuple[Path, Reader]] = []
@@ -109,7 +117,7 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
     if len(names) > 1:
         found = ", ".join(f"{file.name} ({reader.name})" for file, reader in chosen)
         raise InputError(
-            f"logs of several formats: {found}; name those to be read, as by {files[0].parent}/*.csv", paths[0]
+            f"logs of several formats: {found}; name those to be read, for example by {files[0].parent}/*.csv", paths[0]
         )
     if refused is not None and not chosen:
         raise refused
@@ -117,9 +125,9 @@ def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | N
 
 
 def _join_logs(logs: Sequence[RangeLog], source: Path) -> RangeLog:
-    """All ranges in the order of their times, each between the tag and the anchor of its record."""
+    """Join logs into one, sorted by time if there are times; each range is between the tag and anchor of its record."""
     if len({log.timestamp_s is None for log in logs}) > 1:
-        raise InputError("some of the files have times and others have names of photos, expected all alike", source)
+        raise InputError("some of the files have times and others names of photos, expected the same in all", source)
     ends = [log.end_ids() for log in logs]
     times = [log.timestamp_s for log in logs if log.timestamp_s is not None]
     columns = {
@@ -141,7 +149,11 @@ def _join_logs(logs: Sequence[RangeLog], source: Path) -> RangeLog:
 
 
 def files_of_log(path: Path) -> list[Path]:
-    """The files of a log: the path itself, all in a folder, or those of a pattern as ``uwb_*.csv``; or InputError."""
+    """Return the files of a log: the path itself, all files in a folder, or those that fit a pattern.
+
+    Raises:
+        InputError: there are none.
+    """
     text = str(path)
     if "\0" in text:
         raise InputError("no file has such a name", path)
@@ -157,7 +169,15 @@ def files_of_log(path: Path) -> list[Path]:
 
 
 def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: str | None = None) -> Reader:
-    """The reader of a file; InputError, with advice for tables, if it is no log for sure."""
+    """Find the reader of a file.
+
+    Args:
+        options: options of reading, for tables.
+        format: name of the reader; None: recognized by content.
+
+    Raises:
+        InputError: no reader recognizes the file for sure; for a table the error has advice.
+    """
     if format is not None and format != TABLE.name:
         named = next((reader for reader in _READERS if reader.name == format), None)
         if named is None:

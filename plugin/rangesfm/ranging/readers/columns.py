@@ -1,4 +1,4 @@
-"""From named columns of a table to a range log: what the canonical CSV and mapped ones share."""
+"""Range logs from the named columns of a table; shared by the canonical CSV and by mapped tables."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ QUANTITIES = (
     *("los", "nlos", *STAMPS),
 )
 
-_MAX_TIME_S = 1e11  # three thousand years
+_MAX_TIME_S = 1e11  # three thousand years; a larger time is in another unit
 _TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
 
 
 @dataclass(frozen=True)
 class Columns:
-    """Where a table has what a log needs.
+    """Columns of a table that hold the quantities of a log.
 
     Attributes:
-        required: name in the file of each of QUANTITIES that it must have: range (or the first four of STAMPS
-            instead, or ``wide``) and one of timestamp and image_name.
-        optional: the same for those that it may have.
-        wide: names of columns of ranges that each are of one anchor and one tag, with the ids of these.
-        anchor_id: of all ranges, where neither a column nor ``wide`` says it.
-        layout: of the file; None: its first row is its header.
-        is_strict: a cell of ranges is a number, and ids are taken to the letter; otherwise it may also be empty (no
-            measurement), and 1.000 is the id 1.
-        notes: how all this was found.
+        required: by quantity (QUANTITIES), the names of columns that the table must have: one of timestamp and
+            image_name, and range, or instead of it the first four of STAMPS, or ``wide``.
+        optional: by quantity, the names of columns that it may have.
+        wide: by name, the columns of ranges that each belong to one anchor and one tag, with the ids of these.
+        anchor_id: anchor of all ranges, if neither a column nor ``wide`` gives it.
+        layout: layout of the file; None: its first row is its header.
+        is_strict: whether every cell of ranges must be a number, and ids are taken literally. Otherwise a cell may also
+            be empty (no measurement), and 1.000 is the id 1.
+        notes: lines for the user about how the columns were found.
     """
 
     required: Mapping[str, str]
@@ -64,15 +64,15 @@ class Columns:
 
 
 def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str) -> RangeLog:
-    """Read a log off the named columns.
+    """Read a log from the named columns of a table.
 
     Args:
-        options: what the user says of units, time stamps and, without a layout, the separator.
-        format: name of the reader, for the record.
+        options: the user's options for units, time stamps and, without a layout, the separator.
+        format: name of the reader, which the log keeps.
 
     Raises:
-        InputError: with the line, for whatever is not a time, an id or a range; also if no range is left, or if a
-            unit may be one or another.
+        InputError: a cell is not a time, an id or a range (the error gives the line), no range is left, or a unit is
+            ambiguous.
     """
     named, layout = {**columns.optional, **columns.required}, columns.layout
     anchors = [column for anchor_id, _ in columns.wide.values() if (column := column_of_anchor(anchor_id))]
@@ -84,7 +84,7 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     else:
         table, more = layout.read()
         notes += more
-        if layout.are_records and "range" in named:  # others are not of ranges
+        if layout.are_records and "range" in named:  # records without a range are about something else
             table = table.where([cell != "" for cell in table.text(named["range"], empty="")])
     name = {key: column for key, column in named.items() if column in table}
     units = layout.units if layout else {}
@@ -127,7 +127,7 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
 
 
 def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
-    """Of each range, row after row: the same in each row, or what a column says."""
+    """Return the anchor of each range, row by row: the same in each row, or from a column."""
     if not columns.wide:
         if "anchor_id" not in name:
             return _repeated([columns.anchor_id or ""], len(table))
@@ -143,7 +143,7 @@ def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categor
 
 
 def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
-    """Of each range, as ``_anchors``; tags with several antennas are one for each."""
+    """Return the tag of each range, row by row; each antenna of a tag counts as a tag of its own."""
     if "tag_id" not in name:
         tag_ids = [tag_id or DEFAULT_TAG_ID for _, tag_id in columns.wide.values()]
         return _repeated(tag_ids or [DEFAULT_TAG_ID], len(table))
@@ -157,12 +157,15 @@ def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories
 
 
 def column_of_anchor(anchor_id: str) -> str | None:
-    """The name of the column that says the anchor of another, which has "@" and this name in an anchor's place."""
+    """Return the name of the column that holds the anchor of a column of ranges, or None.
+
+    Such a column of ranges has "@" and that name in the place of its anchor.
+    """
     return anchor_id[1:] if anchor_id.startswith("@") else None
 
 
 def _repeated(ids: list[str], num_rows: int) -> Categories:
-    """The same ids in every row."""
+    """Return the ids, repeated in every row."""
     each = Categories.of(ids)
     return Categories(each.names if num_rows else (), np.tile(each.index, num_rows))
 
@@ -179,7 +182,7 @@ def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Cate
 
 
 def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: ReadOptions) -> Array:
-    """(n,) in the unit of the file, those of a row after each other; not positive: no measurement."""
+    """Return the ranges (n,) in the unit of the file, row by row; one that is not positive means no measurement."""
     if "range" not in name and not columns.wide:
         return _ranges_by_stamps(table, name, StampOptions.of(options))
     unit = " of metres" if options.range_unit in (None, "m") else f" of {options.range_unit}"
@@ -189,7 +192,7 @@ def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: Re
 
 
 def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptions) -> Array:
-    """Two-way ranging, double-sided where the third message is there; 0 (no measurement) where a stamp is empty."""
+    """Compute ranges (n,) from two-way ranging, double-sided if there is a third message; 0 where a stamp is empty."""
     stamps = {
         stamp: table.numbers(name[stamp], empty=np.nan, expected="a time stamp or nothing")
         for stamp in STAMPS
@@ -224,13 +227,13 @@ def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes:
     dates = [match[1] for match in civil]
     order = unit if unit in DATE_ORDERS else date_order(dates) if dates else "ymd"
     if order is None:
-        raise ask(DATE_ORDERS, f"dates as {dates[0]}")
+        raise ask(DATE_ORDERS, f"dates such as {dates[0]}")
     clock, seconds = CivilClock(order), np.empty(len(table))
     for row, text in enumerate(texts):
         try:
             seconds[row] = clock.seconds(text)
         except ValueError:
-            expected = f"a date as {order} and a time" if dates else "a time as 2026-01-31T12:00:00.000Z"
+            expected = f"a date as {order} and a time" if dates else "a time such as 2026-01-31T12:00:00.000Z"
             raise table.error(row, name["timestamp"], expected) from None
     if texts and TIME_OF_DAY.fullmatch(texts[0]):
         notes.append("times of day without a date: counted from the midnight before the first")

@@ -1,6 +1,7 @@
-"""Which column of a table is what, by its name and its values; and how sure that is.
+"""Guess of the quantity in each column of a table, from names and values, with the doubts that remain.
 
-A name that says it, or values that admit one reading only, make a guess sure. Everything else is asked.
+A guess is sure if the names of the columns say it, or if the values allow one interpretation only. In all other cases
+the user is asked.
 """
 
 from __future__ import annotations
@@ -18,18 +19,21 @@ from rangesfm.ranging.readers.layout import Column, Layout
 from rangesfm.ranging.readers.reader import Sides
 
 _MAX_NUM_IDS = 64
-_SAME_SPOT_M = 1.5  # tags on one rig are not further apart, nor does their range to an anchor differ by more
+_SAME_SPOT_M = 1.5  # largest distance between tags on one rig, and so largest difference of their ranges to an anchor
 
 
 @dataclass
 class Guess:
-    """What a table seems to hold.
+    """Guess of what a table holds.
 
     Attributes:
-        columns: name in the file of each quantity; those that could not be found at all are ``missing``.
+        columns: by quantity, the name of its column in the file.
         wide: columns of ranges, each with its anchor and tag.
-        doubts: why it is no more than a guess; none: it is sure.
-        span: ``wide`` in a few words, where its columns have no names: quantity and columns.
+        sides: what the log says about the two ends of a range.
+        notes: lines for the user about what was found.
+        doubts: why the guess is not sure; empty if it is.
+        missing: quantities for which no column was found.
+        span: ``wide`` in short, if its columns have no names: quantity and columns.
     """
 
     columns: dict[str, str] = field(default_factory=dict)
@@ -42,14 +46,14 @@ class Guess:
 
     @property
     def told(self) -> dict[str, str]:
-        """All of it as the user would say it."""
+        """The guess in the form in which the user would give the columns."""
         wide = {f"range:{anchor}" + f":{tag}" * bool(tag): name for name, (anchor, tag) in self.wide.items()}
         columns = dict(sorted(self.columns.items(), key=lambda item: item[0] != "timestamp"))
         return {**columns, **(dict([self.span]) if self.span else wide)}
 
 
 def guess_columns(layout: Layout) -> Guess:
-    """What the columns of a table are."""
+    """Guess the quantities in the columns of a table."""
     guess = Guess()
     free = [column for column in layout.columns if column.kind != "nothing"]
     for find in (_find_time, _find_pairs, _find_range, _find_nodes) if layout.has_names else ():
@@ -74,12 +78,12 @@ def _find_time(free: list[Column], guess: Guess) -> list[Column]:
     elif time.is_whole and fractions and float(np.median(time.numbers)) < 1e11:
         guess.columns["nanoseconds"] = fractions[0].name
     if also := [column for column in others if column not in fractions]:
-        guess.notes.append(f"the times are those of {time.name}; there are also {_names(also)}")
+        guess.notes.append(f"the times are taken from {time.name}; there are also {_names(also)}")
     return [column for column in free if column not in (time, *others, *dates, *fractions)]
 
 
 def _time_rank(column: Column) -> tuple[float, int] | None:
-    """Smaller for a better column of times; None for none."""
+    """Return a rank of a column as the time, smaller for a better one, or None if it is not one."""
     words = [word for word in column.words if word not in terms.PLAIN]
     if column.kind not in ("numbers", "times") or terms.NO_TIME & {*words} or terms.NANOSECONDS & {*words}:
         return None
@@ -88,13 +92,13 @@ def _time_rank(column: Column) -> tuple[float, int] | None:
     stands_still = len(column.numbers) > 2 and bool(np.all(column.numbers == column.numbers[0]))
     if not is_named or stands_still:
         return None
-    # rostopic's %time and its like are when a message arrived; the stamp in it is when it was measured.
+    # Columns like rostopic's %time hold the time of arrival of a message. Its stamp holds the time of measurement.
     is_arrival = column.name.startswith(("%", "__")) or bool(terms.SECOND_TIME & {*words})
     return is_arrival + 0.5 * (not terms.TIME & {*words}), len({*words} - terms.TIME - terms.TIME_IN_SHORT)
 
 
 def _find_pairs(free: list[Column], guess: Guess) -> list[Column]:
-    """Anchors and their ranges, several times: of one number, or beside each other."""
+    """Find several pairs of columns with an anchor and its range, of the same number or next to each other."""
     nodes = {_numbers(column): column for column in free if _names_anchor(column)}
     values = [column for column in free if _is_range(column)]
     pairs = [(nodes[number], value) for value in values if (number := _numbers(value)) in nodes]
@@ -108,7 +112,7 @@ def _find_pairs(free: list[Column], guess: Guess) -> list[Column]:
 
 def _take_pairs(pairs: Sequence[tuple[Column, Column]], guess: Guess) -> None:
     guess.wide = {value.name: (f"@{node.name}", "") for node, value in pairs}
-    guess.notes.append(f"an anchor and its range in {len(pairs)} pairs of columns, as {pairs[0][0].name}")
+    guess.notes.append(f"an anchor and its range in {len(pairs)} pairs of columns, such as {pairs[0][0].name}")
 
 
 def _names_anchor(column: Column) -> bool:
@@ -144,18 +148,18 @@ def _find_range(free: list[Column], guess: Guess) -> list[Column]:
         if len(first) > 1:
             guess.doubts.append(f"any of {_names(first)} may be the ranges")
         elif others := [column for column in single if column not in first]:
-            guess.notes.append(f"the ranges are those of {first[0].name}; there are also {_names(others)}")
+            guess.notes.append(f"the ranges are taken from {first[0].name}; there are also {_names(others)}")
     elif groups:
         _take_wide(groups[0], guess)
         guess.doubts += ["there are several groups of columns that may be ranges"] * (len(groups) > 1)
     elif len(stamps) == 4:
-        guess.notes.append("there are no ranges but the time stamps of two-way ranging: these are used")
+        guess.notes.append("there are no ranges, and the time stamps of two-way ranging are used")
         guess.columns |= stamps
     return [column for column in free if column not in named and column.name not in in_groups]
 
 
 def _is_range(column: Column) -> bool:
-    """Whether the name is that of one range; ``d`` and ``r`` only where nothing else is said."""
+    """Whether a column is a single column of ranges by its name; ``d`` and ``r`` count only alone or with a unit."""
     words = {*_without_numbers(column)}
     if column.kind != "numbers" or terms.NO_RANGE & words:
         return False
@@ -163,7 +167,7 @@ def _is_range(column: Column) -> bool:
 
 
 def _groups(columns: Sequence[Column]) -> list[list[tuple[Column, list[int]]]]:
-    """Columns whose names differ in ids only, and which of their words these are."""
+    """Return groups of columns whose names differ in ids only, with the indices of these words in each name."""
     groups: dict[tuple[str, ...], list[tuple[Column, list[int]]]] = defaultdict(list)
     for column in columns:
         ids = [
@@ -180,7 +184,7 @@ def _groups(columns: Sequence[Column]) -> list[list[tuple[Column, list[int]]]]:
 
 
 def _is_letter(word: str, k: int, words: list[str]) -> bool:
-    """Whether a single letter at the end is an id, as in dist_A."""
+    """Whether a word is a single letter at the end of a name and an id, as in dist_A."""
     return len(word) == 1 and k == len(words) - 1 > 0 and bool(terms.RANGE & {*words}) and word not in terms.LENGTH_UNIT
 
 
@@ -198,7 +202,7 @@ def _take_wide(group: list[tuple[Column, list[int]]], guess: Guess) -> None:
         guess.wide[column.name] = (anchor, tag)
     words = {word for column, _ in group for word in column.words}
     first = _names(column for column, _ in group[:4])
-    guess.notes.append(f"a column an anchor: {first}{', ..' * (len(group) > 4)}")
+    guess.notes.append(f"one column per anchor: {first}{', ..' * (len(group) > 4)}")
     if any(len(ids) - bool(guess.wide[column.name][1]) > 1 for column, ids in group):
         guess.doubts.append("the names of the columns hold two ids, and do not say which is the anchor's")
     elif not any(tag for _, tag in guess.wide.values()) and not words & (
@@ -208,7 +212,7 @@ def _take_wide(group: list[tuple[Column, list[int]]], guess: Guess) -> None:
 
 
 def _id_at(words: list[str], k: int, name: str) -> str:
-    """The id, with the one or two letters that stand before it (A0), as the file spells it."""
+    """Return the id at word ``k`` as the file spells it, with one or two letters before it (A0)."""
     before = words[k - 1] if k and len(words[k - 1]) <= 2 and words[k - 1] not in terms.RANGE_IN_SHORT else ""
     text = before + words[k]
     at = name.lower().find(text)
@@ -216,9 +220,9 @@ def _id_at(words: list[str], k: int, name: str) -> str:
 
 
 def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
-    """The columns of ids: by their names, or two of ids alone."""
+    """Find the columns of ids by name; if the names give no role, the last is the anchor's and the first the tag's."""
     ids: dict[str, list[Column]] = defaultdict(list)
-    # What stands in the same record as the range tells its anchor, what stands around it the tag.
+    # An id in the same nested record as the range is the anchor's, and an id outside of it is the tag's.
     within = guess.columns.get("range", "").rpartition(".")[0] + "."
     for column in free:
         words = {word for word in terms.words_of(column.name.removeprefix(within)) if not word.isdigit()} - terms.PLAIN
@@ -237,7 +241,7 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
     guess.sides = Sides.ASKED if anchor and anchor[0] not in ids["anchor"] and tag else Sides.TOLD
     anchor, tag = _by_id_rather_than_index(anchor), _by_id_rather_than_index(tag)
     if guess.wide and max(len(anchor), len(nameless)) > 1:
-        guess.doubts.append("the anchor of a column of ranges seems to stand in another column")
+        guess.doubts.append("the anchor of a column of ranges seems to be given in another column")
     for role, columns in (("anchor_id", anchor), ("tag_id", tag), ("antenna", ids["antenna"][: bool(tag)])):
         if columns and not (guess.wide and role == "anchor_id"):
             guess.columns[role] = columns[0].name
@@ -249,7 +253,9 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
         guess.columns["anchor_id"] = others[0].name
         guess.doubts.append(f"{others[0].name} may be the anchor")
     if "antenna" in guess.columns and ids["antenna"][0].num_distinct > 1:
-        guess.notes.append(f"tags with several antennas ({guess.columns['antenna']}) are one for each, as 3/1")
+        guess.notes.append(
+            f"each antenna of a tag ({guess.columns['antenna']}) counts as a tag of its own, such as 3/1"
+        )
     for column in free:
         name = column.name.lower()
         if name in ("los", "nlos") and {*column.cells} <= {"0", "1", "0.0", "1.0", ""}:
@@ -262,7 +268,10 @@ def _by_id_rather_than_index(columns: list[Column]) -> list[Column]:
 
 
 def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
-    """What names did not tell. Where there are names, they ought to have: a guess then."""
+    """Find by their values the columns that were not found by name.
+
+    If the table has names, the names should have told, so that such a finding is not sure.
+    """
     if not {"timestamp", "image_name"} & {*guess.columns}:
         rising = [column for column in free if column.kind == "times" or _is_rising(column)]
         counters = [column for column in rising if column.is_whole and np.all(np.diff(column.numbers) == 1)]
@@ -289,7 +298,7 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
     reals = [column for column in reals if not terms.NO_RANGE & {*column.words} and column.num_distinct > 1] or reals
     if alike := sorted(_groups(reals), key=len):
         reals = [column for column, _ in alike[-1]] if has_names else reals
-    # A column of whole numbers beside one of decimals is no range but a count, or a power.
+    # If there are columns of decimals, a column of whole numbers is no range but for example a count or a power.
     reals = [column for column in reals if not column.is_whole] or reals
     if len(reals) == 1:
         guess.columns["range"] = reals[0].name
@@ -303,7 +312,7 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
 
 
 def _pairs_by_values(free: Sequence[Column]) -> list[tuple[Column, Column]]:
-    """The columns of ids with decimals beside them, as many as are equally far from each other."""
+    """Return the longest series of equally spaced pairs of a column of ids and a column of decimals after it."""
     at = [k for k, (node, value) in enumerate(pairwise(free)) if _is_id(node) and _is_real(value)]
     run: list[int] = []
     for first, step in product(at, {*np.diff(at).tolist()}):
@@ -316,12 +325,12 @@ def _is_real(column: Column) -> bool:
 
 
 def _is_nanoseconds(column: Column) -> bool:
-    """Whether it counts up to a second, beside a column that counts those."""
+    """Whether a column holds the nanoseconds within a second."""
     return column.is_whole and column.num_distinct > 9 and 1e8 < float(np.max(column.numbers)) < 1e9
 
 
 def _ids_by_values(ids: list[Column], guess: Guess) -> None:
-    """Anchors are many and tags few."""
+    """Choose the column of anchors and that of tags among columns of ids, by the rule that there are more anchors."""
     *others, anchor = sorted(ids, key=lambda column: column.num_distinct)
     tag = others[-1] if others else None
     if len(others) > 1:
@@ -345,13 +354,14 @@ def _is_positive(column: Column) -> bool:
 
 
 def _is_id(column: Column) -> bool:
-    is_word = column.num_distinct == 1 and not any(map(str.isdigit, column.cells[0]))  # in each row, as "range:" or "m"
+    # A word without digits that is the same in each row, such as "range:" or "m", is not an id.
+    is_word = column.num_distinct == 1 and not any(map(str.isdigit, column.cells[0]))
     few = column.num_distinct <= min(_MAX_NUM_IDS, max(2, len(column.cells) // 4))
     return few and not is_word and (column.kind == "text" or (column.is_whole and bool(np.all(column.numbers >= 0))))
 
 
 def _wide_by_values(columns: list[Column], guess: Guess) -> None:
-    """Columns alike: one an anchor, or one for each tag and anchor; a guess in any case."""
+    """Take similar columns for ranges, one per anchor, or one per tag and anchor; this is never sure."""
     num_tags = _num_tags(columns)
     num = len(columns) // num_tags
     names = [column.name for column in columns]
@@ -367,7 +377,10 @@ def _wide_by_values(columns: list[Column], guess: Guess) -> None:
 
 
 def _num_tags(columns: Sequence[Column]) -> int:
-    """The largest number of neighbouring columns that always are nearly alike, as ranges of tags on one rig are."""
+    """Return the number of tags: the largest size of groups of neighbouring columns with nearly equal values.
+
+    Ranges of tags on one rig to one anchor are nearly equal.
+    """
     num_rows = min(len(column.numbers) for column in columns)
     ranges = np.column_stack([column.numbers[:num_rows] for column in columns])
     for num in range(min(6, len(columns) // 2), 1, -1):
@@ -377,14 +390,14 @@ def _num_tags(columns: Sequence[Column]) -> int:
 
 
 def _are_alike(ranges: Array) -> bool:
-    """Whether the last axis of (n, anchors, tags) differs little, and less than the one before."""
+    """Whether ranges (n, anchors, tags) differ little between tags, and clearly less than between anchors."""
     spread = np.percentile(np.ptp(ranges, axis=2), 95, axis=0)
     apart = np.median(np.ptp(ranges[:, :, 0], axis=1))
     return bool(np.max(spread) < min(_SAME_SPOT_M, apart / 3))
 
 
 def described(columns: Collection[Column]) -> Iterator[str]:
-    """What a table holds, for people; not more than they would read."""
+    """Yield a description of each column for the user; of many columns, only the first eight."""
     for k, column in enumerate(columns):
         if k == 8 and len(columns) > 9:
             yield f"and {len(columns) - k} more"

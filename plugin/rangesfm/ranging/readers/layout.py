@@ -1,6 +1,6 @@
-"""How a table of text is laid out, by its first rows: separator, header row or none, and how cells are spelt.
+"""Layout of a table of text, found from its first rows: separator, header row, and the form of the cells.
 
-Logs whose every value has its name beside it are tables too: JSON, ``rostopic echo``, ``anchor=A1 range=2.34``.
+Logs in which every value comes with its name are tables, too: JSON, ``rostopic echo``, ``anchor=A1 range=2.34``.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ MISSING = (
     "timeout", "error", "err", "fail", "failed", "invalid", "lost",
 )
 # fmt: on
-"""What stands in a cell without a number, in small letters."""
+"""Texts in small letters of a cell that holds no number."""
 
-_SEPARATORS = "\t;|, "  # a comma may stand in numbers, a blank in times
-_NUM_ROWS = 1000
-_MAX_NUM_WORDS = 20  # lines before the table
-_MAX_SHARE_OF_WORDS = 0.02  # and in it
+_SEPARATORS = "\t;|, "  # the comma and the blank come last, because numbers may contain commas and times blanks
+_NUM_ROWS = 1000  # rows from which the layout is found
+_MAX_NUM_WORDS = 20  # lines of text before the table
+_MAX_SHARE_OF_WORDS = 0.02  # lines of text inside the table, as a share of all
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", re.ASCII)
 _WITH_UNIT = re.compile(rf"({_NUMBER.pattern}) ?([A-Za-z]+)", re.ASCII)
@@ -42,19 +42,21 @@ _DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}", re.ASCI
 _UNITS = {*TIMES, *LENGTHS, "dbm"} - {"d", "h"}  # 1d may be an id
 
 Record = dict[str, str]
-_BLOCK = "\n---\n"  # ends a message of rostopic echo
+_BLOCK = "\n---\n"  # end of a message of rostopic echo
 _NAMED = re.compile(r"(?<![\w.:/])([A-Za-z]\w*)(?: ?= ?|: +)(\"[^\"]*\"|[^\s,;\[\]{}]+)", re.ASCII)
 _KEY = re.compile(r"([A-Za-z_]\w*):(?: +(.*))?", re.ASCII)
-_MIN_SHARE_NAMED = 0.9
+_MIN_SHARE_NAMED = 0.9  # smallest share of lines or blocks with named values in a file of records
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column by its name and its first cells.
+    """A column with its name and its first cells.
 
     Attributes:
-        unit: that stands behind each of its numbers, "" for none.
-        cure: of a cell as the file has it to one as others have it.
+        name: name of the column.
+        cells: its first cells.
+        unit: unit after each of its numbers, "" if there is none.
+        cure: conversion of a cell from the form in the file to the usual form; None if none is needed.
     """
 
     name: str
@@ -68,7 +70,7 @@ class Column:
 
     @cached_property
     def numbers(self) -> Array:
-        """Of the cells that are finite ones."""
+        """Values of the cells that are finite numbers."""
         values = np.array([float(cell) for cell in self.cells if _NUMBER.fullmatch(cell)], np.float64)
         return values[np.isfinite(values)]
 
@@ -78,7 +80,7 @@ class Column:
 
     @cached_property
     def kind(self) -> str:
-        """What the cells are, but for empty ones: numbers, civil times, dates, text or nothing."""
+        """Kind of the cells that are not empty: "numbers", "times" (civil times), "dates", "text" or "nothing"."""
         patterns = {"numbers": (_NUMBER,), "times": (CIVIL_TIME, TIME_OF_DAY), "dates": (_DATE,)}
         for kind, those in patterns.items():
             if self.filled and all(any(pattern.fullmatch(cell) for pattern in those) for cell in self.filled):
@@ -94,7 +96,7 @@ class Column:
         return len(set(self.cells))
 
     def cured(self) -> Column:
-        """With numbers and dates as others spell them: points for decimal commas, no units, 2026-01-31."""
+        """Return the column with numbers and dates in the usual form: decimal points, no units, 2026-01-31."""
         cure: Callable[[str], str]
         unit = ""
         if self.filled and all(map(spelt_date, self.filled)):
@@ -130,13 +132,13 @@ def _without(unit: str) -> Callable[[str], str]:
 
 @dataclass(frozen=True)
 class Layout:
-    """A table of text.
+    """Layout of a table of text.
 
     Attributes:
-        columns: what the first rows have under each name.
+        columns: the columns with the cells of the first rows.
         has_names: whether the file names its columns.
-        read_cells: all rows as they stand in the file, and what is to be said of them.
-        are_records: whether a row may say nothing at all of a column.
+        read_cells: reads all rows as they are in the file, with lines for the user about them.
+        are_records: whether the rows are records, in which values may be missing.
     """
 
     columns: tuple[Column, ...]
@@ -146,11 +148,15 @@ class Layout:
 
     @property
     def units(self) -> dict[str, str]:
-        """Behind the numbers of each column."""
+        """Unit after the numbers of each column, by the column's name."""
         return {column.name: column.unit for column in self.columns}
 
     def read(self) -> tuple[Table, list[str]]:
-        """All rows, and what is to be said of them; InputError where too many lines are none."""
+        """Read all rows, with lines for the user about them.
+
+        Raises:
+            InputError: too many lines are not rows of the table.
+        """
         table, notes = self.read_cells()
         cures = {column.name: column.cure for column in self.columns if column.cure}
         cured = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items()}
@@ -159,13 +165,13 @@ class Layout:
 
 
 def layout_without_header(path: Path, header: Sequence[str], separator: str) -> Layout:
-    """Of a file that is known to have these columns."""
+    """Return the layout of a file without a header row that is known to have these columns."""
     columns = tuple(Column(name, ()) for name in header)
     return Layout(columns, True, lambda: _read_rows(path, header, separator, 0, ()))
 
 
 def find_layout(path: Path, separator: str | None = None) -> Layout | None:
-    """The layout of a file; None if it has no two rows alike."""
+    """Find the layout of a file; None if it has no table."""
     if table := _read_records(path):
         first_rows = (Column(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
         return Layout(tuple(column.cured() for column in first_rows), True, lambda: (table, []), True)
@@ -179,14 +185,14 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     num = Counter(map(len, rows)).most_common(1)[0][0]
     first = next(k for k, row in enumerate(rows) if len(row) == num)
     if first and len(rows[first - 1]) == num - 1 and not any(row[-1] for row in rows[first:] if len(row) == num):
-        first -= 1  # only the rows end in a separator
+        first -= 1  # the rows end in a separator and the header does not
     body = [row for row in rows[first:] if len(row) == num]
     names, num_skipped = None, content[first][0] - 1
     below = body[1:] if len(rows[first]) == num else body
-    again = [row for row in below if row != rows[first]]  # the header row once more: somebody joined files
+    again = [row for row in below if row != rows[first]]  # in joined files the header row is repeated
     if _is_header(rows[first], again) or _is_header(rows[first], again[1:]):
         names, num_skipped, body = rows[first], content[first][0], again
-        if len(body) > 1 and len(names) == num and _is_header(body[0], body[1:]):  # their units
+        if len(body) > 1 and len(names) == num and _is_header(body[0], body[1:]):  # a second header row with units
             names, num_skipped = [" ".join(both) for both in zip(names, body[0])], content[first + 1][0]
             body = body[1:]
     elif comments := [line for number, line in numbered if number < content[first][0] and _is_comment(line)]:
@@ -207,7 +213,7 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
 def _read_rows(
     path: Path, header: Sequence[str], separator: str, num_skipped: int, names: Sequence[str]
 ) -> tuple[Table, list[str]]:
-    """All rows; a few lines that are none (words, one that was cut off, the header again) are left out and told."""
+    """Read all rows, and leave out a few other lines (text, a truncated line, a repeated header) with a note."""
     numbered = enumerate(read_text(path).split("\n")[num_skipped:], num_skipped + 1)
     content = [(line, _cells(text, separator)) for line, text in numbered if text.strip() and not _is_comment(text)]
     rows = [(line, row) for line, row in content if len(row) == len(header) and row != names]
@@ -215,19 +221,19 @@ def _read_rows(
     if len(odd) > 1 + _MAX_SHARE_OF_WORDS * len(content):
         line, row = odd[0]
         raise InputError(f"has {len(row)} cell{'s' * (len(row) != 1)}, the header row has {len(header)}", path, line)
-    lost = f"lines that are no rows of the table are left out: {len(odd)}, first line {odd[0][0]}" if odd else ""
+    lost = f"{len(odd)} lines that are not rows of the table are left out, the first is line {odd[0][0]}" if odd else ""
     columns = list(zip(*(row for _, row in rows))) or [()] * len(header)
     cells = {name: [*column] for name, column in zip(header, columns)}
     return Table(path, tuple(header), np.array([line for line, _ in rows], np.int64), cells), [lost] if lost else []
 
 
 def _is_comment(line: str) -> bool:
-    """As Python, MATLAB and C have them; rostopic's ``%time`` is a name."""
+    """Whether a line is a comment of Python, MATLAB or C; rostopic's ``%time`` is a name, not a comment."""
     return line.lstrip().startswith(("#", "% ", "%%", "//"))
 
 
 def _split(content: list[tuple[int, str]], separator: str) -> tuple[list[list[str]], str] | None:
-    """The cells of all rows, if most have the same number of them."""
+    """Return the cells of all rows and the separator, or None if most rows do not have the same number of cells."""
     rows = [_cells(line, separator) for _, line in content]
     if not rows:
         return None
@@ -261,9 +267,9 @@ def _unique(names: list[str], num: int) -> list[str]:
 
 
 def _read_records(path: Path) -> Table | None:
-    """The table of a file of records, a row a range where they hold several; None if it is none.
+    """Read a file of records as a table, or return None if it is not one.
 
-    Cells are empty where a record does not speak of a thing at all.
+    A record that holds several ranges gives a row for each. A cell is empty if its record has no such value.
     """
     head = read_head(path).lstrip()
     if head.startswith(("{", "[{")):
@@ -279,13 +285,13 @@ def _read_records(path: Path) -> Table | None:
 
 
 def _share_named(head: str) -> float:
-    """Of its units, as far as they are whole, those with at least two names."""
+    """Return the share of complete lines or blocks that hold at least two named values."""
     units = [unit for _, unit in _units(head)][:-1]
     return sum(len(_NAMED.findall(unit)) > 1 for unit in units) / len(units) if units else 0.0
 
 
 def _units(text: str) -> Iterator[tuple[int, str]]:
-    """The lines of a text, or its blocks, each with its first line's number."""
+    """Yield the lines of a text, or its blocks if it has any, each with the number of its first line."""
     line, end = 1, _BLOCK if _BLOCK in text else "\n"
     for unit in text.split(end):
         if unit.strip():
@@ -294,7 +300,10 @@ def _units(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _named_records(text: str) -> Iterator[tuple[int, Record]]:
-    """A time without a name stands before the others; a name that comes again has a number behind it."""
+    """Yield the record of each line or block, with its line number.
+
+    A time without a name comes first, as "time". A name that is repeated gets a number.
+    """
     for line, unit in _units(text):
         time = CIVIL_TIME.search(unit) or TIME_OF_DAY.search(unit)
         record, num = {"time": time[0]} if time else {}, Counter[str]()
@@ -311,12 +320,12 @@ def _blocks(text: str) -> Iterator[tuple[int, Record]]:
 
 
 def _nested(lines: Sequence[tuple[int, str]]) -> Any:
-    """What indented lines of YAML hold, as far as messages are printed in it."""
+    """Return the content of indented lines of YAML, as far as printed messages use it."""
     indent, first = lines[0] if lines else (0, "")
     is_list = first.startswith("- ") or first == "-"
     if not is_list and not _KEY.fullmatch(first):
         return _value(first)
-    # The items of a list may be as far in as the key that they are of.
+    # The items of a list may have the same indentation as the list's key.
     starts = [k for k, (at, text) in enumerate(lines) if at == indent and (is_list or not text.startswith("-"))]
     parts = [lines[k:stop] for k, stop in zip(starts, [*starts[1:], len(lines)])]
     if is_list:
@@ -338,14 +347,14 @@ def _json_records(text: str) -> Iterator[tuple[int, Record]]:
         line, counted = line + text.count("\n", counted, begin), begin
         try:
             value, at = decoder.raw_decode(text, begin)
-        except (ValueError, RecursionError):  # a line that was cut off, or no record
+        except (ValueError, RecursionError):  # a truncated line, or not a record
             at = begin + 1
             continue
         yield from ((line, record) for record in _flat(value))
 
 
 def _flat(value: Any) -> list[Record]:
-    """One record for each object in each of its lists, with the values that hold for all; or one of these alone."""
+    """Return a record for each object in the value's lists, with the values outside of lists, or else one record."""
     common, each = _common_and_each(value, "")
     return [{**common, **record} for record in each] or [common]
 

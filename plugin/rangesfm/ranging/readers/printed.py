@@ -1,7 +1,7 @@
-"""Logs of lines that a radio prints, in which each range is a phrase of its own, and the formats of such lines.
+"""Logs of lines printed by a radio, in which each range is a phrase of its own, and the formats of such lines.
 
-Serial lines lose and double characters. So the phrases are found one by one, wherever they stand: what
-is whole in a damaged line survives, and what was begun and is not whole counts as no measurement.
+Serial lines lose and double characters. The phrases are therefore found one by one, anywhere in a line. Complete
+phrases in a damaged line are used, and incomplete ones count as no measurement.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LOST = Reading(0.0, "", math.nan)
 
 
 def _one_range(phrase: re.Match[str], timestamp_s: float, line: int) -> Iterator[Reading]:
-    """Of metres, by the groups anchor_id and range, and possibly tag_id and variance."""
+    """Yield the range of a phrase, from its groups anchor_id and range (metres), and optionally tag_id and variance."""
     groups = phrase.groupdict()
     tag_id, stddev_m = groups.get("tag_id") or DEFAULT_TAG_ID, math.sqrt(max(float(groups.get("variance") or 0), 0))
     yield Reading(timestamp_s, phrase["anchor_id"], float(phrase["range"]), line, tag_id, stddev_m)
@@ -41,14 +41,15 @@ def _reader(
     ranges: Callable[[re.Match[str], float, int], Iterable[Reading]] = _one_range,
     sides: Sides = Sides.TOLD,
 ) -> Reader:
-    """The reader of lines with phrases, given as patterns of ASCII.
+    """Make the reader of lines with phrases that are given as ASCII patterns.
 
     Args:
-        begin: begins a line's first range; the host's time stands before it.
-        each: begins each range.
-        whole: all of it; groups x, y and z, if there are any, are where the anchor stands, in metres; a group time
-            is the time of the range, which stands in no other place then.
-        ranges: of such a phrase, its time in seconds and its line.
+        begin: beginning of the first range in a line; the host's time is before it.
+        each: beginning of each range.
+        whole: a complete phrase. Groups x, y and z, if present, are the position of the anchor in metres. A group time,
+            if present, is the time of the range, and no time before the phrase is used.
+        ranges: yields the ranges of a phrase, given its time in seconds and its line.
+        sides: what the log says about the two ends of a range.
     """
     first, begun, phrase = (re.compile(pattern, re.ASCII | re.MULTILINE) for pattern in (begin, each, whole))
     has_time = "time" in phrase.groupindex
@@ -73,11 +74,14 @@ def _reader(
 
 
 def _anchors_said(phrase: re.Pattern[str], path: Path) -> tuple[Anchor, ...]:
-    """At the median of what was said of each; those that share a place were never set up: unknown."""
+    """Return the anchors in a log, each at the median of its positions; anchors with equal positions are unknown.
+
+    Equal positions mean that nobody has set up the anchors.
+    """
     positions: dict[str, list[tuple[float, float, float]]] = {}
     for _, text in _numbered_lines(path) if "x" in phrase.groupindex else ():
         for one in phrase.finditer(text):
-            if one["z"] is not None:  # a place in the plane does not say how high
+            if one["z"] is not None:  # a position in the plane has no height
                 positions.setdefault(one["anchor_id"], []).append((float(one["x"]), float(one["y"]), float(one["z"])))
     medians = {anchor_id: np.median(said, axis=0) for anchor_id, said in positions.items()}
     places = [tuple(median.tolist()) for median in medians.values()]
@@ -88,12 +92,12 @@ def _anchors_said(phrase: re.Pattern[str], path: Path) -> tuple[Anchor, ...]:
 
 
 def _numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Every line with its 1-based number; bytes that are no text, as serial lines have them, are replaced."""
+    """Yield every line with its 1-based number; bytes that are not text, as in serial logs, are replaced."""
     return enumerate(read_text(path, errors="replace").split("\n"), 1)
 
 
-# DWM1001, MDEK1001, LEAPS and PANS PRO: what the shell commands lec, les and their like print; LEAPS and PANS PRO print
-# a quality in percent after each anchor's position. Always two decimals: a number with fewer was cut off.
+# Output of the shell commands lec, les and similar ones of DWM1001, MDEK1001, LEAPS and PANS PRO. LEAPS and PANS PRO
+# print a quality in percent after each anchor's position. Numbers always have two decimals; one with fewer is cut off.
 _DECIMALS = r"-?\d{1,6}\.\d\d(?![\d.])"
 _XYZ = rf"(?P<x>{_DECIMALS}),(?P<y>{_DECIMALS}),(?P<z>{_DECIMALS})"
 _RANGE = rf"(?P<range>{_DECIMALS})"
@@ -127,11 +131,11 @@ _DWM1001 = (
     ),
 )
 
-# Inputs of solvers of factor graphs, in which a line's first word says what it holds: libRSF and PyFactorGraph.
+# Input files of factor graph solvers, in which the first word of a line is its type: libRSF and PyFactorGraph.
 _NUMBER = r"-?\d{1,19}(?:\.\d{0,20})?(?:[eE][-+]?\d{1,3})?"
 _TIME_AND = rf"(?P<time>{_NUMBER}) "
 _RANGE_AND_VARIANCE = rf"(?P<range>{_NUMBER}) (?P<variance>{_NUMBER})"
-# A12 is where the robot A was at its twelfth pose; L3 is a landmark, and has no other name.
+# A12 is the twelfth pose of the robot A, which counts as the node A; L3 is a landmark, which is the node L3.
 _ROBOT_OR_LANDMARK = r"L\d{1,9}|[A-KM-Za-z](?=\d{1,9} )"
 _FACTOR_GRAPHS = (
     _reader(  # range2 TIME RANGE VARIANCE X Y ID SNR, or range3
@@ -156,13 +160,13 @@ _FACTOR_GRAPHS = (
 
 
 def _mauwb_ranges(record: re.Match[str], timestamp_s: float, line: int) -> Iterator[Reading]:
-    """Of the slots that say that they hold one: by their anchor's id, or by the mask of old firmware."""
+    """Yield the ranges of the slots that hold one, by the anchors' ids, or by the mask that old firmware prints."""
     ranges_cm = list(map(int, record["range"].split(",")))
     if record["rest"]:
         anchor_ids = list(map(int, record["anchor_id"].split(","))) if record["anchor_id"] else []
     else:
         anchor_ids = [slot if int(record["mask"], 16) >> slot & 1 else -1 for slot in range(len(ranges_cm))]
-    if len(anchor_ids) != len(ranges_cm):  # damaged: whose ranges these are is lost
+    if len(anchor_ids) != len(ranges_cm):  # the line is damaged, and the anchors of the ranges are not known
         yield from [_LOST] * len(ranges_cm)
         return
     for range_cm, anchor_id in zip(ranges_cm, anchor_ids):
@@ -170,7 +174,7 @@ def _mauwb_ranges(record: re.Match[str], timestamp_s: float, line: int) -> Itera
             yield Reading(timestamp_s, str(anchor_id), range_cm / 100, line, record["tag_id"])
 
 
-# Qorvo DWM3001CDK and QM33 shell: SESSION_INFO_NTF: {..} over several lines, and the older {"Block":1, "results":[..]}.
+# Qorvo's shell of DWM3001CDK and QM33: SESSION_INFO_NTF: {..} on several lines, or older {"Block":1, "results":[..]}.
 _DEFAULT_RANGING_INTERVAL_S = 0.2
 _QORVO_BEGIN = re.compile(r'SESSION_INFO_NTF:?\s{0,9}\{|\{\s{0,9}"Block"\s{0,9}:', re.ASCII)
 _QORVO_END = re.compile(r"\]\s{0,9}\}")
@@ -188,7 +192,7 @@ _QORVO_MEASUREMENT = re.compile(
 
 
 def _qorvo_readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
-    """At the host's time before a record; in a log without any, by the radio's count of ranging intervals."""
+    """Yield the ranges with the host's time before a record, or if there is none, by the radio's interval count."""
     text, clock = read_text(path, errors="replace"), HostClock(path, options)
     interval_s = options.ranging_interval_s or _DEFAULT_RANGING_INTERVAL_S
     has_host_time, count = None, -1
@@ -244,7 +248,7 @@ PRINTED = (
         ranges=_mauwb_ranges,
         sides=Sides.APART,
     ),
-    _reader(  # Arduino sketches for the DW1000, as Makerfabs ships them: from: D325 Range: 29.40 m ..
+    _reader(  # Arduino sketches for the DW1000, such as those of Makerfabs: from: D325 Range: 29.40 m ..
         "arduino",
         begin=r"from:\s{0,9}[0-9A-Fa-f]{1,16}\s{1,9}Range:",
         each=r"from:",

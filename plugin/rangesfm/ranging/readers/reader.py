@@ -1,4 +1,4 @@
-"""What a reader of one log format is, how the ranges that it finds become a log, and which of its nodes are anchors."""
+"""Reader: the reader of one log format, the log made of its ranges, and the distinction of anchors and tags."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
 
-# A value that stands for no measurement: so often, so many times the largest range, where so many show what is usual.
+# The largest value in a log means no measurement if it occurs at least _MIN_NUM_FAR times and exceeds the next largest
+# by the factor _FAR, and there are at least _MIN_NUM other values.
 _MIN_NUM_FAR, _FAR, _MIN_NUM = 3, 4.0, 20
-_NOTHING = 1e-12  # in any unit
+_NOTHING = 1e-12  # a smaller value counts as 0, in any unit
 
 
 class ReadOptions(LogOptions):
-    """What the user says about a log."""
+    """The user's options for reading a log."""
 
     given: tuple[str, ...] = ()
-    """What the user calls it."""
+    """Paths of the log as the user gave them."""
 
     def command(self, path: Path, **more: str) -> str:
-        """What to type to read the log with these options and some more."""
+        """Return the command that reads the log with these options and some more."""
         columns = ",".join(f"{quantity}={name}" for quantity, name in self.columns.items())
         said = {"columns": columns, "timestamp_unit": self.timestamp_unit, "range_unit": self.range_unit}
         flags = {**said, "separator": self.separator, **more}
@@ -40,14 +41,20 @@ class ReadOptions(LogOptions):
         return shlex.join(["rangesfm", "ranges", *(self.given or [str(path)]), *typed])
 
     def which_unit(self, path: Path, quantity: str, units: Sequence[str], why: str) -> InputError:
-        """What asks for a unit that may be one or another, with the commands that say it."""
+        """Return the error that asks for an ambiguous unit, with the command for each possible unit.
+
+        Args:
+            quantity: "range" or "timestamp".
+            units: the possible units.
+            why: what was found.
+        """
         flag, either = f"{quantity}_unit", " or ".join(units)
         message = f"the {quantity} has {why}, which may be {either}; say which by --{flag} (in a survey file: {flag})"
         return InputError(message, path, advice=[self.command(path, **{flag: unit}) for unit in units])
 
 
 class Sides(Enum):
-    """What a log format says of the two ends of a range."""
+    """What a log format says about the two ends of a range."""
 
     ASKED = "who asked whom"
     TOLD = "a side for tags and one for anchors, where a peer may stand on the other's side"
@@ -56,14 +63,14 @@ class Sides(Enum):
 
 @dataclass(frozen=True)
 class Reader:
-    """One log format. What ``read`` and ``read_anchors`` find wrong is an InputError.
+    """Reader of one log format. ``read`` and ``read_anchors`` raise InputError if the file is not valid.
 
     Attributes:
-        name: by which the user asks for it.
-        recognizes: whether the beginning of a file looks like this format.
-        read: the whole file.
-        read_anchors: the anchors whose positions the log tells.
-        sides: what the log says of the two ends of a range.
+        name: name by which the user asks for the format.
+        recognizes: returns whether the beginning of a file has this format.
+        read: reads the whole file.
+        read_anchors: returns the anchors whose positions the log contains.
+        sides: what the log says about the two ends of a range.
     """
 
     name: str
@@ -74,7 +81,7 @@ class Reader:
 
 
 class Reading(NamedTuple):
-    """A range as a radio tells it (see RangeLog); one that is not a positive number is no measurement."""
+    """A range as a radio reports it (see RangeLog); one that is not a positive number means no measurement."""
 
     timestamp_s: float
     anchor_id: str
@@ -86,10 +93,13 @@ class Reading(NamedTuple):
 
 
 def which_are_measured(ranges: Array, path: Path) -> tuple[Mask, tuple[str, ...]]:
-    """(n,) which of the ranges in a file are one, and what to say of the others; InputError if none is.
+    """Return which ranges in a file (n,) are measurements, and notes about the others.
 
-    Those are none that are not positive, and the largest where it stands for no measurement, as 65535: far above all
-    others and often.
+    A range that is not positive is not a measurement. Neither is a value like 65535 that occurs often and is far above
+    all others.
+
+    Raises:
+        InputError: there is no measurement.
     """
     positive = ranges[(ranges > 0) & (ranges < math.inf)]
     largest = float(np.max(positive, initial=0.0))
@@ -100,7 +110,7 @@ def which_are_measured(ranges: Array, path: Path) -> tuple[Mask, tuple[str, ...]
     if not measured.any():
         said = f"all {len(ranges)} records say that there was no measurement" if len(ranges) else "no records"
         raise InputError(f"no usable range: {said}", path)
-    note = f"{largest:.10g} stands there {num_far} times, far above all other ranges: taken for no measurement"
+    note = f"{largest:.10g} occurs {num_far} times, far above all other ranges: it is taken to mean no measurement"
     return measured, (note,) if is_far else ()
 
 
@@ -111,11 +121,11 @@ def reader_of_readings(
     read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: (),
     sides: Sides = Sides.TOLD,
 ) -> Reader:
-    """Of a format of its own, which has no columns to be described."""
+    """Make the reader of a format that is not a table, from a function that yields its ranges."""
 
     def read(path: Path, options: ReadOptions) -> RangeLog:
         if options.columns or options.range_unit is not None or options.separator is not None:
-            message = "the log has a format of its own, without columns, range_unit or separator to be given"
+            message = "the log's format is not a table: columns, range_unit and separator cannot be given"
             raise InputError(message, path)
         found = list(readings(path, options))
         measured, notes = which_are_measured(np.array([reading.range_m for reading in found], np.float64), path)
@@ -144,17 +154,17 @@ def tell_roles(
     known_anchor_ids: Collection[str] = (),
     known_tag_ids: Collection[str] = (),
 ) -> RangeLog:
-    """Put every range's tag and anchor in their places, and tell those between two of a kind.
+    """Return the log with every node as an anchor or a tag, and with ranges between two anchors or two tags.
 
-    What is known decides. A node that stands on one side only has the role of that side, but for one that only
-    known anchors range with: it is a tag. One on both sides is a tag where the anchors are known, an anchor where
-    the tags are known and sides mean nothing; else it is what it is in most ranges. Where an id ranges with itself,
-    or is known as both, tags and anchors are numbered by themselves, and their sides count.
+    Known anchors and tags are decisive. A node that is always on one side has the role of that side, except a node that
+    only known anchors range with, which is a tag. A node on both sides is a tag if the anchors are known, and an anchor
+    if the tags are known and the sides mean nothing. Otherwise it has its role in most ranges. If an id ranges with
+    itself, or is known as both, tags and anchors are numbered separately, and the sides are the roles.
 
     Args:
-        log: as read: all ranges between the tag and the anchor of their record.
-        sides: what these mean.
-        known_anchor_ids, known_tag_ids: as far as anybody said.
+        log: log as read, with all ranges between the tag and the anchor of their record.
+        sides: meaning of the two sides of a record.
+        known_anchor_ids, known_tag_ids: ids of known anchors and tags.
     """
     known_anchors, known_tags = set(known_anchor_ids), set(known_tag_ids)
     tags, anchors = set(log.tag_ids), set(log.anchor_ids)
@@ -162,7 +172,7 @@ def tell_roles(
         return log
     if not (tags & anchors or tags & known_anchors or anchors & known_tags):
         is_hub = len(anchors) == 1 and len(tags) > 1 and not (known_anchors or known_tags)
-        # Anchors are many and tags few.
+        # One node that many others range with is the tag, because there are more anchors than tags.
         return log.with_anchors(tags) if sides is Sides.ASKED and is_hub else log
     asked = Counter(zip(log.tag_index.tolist(), log.anchor_index.tolist()))
     num_by_pair = {(log.tag_ids[tag], log.anchor_ids[anchor]): num for (tag, anchor), num in asked.items()}

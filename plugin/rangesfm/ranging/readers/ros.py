@@ -17,7 +17,7 @@ _LED_NO_LINE_OF_SIGHT = 16
 
 
 def _readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
-    """The ranges in all messages that hold any, each with the 1-based number of its message as its line."""
+    """Yield the ranges in all messages, each with the 1-based number of its message as its line."""
     with open_bag(path) as bag:
         connections = [connection for connection in bag.connections if type_name(connection.msgtype) in _RANGES_IN]
         if not connections:
@@ -56,7 +56,8 @@ def _linktrack_tagframe(message: Any) -> Iterator[Reading]:
         yield Reading(0.0, str(slot), float(range_m), tag_id=str(message.id))
 
 
-# By the last part of the type's name: any package may define it. A time of 0 is none, that of receiving counts.
+# Functions that return the ranges of a message, by the last part of the type's name, because any package may define the
+# type. A time of 0 is not set, and the time of arrival is used instead.
 _RANGES_IN: dict[str, Callable[[Any], Iterable[Reading]]] = {
     "RangeStamped": lambda each: [_stamped(each, each.to_id, each.range, each.from_id, _root(each.covariance))],
     "TwoWayRangeStamped": _two_way_range_stamped,

@@ -1,7 +1,7 @@
-"""Any table: by the columns that the user names, by those of a known data set, or by what its names and values say.
+"""Readers of tables: with columns named by the user, columns of a known data set, or columns that are recognized.
 
-The canonical CSV is ``timestamp_s,anchor_id,range_m[,tag_id,range_stddev_m,los]``. ``image_name`` may take the place of
-``timestamp_s``; where both stand, the time counts.
+The canonical CSV is ``timestamp_s,anchor_id,range_m[,tag_id,range_stddev_m,los]``. ``image_name`` may replace
+``timestamp_s``; if both are present, the time is used.
 """
 
 from __future__ import annotations
@@ -58,17 +58,18 @@ _NO_RANGES = (
 
 
 def _anchor_of_file(path: Path) -> str:
-    """The anchor that the name of a file stands for: A5 of ``run_3_A5.csv``, else all of the name before its ending."""
+    """Return the anchor id in a file name: A5 in ``run_3_A5.csv``, or else the whole name without its ending."""
     stem = path.name.split(".")[0]
     found = _ID_IN_NAME.fullmatch(stem)
     return found[1] if found else stem
 
 
 def table_reader(path: Path, options: ReadOptions) -> Reader:
-    """The reader of one table that nobody described.
+    """Return the reader of a table whose columns are recognized by names and values.
 
     Raises:
-        InputError: it is not understood for sure; with what was found, the closest guess and what to type.
+        InputError: the columns are not known for sure. The advice gives what was found, the closest guess and the
+            command to type.
     """
     layout = find_layout(path, options.separator)
     guess = None if layout is None else guess_columns(layout)
@@ -87,7 +88,7 @@ def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
     yield f"columns taken: {said}{by_values}"
     yield from guess.notes
     if "anchor_id" not in guess.columns and not guess.wide:
-        yield f"no column says which anchor it was: it is called '{_anchor_of_file(path)}', as the file"
+        yield f"no column gives the anchor: it is named '{_anchor_of_file(path)}' after the file"
 
 
 def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
@@ -96,7 +97,7 @@ def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Gu
         return InputError(f"the log {instead}", path)
     if layout is None or guess is None:
         first_line = printable(head.strip().split("\n")[0])
-        return InputError(f"not a known log format, and no table; it begins with '{first_line}'", path)
+        return InputError(f"neither a known log format nor a table; it begins with '{first_line}'", path)
     found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
     told = {**guess.told, **dict.fromkeys(guess.missing, "NAME")}
     command = options.changed(columns=told).command(path)
@@ -121,7 +122,7 @@ def _recognizes(format: str, head: str) -> bool:
 
 
 def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
-    """By the columns of a preset, and those that the user named."""
+    """Read a table by the columns of a preset and those that the user named."""
     told = {**_PRESETS.get(format, {}), **options.columns}
     for quantity in (key.partition(":")[0] for key in told):
         if quantity not in QUANTITIES:
@@ -142,14 +143,17 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
         stamps = {stamp: columns.get(stamp, stamp) for stamp in STAMPS}
         if not {*(stamps[stamp] for stamp in STAMPS[:4])} <= set(names):
             wanted, found = ", ".join(STAMPS[:4]), printable(", ".join(names))
-            raise InputError(f"columns name no column range, nor the time stamps {wanted}; found {found}", path)
+            raise InputError(f"columns name neither range nor the time stamps {wanted}; found {found}", path)
         columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
         third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
     return read_columns(path, Columns(columns, third_message, wide, _anchor_of_file(path), layout), options, format)
 
 
 def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
-    """Columns that are of one anchor and one tag each: ``range:A1=d1``, or many, ``range:0-7:T0-T2=2-25``."""
+    """Return the columns that belong to one anchor and one tag each, with the ids of these.
+
+    The user gives them one by one, as ``range:A1=d1``, or many at once, as ``range:0-7:T0-T2=2-25``.
+    """
     wide: dict[str, tuple[str, str]] = {}
     for key, name in told.items():
         quantity, _, ids = key.partition(":")
@@ -158,13 +162,13 @@ def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
             names = _spanned(name) if len(anchors) * len(tags) > 1 else [name]
             if len(names) != len(anchors) * len(tags):
                 expected = f"{len(anchors)} x {len(tags)}"
-                raise InputError(f"columns: {key} is {len(names)} columns, expected {expected}, tags in turn", path)
+                raise InputError(f"columns: {key} names {len(names)} columns, expected {expected}, tags in turn", path)
             wide |= dict(zip(names, ((anchor, tag) for anchor in anchors for tag in tags)))
     return wide
 
 
 def _spanned(text: str) -> list[str]:
-    """T0, T1, T2 of T0-T2."""
+    """Return the items of a span: T0, T1, T2 for T0-T2."""
     span = _SPAN.fullmatch(text)
     if span is None or span[3] not in ("", span[1]) or int(span[4]) < int(span[2]):
         return [text]
@@ -172,9 +176,12 @@ def _spanned(text: str) -> list[str]:
 
 
 def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
-    """Write ``log`` as canonical CSV, optional columns only where the log says anything; or InputError.
+    """Write a log as canonical CSV; optional columns are written only if the log has values for them.
 
-    Of a range between two of a kind, the peer stands in the column of the tag (or of the anchor).
+    For a range between two anchors or two tags, the other end is in the column of the tag or of the anchor.
+
+    Raises:
+        InputError: the file cannot be written.
     """
     columns: dict[str, Iterable[str]] = {}
     if log.timestamp_s is not None:

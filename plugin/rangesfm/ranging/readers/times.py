@@ -1,4 +1,4 @@
-"""Times as logs spell them, in seconds; also those that a logging program writes before what the radio printed."""
+"""Times in logs, in seconds, including those that a logging program writes in front of the radio's output."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ _WITH_MONTH = re.compile(
 )
 _NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
 _DAY_S = 86400.0
-# Of a time since 1970, the digits tell the unit: 1e11 s are three thousand years, 1e11 ms are three.
+# The size of a time since 1970 tells its unit: 1e11 s are three thousand years, and 1e11 ms are three years.
 _UNIT_ABOVE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 
 
 def unit_by_digits(value: float) -> str | None:
-    """The unit that a number has if it is a time since 1970; None for one too small to be in ms, us or ns."""
+    """Return the unit of a number if it is a time since 1970, or None if it is too small for ms, us or ns."""
     return next((unit for above, unit in _UNIT_ABOVE if abs(value) > above), None)
 
 
 def spelt_date(text: str) -> str | None:
-    """A date of digits alone, or with its month in words, as 2026-01-31; None for any other text."""
+    """Convert a date and time of digits alone, or with the month in words, to the form 2026-01-31; else None."""
     if compact := _COMPACT.fullmatch(text):
         year, month, day, hour, minute, second, fraction, zone = compact.groups()
         return f"{year}-{month}-{day}T{hour}:{minute}:{second}.{fraction or 0}{zone}"
@@ -51,7 +51,7 @@ def spelt_date(text: str) -> str | None:
 
 
 def date_order(dates: Sequence[str]) -> str | None:
-    """How all of some dates must be read: "ymd", "dmy" or "mdy"; None for days and months that may be either."""
+    """Return the order of day, month and year in dates: "ymd", "dmy" or "mdy", or None if it is ambiguous."""
     first, second = (max(int(re.split("[-/.]", date)[k]) for date in dates) for k in (0, 1))
     if first > 31:
         return "ymd"
@@ -59,7 +59,7 @@ def date_order(dates: Sequence[str]) -> str | None:
 
 
 def _seconds_from_civil(text: str, order: str) -> float:
-    """Seconds since 1970 of a date and a time; without a zone it counts as UTC. ValueError if it is none."""
+    """Return the seconds since 1970 of a date and time, in UTC if it has no zone; ValueError if it is not one."""
     match = CIVIL_TIME.fullmatch(text)
     if match is None:
         raise ValueError(text)
@@ -75,7 +75,7 @@ def _seconds_from_civil(text: str, order: str) -> float:
 
 
 class CivilClock:
-    """Reads civil times one after the other; a time of day goes on counting after midnight."""
+    """Reader of successive civil times; times of day without a date continue after midnight."""
 
     def __init__(self, order: str = "ymd") -> None:
         self._order = order
@@ -83,7 +83,11 @@ class CivilClock:
         self._last_of_day_s = 0.0
 
     def seconds(self, text: str) -> float:
-        """Seconds since 1970, or of a time of day since the midnight before the first; ValueError if it is neither."""
+        """Return the seconds since 1970, or for a time of day since the midnight before the first one.
+
+        Raises:
+            ValueError: the text is neither a date and time nor a time of day.
+        """
         of_day = TIME_OF_DAY.fullmatch(text)
         if of_day is None:
             return _seconds_from_civil(text, self._order)
@@ -95,7 +99,7 @@ class CivilClock:
 
 
 class HostClock:
-    """Reads the times of one log, each from what stands before a range."""
+    """Reader of the times in one log, each from the text before a range."""
 
     def __init__(self, path: Path, options: ReadOptions):
         self._path = path
@@ -103,7 +107,10 @@ class HostClock:
         self._civil = CivilClock(self._unit if self._unit in DATE_ORDERS else "ymd")
 
     def find_seconds(self, prefix: str) -> float | None:
-        """The time in ``prefix``: ISO 8601, a time of day, or a number of seconds, ms, us or ns; None without any."""
+        """Return the time in a text in seconds, or None without one.
+
+        It may be ISO 8601, a time of day, or a number of seconds, ms, us or ns.
+        """
         is_civil = self._unit in CIVIL_UNITS
         if (is_civil or self._unit is None) and (civil := self._find_civil(prefix)):
             try:
@@ -117,7 +124,7 @@ class HostClock:
         return value * SECONDS_PER_UNIT[self._unit or unit_by_digits(value) or "s"]
 
     def _find_civil(self, prefix: str) -> str | None:
-        """A date whose order is not known is left out: the time of day does."""
+        """Return the civil time in a text; of a date whose order is not known, only the time of day."""
         dated = CIVIL_TIME.search(prefix)
         if dated and (self._unit in DATE_ORDERS or date_order([dated[1]]) == "ymd"):
             return dated[0]
@@ -125,11 +132,15 @@ class HostClock:
         return of_day and of_day[0]
 
     def seconds(self, prefix: str, line: int) -> float:
-        """As ``find_seconds``, but InputError if there is no time."""
+        """Return the time in a text in seconds.
+
+        Raises:
+            InputError: the text has no time.
+        """
         seconds = self.find_seconds(prefix)
         if seconds is None:
             raise InputError(
-                "no time before the range; the radio prints none, so record the log with the host's time at the "
+                "no time before the range; this radio prints no times, so record the log with the host's time at the "
                 "beginning of each line (seconds, ms, us or ns, or 2026-01-31T12:00:00.000Z)",
                 self._path,
                 line,

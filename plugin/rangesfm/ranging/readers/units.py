@@ -1,4 +1,4 @@
-"""Units of times and ranges: as a column's name says, else by what its values can only mean; doubts are asked."""
+"""Units of times and ranges, from a column's name, else from its values; the user is asked if they are ambiguous."""
 
 from __future__ import annotations
 
@@ -13,32 +13,42 @@ from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
 UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048}
 
-_MIN_NUM = 20  # fewer values show nothing
-_SECONDS_SINCE_1970 = (1e9, 4e9)
-# From one time of a log to the next: a log that is faster, were it in another unit than seconds, is none.
+_MIN_NUM = 20  # number of values below which the values do not show their unit
+_SECONDS_SINCE_1970 = (1e9, 4e9)  # the years 2001 to 2096
+# Smallest and largest plausible median step between times, in seconds, by unit. In other units than seconds, a smaller
+# step means that the unit is wrong.
 _FASTEST_S, _SLOWEST_S = {"s": 0.0, "ms": 2e-3, "us": 2e-3, "ns": 2e-3}, 5.0
-# On the average no radio is faster: its times are minutes, hours, or days as those of Excel and MATLAB.
+# Smallest mean step between times in seconds. With a smaller one the times are minutes, hours, or days like those of
+# Excel and MATLAB.
 _FASTEST_ON_AVERAGE_S = 1e-4
+# Number of the day 1970-01-01 in Excel and in MATLAB, by the interval in which present days are.
 _DAYS_OF_1970 = {(3e4, 6e4): 25569.0, (7e5, 8e5): 719529.0}
+# Largest speed of a tag, largest range, and largest noise of a range, the latter two by unit.
 _FASTEST_M_PER_S = 30.0
 _LARGEST_M = {"m": 1000.0, "cm": 300.0, "mm": 300.0}
 _NOISE_M = {"m": 3.0, "cm": 0.6, "mm": 0.6}
-# Most ranges are longer, were they in cm or mm; without a unit's name, decimals stand for metres.
+# Ranges in cm or mm must exceed the first length at the 95th percentile, or the second one if they have decimals,
+# because decimals without the name of a unit usually mean metres.
 _NEAR_M, _NEAR_WITH_DECIMALS_M = 0.6, 2.0
+# Largest share of ranges that differ from the one before by more than noise and motion allow.
 _MAX_SHARE_OF_JUMPS = 0.25
 
 
 Ask = Callable[[Sequence[str], str], InputError]
-"""Makes the question which of several units it is, and why it may be any of them."""
+"""Function that returns the error which asks for one of several units, given the units and what was found."""
 
 
 def time_unit(name: str, times: Array, notes: list[str], ask: Ask) -> str:
-    """The unit of a column of numbers, with a note where the name does not say it; asks where it may be several."""
+    """Return the unit of a column of times, and add a note if it is not from the name.
+
+    Raises:
+        InputError: the unit is ambiguous.
+    """
     named, distinct = _named(name, TIMES), np.unique(times)
     by_digits = unit_by_digits(float(np.median(times))) if len(times) else None
     step = float(np.median(np.diff(distinct))) if len(distinct) > 1 else 0.0
     is_so = by_digits is not None and step * SECONDS_PER_UNIT[by_digits] <= _SLOWEST_S
-    # A name may well say a finer unit, of a clock that began later than 1970.
+    # A finer unit in the name is believed, because it may belong to a clock that started after 1970.
     if by_digits is not None and (is_so if named is None else SECONDS_PER_UNIT[named] > SECONDS_PER_UNIT[by_digits]):
         notes.append(f"{name} has as many digits as {by_digits} since 1970: taken as {by_digits}")
         return by_digits
@@ -61,13 +71,21 @@ def time_unit(name: str, times: Array, notes: list[str], ask: Ask) -> str:
 
 
 def days_before_1970(days: Array) -> float:
-    """What to take off days as Excel and MATLAB count them; 0 if they began at another time."""
+    """Return the number of the day 1970-01-01 in the count of Excel or MATLAB, or 0 if it is neither."""
     middle = float(np.median(days)) if len(days) else 0.0
     return next((first for (low, high), first in _DAYS_OF_1970.items() if low < middle < high), 0.0)
 
 
 def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, notes: list[str], ask: Ask) -> str:
-    """As ``time_unit``, of positive ranges between some pairs of nodes; ``times`` in seconds."""
+    """Return the unit of a column of positive ranges, and add a note if it is not from the name.
+
+    Args:
+        times: (n,) seconds, or None.
+        pair: (n,) index of each range's pair of nodes.
+
+    Raises:
+        InputError: the unit is ambiguous.
+    """
     named = _named(name, LENGTHS)
     if named is not None or len(ranges) < _MIN_NUM:
         return named or "m"
@@ -90,7 +108,7 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, not
 
 
 def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, noise_m: float) -> float:
-    """How many ranges are further from the one before, of their pair, than anybody moves in the time between."""
+    """Return the share of ranges that differ from their pair's previous one by more than noise and motion allow."""
     if times is None:
         return 0.0
     order = np.lexsort((times, pair))
@@ -100,5 +118,5 @@ def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, noise_m
 
 
 def _named(name: str, units: dict[str, str]) -> str | None:
-    """The unit that the words of a name hold, the last one if there are several."""
+    """Return the unit in the words of a name, the last one if there are several, or None."""
     return next((units[word] for word in reversed(words_of(name)) if word in units), None)

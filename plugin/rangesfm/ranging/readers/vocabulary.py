@@ -1,4 +1,4 @@
-"""The words by which columns, times and lengths are called, in the languages of those who log."""
+"""Words in the names of columns, times and lengths, in several languages."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ LENGTHS = _unit_by_word(
         "ft": "ft foot feet",
     }
 )
-"""The unit that each word stands for."""
+"""Units of lengths, by the words for them."""
 
 
 def words_of(name: str) -> list[str]:
-    """The words of a column's name in small letters, digits apart; an id in hexadecimal digits is one."""
+    """Split a column's name into words in small letters; digits are separate words, a hexadecimal id is one word."""
     words: list[str] = []
     for part in re.findall(r"[^\W_]+", name):
         is_id = re.fullmatch("(?:0[xX])?[0-9A-F]{4,16}", part) and not part.isdigit()
@@ -47,12 +47,13 @@ def _words(text: str) -> frozenset[str]:
 
 RANGE = _words("range ranges rng distance distances dist dists dis abstand entfernung distanz distancia 距离")
 RANGE_IN_SHORT = _words("d r")
-# What may stand beside the range, and is none, or is second to it.
+# Words in the names of columns that accompany the range and are not ranges.
 NO_RANGE = _words(
     "gt true truth ground actual real ref reference expected est estimated error err bias std stddev stdev sigma var "
     "variance cov covariance rate dot vel velocity speed count quality rssi power snr offset x y z min max threshold "
     "id index idx rtt"
 )
+# Words in the names of processed ranges, which are used only if there is no other range.
 SECOND_RANGE = _words("calib calibrated corr corrected filtered filter smoothed smooth mean avg average median last")
 TIME = _words(
     "time times timestamp timestamps timestep stamp datetime epoch elapsed clock zeit zeitstempel uhrzeit tiempo 时间"
