@@ -1,1 +1,1 @@
-"""The offset between the radio's clock and the camera's."""
+"""Estimation of the offset between the clocks of radio and camera."""

@@ -1,4 +1,4 @@
-"""The offset of the clocks in a stop-and-go survey: a burst of ranges around each photo."""
+"""Time offset of a stop-and-go survey, in which there is a burst of ranges around each photo."""
 
 from __future__ import annotations
 
@@ -13,18 +13,22 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.clock.search import CostCurve, TimedRanges
 from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, fit_squares
 
-# Shares of the usual time between photos: a pause this long ends a burst; a photo's burst is this near.
+# A pause of this fraction of the median time between photos ends a burst. The burst of a photo is at most this fraction
+# away from it.
 _PAUSE_SHARE = 0.25
 _REACH_SHARE = 0.25
-# A burst with fewer ranges than this share of the usual number is a stray.
+# A burst with fewer ranges than this fraction of the median number is ignored.
 _MIN_SIZE_SHARE = 0.25
-# Fewer bursts than this share of the photos: the log is not one of bursts.
+# With fewer bursts than this fraction of the photos, the log is not one of bursts.
 _MIN_BURST_SHARE = 0.5
-# An offset that pairs fewer bursts than this share of the most possible is not tried.
+# An offset that pairs fewer bursts than this fraction of the largest possible number is not tried.
 _MIN_PAIRED_SHARE = 0.75
-# Medians of bursts are nearly Gaussian, and too few to give one up lightly.
+# Width of the robust loss in standard deviations. Medians of bursts are nearly Gaussian, and there are few of them, so
+# that the loss is wide.
 _LOSS_SCALE = 5.0
+# Smallest number of medians beyond the unknowns for a pairing to be tested.
 _MIN_NUM_SPARE = 4.0
+# Largest probability that a pairing explains the medians by chance.
 _MAX_CHANCE = 1e-3
 
 
@@ -32,10 +36,10 @@ class Bursts(NamedTuple):
     """B groups of ranges between pauses of the log.
 
     Attributes:
-        start_s, end_s: (B,) first and last range, radio's clock.
-        num_ranges: (B,)
+        start_s, end_s: (B,) times of the first and the last range, radio's clock.
+        num_ranges: (B,) number of ranges.
         range_m: (B, L) median range of each link (an anchor and a tag); NaN where there is none.
-        anchor, tag: (L,) of each link.
+        anchor, tag: (L,) indices of the anchor and the tag of each link.
     """
 
     start_s: Array
@@ -52,14 +56,14 @@ class Bursts(NamedTuple):
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which burst belongs to which photo, and how well its ranges suit the path then.
+    """Assignment of bursts to photos, and how well the ranges then fit the path.
 
     Attributes:
-        offset_s: centres the bursts on their photos.
-        burst, photo: (k,) the pairs.
-        variance: of the medians' residuals, m^2.
-        num_spare: how many medians there are beyond the unknowns.
-        chance: that the path suits the medians no better than no motion at all (F test).
+        offset_s: time offset that centres the bursts on their photos.
+        burst, photo: (k,) indices of the pairs.
+        variance: variance of the medians' residuals, m^2.
+        num_spare: number of medians beyond the unknowns.
+        chance: p-value of the hypothesis that the path fits the medians no better than no motion (F test).
     """
 
     offset_s: float
@@ -70,18 +74,18 @@ class Pairing:
     chance: float
 
     def explains(self) -> bool:
-        """Whether there are medians enough, and the path explains them better than no motion at all."""
+        """Whether there are enough medians, and the path explains them better than no motion at all."""
         return self.num_spare >= _MIN_NUM_SPARE and self.chance < _MAX_CHANCE
 
     def log_odds(self, rival: Pairing) -> float:
-        """Log of the ratio of their likelihoods; infinite if the rival is of too few medians to have one."""
+        """Return the logarithm of the likelihood ratio to a rival; infinite if the rival has too few medians."""
         if rival.num_spare < _MIN_NUM_SPARE:
             return np.inf
         return 0.5 * min(self.num_spare, rival.num_spare) * float(np.log(rival.variance / self.variance))
 
 
 def find_bursts(ranges: TimedRanges, photo_times_s: Array) -> Bursts | None:
-    """Cut the log at its pauses; None if it does not pause between photos."""
+    """Cut the log at its pauses into bursts; None if it does not pause between photos."""
     ranges = ranges.take(np.argsort(ranges.times_s, kind="stable"))
     pause_s = _PAUSE_SHARE * float(np.median(np.diff(photo_times_s)))
     starts = np.flatnonzero(np.diff(ranges.times_s, prepend=-np.inf) > pause_s)
@@ -101,7 +105,11 @@ def find_bursts(ranges: TimedRanges, photo_times_s: Array) -> Bursts | None:
 
 
 def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) -> list[Pairing]:
-    """Every way to lay the bursts on the photos that pairs most of them; the best first. (num_tags, 3) lever arms."""
+    """Return all assignments of bursts to photos that pair most of them, the best first.
+
+    Args:
+        tags_in_cam_m: (num_tags, 3) lever arms, metres.
+    """
     photo_times = trajectory.timestamps_s
     assert photo_times is not None, "a path in time needs times"
     reach_s = _REACH_SHARE * float(np.median(np.diff(photo_times)))
@@ -115,7 +123,10 @@ def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) ->
 
 
 def offsets_that_keep(pairing: Pairing, bursts: Bursts, trajectory: Trajectory) -> tuple[float, float]:
-    """The first and the last offset at which every burst is nearest to its photo; in wrong order if none is."""
+    """Return the smallest and the largest offset at which every burst is nearest to its photo.
+
+    If there is no such offset, the first is larger than the second.
+    """
     assert trajectory.timestamps_s is not None
     gaps = np.diff(trajectory.timestamps_s)
     before = np.minimum(np.concatenate([[np.inf], gaps]), np.median(gaps)) / 2
@@ -128,7 +139,7 @@ def offsets_that_keep(pairing: Pairing, bursts: Bursts, trajectory: Trajectory) 
 
 
 def curve_of(pairings: list[Pairing], bursts: Bursts, trajectory: Trajectory) -> CostCurve:
-    """What all pairings cost: each the same wherever its bursts stay nearest to their photos."""
+    """Return the cost curve of all pairings; the cost is constant while the bursts stay nearest to their photos."""
     points: list[tuple[float, float]] = []
     for pairing in pairings:
         earliest_s, latest_s = offsets_that_keep(pairing, bursts, trajectory)
@@ -138,7 +149,7 @@ def curve_of(pairings: list[Pairing], bursts: Bursts, trajectory: Trajectory) ->
 
 
 def _offsets(burst_times: Array, photo_times: Array, reach_s: float) -> list[float]:
-    """The offsets that bring most bursts within reach of a photo."""
+    """Return the offsets that bring most bursts within reach of a photo."""
     differences = np.sort((photo_times[:, None] - burst_times).ravel())
     first = np.searchsorted(differences, differences - reach_s)
     last = np.searchsorted(differences, differences + reach_s, side="right")

@@ -1,4 +1,4 @@
-"""The offset between the camera's and the radio's clock, from the motion that both have seen."""
+"""Estimation of the offset between the clocks of camera and radio, from the motion that both have measured."""
 
 from __future__ import annotations
 
@@ -23,36 +23,38 @@ from rangesfm.ranging.log import RangeKind, RangeLog
 from rangesfm.ranging.observations import RangeStatus
 
 REMEDY = "give the time offset (--ranges_time_offset)"
-# Less likely offsets than this are not.
+# Offsets with a lower probability are discarded.
 _MIN_PROBABILITY = 0.01
+# With more likely offsets than this the estimate fails.
 _MAX_NUM_LIKELY = 3
-# Two descents that end this close, or within their stddevs, have found the same offset.
+# Two descents have found the same offset if they end this close, or within this many standard deviations.
 _SAME_OFFSET_S = 0.25
 _SAME_OFFSET_STDDEVS = 5.0
-# Log and photos are usually meant to cover each other: an offset that puts fewer ranges on the path than this share
-# of the best one's is so likely beforehand.
+# Log and photos usually cover the same time. An offset that puts fewer ranges on the path than this fraction of the
+# best offset's number gets this prior probability, relative to the others.
 _COVERING_SHARE = 0.7
 _PRIOR_OF_THE_OTHERS = 0.05
-# With fewer ranges in common than this share two offsets are judged by all that each puts on the path.
+# Two offsets with a smaller fraction of ranges in common are compared by all ranges that each puts on the path.
 _MIN_SHARED = 0.5
 _MIN_NUM_KEYFRAMES = 4
+# Largest number of candidates from the scan, and their smallest distance from each other.
 _MAX_NUM_CANDIDATES = 12
 _CANDIDATE_SEPARATION_S = 0.5
-# Enough ranges to tell candidates apart; enough to leave nothing to gain.
+# Numbers of ranges that suffice to compare candidates, and for the final estimate.
 _NUM_RANGES_PER_CANDIDATE = 3000
 _NUM_RANGES_OF_FINAL = 40000
-# So many of the ranges in bursts must stay at their photos for the offset not to matter.
+# The offset does not matter if this fraction of the ranges in bursts stays at the same photos.
 _MIN_SAME_SHARE = 0.95
-# Around the best offset the curve shows all: at least this far, and so many stddevs.
+# Near the best offset the curve has all offsets, up to the larger of this distance and this many standard deviations.
 _FINE_REACH_S, _FINE_REACH_STDDEVS = 1.0, 6.0
-# An offset less certain than this is none.
+# An offset with a larger standard deviation is refused.
 _MOST_UNCERTAIN_S = 0.5
-# Photos too far apart for ranges to be interpolated still show the motion: up to this many times their usual gap.
+# To find the offset, poses are also interpolated across gaps up to this many times the median gap between photos.
 _MAX_GAPS = 1.5
 
 
 class Rival(NamedTuple):
-    """Another offset of the clocks that may be the right one: image time = range time + ``value_s``."""
+    """Another time offset that may be the right one: image time = range time + ``value_s``."""
 
     value_s: float
     probability: float
@@ -60,21 +62,21 @@ class Rival(NamedTuple):
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """The clocks' offset: image time = range time + ``value_s``.
+    """Offset of the clocks: image time = range time + ``value_s``.
 
     Attributes:
-        value_s: where the clocks drift, at ``reference_s``.
-        stddev_s: of the value, with allowance for correlated residuals.
-        curve: what all offsets cost, for the report.
-        offset_matters: False where any offset near the value puts the ranges at the same photos.
-        drift: what camera time gains on radio time, seconds a second.
-        drift_stddev: of the drift; infinite where it was not looked for.
-        drift_is_followed: whether the drift is beyond doubt, so that ``at`` follows it.
+        value_s: the offset; if the clocks drift, at the radio's time ``reference_s``.
+        stddev_s: its standard deviation, which accounts for correlated residuals.
+        curve: cost of all offsets, for the report.
+        offset_matters: False if any offset near the value puts the ranges at the same photos.
+        drift: gain of the camera's clock on the radio's, seconds per second.
+        drift_stddev: its standard deviation; infinite if no drift was estimated.
+        drift_is_followed: whether the drift is significant, so that ``at`` follows it.
         reference_s: radio's time at which the clocks differ by ``value_s``.
-        note: what the user should know; None if nothing.
-        probability: that the value is the right offset and none of the rivals.
-        rivals: the other offsets that cannot be ruled out, the likeliest first.
-        is_certain: whether its stddev makes less of a range than the noise does.
+        note: message for the user, or None.
+        probability: probability that the value is the right offset, and none of the rivals is.
+        rivals: other offsets that cannot be ruled out, the most likely first.
+        is_certain: whether the error of a range due to ``stddev_s`` is smaller than its noise.
     """
 
     value_s: float
@@ -91,11 +93,11 @@ class TimeOffset:
     is_certain: bool = True
 
     def of_rival(self, rival: Rival) -> TimeOffset:
-        """The same clocks at a rival's offset; a drift is that of the value alone."""
+        """Return the offset with a rival's value; the drift was estimated for the present value and is not followed."""
         return replace(self, value_s=rival.value_s, drift_is_followed=False, probability=rival.probability, rivals=())
 
     def at(self, radio_times_s: Array) -> Array:
-        """(n,) offsets at times of the radio's clock."""
+        """Return the offsets (n,) at times (n,) of the radio's clock."""
         drift = self.drift if self.drift_is_followed else 0.0
         return self.value_s + drift * (radio_times_s - self.reference_s)
 
@@ -112,29 +114,29 @@ def estimate_time_offset(
 ) -> TimeOffset:
     """Find the offset at which the ranges follow the camera's path.
 
-    Neither the anchors nor the path's scale need be known: at every offset the ranges are
-    held against the path with the anchors and the scale that suit it best. The clocks may
-    be years apart.
+    Neither the anchors nor the scale of the path need to be known. At every offset the ranges are compared with the
+    path, with the anchors and the scale that fit best. The clocks may differ by years.
 
     Args:
         log: ranges with timestamps, to one anchor or more.
-        trajectory: keyframes with times, in any unit.
-        tag_in_cam_m: (3,) antenna in the camera (rig) frame, metres; or (num_tags, 3), as ``log.tag_ids``.
-        association: how ranges will be put on the path.
-        seed: of the choice of ranges where there are more than needed.
-        progress: told of the offsets looked into.
+        trajectory: keyframes with times, in any unit of length.
+        tag_in_cam_m: (3,) lever arm, the antenna in the camera (rig) frame, metres; or (num_tags, 3) in the order of
+            ``log.tag_ids``.
+        association: options of the association of ranges with the path.
+        seed: seed of the choice of ranges where there are more than needed.
+        progress: receives the number of candidates that have been examined.
 
     Raises:
         InputError: log or photos have no times, or the log has more tags than lever arms.
-        GeometryError: the motion does not determine the offset, nor leaves the choice between a few.
+        GeometryError: the motion does not determine the offset, not even up to a few alternatives.
     """
     if log.timestamp_s is None:
-        raise InputError("the log has no timestamps, so that there is no time offset to find", log.source)
+        raise InputError("the log has no timestamps, so that no time offset can be found", log.source)
     if trajectory.timestamps_s is None:
-        raise InputError("the photos have no times, so that there is no time offset to find: give image times")
+        raise InputError("the photos have no times, so that no time offset can be found: give image times")
     if len(trajectory) < _MIN_NUM_KEYFRAMES or not len(log):
         raise GeometryError(
-            f"{len(trajectory)} photos and {len(log)} ranges are too few to find the time offset by: {REMEDY}"
+            f"{len(trajectory)} photos and {len(log)} ranges are too few to find the time offset: {REMEDY}"
         )
     association = association or AssociationOptions()
     tags = lever_arms(log, tag_in_cam_m)
@@ -160,12 +162,12 @@ def _offset_of_motion(
     seed: int,
     progress: Progress,
 ) -> TimeOffset:
-    """Scan all offsets, descend from the best few, and see which of them are likely."""
+    """Estimate the offset from motion: scan all offsets, refine the best few, and find out which of them are likely."""
     path = moving_path(trajectory, tags_in_cam_m, association)
     if np.count_nonzero(path.is_known) < 2:
-        raise GeometryError(f"no part of the path and the log can be compared to find the time offset: {REMEDY}")
+        raise GeometryError(f"no part of the path can be compared with the log to find the time offset: {REMEDY}")
     scanned = scan_offsets(ranges, path)
-    # In one random order, so that different offsets are judged by the same ranges.
+    # All offsets use ranges in the same random order, so that different offsets are compared by the same ranges.
     ranges = ranges.take(np.random.default_rng(seed).permutation(len(ranges.times_s)))
     candidates = scanned.peaks(_CANDIDATE_SEPARATION_S, _MAX_NUM_CANDIDATES)
     fits: list[OffsetFit] = []
@@ -177,7 +179,7 @@ def _offset_of_motion(
             fits.append(refine_offset(near, path, offset_s, best))
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
-        raise GeometryError(f"too few ranges along the camera's path to find the time offset by: {REMEDY}")
+        raise GeometryError(f"too few ranges along the camera's path to find the time offset: {REMEDY}")
     (best, probability), *rivals = _likely_fits(fits, ranges, path)
     if not best.explains():
         raise GeometryError(
@@ -212,12 +214,12 @@ def _offset_of_motion(
 def _offset_of_bursts(
     bursts: Bursts, log: RangeLog, trajectory: Trajectory, tags_in_cam_m: Array, association: AssociationOptions
 ) -> TimeOffset | None:
-    """The offset that centres each burst on its photo; None if the camera did not stand still meanwhile."""
+    """Return the offset that centres each burst on its photo, or None if the camera did not stand still in them."""
     pairings = pair_bursts(bursts, trajectory, tags_in_cam_m)
     best = pairings[0]
     if not best.explains():
         raise GeometryError(
-            f"at no time offset do the {len(bursts.start_s)} bursts of ranges suit the {len(trajectory)} photos "
+            f"at no time offset do the {len(bursts.start_s)} bursts of ranges fit the {len(trajectory)} photos "
             f"better than by chance: {REMEDY}"
         )
     likely = likely_offsets([each.offset_s for each in pairings], [-best.log_odds(each) for each in pairings])
@@ -245,7 +247,7 @@ def _offset_of_bursts(
 def _num_at_same_photo(
     log: RangeLog, trajectory: Trajectory, association: AssociationOptions, *offsets_s: float
 ) -> int:
-    """How many ranges are taken to be at the same photo with all the offsets."""
+    """Return the number of ranges that are associated with the same photo at all of the offsets."""
     photos = []
     for offset_s in offsets_s:
         places = associate(log, trajectory, np.zeros(3), time_offset_s=offset_s, options=association)
@@ -254,10 +256,10 @@ def _num_at_same_photo(
 
 
 def likely_offsets(offsets_s: Sequence[float], log_likelihoods: Sequence[float]) -> list[tuple[int, float]]:
-    """The offsets that cannot be ruled out, by their numbers, with their probabilities; the likeliest first.
+    """Return the indices and probabilities of the offsets that cannot be ruled out, the most likely first.
 
     Raises:
-        GeometryError: they are too many to be of use.
+        GeometryError: there are too many of them.
     """
     weights = np.exp(np.asarray(log_likelihoods) - np.max(log_likelihoods))
     likely = np.flatnonzero(weights > _MIN_PROBABILITY * weights.sum())
@@ -265,19 +267,19 @@ def likely_offsets(offsets_s: Sequence[float], log_likelihoods: Sequence[float])
     probabilities = weights[likely] / weights[likely].sum()
     if len(likely) > _MAX_NUM_LIKELY:
         some = ", ".join(f"{offsets_s[k]:+.2f} s ({share:.0%})" for k, share in zip(likely[:3], probabilities))
-        raise GeometryError(f"the motion does not tell apart {len(likely)} time offsets, such as {some}: {REMEDY}")
+        raise GeometryError(f"the motion does not distinguish {len(likely)} time offsets, such as {some}: {REMEDY}")
     return list(zip(likely.tolist(), probabilities.tolist()))
 
 
 def _likely_fits(fits: list[OffsetFit], ranges: TimedRanges, path: PathSamples) -> list[tuple[OffsetFit, float]]:
-    """The fits that cannot be ruled out with their probabilities, the likeliest first.
+    """Return the fits that cannot be ruled out, with their probabilities, the most likely first.
 
     Args:
-        fits: at least one of them testable.
-        ranges: of the whole log.
+        fits: fits of which at least one is testable.
+        ranges: ranges of the whole log.
 
     Raises:
-        GeometryError: they are too many to be of use.
+        GeometryError: there are too many of them.
     """
     num_on_path = np.array([np.count_nonzero(path.knows(ranges.times_s + fit.offset_s)) for fit in fits])
     order = [k for k in np.argsort([-fit.score for fit in fits] * num_on_path) if fits[k].is_testable]
@@ -295,7 +297,7 @@ def _likely_fits(fits: list[OffsetFit], ranges: TimedRanges, path: PathSamples) 
 
 
 def _log_odds(fit: OffsetFit, rival: OffsetFit, path: PathSamples) -> float:
-    """Log of the ratio of their likelihoods, as if there were only so many ranges as err on their own."""
+    """Return the logarithm of the likelihood ratio of two fits, for the number of ranges with independent errors."""
     num = min(fit.num_independent, rival.num_independent)
     mine = path.knows(fit.ranges.times_s + rival.offset_s)
     theirs = path.knows(rival.ranges.times_s + fit.offset_s)

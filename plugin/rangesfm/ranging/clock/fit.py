@@ -1,4 +1,4 @@
-"""The robust fit of ranges to the path at one offset of the clocks, how well it fixes the offset, and their drift."""
+"""Robust fit of ranges to the path at one time offset, with the offset's uncertainty and the drift of the clocks."""
 
 from __future__ import annotations
 
@@ -14,44 +14,48 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.clock.search import PathSamples, TimedRanges
 from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev, rows_by_anchor
 
-# Ranges to one anchor within a second say much the same where people carry the camera.
+# Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
 _CELL_S = 1.0
+# Numbers of Gauss-Newton steps, largest step, and step at which the offset has converged.
 _MIN_NUM_STEPS, _MAX_NUM_STEPS = 2, 12
 _MAX_STEP_S = 1.0
 _CONVERGED_STEP_S = 1e-4
-# Twice the residuals, and what that makes of the log of the odds.
+# A descent is given up if its residuals are at least twice a rival's, and the logarithm of the odds exceeds this.
 _FAR_BEHIND, _HOPELESS = float(np.log(2)), 30.0
-# A descent that leaves more of its ranges than this off the path leads nowhere.
+# A descent ends if a smaller fraction of its ranges stays on the path.
 _MIN_KEPT_SHARE = 0.5
-# If the other unknowns explain all but this share of the ranges' rate of change, the rest is round-off.
+# If the other unknowns explain the ranges' rates of change up to this fraction, the rest is rounding error.
 _MIN_OWN_RATE = 1e-3
-# Residuals of real radios stay correlated for seconds: blocks this long count as independent.
+# Residuals of real radios are correlated over seconds. Blocks of this length count as independent.
 _BLOCK_S = 10.0
 _MIN_NUM_BLOCKS = 12
-# How long they stay so is not known: the stddev is that of the mean variance with so many blocks of time.
+# The correlation time is not known. The variance is therefore the mean of the variances with these numbers of blocks.
 _JACKKNIFE_NUM_BLOCKS = (6, 12, 24)
-# In longer logs than this there are more of them, of 40, 20 and 10 s.
+# In longer logs the numbers of blocks grow, so that the blocks have 40, 20 and 10 s.
 _LONG_LOG_S = 240.0
-# Without one block the others must still determine everything: of columns of length one.
+# Smallest eigenvalue of the curvature without one block, for columns of length one. Below it the other blocks do not
+# determine all unknowns.
 _MIN_LEFT_CURVATURE = 1e-6
-# The tag's delay makes all ranges read too long or too short by about this.
+# Standard deviation of the bias that all ranges share because of the tag's delay.
 _RANGE_BIAS_STDDEV_M = 0.05
-# The path explains the ranges if they are likelier on it by this many stddevs, as blocks of time have them: the best
-# of some hundred offsets of a log of another walk reaches 6, of Student's distribution with a dozen blocks.
+# The path explains the ranges if their gain in likelihood is this many standard deviations above 0, with blocks of time
+# as independent samples. For a log of another walk, the best of some hundred offsets reaches 6, by Student's
+# distribution with a dozen blocks.
 _MIN_GAIN_STDDEVS = 7.0
-# A drift of fewer stddevs than this may be chance and is left alone.
+# A drift of fewer standard deviations may be chance and is not corrected.
 _MIN_STDDEVS = 3.0
+# Largest number of corrections of the drift, and size of a correction (in standard deviations) at which it converged.
 _MAX_NUM_DRIFTS = 6
 _CONVERGED_STDDEVS = 0.05
 
 
 class Timing(NamedTuple):
-    """What ranges say of the clocks near an offset.
+    """Uncertainty of the time offset, and the drift of the clocks.
 
     Attributes:
-        stddev_s: of the offset; infinite where the motion does not determine it.
-        drift: what camera time gains on radio time, seconds a second.
-        drift_stddev: of the drift.
+        stddev_s: standard deviation of the offset; infinite if the motion does not determine it.
+        drift: gain of the camera's clock on the radio's, seconds per second.
+        drift_stddev: standard deviation of the drift.
     """
 
     stddev_s: float
@@ -61,16 +65,16 @@ class Timing(NamedTuple):
 
 @dataclass(frozen=True)
 class OffsetFit:
-    """Ranges fitted to the path at one offset.
+    """Fit of ranges to the path at one time offset.
 
     Attributes:
-        offset_s: image time - range time.
-        ranges: the n on the path.
-        squares: the fit of their squares.
-        residuals_m: (n,) of that fit, enlarged by what its unknowns took from them.
-        num_spare: how many independent ranges there are beyond the unknowns.
-        deviations_m: (n,) of the ranges from their anchor's median.
-        rates: (n,) change of each predicted range with the offset, m/s.
+        offset_s: image time minus range time.
+        ranges: the n ranges on the path.
+        squares: fit of their squares.
+        residuals_m: (n,) residuals of that fit, enlarged to account for its number of unknowns.
+        num_spare: number of independent ranges beyond the unknowns.
+        deviations_m: (n,) deviations of the ranges from the median of their anchor's ranges.
+        rates: (n,) derivative of each predicted range by the offset, m/s.
     """
 
     offset_s: float
@@ -92,22 +96,25 @@ class OffsetFit:
 
     @cached_property
     def losses(self) -> Array:
-        """(n,) negative log likelihood of each residual, up to a constant."""
+        """Negative log-likelihood of each residual (n,), up to a constant."""
         return _losses(self.residuals_m)
 
     @cached_property
     def gains(self) -> Array:
-        """(n,) by how much each range's log likelihood is greater than if the camera stood still."""
+        """Gain in each range's log-likelihood over a camera that stands still (n,)."""
         return _losses(self.deviations_m) - self.losses
 
     @property
     def score(self) -> float:
-        """Mean gain: near the log of how many times smaller the residuals are than the deviations."""
+        """Mean gain, which is about the logarithm of the ratio of the deviations' size to the residuals'."""
         return float(self.gains.mean())
 
     @property
     def num_independent(self) -> float:
-        """As many ranges that err each on its own say as much: errors that hang together vary more by block of time."""
+        """Number of ranges with independent errors that carry the same information.
+
+        It is found from the variation of the losses between blocks of time, which is larger for correlated errors.
+        """
         variance = _variance_of_mean(self.losses, self.ranges.times_s)
         return min(self.num_spare, float(np.var(self.losses)) / max(variance, 1e-300))
 
@@ -117,12 +124,12 @@ class OffsetFit:
         return bool(self.score > least)
 
     def is_hopeless_beside(self, rival: OffsetFit) -> bool:
-        """Whether its residuals are so much larger that what is left of a descent makes no difference."""
+        """Whether its residuals are so much larger than a rival's that further descent makes no difference."""
         behind = rival.score - self.score
         return behind > _FAR_BEHIND and behind * min(self.num_independent, rival.num_independent) > _HOPELESS
 
     def timing(self) -> Timing:
-        """Offset and drift with stddevs that allow for residuals correlated within blocks of time."""
+        """Return the drift, and standard deviations that account for residuals correlated within blocks of time."""
         times = self.ranges.times_s - self.ranges.times_s.mean()
         own = self.squares.unexplained(np.stack([self.rates, self.rates * times], axis=1))
         if not _is_determined(own[:, 0], self.rates):
@@ -134,7 +141,7 @@ class OffsetFit:
         return Timing(float(np.sqrt(alone[0])), float(change[1]), float(np.sqrt(both[1])))
 
     def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
-        """(k,) of the unknowns with columns ``own``, from chance and from a constant bias of all ranges."""
+        """Return the variances (k,) of unknowns with columns ``own`` (n, k), from noise and a bias of all ranges."""
         span_s = float(np.ptp(times))
         num_blocks = [max(num, round(num * span_s / _LONG_LOG_S)) for num in _JACKKNIFE_NUM_BLOCKS]
         by_chance = _jackknife_variances(own, residuals, self.squares, [_blocks(times, num) for num in num_blocks])
@@ -143,11 +150,13 @@ class OffsetFit:
 
 
 def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, rival: OffsetFit | None = None) -> OffsetFit:
-    """Descend from an offset, at which (nearly) all ranges are on the path, to the nearest one that explains them best
-    (Gauss-Newton).
+    """Refine an offset by Gauss-Newton steps to the nearest one that fits the ranges best.
 
     Args:
-        rival: far behind which it is not worth going on; None: there is none.
+        ranges: ranges that are (nearly) all on the path at the given offset.
+        path: the path.
+        offset_s: the offset to start from.
+        rival: the refinement stops early if it is far behind this fit; None: there is none.
     """
     found = fit_at_offset(ranges, path, offset_s)
     for num_steps in range(_MAX_NUM_STEPS):
@@ -157,7 +166,7 @@ def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, rival
         if not _is_determined(own, found.rates):
             break
         step_s = float(own @ found.squares.weighted_residuals / (own @ own))
-        # The first steps also bring in the lever arm, which needs the scale.
+        # The first steps are always done, because the lever arm comes in only after the scale has been estimated.
         if abs(step_s) < _CONVERGED_STEP_S and num_steps >= _MIN_NUM_STEPS:
             break
         offset_s = found.offset_s + float(np.clip(step_s, -_MAX_STEP_S, _MAX_STEP_S))
@@ -168,10 +177,10 @@ def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, rival
 
 
 def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
-    """Fit the ranges that an offset puts on the path.
+    """Fit the ranges that are on the path at one offset.
 
     Args:
-        scale: metres per model unit, for the lever arm; infinite to leave it out.
+        scale: metres per model unit, for the lever arm; infinity leaves the lever arm out.
     """
     ranges = ranges.take(path.knows(ranges.times_s + offset_s))
     points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
@@ -188,40 +197,44 @@ def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale
 
 
 def _losses(errors_m: Array) -> Array:
-    """(n,) negative log likelihoods: Cauchy of the errors' own size, so that errors twice as large lose log 2."""
+    """Return the negative log-likelihoods (n,) of errors by a Cauchy distribution of the errors' own size.
+
+    Errors that are twice as large lose log 2.
+    """
     stddev_m = residual_stddev(errors_m)
     return np.asarray(np.log(stddev_m) + np.log1p((errors_m / stddev_m) ** 2))
 
 
 def _variance_of_mean(values: Array, times: Array) -> float:
-    """Of n values if chance acts on blocks of time."""
+    """Return the variance of the mean of n values that are correlated within blocks of time."""
     sums = np.bincount(_blocks(times, max(_MIN_NUM_BLOCKS, int(np.ptp(times) / _BLOCK_S))), values - values.mean())
     return float(sums @ sums) / len(values) ** 2 * len(sums) / max(len(sums) - 1, 1)
 
 
 def _is_determined(own: Array, rates: Array) -> bool:
-    """Whether the offset changes the ranges in a way that nothing else could."""
+    """Whether the offset changes the ranges in a way that the other unknowns cannot explain."""
     return bool(own @ own > _MIN_OWN_RATE**2 * (rates @ rates))
 
 
 def _blocks(times: Array, num_blocks: int) -> Indices:
-    """(n,) number of the block of time each range falls into, without gaps."""
+    """Return the index of each range's block of time (n,); empty blocks are not counted."""
     length_s = max(float(np.ptp(times)) / num_blocks, 1e-9)
     return np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
 
 
 def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, blocks: Sequence[Indices]) -> list[Array]:
-    """(k,) variances of an M-estimate whose residuals are correlated within blocks of time, for each way to cut it.
+    """Return the variances (k,) of an M-estimate with residuals correlated within blocks, for each set of blocks.
 
-    The delete-one-block jackknife, each time by one Newton step with everything that the fit adjusts
-    (Bell and McCaffrey, Survey Methodology 2002). Sums of residuals over blocks, without the step, are
-    too small where a block's own ranges pull the fit: on short logs by half. With Student's quantile in
-    place of the Gaussian one, as there are few blocks.
+    This is the delete-one-block jackknife, with one Newton step of all unknowns of the fit for each block (Bell and
+    McCaffrey, Survey Methodology 2002). Sums of residuals over blocks, without the step, are too small where a block's
+    own ranges pull the fit; on short logs they are half as large. Because there are few blocks, the standard deviation
+    is enlarged by the ratio of Student's quantile to the Gaussian one.
 
     Args:
-        own: (n, k) columns of the unknowns in question, which nothing else explains.
-        residuals: (n,) weighted, metres, of the fit ``squares``.
-        blocks: (n,) number of the block of each range.
+        own: (n, k) columns of the unknowns, without the parts that other unknowns explain.
+        residuals: (n,) weighted residuals of the fit ``squares``, metres.
+        squares: the fit.
+        blocks: divisions, each the index (n,) of each range's block.
     """
     sizes = np.linalg.norm(own, axis=0)
     columns = np.column_stack([squares.basis, own / sizes])
@@ -244,12 +257,12 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, bloc
 
 
 def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:
-    """``refine_offset``; if the ranges then show a drift beyond doubt, offset and drift.
+    """Refine an offset, and if the ranges show a significant drift, offset and drift together.
 
     Returns:
-        the fit at the offset, of ranges whose times are freed of the drift that is followed; what it says of the offset
-        and of the drift that is left; what camera time gains on radio time, seconds a second, where it is beyond doubt,
-        else 0; and the radio's time at which the offset holds.
+        The fit, with the drift removed from the times of its ranges. The uncertainty of the offset, with the drift that
+        is left. The drift, in seconds per second, or 0 if it is not significant. The radio's time at which the offset
+        is valid.
     """
     reference_s = float(ranges.times_s.mean())
     fit = refine_offset(ranges, path, offset_s)
@@ -258,7 +271,7 @@ def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple
         if not abs(timing.drift) > least_stddevs * timing.drift_stddev:
             break
         followed, least_stddevs = followed + timing.drift, _CONVERGED_STDDEVS
-        # Of a radio clock that runs like the camera's.
+        # The times become those of a radio clock that runs at the rate of the camera's.
         times_s = ranges.times_s + followed * (ranges.times_s - reference_s)
         fit = refine_offset(ranges._replace(times_s=times_s), path, fit.offset_s)
         timing = fit.timing()
@@ -266,7 +279,7 @@ def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple
 
 
 def drift_note(drift: float, stddev: float, times_s: Array) -> str:
-    """What a user should know of a drift that was found."""
+    """Return a message for the user about a drift that was found."""
     half_span_s = float(np.ptp(times_s)) / 2
     return (
         f"the clocks drift: the camera's gains {1e6 * drift:+.0f} ppm on the radio's (stddev {1e6 * stddev:.0f} ppm); "

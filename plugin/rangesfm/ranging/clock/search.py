@@ -1,8 +1,8 @@
-"""How well every offset of the clocks explains the ranges: all of them at once, by correlation.
+"""Search over all time offsets: the fit of the ranges at every offset, computed at once by correlation.
 
-The sums in the normal equations of the linear fit (see ``squares``) at every offset
-are correlations in time of the ranges with products of |c|^2, c and 1 along the path, so that
-fast Fourier transforms give the best fit at all offsets in one pass.
+The sums in the normal equations of the linear fit (see ``squares``) are correlations in time of the ranges with
+products of |c|^2, c and 1 along the path. Fast Fourier transforms therefore give the best fit at all offsets in one
+pass.
 """
 
 from __future__ import annotations
@@ -24,22 +24,26 @@ from rangesfm.ranging.clock.squares import MIN_RANGE_M, rows_by_anchor
 from rangesfm.ranging.log import RangeLog
 from rangesfm.ranging.observations import RangeStatus
 
-# Between samples this close a straight line is off by less than a millimetre, even at 10 m/s^2.
+# Time between samples of the path. Linear interpolation between them is off by less than a millimetre, even at an
+# acceleration of 10 m/s^2.
 _SAMPLE_STEP_S = 0.025
-# Photos of more than seven hours are sampled more coarsely.
+# Largest number of samples; a path of more than seven hours is sampled more coarsely.
 _MAX_NUM_SAMPLES = 1 << 20
-# An offset that puts fewer ranges on the path than this share of the most possible is not tried.
+# An offset that puts fewer ranges on the path than this fraction of the largest possible number is not tried.
 _MIN_COVERAGE = 0.5
-# A twentieth of what a walker's motion needs to change; less than that for logs of more than seven hours.
+# Step between offsets, a twentieth of the time in which a walker's motion changes. It is larger for logs of more than
+# seven hours.
 _STEP_S = 0.05
 _MAX_NUM_STEPS = 1 << 19
+# Numbers of offsets in the curve for the report: of all offsets, and near the best one.
 _NUM_COARSE, _MAX_NUM_FINE = 160, 200
+# Columns of the linear fit: |c|^2, c and 1.
 _NUM_COLUMNS = 5
 _PAIRS = [(i, j) for i in range(_NUM_COLUMNS) for j in range(i, _NUM_COLUMNS)]
 
 
 class TimedRanges(NamedTuple):
-    """n ranges: radio's clock, metres, and the numbers of each one's anchor and tag."""
+    """n ranges: times on the radio's clock, ranges in metres, and indices of anchor and tag."""
 
     times_s: Array
     range_m: Array
@@ -52,12 +56,14 @@ class TimedRanges(NamedTuple):
 
 @dataclass(frozen=True)
 class PathSamples:
-    """m camera poses, ``step_s`` apart, from ``start_s`` on (camera's clock).
+    """m camera poses, evenly spaced in time.
 
     Attributes:
+        start_s: time of the first pose, camera's clock.
+        step_s: time between poses.
         centers: (m, 3) camera centres, model units; 0 where unknown.
-        tag_from_center: (num_tags, m, 3) lever arms turned into the world, metres.
-        is_known: (m,) whether the camera's pose is known then.
+        tag_from_center: (num_tags, m, 3) lever arms in the axes of the world, metres.
+        is_known: (m,) whether the pose is known.
     """
 
     start_s: float
@@ -70,20 +76,22 @@ class PathSamples:
         return len(self.is_known)
 
     def knows(self, times_s: Array) -> Mask:
-        """(n,) times at which the pose is known."""
+        """Return whether the pose is known at each of the times (n,)."""
         place = (times_s - self.start_s) / self.step_s
         inside = (place >= 0) & (place < len(self) - 1)
         before = np.where(inside, place, 0).astype(np.int64)
         return np.asarray(inside & self.is_known[before] & self.is_known[np.minimum(before + 1, len(self) - 1)])
 
     def tag(self, times_s: Array, tag: Indices, scale: float) -> tuple[Array, Array]:
-        """Where the antenna of a tag is at known times, and how it moves.
+        """Return positions and velocities of tags' antennas at times at which the pose is known.
 
         Args:
-            scale: metres per model unit; infinite to leave the lever arm out.
+            times_s: (n,) times, camera's clock.
+            tag: (n,) index of the tag at each time.
+            scale: metres per model unit; infinity leaves the lever arm out.
 
         Returns:
-            (n, 3) positions, model units; (n, 3) velocities, model units a second.
+            (n, 3) positions in model units, and (n, 3) velocities in model units per second.
         """
         place = (times_s - self.start_s) / self.step_s
         before = np.clip(place, 0, len(self) - 2).astype(np.int64)
@@ -94,14 +102,18 @@ class PathSamples:
 
 
 def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: AssociationOptions) -> PathSamples:
-    """The path where ranges would be interpolated between keyframes; ``tags_in_cam_m``: (num_tags, 3)."""
+    """Sample the path where poses are interpolated between keyframes.
+
+    Args:
+        tags_in_cam_m: (num_tags, 3) lever arms, metres.
+    """
     assert trajectory.timestamps_s is not None, "a path in time needs times"
     start_s = float(trajectory.timestamps_s[0])
     span_s = float(trajectory.timestamps_s[-1]) - start_s
     step_s = max(_SAMPLE_STEP_S, span_s / _MAX_NUM_SAMPLES)
     times = start_s + step_s * np.arange(int(span_s / step_s) + 1)
     probe = RangeLog.from_arrays(["probe"] * len(times), np.ones(len(times)), timestamp_s=times)
-    # A negative tolerance: a sample next to a keyframe is interpolated like all others.
+    # With a negative tolerance, a sample next to a keyframe is interpolated like all others.
     options = options.model_copy(update={"max_time_difference_s": -1.0})
     by_tag = [associate(probe, trajectory, tag_in_cam_m, options=options) for tag_in_cam_m in tags_in_cam_m]
     places = by_tag[0]
@@ -112,19 +124,18 @@ def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: Associati
 
 
 def ranges_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int) -> TimedRanges:
-    """The first ranges that an offset puts on the path, at most so many."""
+    """Return the first ranges that are on the path at an offset, at most ``max_num``."""
     return ranges.take(np.flatnonzero(path.knows(ranges.times_s + offset_s))[:max_num])
 
 
 @dataclass(frozen=True)
 class CostCurve:
-    """What offsets of the clocks cost.
+    """Cost of time offsets.
 
     Attributes:
-        offsets_s: (m,) increasing: all offsets at which log and photos overlap, closer together
-            near the best one.
+        offsets_s: (m,) offsets at which log and photos overlap, increasing, and denser near the best one.
         costs_m: (m,) root mean square of the residuals of the ranges on the path, with the anchors and the scale that
-            suit each offset best; each range weighs as it does at the best offset.
+            fit best at each offset; each range has its weight at the best offset.
     """
 
     offsets_s: Array
@@ -133,17 +144,22 @@ class CostCurve:
 
 @dataclass(frozen=True)
 class OffsetCurve(CostCurve):
-    """How well each of m offsets explains the ranges: only those that put a fair share of them on the path.
+    """Cost and score of m offsets that put a large enough fraction of the ranges on the path.
 
     Attributes:
-        scores: (m,) natural log of how many times smaller the residuals on the path are than
-            the ranges' own variation there; 0 explains nothing.
+        scores: (m,) natural logarithm of the ratio of the ranges' own variation to their residuals; 0 if the path
+            explains nothing.
     """
 
     scores: Array
 
     def around(self, best_s: float, reach_s: float) -> CostCurve:
-        """To look at: the best offset of each stretch of all, and all those within reach of the best of all."""
+        """Return a curve for the report: the best offset of each interval, and all offsets near the best one.
+
+        Args:
+            best_s: the best offset.
+            reach_s: distance from it up to which all offsets are kept.
+        """
         from_best_s = np.abs(self.offsets_s - best_s)
         near = np.flatnonzero(from_best_s < reach_s)
         fine = near[np.argsort(from_best_s[near])[:_MAX_NUM_FINE]]
@@ -153,7 +169,7 @@ class OffsetCurve(CostCurve):
         return CostCurve(self.offsets_s[shown], self.costs_m[shown])
 
     def peaks(self, separation_s: float, max_num: int) -> list[float]:
-        """The offsets whose score is the highest within ``separation_s``, best first."""
+        """Return the offsets whose score is the highest within ``separation_s``, the best first."""
         if len(self.offsets_s) < 2:
             return list(map(float, self.offsets_s))
         step_s = float(np.median(np.diff(self.offsets_s)))
@@ -164,10 +180,14 @@ class OffsetCurve(CostCurve):
 
 
 def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None = None) -> OffsetCurve:
-    """Try every offset at which log and path overlap; the lever arm changes little at this resolution.
+    """Compute cost and score of every offset at which log and path overlap, without the lever arm.
+
+    The lever arm makes little difference at this resolution.
 
     Args:
-        path: with some pose known. weights: (n,) of the ranges, in any order; None: all weigh the same.
+        ranges: n ranges in any order.
+        path: a path with at least one known pose.
+        weights: (n,) weights of the ranges; None: equal weights.
     """
     weights = np.ones(len(ranges.range_m)) if weights is None else weights
     scanned: list[tuple[Array, Array, Array, Array]] = []
@@ -184,16 +204,16 @@ def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None =
 
 
 def _parts(times: Array, path_span_s: float) -> list[Indices]:
-    """The log's rows, cut where its pauses are longer than the path: no offset puts both sides on it.
+    """Split the rows of the log at pauses longer than the path, because no offset puts both sides on the path.
 
-    A clock that starts at zero and is set to the date later costs nothing so.
+    A clock that starts at zero and is set to the date later therefore causes no huge search.
     """
     order = np.argsort(times, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(times[order]) > path_span_s) + 1)
 
 
 def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> tuple[Array, Array, Array, Array]:
-    """(m,) numbers on the path (sums of weights), offsets, scores and costs of one part of the log."""
+    """Return sums of weights on the path, offsets, scores and costs, (m,) each, of one part of the log."""
     first_s, last_s = float(ranges.times_s.min()), float(ranges.times_s.max())
     span_s = len(path) * path.step_s + last_s - first_s
     stride = max(1, round(max(_STEP_S, span_s / _MAX_NUM_STEPS) / path.step_s))
@@ -215,7 +235,10 @@ def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> tuple[Array
 
 
 def _columns(path: PathSamples, stride: int) -> Array:
-    """(m, 5) what the squared range is linear in: |c|^2, c (centred and scaled) and 1; 0 off the path."""
+    """Return the columns (m, 5) in which the squared range is linear: |c|^2, c and 1, with c centred and scaled.
+
+    Rows off the path are 0.
+    """
     known = path.is_known[::stride, None]
     num_known = max(int(np.count_nonzero(known)), 1)
     centers = path.centers[::stride]
@@ -227,7 +250,7 @@ def _columns(path: PathSamples, stride: int) -> Array:
 
 
 class _Correlation:
-    """Correlations in time of cells of the log with samples of the path, at every shift that lets them meet."""
+    """Correlations in time of cells of the log with samples of the path, at every shift at which they overlap."""
 
     def __init__(self, num_samples: int, num_cells: int):
         self.num_samples, self.num_cells = num_samples, num_cells
@@ -238,7 +261,8 @@ class _Correlation:
         return np.asarray(rfft(values, self._size))
 
     def __call__(self, samples: npt.NDArray[np.complex128], cells: npt.NDArray[np.complex128]) -> Array:
-        """(num_offsets,) from both transforms; first the last cell on the first sample."""
+        """Return the correlation (num_offsets,) from both transforms; at the first offset the last cell is on the first
+        sample."""
         around = irfft(samples * np.conj(cells), self._size)
         return np.concatenate([around[self._size - self.num_cells + 1 :], around[: self.num_samples]])
 
@@ -250,13 +274,13 @@ def _sums_of_anchor(
     products: dict[tuple[int, int], npt.NDArray[np.complex128]],
     correlate: _Correlation,
 ) -> Array:
-    """(5, num_offsets) sums over the ranges on the path.
+    """Return five weighted sums over the ranges of one anchor on the path (5, num_offsets).
 
-    How many they are; their squared deviation from the anchor's mean; that which c and 1 leave of it; the square of
-    what these leave of the column |c|^2; the product of what they leave of both.
+    They are the sum of weights; the squared deviation from the anchor's mean; its part that c and 1 do not explain; the
+    squared part of the column |c|^2 that c and 1 do not explain; and the product of both unexplained parts.
     """
     squared = range_m**2 - np.median(range_m**2)
-    # The derivative of rho^2 turns residuals back into metres.
+    # Division by the derivative of rho^2 converts residuals back to metres.
     weight = weights / (2 * np.maximum(range_m, MIN_RANGE_M)) ** 2
 
     def cells(values: Array) -> npt.NDArray[np.complex128]:
@@ -270,7 +294,7 @@ def _sums_of_anchor(
     total = correlate(products[4, 4], cells(weight * squared**2))
     num = correlate(products[4, 4], cells(weights))
 
-    # The anchor's own unknowns are eliminated; what they leave adds up over the anchors.
+    # The anchor's own unknowns are eliminated, and the unexplained parts are summed over the anchors.
     own = normal[:, 1:, 1:] + (1e-6 * normal[:, 4, 4] + 1e-9 * weight.sum())[:, None, None] * np.eye(4)
     solved = np.linalg.solve(own, np.stack([normal[:, 1:, 0], right[:, 1:]], axis=2))
     return np.stack(

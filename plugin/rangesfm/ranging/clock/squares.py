@@ -1,8 +1,8 @@
-"""Ranges against antenna positions when neither the anchors nor the scale are known.
+"""Fit of ranges to antenna positions with unknown anchors and unknown scale.
 
-With the anchor at a, the scale alpha and the antenna at p (model units), the squared range is
-linear in what is unknown: rho^2 = alpha^2 |p|^2 - 2 alpha a.p + |a|^2. The relation between
-its coefficients is not used, so that there is one solution and no need of a start.
+With the anchor at a, the scale alpha and the antenna at p (model units), the squared range is linear in the unknown
+coefficients: rho^2 = alpha^2 |p|^2 - 2 alpha a.p + |a|^2. The relation between the coefficients is not used, so that
+there is one solution and no start is needed.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 
-# Ranges shorter than this say as little of the squared distance as one of this length.
+# Shorter ranges get the weight of a range of this length, because the derivative of their square is near 0.
 MIN_RANGE_M = 0.3
-# A residual below this is as good as none (radios resolve a centimetre).
+# Smallest size of residuals, because radios resolve only about a centimetre.
 MIN_RESIDUAL_M = 1e-3
 _NUM_REWEIGHTINGS = 6
-# The curvature of |p|^2 must be seen this clearly before it tells the scale.
+# The column |p|^2 must be significant by this many standard deviations for the scale to be used.
 _MIN_CURVATURE_STDDEVS = 5.0
 
 
 @dataclass(frozen=True)
 class SquaresFit:
-    """Robust fit of ``rho^2 = alpha^2 |p|^2 + b.p + k``: b and k of each anchor, alpha of all.
+    """Robust fit of ``rho^2 = alpha^2 |p|^2 + b.p + k``, with b and k for each anchor and one alpha for all.
 
     Attributes:
-        weights: (n,) Cauchy, in [0, 1].
-        residuals_m: (n,) measured minus fitted range.
-        gradient: (n, 3) of the fitted range at each point, metres per model unit.
-        scale: alpha, metres per model unit; infinite where the path is too small to tell.
+        weights: (n,) weights of the Cauchy loss, in [0, 1].
+        residuals_m: (n,) measured minus fitted ranges.
+        gradient: (n, 3) derivative of the fitted range by each point, metres per model unit.
+        scale: alpha, metres per model unit; infinite if the path is too small to determine it.
     """
 
     weights: Array
@@ -44,40 +44,42 @@ class SquaresFit:
 
     @property
     def num_unknowns(self) -> int:
-        """Four of each anchor, and the scale."""
+        """Number of unknowns: four for each anchor, and the scale."""
         return 4 * self._columns.num_anchors + 1
 
     @property
     def weighted_residuals(self) -> Array:
-        """(n,) metres."""
+        """Residuals times the roots of their weights (n,), metres."""
         return np.asarray(np.sqrt(self.weights) * self.residuals_m)
 
     @cached_property
     def basis(self) -> Array:
-        """(n, p) orthonormal weighted columns of all that the fit adjusts."""
+        """Orthonormal weighted columns (n, p) of all unknowns of the fit."""
         curvature = self._columns.curvature
         norm = max(float(np.linalg.norm(curvature)), 1e-300)
         return np.column_stack([self._columns.anchors_basis(), curvature / norm])
 
     def unexplained(self, values: Array) -> Array:
-        """(n, k) weighted columns of small changes of the ranges, less what anchors and scale could explain."""
+        """Return weighted changes of the ranges (n, k) without the parts that anchors and scale can explain."""
         left = self._columns.without_anchors(np.sqrt(self.weights)[:, None] * values)
         curvature = self._columns.curvature
         return np.asarray(left - np.outer(curvature, curvature @ left) / max(float(curvature @ curvature), 1e-300))
 
 
 def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: float = CAUCHY.width) -> SquaresFit:
-    """Iteratively reweighted least squares from equal weights.
+    """Fit ranges by iteratively reweighted least squares, starting from equal weights.
 
     Args:
-        points: (n, 3) antenna, model units. range_m: (n,). anchor: (n,) number of each one's anchor.
-        loss_scale: in stddevs, from which a residual is down-weighted.
+        points: (n, 3) positions of the antenna, model units.
+        range_m: (n,) ranges, metres.
+        anchor: (n,) index of each range's anchor.
+        loss_scale: width of the loss, in standard deviations of the residuals.
     """
     middle = points.mean(axis=0)
     unit = max(float(np.sqrt(np.mean((points - middle) ** 2))), 1e-300)
     points = (points - middle) / unit
     design, groups = np.column_stack([points, np.ones(len(points))]), rows_by_anchor(anchor)
-    # Dividing by the derivative of rho^2 turns residuals back into metres.
+    # Division by the derivative of rho^2 converts residuals back to metres.
     metres = 1 / (2 * np.maximum(range_m, MIN_RANGE_M))
     residuals_m = np.zeros(len(points))
     for _ in range(_NUM_REWEIGHTINGS + 1):
@@ -92,11 +94,11 @@ def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: floa
 
 
 class _LinearColumns:
-    """The weighted columns of the linear model, with those of each anchor made orthonormal.
+    """Weighted columns of the linear model, with those of each anchor made orthonormal.
 
     Attributes:
-        num_anchors: that have ranges.
-        curvature: (n,) the column |p|^2, less what the anchors' own unknowns explain of it.
+        num_anchors: number of anchors with ranges.
+        curvature: (n,) part of the column |p|^2 that the anchors' own unknowns do not explain.
     """
 
     def __init__(self, design: Array, row_weights: Array, groups: list[Indices]):
@@ -108,21 +110,21 @@ class _LinearColumns:
         of_groups = [weighted[rows] for rows in groups]
         decomposed = np.linalg.eigh([own.T @ own for own in of_groups])
         for rows, own, squared_lengths, directions in zip(groups, of_groups, *decomposed, strict=True):
-            # A flat or straight path leaves columns that only round-off fills.
+            # On a flat or straight path some columns contain only rounding errors, and are dropped.
             kept = squared_lengths > 1e-10 * squared_lengths[-1]
             solution = directions[:, kept] / np.sqrt(squared_lengths[kept])
             self._factors.append((rows, own @ solution, solution))
         self.curvature = self.without_anchors((row_weights * self._squared_norm)[:, None])[:, 0]
 
     def without_anchors(self, values: Array) -> Array:
-        """(n, k) columns less their part that the anchors' own unknowns explain."""
+        """Return columns (n, k) without the part that the anchors' own unknowns explain."""
         left_over = values.copy()
         for rows, basis, _ in self._factors:
             left_over[rows] -= basis @ (basis.T @ values[rows])
         return left_over
 
     def anchors_basis(self) -> Array:
-        """(n, <= 4 num_anchors) the anchors' own columns; each is zero for ranges to the others."""
+        """Return the anchors' own columns (n, up to 4 num_anchors); each is zero for ranges to other anchors."""
         padded = []
         for rows, basis, _ in self._factors:
             padded.append(np.zeros((len(self._row_weights), basis.shape[1])))
@@ -130,7 +132,7 @@ class _LinearColumns:
         return np.column_stack(padded)
 
     def solve(self, squared_ranges: Array) -> tuple[float, Array, Array]:
-        """alpha^2 (not negative), (n, 3) the vector b of each range's anchor, (n,) weighted residuals."""
+        """Return alpha^2 (not negative), the vector b of each range's anchor (n, 3), and weighted residuals (n,)."""
         weighted = self._row_weights * squared_ranges
         left_over = self.without_anchors(weighted[:, None])[:, 0]
         curvature = self.curvature
@@ -143,7 +145,7 @@ class _LinearColumns:
 
 
 def residual_stddev(residuals_m: Array) -> float:
-    """Robust, of residuals of which none is better than a radio resolves."""
+    """Return a robust standard deviation of residuals, at least MIN_RESIDUAL_M."""
     return max(robust_stddev(residuals_m), MIN_RESIDUAL_M)
 
 
