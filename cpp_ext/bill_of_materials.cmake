@@ -1,7 +1,7 @@
-# What is compiled into the extension and lies in the package beside it, with versions and licences, as a CycloneDX
-# document in the wheel's metadata (PEP 770). Python packages that are only depended on are not in it.
+# Bill of materials: the software that is compiled into the extension or shipped in the package, with versions and
+# licences, as a CycloneDX document in the wheel's metadata (PEP 770). Python dependencies are not part of it.
 
-# Ceres' version is three numbers in a header.
+# Ceres' version is given by three numbers in a header.
 list(GET RANGESFM_CERES_INCLUDE_DIRS 0 ceres_headers)
 foreach(name MAJOR MINOR REVISION)
   file(STRINGS ${ceres_headers}/ceres/version.h line REGEX "^#define CERES_VERSION_${name} +[0-9]+" LIMIT_COUNT 1)
@@ -10,7 +10,7 @@ foreach(name MAJOR MINOR REVISION)
 endforeach()
 list(JOIN CERES_HEADERS_VERSION "." CERES_HEADERS_VERSION)
 
-# What the first line of a bundled script says.
+# Read the version of a library from the first line of a bundled script.
 function(rangesfm_version_of_script file name result)
   file(READ ${CMAKE_CURRENT_SOURCE_DIR}/../plugin/rangesfm/report/assets/vendor/${file} text LIMIT 100)
   string(REGEX MATCH "${name} ([0-9.]+)" text "${text}")
@@ -21,7 +21,7 @@ rangesfm_version_of_script(three.min.js "three\\.js" THREE_VERSION)
 rangesfm_version_of_script(vega.min.js "Vega" VEGA_VERSION)
 rangesfm_version_of_script(vega.min.js "Vega-Lite" VEGA_LITE_VERSION)
 
-# Appends to COMPONENTS and COMPONENT_NAMES; `purl` is the kind of its package URL.
+# Append a component to COMPONENTS and COMPONENT_NAMES; `purl` is the type of its package URL.
 function(rangesfm_component name version license purl description)
   string(APPEND COMPONENTS "\n    { \"type\": \"library\", \"bom-ref\": \"${name}\", \"name\": \"${name}\", "
     "\"version\": \"${version}\", \"description\": \"${description}\", "

@@ -1,14 +1,15 @@
-# The headers of Ceres and Eigen, downloaded: for machines without packages of them, as those that build the wheels.
+# Download the headers of Ceres and Eigen, for machines without packages of them, such as those that build the wheels.
 #
-# Gives the target Eigen3::Eigen, Eigen3_VERSION and RANGESFM_CERES_INCLUDE_DIRS, as the packages would. Sources that are already there
-# are used instead with FETCHCONTENT_SOURCE_DIR_CERES and FETCHCONTENT_SOURCE_DIR_EIGEN.
+# The result is the same as that of the packages: the target Eigen3::Eigen, Eigen3_VERSION and
+# RANGESFM_CERES_INCLUDE_DIRS. Sources that are already on the disk can be used instead by setting
+# FETCHCONTENT_SOURCE_DIR_CERES and FETCHCONTENT_SOURCE_DIR_EIGEN.
 
 include(FetchContent)
 if(POLICY CMP0135)
-  cmake_policy(SET CMP0135 NEW) # files are as old as their download
+  cmake_policy(SET CMP0135 NEW) # extracted files get the time of the download
 endif()
 
-# Nothing of either is built: neither has a CMakeLists.txt in a folder of this name.
+# Neither library is built, because neither has a CMakeLists.txt in a folder of this name.
 FetchContent_Declare(ceres
   URL http://ceres-solver.org/ceres-solver-2.2.0.tar.gz
   URL_HASH SHA256=48b2302a7986ece172898477c3bcd6deb8fb5cf19b3327bc49969aad4cede82d
@@ -20,7 +21,7 @@ FetchContent_Declare(eigen
   SOURCE_SUBDIR headers_only)
 FetchContent_MakeAvailable(ceres eigen)
 
-# Ceres' own configuration for builds without CMake, and its stand-in for glog's header.
+# Include Ceres' configuration for builds without CMake, and its replacement for glog's header, too.
 set(RANGESFM_CERES_INCLUDE_DIRS
   ${ceres_SOURCE_DIR}/include
   ${ceres_SOURCE_DIR}/config

@@ -1,8 +1,8 @@
-// Factories of the cost functions and of a manifold for Python: documented here, checked at the gate.
+// Python factories of the cost functions and of a manifold, with their documentation. Arguments are checked by gate.h.
 //
 // No class is bound. The factories return ceres::CostFunction or ceres::Manifold, types that pyceres registers, and
-// give the object away: pyceres wraps it in the holder it chose itself, owns it and deletes it. The first line of each
-// docstring, its signature, is what plugin/rangesfm/_cpp.pyi is made of (tests/ceres/stub.py).
+// pass on the ownership: pyceres wraps the object in its own holder and deletes it. plugin/rangesfm/_cpp.pyi is made
+// from the signatures, which pybind11 puts into the first line of each docstring (tests/ceres/stub.py).
 
 #include <ceres/cost_function.h>
 #include <ceres/manifold.h>
@@ -63,27 +63,31 @@ RangeModel Model(const OptionalArray& tag_in_cam_m, std::optional<double> short_
   return model;
 }
 
-constexpr auto kRangeCostDoc = R"(Ranges measured at one keyframe to one anchor; each is a residual,
+constexpr auto kRangeCostDoc = R"(Make the cost of ranges measured at one keyframe to one anchor, a residual for each.
 
-``(d + bias + amplitude * exp(-d / short_range_length) - range) / stddev``, ``d = ||R^T (tag_in_cam - t) - anchor||``,
+The error of a range is
 
-made robust for itself: half the sum of squares is the sum of the losses, each times its share. Blocks: rig_from_world
-(7,) as [qx qy qz qw tx ty tz], anchor in the world (3,), range bias (1,): what the radio reads too long. Then, as far
-as they are asked for and in this order: tag_in_cam (3,), amplitude (1,) of what short ranges read too long. With the
-tag on the anchor, where a distance has no derivative, that part of the Jacobian is zero.
+``r = (d + bias + amplitude * exp(-d / short_range_length) - range) / stddev``,
+``d = ||R^T (tag_in_cam - t) - anchor||``.
+
+The square of its residual is the robust loss of r times the range's share. Metres throughout. Parameter blocks:
+rig_from_world (7,) as [qx qy qz qw tx ty tz]; anchor in the world (3,); range bias (1,), positive if the radio reads
+too long. Then, in this order and as far as they are estimated: tag_in_cam (3,); amplitude (1,) of the short-range
+error, positive if short ranges are too long. Where the tag is at the anchor, the distance has no derivative, and that
+part of the Jacobian is zero.
 
 Args:
-    range_m: one, or (n,) ranges as measured, positive.
-    stddev_m: noise of all ranges, or (n,) of each, positive.
-    tag_in_cam_m: (3,) lever arm, the tag's antenna in the rig frame; None makes it a block.
-    share: by how much all ranges count beside their noise, or (n,) each, positive.
-    short_range_length_m: distance over which the short-range error fades, positive; None: there is none.
-    loss_scale: of the robust loss, in stddevs, positive; infinite: least squares.
-    loss_is_bounded: Geman and McClure's loss, ``r^2 / (1 + r^2 / scale^2)``, which no outlier raises beyond
-        ``scale^2``; otherwise Cauchy's, ``scale^2 log(1 + r^2 / scale^2)``.
+    range_m: measured range, or (n,) ranges, positive.
+    stddev_m: standard deviation of the noise of all ranges, or (n,) of each, positive.
+    tag_in_cam_m: (3,) lever arm, the tag's antenna in the rig frame; None makes it a parameter block.
+    share: factor of the loss of all ranges, or (n,) of each, positive.
+    short_range_length_m: distance over which the short-range error decays, positive; None: there is no such error.
+    loss_scale: scale of the robust loss in standard deviations, positive; infinity means least squares.
+    loss_is_bounded: whether the loss is Geman and McClure's, ``r^2 / (1 + r^2 / scale^2)``, which never exceeds
+        ``scale^2``; otherwise it is Cauchy's, ``scale^2 log(1 + r^2 / scale^2)``.
 
 Raises:
-    ValueError: a value is not finite, or outside its limits, or not of its shape.
+    ValueError: a value is not finite or outside its limits, or an array has another shape.
 )";
 
 ceres::CostFunction* MakeRangeCost(const Array& range_m, const Array& stddev_m, const OptionalArray& tag_in_cam_m,
@@ -93,19 +97,20 @@ ceres::CostFunction* MakeRangeCost(const Array& range_m, const Array& stddev_m, 
                                       Model(tag_in_cam_m, short_range_length_m, loss_scale, loss_is_bounded));
 }
 
-constexpr auto kInterpolatedRangeCostDoc = R"(Ranges measured between two keyframes to one anchor.
+constexpr auto kInterpolatedRangeCostDoc = R"(Make the cost of ranges measured between two keyframes to one anchor.
 
-As ``range_cost``, with the tag at ``(1 - w) * p_before + w * p_after + offset``, ``p = R^T (tag_in_cam - t)`` of either
-pose, and ``w = weight + time_shift / interval``. The time shift is how much later than thought the ranges were taken:
-what to add to the clock offset. Blocks: rig_from_world before (7,) and after (7,), two different frames; anchor in the
-world (3,); range bias (1,). Then, as far as they are asked for and in this order: tag_in_cam (3,), time shift (1,),
-amplitude (1,). Arguments and errors as for ``range_cost``, and
+It is like ``range_cost``, with the tag at ``(1 - w) * p_before + w * p_after + offset``, where
+``p = R^T (tag_in_cam - t)`` for each pose and ``w = weight + time_shift / interval``. The time shift, in seconds, is
+how much later the ranges were taken than assumed, and is to be added to the clock offset. Parameter blocks:
+rig_from_world before (7,) and after (7,), of two different frames; anchor in the world (3,); range bias (1,). Then, in
+this order and as far as they are estimated: tag_in_cam (3,); time shift (1,); amplitude (1,). The other arguments and
+the errors are those of ``range_cost``.
 
 Args:
-    weight: of all, or (n,) of each: from 0 (at the pose before) to 1 (at the pose after).
-    offset_in_world_m: (3,) or (n, 3), what a curved path has beyond the straight line; it stays as it is, also where
-        the lever arm is a block.
-    interval_s: time from the keyframe before to that after, positive; given, the time shift is a block.
+    weight: interpolation weight of all ranges, or (n,) of each, from 0 (at the pose before) to 1 (at the pose after).
+    offset_in_world_m: (3,) or (n, 3) deviation of a curved path from the straight line; it is constant, also if the
+        lever arm is a parameter block.
+    interval_s: time from the keyframe before to the one after, positive; if given, the time shift is a parameter block.
 )";
 
 ceres::CostFunction* MakeInterpolatedRangeCost(const Array& range_m, const Array& stddev_m,
@@ -123,21 +128,22 @@ ceres::CostFunction* MakeInterpolatedRangeCost(const Array& range_m, const Array
   return new RangeCost<InterpolatedPlace>(std::move(place), std::move(measured), std::move(model));
 }
 
-constexpr auto kDistanceCostDoc = R"(A distance between two ends a and b, by tape or by radio.
+constexpr auto kDistanceCostDoc = R"(Make the cost of a distance between two ends a and b, measured by tape or by radio.
 
-The residual is ``(||a - b|| + bias - distance) / stddev``. An end is a point in the world or fixed to a camera. Blocks:
-of end a, then of end b, each a point (3,) or, where its place in the rig frame is given, rig_from_world (7,); then the
-bias (1,), what is read too long, if there is one. The two ends are different blocks.
+The residual is ``(||a - b|| + bias - distance) / stddev``. An end is a point in the world, or is fixed to a camera.
+Parameter blocks: end a and end b, which must be different blocks, each a point (3,) or, if its position in the rig
+frame is given, rig_from_world (7,); then the bias (1,), positive if the distance is measured too long, if there is one.
 
 Args:
-    distance_m: measured, positive.
-    stddev_m: its noise, positive.
-    a_in_cam_m, b_in_cam_m: (3,) the end in the rig frame; None for a point.
-    has_bias: whether a bias is a block.
-    loss_scale: of Geman and McClure's loss (see ``range_cost``), in stddevs, positive; infinite: least squares.
+    distance_m: measured distance, positive.
+    stddev_m: standard deviation of its noise, positive.
+    a_in_cam_m, b_in_cam_m: (3,) position of the end in the rig frame; None for a point.
+    has_bias: whether there is a parameter block of the bias.
+    loss_scale: scale of Geman and McClure's loss (see ``range_cost``) in standard deviations, positive; infinity means
+        least squares.
 
 Raises:
-    ValueError: as ``range_cost``.
+    ValueError: see ``range_cost``.
 )";
 
 ceres::CostFunction* MakeDistanceCost(double distance_m, double stddev_m, const OptionalArray& a_in_cam_m,
@@ -155,17 +161,17 @@ ceres::CostFunction* MakeDistanceCost(double distance_m, double stddev_m, const 
   return a_in_cam_m ? from(CamEnd(FiniteVector3("a_in_cam_m", *a_in_cam_m))) : from(PointEnd());
 }
 
-constexpr auto kDirectionCostDoc = R"(A direction of the world that was seen from a camera, such as the vertical.
+constexpr auto kDirectionCostDoc = R"(Make the cost of a direction in the world that was measured in a camera's frame.
 
-Three residuals, ``(R direction_in_world - direction_in_cam) / stddev``, of two degrees of freedom.
-Block: rig_from_world (7,).
+An example is the vertical. The three residuals are ``(R direction_in_world - direction_in_cam) / stddev``, with two
+degrees of freedom. Parameter block: rig_from_world (7,).
 
 Args:
-    direction_in_world, direction_in_cam: (3,) of any length but 0 ("cam" is the rig frame).
-    stddev_rad: of the direction, as an angle, positive.
+    direction_in_world, direction_in_cam: (3,) vectors of any length except 0 ("cam" is the rig frame).
+    stddev_rad: standard deviation of the direction as an angle, positive.
 
 Raises:
-    ValueError: as ``range_cost``.
+    ValueError: see ``range_cost``.
 )";
 
 ceres::CostFunction* MakeDirectionCost(const Array& direction_in_world, const Array& direction_in_cam,
@@ -174,17 +180,17 @@ ceres::CostFunction* MakeDirectionCost(const Array& direction_in_world, const Ar
                            Direction3("direction_in_cam", direction_in_cam), Positive("stddev_rad", stddev_rad));
 }
 
-constexpr auto kJointPriorCostDoc = R"(What was known beforehand of n numbers that are not independent.
+constexpr auto kJointPriorCostDoc = R"(Make the cost of a prior on n numbers that are correlated.
 
-The n residuals are ``whitening (x - mean)``. Blocks: each number for itself (1,), as the range biases of anchors, which
-share the tag's.
+The n residuals are ``whitening (x - mean)``. Parameter blocks: each number (1,). An example are the range biases of
+anchors, which have the tag's bias in common.
 
 Args:
-    mean: (n,) in the blocks' unit.
-    whitening: (n, n) ``whitening^T whitening`` is the inverse of the numbers' covariance.
+    mean: (n,) prior mean, in the blocks' unit.
+    whitening: (n, n) matrix such that ``whitening^T whitening`` is the inverse of the numbers' covariance.
 
 Raises:
-    ValueError: as ``range_cost``.
+    ValueError: see ``range_cost``.
 )";
 
 ceres::CostFunction* MakeJointPriorCost(const Array& mean, const Array& whitening) {
@@ -193,7 +199,7 @@ ceres::CostFunction* MakeJointPriorCost(const Array& mean, const Array& whitenin
   if (whitening.ndim() != 2 || whitening.shape(0) != size || whitening.shape(1) != size) {
     FailOnShape("whitening", whitening, std::to_string(size) + " rows and columns");
   }
-  // C order: what Eigen takes for columns are rows.
+  // The array is in C order, so that Eigen's columns are its rows.
   const Eigen::MatrixXd matrix = Eigen::Map<const Eigen::MatrixXd>(whitening.data(), size, size).transpose();
   CheckEach("whitening", matrix.reshaped(), Finite);
   return new JointPriorCost(means, matrix);
@@ -216,7 +222,7 @@ PYBIND11_MODULE(_cpp, m) {
   using py::arg;
   using rangesfm::kLeastSquares;
   using rangesfm::kOwn;
-  m.doc() = "Cost functions of rangesfm; its package rangesfm.ceres is the door to them.";
+  m.doc() = "Cost functions of rangesfm, to be used through the package rangesfm.ceres.";
   m.attr("pybind11_version") = PYBIND11_TOSTRING(PYBIND11_VERSION_MAJOR) "." PYBIND11_TOSTRING(
       PYBIND11_VERSION_MINOR) "." PYBIND11_TOSTRING(PYBIND11_VERSION_PATCH);
   m.attr("ceres_version") = CERES_VERSION_STRING;

@@ -1,7 +1,8 @@
-// What the two base classes of Ceres that the extension derives from have outside their headers.
+// Definitions of the members that two base classes of Ceres have outside of their headers.
 //
-// Defined here, the extension is built from Ceres' headers alone: no Ceres is linked, static or shared, none needs to
-// be on the system that it is installed on, and none meets the copies inside pycolmap and pyceres.
+// With these definitions the extension is built from Ceres' headers alone. No Ceres library is linked, statically or
+// dynamically, none is needed on the system that the extension is installed on, and none can conflict with the copies
+// of Ceres in pycolmap and pyceres.
 
 #include <ceres/cost_function.h>
 #include <ceres/manifold.h>
@@ -13,7 +14,7 @@ CostFunction::~CostFunction() = default;
 
 Manifold::~Manifold() = default;
 
-// Every manifold of the extension has its own.
+// Every manifold of the extension overrides this function.
 bool Manifold::RightMultiplyByPlusJacobian(const double* /*x*/, const int /*num_rows*/,
                                            const double* /*ambient_matrix*/, double* /*tangent_matrix*/) const {
   return false;

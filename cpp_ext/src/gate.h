@@ -1,4 +1,4 @@
-// What Python hands over, checked and turned into Eigen's types. What passes here never fails in the solver.
+// Conversion of arguments from Python to Eigen's types, with checks. Checked arguments never fail in the solver.
 
 #pragma once
 
@@ -13,7 +13,7 @@ namespace rangesfm {
 
 using Array = pybind11::array_t<double, pybind11::array::c_style | pybind11::array::forcecast>;
 
-// The value, if it is as expected.
+// Returns the value if it is as expected, and throws if not.
 template <typename Value>
 Value Checked(const std::string& name, Value value, bool is_as_expected, const std::string& expected) {
   if (!is_as_expected) {
@@ -30,7 +30,7 @@ inline double Positive(const std::string& name, double value) {
   return Checked(name, Finite(name, value), value > 0.0, "more than 0");
 }
 
-// A loss scale: infinity stands for least squares.
+// Checks a loss scale; infinity means least squares.
 inline double PositiveOrInfinite(const std::string& name, double value) {
   return std::isinf(value) && value > 0.0 ? value : Positive(name, value);
 }
@@ -46,7 +46,7 @@ inline int BlockSize(const std::string& name, int value) { return Checked(name, 
                               std::to_string(array.size()) + " numbers, expected " + expected);
 }
 
-// Each number as `check` lets it through.
+// Applies `check` to each number.
 template <typename Check>
 void CheckEach(const std::string& name, const Eigen::VectorXd& values, const Check& check) {
   for (const double value : values) {
@@ -70,7 +70,7 @@ inline Eigen::Vector3d FiniteVector3(const std::string& name, const Array& array
   return FiniteVector(name, array);
 }
 
-// Of length 1.
+// Returns the vector scaled to length 1.
 inline Eigen::Vector3d Direction3(const std::string& name, const Array& array) {
   const Eigen::Vector3d vector = FiniteVector3(name, array);
   if (vector.stableNorm() == 0.0) {
@@ -79,7 +79,7 @@ inline Eigen::Vector3d Direction3(const std::string& name, const Array& array) {
   return vector.stableNormalized();
 }
 
-// (n,): one number for each of n ranges, or one for all.
+// Returns a vector (n,) with a number for each of n ranges, from such an array or from one number for all.
 template <typename Check>
 Eigen::VectorXd ForEachRange(const std::string& name, const Array& array, Eigen::Index num_ranges, const Check& check) {
   Eigen::VectorXd vector;
@@ -94,7 +94,7 @@ Eigen::VectorXd ForEachRange(const std::string& name, const Array& array, Eigen:
   return vector;
 }
 
-// (n, 3), a vector for each of n ranges, or (3,), one for all; as columns.
+// Returns a column for each of n ranges, from an array (n, 3), or from one vector (3,) for all.
 inline Eigen::Matrix3Xd Vector3ForEachRange(const std::string& name, const Array& array, Eigen::Index num_ranges) {
   Eigen::Matrix3Xd columns;
   if (array.ndim() == 1 && array.size() == 3) {

@@ -1,4 +1,4 @@
-// What the tests of the costs share: random poses, evaluation, and the gradient check on COLMAP's manifolds.
+// Common parts of the cost tests: random poses, evaluation, and the gradient check on COLMAP's manifolds.
 
 #pragma once
 
@@ -23,7 +23,7 @@ constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 using Block = std::vector<double>;
 
-// As COLMAP parametrises a frame: quaternion on the left of the seven numbers, then translation.
+// COLMAP's parametrization of a frame by seven numbers: the quaternion, then the translation.
 using PoseManifold = ceres::ProductManifold<ceres::EigenQuaternionManifold, ceres::EuclideanManifold<3>>;
 
 class Random {
@@ -49,7 +49,7 @@ class Random {
 
 inline Block ToBlock(const Eigen::Vector3d& v) { return {v.x(), v.y(), v.z()}; }
 
-// The pose block of a camera by its centre: t = -R c.
+// Returns the pose block of a camera with a given centre c: t = -R c.
 inline Block PoseBlock(const Eigen::Quaterniond& cam_from_world, const Eigen::Vector3d& cam_in_world) {
   const Eigen::Vector3d t = -(cam_from_world * cam_in_world);
   return {cam_from_world.x(), cam_from_world.y(), cam_from_world.z(), cam_from_world.w(), t.x(), t.y(), t.z()};
@@ -66,7 +66,7 @@ inline std::vector<const double*> Pointers(const std::vector<Block>& blocks) {
 
 struct Evaluation {
   std::vector<double> residuals;
-  std::vector<std::vector<double>> jacobians;  // row-major, one a block
+  std::vector<std::vector<double>> jacobians;  // row-major, one for each block
 };
 
 inline Evaluation Evaluate(const ceres::CostFunction& cost, const std::vector<Block>& blocks) {
@@ -76,15 +76,16 @@ inline Evaluation Evaluate(const ceres::CostFunction& cost, const std::vector<Bl
   jacobians.reserve(blocks.size());
   evaluation.jacobians.reserve(blocks.size());
   for (const Block& block : blocks) {
-    // Filled with what an untouched entry must not be taken for.
+    // The initial value is one that no Jacobian has, so that an entry which is not written is noticed.
     jacobians.push_back(evaluation.jacobians.emplace_back(cost.num_residuals() * block.size(), 1e300).data());
   }
   EXPECT_TRUE(cost.Evaluate(Pointers(blocks).data(), evaluation.residuals.data(), jacobians.data()));
   return evaluation;
 }
 
-// Expects the analytic Jacobians to be what Ridders' method makes of the residuals, in the tangent spaces. Which first
-// step leads it to the last digits depends on how curved the residuals are: a wrong Jacobian fails for any.
+// Expects the analytic Jacobians to agree with numeric ones by Ridders' method, in the tangent spaces. The first step
+// that gives the best accuracy depends on the curvature of the residuals, so several are tried. A wrong Jacobian fails
+// with all of them.
 inline void ExpectGradientsAreRight(const ceres::CostFunction& cost, const std::vector<Block>& blocks,
                                     double tolerance = 1e-8) {
   const PoseManifold pose_manifold;
@@ -105,7 +106,8 @@ inline void ExpectGradientsAreRight(const ceres::CostFunction& cost, const std::
   ADD_FAILURE() << results.error_log;
 }
 
-// Ceres asks for residuals alone in line searches and leaves out the Jacobians of constant blocks.
+// Expects the same results if Jacobians are not requested: Ceres requests only residuals in line searches, and no
+// Jacobians of constant blocks.
 inline void ExpectAnyJacobianMayBeLeftOut(const ceres::CostFunction& cost, const std::vector<Block>& blocks) {
   const Evaluation all = Evaluate(cost, blocks);
   std::vector<double> residuals(cost.num_residuals());

@@ -36,8 +36,8 @@ TEST(DirectionCost, ATurnAboutTheDirectionChangesNothing) {
   }
 }
 
-// A turn about an axis leaves the number along it as it is; that derivative is zero but for rounding, of which the
-// shared check would compare the digits. Mixtures of the three numbers have no such derivative.
+// A rotation about an axis does not change the component along it. That derivative is zero up to rounding, and the
+// shared check would compare rounding errors. Linear combinations of the three components have no such derivative.
 class MixedDirectionCost final : public ceres::CostFunction {
  public:
   MixedDirectionCost(const DirectionCost& cost, const Eigen::Matrix3d& mixture) : cost_(cost), mixture_(mixture) {

@@ -11,8 +11,9 @@ namespace {
 Block RandomPose(Random& random, double extent) { return PoseBlock(random.Rotation(), random.Vector(extent)); }
 
 TEST(DistanceCost, ResidualIsTheHandComputedOne) {
-  // One camera at (1, 2, 0), turned by 180 degrees about z, its end 1 m along its x axis, at (0, 2, 0); the other at
-  // the origin with its end at (0, 0, 0). 2 m apart, read 0.25 m too long, taped as 1.75 m, in stddevs of 0.1 m: 5.
+  // One camera is at (1, 2, 0), rotated by 180 degrees about z, with its end 1 m along its x axis, at (0, 2, 0). The
+  // other camera and its end are at the origin. The ends are 2 m apart. With a bias of 0.25 m, a measured distance
+  // of 1.75 m and a standard deviation of 0.1 m, the residual is 5.
   const Block a = {0.0, 0.0, 1.0, 0.0, 1.0, 2.0, 0.0};
   const Block b = {0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0};
   const CamEnd end_a(Eigen::Vector3d(1.0, 0.0, 0.0));

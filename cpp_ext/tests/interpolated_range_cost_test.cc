@@ -14,11 +14,12 @@ std::vector<Block> RandomBlocks(Random& random, double extent) {
 }
 
 TEST(InterpolatedRangeCost, ResidualIsTheHandComputedOne) {
-  // A quarter of the way from (0, 2, 0) to (4, 2, 0), plus an offset of half a metre in z: the tag is at (1, 2, 0.5),
-  // and 5 m from the anchor. Predicted 5.25 m, measured 5 m, in stddevs of 0.1 m: 2.5.
+  // The tag is a quarter of the way from (0, 2, 0) to (4, 2, 0), plus an offset of half a metre in z: at (1, 2, 0.5),
+  // 5 m from the anchor. The predicted range is 5.25 m and the measured one 5 m, with a standard deviation of 0.1 m, so
+  // that the residual is 2.5.
   const auto cost = BetweenKeyframes(5.0, Eigen::Vector3d::Zero(), 0.25, Eigen::Vector3d(0.0, 0.0, 0.5), 0.1);
   const Block before = {0.0, 0.0, 0.0, 1.0, 0.0, -2.0, 0.0};
-  const Block after = {0.0, 0.0, 1.0, 0.0, 4.0, 2.0, 0.0};  // turned by 180 degrees about z
+  const Block after = {0.0, 0.0, 1.0, 0.0, 4.0, 2.0, 0.0};  // rotated by 180 degrees about z
   EXPECT_NEAR(Evaluate(cost, {before, after, {4.0, 6.0, 0.5}, {0.25}}).residuals[0], 2.5, 1e-13);
 }
 

@@ -9,7 +9,7 @@ namespace {
 
 TEST(JointPriorCost, SumOfSquaresIsThatOfTheCovariance) {
   Eigen::Matrix2d covariance;
-  covariance << 5.0, 4.0, 4.0, 5.0;  // own stddev 1, common stddev 2
+  covariance << 5.0, 4.0, 4.0, 5.0;  // standard deviations: 1 of each number alone, 2 in common
   const Eigen::Matrix2d whitening = Eigen::Matrix2d(covariance.llt().matrixL()).inverse();
   const Eigen::Vector2d mean(1.0, -1.0);
   const JointPriorCost cost(mean, whitening);

@@ -11,8 +11,9 @@ namespace rangesfm {
 namespace {
 
 TEST(RangeCost, ResidualIsTheHandComputedOne) {
-  // The camera at (1, 2.5, 0), turned by 90 degrees about z: its x axis is the world's -y. The tag, half a metre along
-  // that axis, is at (1, 2, 0), 5 m from the anchor. Predicted 5.25 m, measured 5 m, in stddevs of 0.1 m: 2.5.
+  // The camera is at (1, 2.5, 0), rotated by 90 degrees about z, so that its x axis is the world's -y. The tag, half a
+  // metre along that axis, is at (1, 2, 0), 5 m from the anchor. The predicted range is 5.25 m and the measured one 5
+  // m, with a standard deviation of 0.1 m, so that the residual is 2.5.
   const auto cost = AtKeyframe(5.0, Eigen::Vector3d(0.5, 0.0, 0.0), 0.1);
   const Block pose = {0.0, 0.0, std::sqrt(0.5), std::sqrt(0.5), 2.5, -1.0, 0.0};
   const Evaluation evaluation = Evaluate(cost, {pose, {4.0, 6.0, 0.0}, {0.25}});
@@ -71,7 +72,7 @@ TEST(RangeCost, GradientsAreRightWithTheTagAlmostOnTheAnchor) {
   const Eigen::Vector3d tag_in_world = cam_in_world + cam_from_world.conjugate() * TagInCam();
   const auto cost = AtKeyframe(0.1, TagInCam(), 0.05);
   const Eigen::Vector3d anchor = tag_in_world + Eigen::Vector3d(1e-3, -2e-3, 1e-3);
-  // Steps that stay well on this side of the anchor; what they cost in digits, the tolerance gives.
+  // The steps are so small that they do not cross the anchor. They cost accuracy, which the tolerance allows for.
   ExpectGradientsAreRight(cost, {PoseBlock(cam_from_world, cam_in_world), ToBlock(anchor), {0.0}}, 1e-6);
 }
 
@@ -87,7 +88,7 @@ TEST(RangeCost, AnswerIsFiniteWithTheTagOnTheAnchor) {
 }
 
 TEST(RangeCost, PullsWithFullStrengthAnyDistanceFromTheAnchor) {
-  // The derivative with respect to the anchor is a unit vector over the stddev, however near or far.
+  // The derivative with respect to the anchor is a unit vector over the standard deviation, at any distance.
   const Block pose = {0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0};
   const auto cost = AtKeyframe(1.0, Eigen::Vector3d::Zero(), 0.1);
   for (const double distance : {1e-11, 1e-6, 1.0, 1e6}) {

@@ -1,4 +1,4 @@
-// Range costs of one range and of many, made as the tests want them.
+// Range costs for the tests.
 
 #pragma once
 

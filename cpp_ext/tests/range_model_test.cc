@@ -1,4 +1,4 @@
-// The range costs with everything that can be estimated along with the map, and with many ranges in one block.
+// Tests of the range costs with all optional parameters estimated, and with many ranges in one residual block.
 
 #include <gtest/gtest.h>
 
@@ -36,7 +36,7 @@ InterpolatedPlace Between(Random& random, int size, double interval) {
   return {Uniform(random, size, 0.0, 1.0), Vectors(random, size, 0.3), interval};
 }
 
-// Everything free.
+// A model in which all optional parameters are estimated.
 RangeModel FullModel(double short_range_length, RobustLoss loss) {
   RangeModel model;
   model.has_time_shift = true;
@@ -45,7 +45,7 @@ RangeModel FullModel(double short_range_length, RobustLoss loss) {
   return model;
 }
 
-// Two poses, anchor, bias, lever arm, time shift and amplitude.
+// Parameter blocks: two poses, anchor, bias, lever arm, time shift and amplitude.
 std::vector<Block> FullBlocks(Random& random, double extent) {
   return {PoseBlock(random.Rotation(), random.Vector(extent)),
           PoseBlock(random.Rotation(), random.Vector(extent)),
@@ -57,9 +57,10 @@ std::vector<Block> FullBlocks(Random& random, double extent) {
 }
 
 TEST(RangeModel, PredictionIsTheHandComputedOne) {
-  // From (0, 2, 0) to (4, 2, 0) in 2 s; at weight 0 plus half a second: 1 m on, and 0.6 m of offset in z: tag at
-  // (1, 2, 0.6). The lever arm of 1 m along x moves both ends: (2, 2, 0.6), 5 m from the anchor. A bias of 0.3 m, and
-  // 0.3 m that fade over 5 m: predicted 5.3 + 0.3/e; measured 5 m, stddev 0.1 m.
+  // The camera moves from (0, 2, 0) to (4, 2, 0) in 2 s. With weight 0, half a second later and an offset of 0.6 m in
+  // z, it is at (1, 2, 0.6). The lever arm of 1 m along x puts the tag at (2, 2, 0.6), 5 m from the anchor. With a bias
+  // of 0.3 m and a short-range error of 0.3 m that decays over 5 m, the predicted range is 5.3 + 0.3/e. The measured
+  // range is 5 m, with a standard deviation of 0.1 m.
   InterpolatedPlace place(Eigen::VectorXd::Zero(1), Eigen::Vector3d(0.0, 0.0, 0.6), 2.0);
   const RangeCost<InterpolatedPlace> cost(std::move(place), OneRange(5.0, 0.1), FullModel(5.0, RobustLoss()));
   const std::vector<Block> blocks = {{0.0, 0.0, 0.0, 1.0, 0.0, -2.0, 0.0},
@@ -72,8 +73,8 @@ TEST(RangeModel, PredictionIsTheHandComputedOne) {
   EXPECT_NEAR(Evaluate(cost, blocks).residuals[0], (0.3 + 0.3 / std::exp(1.0)) / 0.1, 1e-12);
 }
 
-// What has faded to nothing is left out, a short-range error far away and an outlier far beyond a bounded loss: its
-// derivative drowns in rounding.
+// Vanishing terms are left out, that is, a short-range error far away and an outlier far beyond a bounded loss. Their
+// derivatives are smaller than rounding errors.
 TEST(RangeModel, GradientsAreRightForEverythingFreeBetweenKeyframes) {
   Random random(1);
   for (int i = 0; i < 40; ++i) {

@@ -47,7 +47,7 @@ TEST(RobustLoss, HalfItsSquareIsHalfOfCeresCauchyLoss) {
     const RobustLoss::Robust robust = loss(residual);
     EXPECT_NEAR(robust.value * robust.value, rho[0], 1e-12 * rho[0] + 1e-15);  // Ceres rounds 1 + x
     EXPECT_EQ(robust.value < 0.0, residual < 0.0);
-    // The gradient of half the square is that of half the loss.
+    // The derivative of half the square equals that of half the loss.
     EXPECT_NEAR(robust.value * robust.slope, rho[1] * residual, 1e-12 * std::abs(residual));
   }
 }

@@ -1,5 +1,5 @@
 """
-Cost functions of rangesfm; its package rangesfm.ceres is the door to them.
+Cost functions of rangesfm, to be used through the package rangesfm.ceres.
 """
 
 from __future__ import annotations

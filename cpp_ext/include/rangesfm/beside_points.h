@@ -1,4 +1,4 @@
-// What keeps anchors and biases out of the elimination of the 3-D points, which stays as fast as it is without them.
+// Tools that keep anchors and biases out of the elimination of the 3-D points, which stays as fast as without them.
 
 #pragma once
 
@@ -10,9 +10,9 @@
 
 namespace rangesfm {
 
-// Two residuals that are always zero and depend on nothing: they say that two blocks belong together, no more. Why an
-// anchor is tied to a point so: keep_from_elimination in plugin/rangesfm/ceres/problem.py. Two rows, since a
-// reprojection has two: for Ceres' specialised kernels the rows of the points must all be of that size.
+// Two residuals that are always zero and only connect two parameter blocks. The reason why an anchor is connected to a
+// point is given at keep_from_elimination in plugin/rangesfm/ceres/problem.py. There are two residuals because a
+// reprojection has two, and Ceres' specialised kernels need residual blocks of one size for all points.
 //
 // Blocks: any two, for example anchor_in_world (3) and a 3-D point (3).
 class ZeroTieCost final : public ceres::CostFunction {
@@ -38,12 +38,12 @@ class ZeroTieCost final : public ceres::CostFunction {
   static constexpr int kNumResiduals = 2;
 };
 
-// Numbers that add up as usual, in a tangent space with further directions that move nothing: a block of k numbers that
-// takes as many columns of the Jacobian as a pose, the last of them zero.
+// Euclidean manifold of k numbers whose tangent space has additional directions that move nothing. A block of k numbers
+// then has as many columns in the Jacobian as a pose, the last of them zero.
 //
-// Among the blocks that share a residual with an eliminated point it is then of the poses' size, for which there are
-// kernels. Levenberg-Marquardt's damping has a floor (Solver::Options::min_lm_diagonal), so that directions that move
-// nothing get a step of zero.
+// All blocks that share a residual with an eliminated point are then of the poses' size, for which Ceres has
+// specialised kernels. The damping of Levenberg-Marquardt has a lower bound (Solver::Options::min_lm_diagonal), so that
+// the step in the additional directions is zero.
 class PaddedManifold final : public ceres::Manifold {
  public:
   PaddedManifold(int ambient_size, int tangent_size) : ambient_size_(ambient_size), tangent_size_(tangent_size) {}

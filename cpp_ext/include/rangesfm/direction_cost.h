@@ -7,9 +7,9 @@
 
 namespace rangesfm {
 
-// Error of a direction of the world that was seen from a camera, in stddevs (formula and block: direction_cost in
-// src/bindings.cc): three numbers for two degrees of freedom, as along the direction only the square of the angle
-// counts. Both directions are unit vectors.
+// Error of a direction in the world that was measured in a camera's frame, in standard deviations. The formula and the
+// block are in the docstring of direction_cost (src/bindings.cc). The three residuals have two degrees of freedom,
+// because the residual along the direction is of second order in the angle. Both directions are unit vectors.
 class DirectionCost final : public ceres::CostFunction {
  public:
   DirectionCost(const Eigen::Vector3d& direction_in_world, const Eigen::Vector3d& direction_in_cam, double stddev)
@@ -28,7 +28,7 @@ class DirectionCost final : public ceres::CostFunction {
   }
 
  private:
-  // Of R v, which for a unit quaternion q = (u, w) is v + 2 w (u x v) + 2 u x (u x v).
+  // Derivative of R v, which for a unit quaternion q = (u, w) is v + 2 w (u x v) + 2 u x (u x v).
   Eigen::Matrix<double, 3, 7> Jacobian(const Eigen::Quaterniond& q) const {
     const Eigen::Vector3d u = q.vec();
     const Eigen::Vector3d& v = in_world_;

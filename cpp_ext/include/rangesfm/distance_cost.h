@@ -9,7 +9,7 @@
 
 namespace rangesfm {
 
-// An end of a distance that is a parameter block itself: a 3-D point, an anchor.
+// An end of a distance that is itself a parameter block, such as a 3-D point or an anchor.
 class PointEnd {
  public:
   static constexpr int kBlockSize = 3;
@@ -26,7 +26,7 @@ class PointEnd {
   };
 };
 
-// An end that is fixed to a camera (to its rig frame), whose pose is the block.
+// An end that is fixed to a camera (in its rig frame), whose pose is the parameter block.
 class CamEnd {
  public:
   static constexpr int kBlockSize = 7;
@@ -48,7 +48,7 @@ class CamEnd {
   Eigen::Vector3d end_in_cam_;
 };
 
-// 1-DoF error of a distance that was measured, by tape or by radio, in stddevs, made robust: formula and blocks are in
+// Robust error of a distance measured by tape or by radio, in standard deviations. The formula and the blocks are in
 // the docstring of distance_cost (src/bindings.cc). Metres throughout.
 template <typename EndA, typename EndB>
 class DistanceCost final : public ceres::CostFunction {

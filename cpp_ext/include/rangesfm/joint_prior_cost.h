@@ -7,7 +7,8 @@
 
 namespace rangesfm {
 
-// n-DoF error of what was known beforehand of n numbers that are not independent: joint_prior_cost in src/bindings.cc.
+// Error of n correlated numbers relative to their prior. The formula is in the docstring of joint_prior_cost
+// (src/bindings.cc).
 class JointPriorCost final : public ceres::CostFunction {
  public:
   JointPriorCost(Eigen::VectorXd mean, Eigen::MatrixXd whitening)

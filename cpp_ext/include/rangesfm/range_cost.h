@@ -13,24 +13,24 @@
 
 namespace rangesfm {
 
-// Ranges as measured, n of them.
+// n measured ranges.
 struct MeasuredRanges {
   Eigen::VectorXd range;
-  Eigen::VectorXd stddev;  // in which the loss counts
-  Eigen::VectorXd share;   // by how much each counts beside that: what its loss is multiplied by
+  Eigen::VectorXd stddev;  // unit of the robust loss
+  Eigen::VectorXd share;   // factor of the robust loss
 };
 
-// How a range follows from the two antennas, and what of that is estimated along with the map.
+// Model of a range between two antennas, and which of its parameters are estimated.
 struct RangeModel {
-  std::optional<Eigen::Vector3d> tag_in_cam;  // nothing: a parameter block
-  bool has_time_shift = false;                // a block; of InterpolatedPlace
-  std::optional<double> short_range_length;   // given: the short-range error's amplitude is a block
+  std::optional<Eigen::Vector3d> tag_in_cam;  // without a value it is a parameter block
+  bool has_time_shift = false;                // whether it is a parameter block; only with InterpolatedPlace
+  std::optional<double> short_range_length;   // with a value, the short-range error's amplitude is a parameter block
   RobustLoss loss;
 };
 
-// n-DoF error of the ranges between the tag at one place and one anchor, in stddevs, made robust one by one, times the
-// root of its share. The formula, its blocks and their order are in the docstring of range_cost (src/bindings.cc).
-// Metres and seconds throughout. Needs the model to be metric already, or close to it.
+// Errors of n ranges between the tag at one place and one anchor, in standard deviations, each robust and times the
+// root of its share. The formula, the blocks and their order are in the docstring of range_cost (src/bindings.cc).
+// Metres and seconds throughout. The scale of the model must be metric, at least approximately.
 template <typename Place>
 class RangeCost final : public ceres::CostFunction {
  public:
@@ -93,7 +93,7 @@ class RangeCost final : public ceres::CostFunction {
             Number(parameters, time_shift_)};
   }
 
-  // Where the derivatives of one range with respect to a block go; null if nobody asks for them.
+  // Returns where to write the derivatives of one range with respect to a block, or null if they are not needed.
   double* Row(int range, int block, double** jacobians) const {
     if (block == kNone || jacobians[block] == nullptr) {
       return nullptr;

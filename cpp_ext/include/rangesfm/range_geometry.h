@@ -1,5 +1,5 @@
-// What ranges and distances share: where a point of a camera is, how far from another, and how both move with the
-// parameters.
+// Geometry of ranges and distances: the position of a point fixed to a camera, the distance between two points, and the
+// derivatives of both.
 
 #pragma once
 
@@ -10,17 +10,18 @@ namespace rangesfm {
 
 using PoseGradient = Eigen::Matrix<double, 1, 7>;
 
-// Antenna of the tag in the world, seen from one of COLMAP's pose blocks, rig_from_world = [qx qy qz qw tx ty tz]:
+// Position of the tag's antenna in the world, from COLMAP's pose block rig_from_world = [qx qy qz qw tx ty tz]:
 //
 //   tag_in_world = R^T d,  d = tag_in_cam - t
 //
-// ("cam" is the rig frame, that is, the rig's reference camera.) With q = (u, w) the rotation is the polynomial that
-// Eigen evaluates for `conjugate(q) * d`,
+// ("cam" is the rig frame, that is, the frame of the rig's reference camera.) With q = (u, w), the rotation is the
+// polynomial that Eigen evaluates for `conjugate(q) * d`,
 //
 //   R^T d = d - 2 w (u x d) + 2 u x (u x d),
 //
-// which turns d only for a unit quaternion. Off the unit sphere its derivative is of no meaning in itself; projected
-// to the tangent space by the quaternion's manifold it is exact, as of any smooth function that agrees on the sphere.
+// which is a rotation only for a unit quaternion. The derivative of the polynomial itself has no meaning off the unit
+// sphere. Its projection to the tangent space by the quaternion's manifold is exact, as for any smooth function that
+// agrees with the rotation on the sphere.
 class TagPosition {
  public:
   TagPosition(const double* rig_from_world, const Eigen::Vector3d& tag_in_cam)
@@ -43,16 +44,16 @@ class TagPosition {
     return gradient;
   }
 
-  // The same with respect to tag_in_cam.
+  // Derivative of direction . tag_in_world with respect to tag_in_cam.
   Eigen::Vector3d LeverArmGradient(const Eigen::Vector3d& direction) const { return cam_from_world_ * direction; }
 
  private:
   Eigen::Map<const Eigen::Quaterniond> cam_from_world_;
-  Eigen::Vector3d tag_from_cam_;  // d: from the camera's centre to the tag, turned as the world is in the camera
+  Eigen::Vector3d tag_from_cam_;  // d: vector from the world's origin to the tag, in the camera's axes
   Eigen::Vector3d in_world_;
 };
 
-// From the anchor to the tag: how far, and in which direction.
+// Distance and direction from the anchor to the tag.
 class AnchorToTag {
  public:
   AnchorToTag(const Eigen::Vector3d& tag_in_world, const double* anchor_in_world)
@@ -64,8 +65,8 @@ class AnchorToTag {
   const Eigen::Vector3d& Direction() const { return direction_; }
 
  private:
-  // Where the two antennas meet the distance has no derivative. Closer than this the offset is rounding noise and its
-  // direction arbitrary; zero is the one subgradient that pushes nobody anywhere, so the answer stays finite and the
+  // Where the two antennas coincide, the distance has no derivative. Below this distance the offset is a rounding error
+  // with an arbitrary direction. Zero is the subgradient that causes no step, so that the result stays finite and the
   // other residuals decide.
   static constexpr double kMinDistance = 1e-12;  // metres
 

@@ -4,12 +4,12 @@
 
 namespace rangesfm {
 
-// A robust loss inside a cost function, so that each of its residuals is judged for itself (one of Ceres' would judge
-// the whole residual block by its sum of squares).
+// A robust loss inside a cost function. It applies to each residual separately, while a loss function of Ceres applies
+// to the sum of squares of a whole residual block.
 //
-// Half the square of the value below is the loss of the residual r: Cauchy's, c^2 / 2 log(1 + r^2 / c^2), which grows
-// on and so leads to a minimum from further away, or Geman and McClure's, 1/2 r^2 / (1 + r^2 / c^2), which no outlier
-// raises beyond c^2 / 2. An infinite scale c is least squares. With x = r^2 / c^2:
+// Half the square of the value below is the loss of the residual r. Cauchy's loss, c^2 / 2 log(1 + r^2 / c^2), keeps
+// growing and so leads to a minimum from farther away. Geman and McClure's loss, 1/2 r^2 / (1 + r^2 / c^2), never
+// exceeds c^2 / 2. An infinite scale c means least squares. With x = r^2 / c^2:
 //
 //   Cauchy          value = r g,              slope = 1 / ((1 + x) g),  g = sqrt(log(1 + x) / x), which is 1 at 0
 //   Geman-McClure   value = r / sqrt(1 + x),  slope = (1 + x)^-3/2
@@ -38,7 +38,7 @@ class RobustLoss {
   }
 
  private:
-  // Below it, value and slope are those of least squares to the last digit.
+  // For smaller x, value and slope equal those of least squares to the last digit.
   static constexpr double kTiny = 1e-17;
 
   double inv_scale_ = 0.0;

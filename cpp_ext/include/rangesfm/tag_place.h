@@ -1,8 +1,7 @@
-// Where the tag was when its ranges were measured: at a keyframe, or between two keyframes.
+// Place of the tag when its ranges were measured: at a keyframe, or between two keyframes.
 //
-// A place says which parameter blocks of poses it has, how many ranges were measured there, and, as its class Now,
-// where the tag is for each of them at the present parameters and how that moves with them. Each gradient is the
-// derivative of direction . tag_in_world.
+// A place has a number of pose blocks. Its class Now gives the position of the tag for each range at the present
+// parameters, and the derivatives of direction . tag_in_world by them.
 
 #pragma once
 
@@ -13,14 +12,14 @@
 
 namespace rangesfm {
 
-// What moves the tag beside the poses: its place in the rig frame, and how much later its ranges were measured than
-// was thought (seconds).
+// Parameters other than the poses that move the tag: its position in the rig frame, and by how many seconds its ranges
+// were measured later than assumed.
 struct TagMotion {
   Eigen::Vector3d tag_in_cam;
   double time_shift;
 };
 
-// At a keyframe: R^T (tag_in_cam - t), the same for all its ranges.
+// Place at a keyframe: R^T (tag_in_cam - t), the same for all ranges.
 class KeyframePlace {
  public:
   static constexpr int kNumPoses = 1;
@@ -44,13 +43,14 @@ class KeyframePlace {
   };
 };
 
-// Between two keyframes, one column and one weight a range:
+// Place between two keyframes, with an offset and a weight for each range:
 //
 //   (1 - w) p_before + w p_after + offset_in_world,
 //   p = R^T (tag_in_cam - t),  w = weight + time_shift / interval
 //
-// The straight line between the tag's two places moves with both poses; the offset is what the path's curvature adds to
-// it. The interval is the time between the keyframes; a line goes on beyond its ends where a time shift leads there.
+// The straight line between the tag's two positions moves with both poses. The offset is the deviation of the curved
+// path from that line. The interval is the time between the keyframes. A time shift may lead beyond the ends of the
+// line, which is then extended.
 class InterpolatedPlace {
  public:
   static constexpr int kNumPoses = 2;
