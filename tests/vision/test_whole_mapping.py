@@ -91,7 +91,7 @@ def test_photos_that_give_no_model_are_told_of(room: Room, output: Path) -> None
         (MAPPER.changed(method="global", pipeline={"ba_local_num_images": 9}), r"unknown key 'ba_local_num_images' in"),
         (
             MAPPER.changed(method="hierarchical", ranges_in_mapping=True),
-            r"\[mapper\] ranges_in_mapping is true, expected false beside method 'hierarchical'",
+            r"\[mapper\] ranges_in_mapping is true, expected false with method 'hierarchical'",
         ),
     ],
 )

@@ -173,7 +173,7 @@ def _all_of(inbox: queue.SimpleQueue[Any]) -> list[Any]:
 def _ending(future: Future) -> Any:
     """Return the result of ``run_on_worker``, or a Failure that says why there is none."""
     if future.cancelled():  # also when the scheduler has ended
-        return Failure("the scheduler gave it up", FAILED)
+        return Failure("the scheduler cancelled it", FAILED)
     error = future.exception(timeout=_MAX_STOP_S)
     if error is None:
         return future.result(timeout=_MAX_STOP_S)

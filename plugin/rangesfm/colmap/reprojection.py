@@ -38,7 +38,7 @@ class PointErrors:
 
     @property
     def fit(self) -> bool:
-        """Whether the points can belong to these photos and cameras; true without points."""
+        """Return whether the points can belong to these photos and cameras; true without points."""
         return not self.median_px > self.max_median_px
 
     def apart(self, whose: str, photos: str = "the photos") -> str:

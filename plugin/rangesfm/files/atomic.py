@@ -30,7 +30,7 @@ _NOT_IN_NAMES = ("Cc", "Cs", "Zl", "Zp")
 
 
 def stays_inside(name: str) -> bool:
-    """Whether a name from a file, taken relative to a folder, stays inside that folder."""
+    """Return whether a name from a file, taken relative to a folder, stays inside that folder."""
     path = Path(name)
     return not path.is_absolute() and ".." not in path.parts
 
@@ -45,7 +45,7 @@ def path_of(text: str) -> Path:
 
 
 def is_plain_name(name: str) -> bool:
-    """Whether a photo's name can be written into tables and files: UTF-8 text on one line, not empty."""
+    """Return whether a photo's name can be written into tables and files: UTF-8 text on one line, not empty."""
     return bool(name) and not any(unicodedata.category(character) in _NOT_IN_NAMES for character in name)
 
 

@@ -20,12 +20,12 @@ _BAG_TABLES = {"topics", "messages"}
 
 
 def is_bag_folder(path: Path) -> bool:
-    """Whether this is the folder of a ROS 2 bag."""
+    """Return whether this is the folder of a ROS 2 bag."""
     return (path / "metadata.yaml").is_file() and any(any(path.glob(f"*{end}*")) for end in _ROS2)
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path has a file name ending of a bag, or is the folder of a ROS 2 bag."""
+    """Return whether a path has a file name ending of a bag, or is the folder of a ROS 2 bag."""
     return path.suffix.lower() in (".bag", *_ROS2) or is_bag_folder(path)
 
 

@@ -84,7 +84,7 @@ class OutputFolder:
                 raise InputError(_NOT_OURS, foreign)
 
     def is_own(self, path: Path) -> bool:
-        """Whether the file at this path was written by this tool and is unchanged."""
+        """Return whether the file at this path was written by this tool and is unchanged."""
         return os.path.lexists(path) and self._manifest.foreign_file(path) is None
 
     def defer(self, new: Mapping[Path, Path]) -> None:
@@ -248,7 +248,7 @@ def absolute(path: Path) -> Path:
 
 
 def is_private(path: Path) -> bool:
-    """Whether a path lies in the hidden folder of an output folder that this or another process holds."""
+    """Return whether a path lies in the hidden folder of an output folder that this or another process holds."""
     return any(parent.name == PRIVATE_NAME and (parent / "lock").is_file() for parent in path.parents)
 
 
@@ -330,7 +330,7 @@ def _lock(folder: Path, private: Path, max_wait_s: float) -> BaseFileLock:
 
 
 def _is_lock(path: Path) -> bool:
-    """Whether a file is a lock of this tool: empty, as when just made, or beginning like the entry of a holder."""
+    """Return whether a file is a lock of this tool: empty, as when just made, or with the entry of a holder."""
     try:
         if path.is_symlink() or not path.is_file():
             return False
@@ -360,7 +360,7 @@ def _holder(lock: Path) -> str:
 
 
 def _is_another_process(pid: int) -> bool:
-    """Whether another living process has this number; leftovers with our own number are an earlier process's."""
+    """Return whether another living process has this number; leftovers with our own number are an earlier process's."""
     import psutil
 
     try:  # a process that has ended remains listed until its parent asks for its exit status

@@ -108,7 +108,7 @@ class Table:
         return texts
 
     def begins_with_number(self, column: str) -> bool:
-        """Whether the first cell of the column is a number, or there is no cell."""
+        """Return whether the first cell of the column is a number, or there is no cell."""
         cells = self.cells[column]
         return not isinstance(cells, list) or not cells or _number(cells[0]) is not None
 
@@ -324,7 +324,7 @@ def header_names(text: str, separator: str | None = None) -> list[str]:
 
 
 def has_columns(text: str, required: Collection[str], aliases: Mapping[str, str] | None = None) -> bool:
-    """Whether the header row in the beginning of a file names the required columns, as ``read_table`` reads it."""
+    """Return whether the header row in a file's beginning names the required columns, as ``read_table`` reads it."""
     return {*required} <= {(aliases or {}).get(name, name) for name in header_names(text)}
 
 

@@ -126,12 +126,12 @@ def check_crs(crs: str) -> None:
 
 
 def is_geographic(crs: str) -> bool:
-    """Whether the coordinates of this system are longitude and latitude in degrees."""
+    """Return whether the coordinates of this system are longitude and latitude in degrees."""
     return bool(_pyproj().CRS.from_user_input(crs).is_geographic)
 
 
 def _holds_at(crs: str, geographic: Array) -> bool:
-    """Whether points (n, 3) lie in the system's area of use; the formulas give some result for wrong input, too.
+    """Return whether points (n, 3) lie in the system's area of use; the formulas give some result for wrong input, too.
 
     Args:
         geographic: longitude and latitude in degrees, and height.

@@ -140,7 +140,7 @@ class Reference:
 
 
 def is_reference_file(head: str) -> bool:
-    """Whether a file with this beginning is a reference: positions by photo or time, or a TUM trajectory."""
+    """Return whether a file with this beginning is a reference: positions by photo or time, or a TUM trajectory."""
     names = header_names(head)
     if _are_numbers(names):
         return abs(float(np.linalg.norm([float(name) for name in names[-4:]])) - 1.0) <= QUATERNION_TOLERANCE
@@ -183,7 +183,7 @@ def write_reference(reference: Reference, path: Path) -> Path:
 
 
 def _are_numbers(cells: list[str]) -> bool:
-    """Whether the first row holds a TUM pose rather than names."""
+    """Return whether the first row holds a TUM pose rather than names."""
     try:
         return len([float(cell) for cell in cells]) == 1 + len(POSITION_COLUMNS) + len(QUATERNION_COLUMNS)
     except ValueError:

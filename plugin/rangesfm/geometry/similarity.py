@@ -58,7 +58,7 @@ def rounding_of(coordinates: Array) -> float:
 
 
 def are_apart(points: Array) -> bool:
-    """Whether points (n, 3) differ by more than rounding, so that they are not all one place."""
+    """Return whether points (n, 3) differ by more than rounding, so that they are not all one place."""
     return bool(np.ptp(points, axis=0).max() > rounding_of(points))
 
 

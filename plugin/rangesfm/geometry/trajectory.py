@@ -136,7 +136,7 @@ def joined_trajectory(parts: Sequence[Trajectory]) -> tuple[Trajectory, list[Ind
 
 
 def is_one_after_the_other(path: Trajectory) -> bool:
-    """Whether no two keyframes have the same time; in a map joined from several cameras' maps they may."""
+    """Return whether no two keyframes have the same time; in a map joined from several cameras' maps they may."""
     return path.timestamps_s is None or bool(np.all(np.diff(path.timestamps_s) > 0))
 
 

@@ -68,7 +68,7 @@ class PlannedPhotos(Options, table="photos"):
     num_photos_of_point: Annotated[int, Field(ge=2, le=1000)] = 8
     """Largest number of successive photos in which a point is found."""
     closes_loops: bool = False
-    """Whether a point is found again later, from about the same direction and distance."""
+    """True if a point is found again later, from about the same direction and distance."""
     feature_stddev: Annotated[float, Field(ge=1e-6, le=0.1)] = 0.0005
     """Standard deviation of each coordinate of a feature, as a fraction of a photo's width."""
 

@@ -57,7 +57,7 @@ class PlannedAnchorOptions(Options, table="anchors"):
     )
     """Positions x, y, z by anchor id, instead of path."""
     frame: Literal["site", "first_camera", "unknown"] = "site"
-    """How a run will know the positions: surveyed in the site, in the first camera's frame, or not at all."""
+    """Knowledge of the positions in a run: surveyed in the site, in the first camera's frame, or not at all."""
     position_stddev_m: _Stddev = 0.0
     """Standard deviation to which each coordinate in places will be known."""
     num_to_place: Annotated[int, Field(ge=1, le=_MAX_NUM_ANCHORS)] | None = None
@@ -101,7 +101,7 @@ class PlannedPathOptions(Options, table="path"):
     photo_rate_hz: Annotated[float, Field(ge=0.5, le=100)] = 2.0
     """Keyframes per second."""
     is_level: bool = False
-    """Whether the camera cannot go up and down, as on a rover."""
+    """True if the camera cannot go up and down, as on a rover."""
 
 
 class PlannedRadioOptions(RangeModelOptions, table="radio"):
@@ -237,7 +237,7 @@ def _anchors(options: PlannedAnchorOptions, allowed_m: Array | None) -> tuple[An
         anchors = read_anchors(options.path)
     for anchor in anchors:
         if anchor.position_m is None:
-            expected = "its planned position (whether a run will know it is said by [anchors] frame)"
+            expected = "its planned position ([anchors] frame says whether a run knows it)"
             raise InputError(f"anchor {anchor.anchor_id} has no position, expected {expected}", options.path)
     if len(anchors) > _MAX_NUM_ANCHORS:
         raise OptionError(f"[anchors] are {len(anchors)}, expected at most {_MAX_NUM_ANCHORS}", "anchors")

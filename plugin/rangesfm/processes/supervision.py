@@ -105,7 +105,7 @@ def _end_with(parent: int) -> None:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a child process ended.
+    """End of a child process.
 
     Attributes:
         last: the last message it sent; None if it sent none.

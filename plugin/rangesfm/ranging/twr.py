@@ -110,7 +110,7 @@ def double_sided_range(
 
 
 def _same_duration(one_s: Array, other_s: Array) -> bool:
-    """Whether most intervals are the same on both clocks, up to the difference of their rates."""
+    """Return whether most intervals are the same on both clocks, up to the difference of their rates."""
     both = np.isfinite(one_s) & np.isfinite(other_s) & (other_s > 0)
     if not np.any(both):
         return False

@@ -10,7 +10,7 @@ from rangesfm.options import MapperOptions
 
 
 def uses_gpu(mapper: MapperOptions) -> bool:
-    """Whether COLMAP is to work on a GPU; without one it would fail in the middle of its work.
+    """Return whether COLMAP is to work on a GPU; without one it would fail in the middle of its work.
 
     Raises:
         OptionError: a GPU is asked for, and there is none.

@@ -124,7 +124,7 @@ def find_image_times(
 
 
 def is_image_times_file(head: str) -> bool:
-    """Whether a file with this beginning is a table of image times."""
+    """Return whether a file with this beginning is a table of image times."""
     return has_columns(head, _COLUMNS, _ALIASES)
 
 

@@ -53,7 +53,7 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
         InputError: a key or value that COLMAP does not have, or that only the incremental mapper has.
     """
     if mapper.ranges_in_mapping and mapper.method != "incremental":
-        message = f"[mapper] ranges_in_mapping is true, expected false beside method '{mapper.method}'"
+        message = f"[mapper] ranges_in_mapping is true, expected false with method '{mapper.method}'"
         raise OptionError(message, "mapper", "ranges_in_mapping")
     options: PipelineOptions
     if mapper.method == "global":

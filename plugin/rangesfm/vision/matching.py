@@ -63,7 +63,7 @@ class MatchingOptions:
 
     @property
     def is_by_place(self) -> bool:
-        """Whether the pairs depend on the order and names of the photos alone, not on their content or position."""
+        """Return whether the pairs depend only on the order and names of the photos, not on their content."""
         if isinstance(self.pairing, (pycolmap.SpatialPairingOptions, pycolmap.VocabTreePairingOptions)):
             return False
         return not (isinstance(self.pairing, pycolmap.SequentialPairingOptions) and self.pairing.loop_detection)

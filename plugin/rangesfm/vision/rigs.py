@@ -46,12 +46,12 @@ class Rigs:
 
     @property
     def are_known(self) -> list[bool]:
-        """For each rig, whether the configuration gives the poses of all its cameras."""
+        """Return, for each rig, whether the configuration gives the poses of all its cameras."""
         return [all(c.ref_sensor or c.cam_from_rig is not None for c in config.cameras) for config in self.configs]
 
     @property
     def are_metric(self) -> bool:
-        """Whether the configuration gives the distance between any two cameras."""
+        """Return whether the configuration gives the distance between any two cameras."""
         return any(_baseline_m(camera) for _, camera in self._cameras)
 
     def camera_of(self, name: str) -> str | None:
@@ -105,7 +105,7 @@ class Rigs:
                 pycolmap.apply_rig_config(list(self.configs), database, *([] if model is None else [model]))
             except ValueError as error:
                 reason = " ".join(str(error).partition("Check failed: ")[2].split())
-                raise InputError(f"does not go with the photos ({reason})", self.path) from None
+                raise InputError(f"does not fit the photos ({reason})", self.path) from None
 
     def ids_of_known(self, database_path: Path) -> set[int]:
         """Return the ids of the rigs in a database whose camera poses are all known.
@@ -193,7 +193,7 @@ def _baseline_m(camera: pycolmap.RigConfigCamera) -> float:
 
 
 def _is_placed_alike(camera: pycolmap.RigConfigCamera, other: pycolmap.RigConfigCamera) -> bool:
-    """Whether two cameras have the same centre in their rigs, to the precision of a configuration file."""
+    """Return whether two cameras have the same centre in their rigs, to the precision of a configuration file."""
     centers = [known.cam_from_rig.inverse().translation for known in (camera, other) if known.cam_from_rig is not None]
     return len(centers) == 2 and bool(np.allclose(centers[0], centers[1], rtol=0, atol=_SAME_PLACE_M))
 

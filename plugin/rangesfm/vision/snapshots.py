@@ -39,7 +39,7 @@ class Snapshots:
             _keep(write_snapshot(model, self._scratch), self._path)
 
     def _is_just_refined(self, model: pycolmap.Reconstruction) -> bool:
-        """Whether all poses have changed since the last photo; without a refinement only those near a new photo do."""
+        """Return whether the whole model was refined, that is, all poses have changed since the last photo."""
         poses = {id_: pose_of(model.frame(id_)).params.tobytes() for id_ in model.reg_frame_ids()}
         before, self._poses = self._poses, poses
         return bool(before) and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)

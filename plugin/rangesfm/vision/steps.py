@@ -101,7 +101,7 @@ class Steps:
 
     @property
     def has_begun(self) -> bool:
-        """Whether the results are in this folder, not in that of the earlier steps."""
+        """Return whether the results are in this folder, not in that of the earlier steps."""
         return self._earlier is None
 
     def begin(self) -> None:
@@ -111,7 +111,7 @@ class Steps:
         self._read_record()
 
     def has_done(self, steps: Mapping[str, str]) -> bool:
-        """Whether all these steps are recorded as done with these inputs, given by the steps' names."""
+        """Return whether all these steps are recorded as done with these inputs, given by the steps' names."""
         states = [(self._record.get(name, {}), inputs) for name, inputs in steps.items()]
         return all(state.get("done") is True and state.get("inputs") == inputs for state, inputs in states)
 

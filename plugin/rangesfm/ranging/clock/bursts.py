@@ -74,7 +74,7 @@ class Pairing:
     chance: float
 
     def explains(self) -> bool:
-        """Whether there are enough medians, and the path explains them better than no motion at all."""
+        """Return whether there are enough medians, and the path explains them better than no motion at all."""
         return self.num_spare >= _MIN_NUM_SPARE and self.chance < _MAX_CHANCE
 
     def log_odds(self, rival: Pairing) -> float:

@@ -91,7 +91,7 @@ class OffsetFit:
 
     @property
     def is_testable(self) -> bool:
-        """Whether there are enough ranges to tell a fit from a coincidence."""
+        """Return whether there are enough ranges to tell a fit from a coincidence."""
         return self.num_spare >= self.squares.num_unknowns
 
     @cached_property
@@ -119,12 +119,12 @@ class OffsetFit:
         return min(self.num_spare, float(np.var(self.losses)) / max(variance, 1e-300))
 
     def explains(self) -> bool:
-        """Whether the path explains the ranges better than no motion at all."""
+        """Return whether the path explains the ranges better than no motion at all."""
         least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.ranges.times_s))
         return bool(self.score > least)
 
     def is_hopeless_beside(self, rival: OffsetFit) -> bool:
-        """Whether its residuals are so much larger than a rival's that further descent makes no difference."""
+        """Return whether its residuals are so much larger than a rival's that further descent makes no difference."""
         behind = rival.score - self.score
         return behind > _FAR_BEHIND and behind * min(self.num_independent, rival.num_independent) > _HOPELESS
 
@@ -212,7 +212,7 @@ def _variance_of_mean(values: Array, times: Array) -> float:
 
 
 def _is_determined(own: Array, rates: Array) -> bool:
-    """Whether the offset changes the ranges in a way that the other unknowns cannot explain."""
+    """Return whether the offset changes the ranges in a way that the other unknowns cannot explain."""
     return bool(own @ own > _MIN_OWN_RATE**2 * (rates @ rates))
 
 
@@ -283,6 +283,6 @@ def drift_note(drift: float, stddev: float, times_s: Array) -> str:
     half_span_s = float(np.ptp(times_s)) / 2
     return (
         f"the clocks drift: the camera's gains {1e6 * drift:+.0f} ppm on the radio's (stddev {1e6 * stddev:.0f} ppm); "
-        f"this is corrected for: the time offset differs by {drift * half_span_s:+.3f} s at the end of the log from "
-        f"that in its middle"
+        f"the drift is corrected, and the time offset at the end of the log differs by {drift * half_span_s:+.3f} s "
+        f"from that in its middle"
     )

@@ -159,7 +159,7 @@ def _find_range(free: list[Column], guess: Guess) -> list[Column]:
 
 
 def _is_range(column: Column) -> bool:
-    """Whether a column is a single column of ranges by its name; ``d`` and ``r`` count only alone or with a unit."""
+    """Return whether a column holds ranges by its name; ``d`` and ``r`` count only alone or with a unit."""
     words = {*_without_numbers(column)}
     if column.kind != "numbers" or terms.NO_RANGE & words:
         return False
@@ -184,7 +184,7 @@ def _groups(columns: Sequence[Column]) -> list[list[tuple[Column, list[int]]]]:
 
 
 def _is_letter(word: str, k: int, words: list[str]) -> bool:
-    """Whether a word is a single letter at the end of a name and an id, as in dist_A."""
+    """Return whether a word is a single letter at the end of a name and an id, as in dist_A."""
     return len(word) == 1 and k == len(words) - 1 > 0 and bool(terms.RANGE & {*words}) and word not in terms.LENGTH_UNIT
 
 
@@ -325,7 +325,7 @@ def _is_real(column: Column) -> bool:
 
 
 def _is_nanoseconds(column: Column) -> bool:
-    """Whether a column holds the nanoseconds within a second."""
+    """Return whether a column holds the nanoseconds within a second."""
     return column.is_whole and column.num_distinct > 9 and 1e8 < float(np.max(column.numbers)) < 1e9
 
 
@@ -390,7 +390,7 @@ def _num_tags(columns: Sequence[Column]) -> int:
 
 
 def _are_alike(ranges: Array) -> bool:
-    """Whether ranges (n, anchors, tags) differ little between tags, and clearly less than between anchors."""
+    """Return whether ranges (n, anchors, tags) differ little between tags, and clearly less than between anchors."""
     spread = np.percentile(np.ptp(ranges, axis=2), 95, axis=0)
     apart = np.median(np.ptp(ranges[:, :, 0], axis=1))
     return bool(np.max(spread) < min(_SAME_SPOT_M, apart / 3))

@@ -228,7 +228,7 @@ def _read_rows(
 
 
 def _is_comment(line: str) -> bool:
-    """Whether a line is a comment of Python, MATLAB or C; rostopic's ``%time`` is a name, not a comment."""
+    """Return whether a line is a comment of Python, MATLAB or C; rostopic's ``%time`` is a name, not a comment."""
     return line.lstrip().startswith(("#", "% ", "%%", "//"))
 
 
@@ -253,7 +253,7 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _is_header(row: list[str], rows: list[list[str]]) -> bool:
-    """Whether a row has words where those below it have numbers or times."""
+    """Return whether a row has words where those below it have numbers or times."""
     below = [Column("", tuple(cells)).cured() for cells in zip(*rows)]
     return any(
         column.kind in ("numbers", "times") and cell and Column("", (cell,)).cured().kind == "text"

@@ -54,7 +54,7 @@ class ReadOptions(LogOptions):
 
 
 class Sides(Enum):
-    """What a log format says about the two ends of a range."""
+    """Meaning of the two ends of a range in a log format."""
 
     ASKED = "who asked whom"
     TOLD = "a side for tags and one for anchors, where a peer may stand on the other's side"
