@@ -7,6 +7,7 @@ HEAD = """# Keys of a survey file
 
 Made by `python examples/keys.py > examples/keys.md`. Every key is optional; `rangesfm run` takes each also as the flag
 beside it, in place of the file's. Paths are relative to the survey file, those of flags to the working directory.
+The [glossary](glossary.md) explains the words.
 """
 
 

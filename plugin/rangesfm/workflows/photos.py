@@ -145,7 +145,7 @@ def find_keyframes(
 ) -> tuple[tuple[str, ...], ImageTimes | None]:
     """Return the keyframes and their times; None in place of times, and order by name, where times are not needed.
 
-    Of the photos that a rig took at the same time, only the one of the reference camera is returned.
+    Of the photos that a rig took at the same time, only one is returned, that of the reference camera if there is one.
 
     Args:
         survey: options.
