@@ -98,6 +98,12 @@ def test_the_metadata_and_the_wheels_are_for_the_versions_that_are_said(project:
         assert f"pybind11>={PYBIND11},<{next_minor(PYBIND11)}" in requirements
 
 
+def test_contributors_install_what_the_build_requires(project: dict[str, Any]) -> None:
+    page = (ROOT / ".github" / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    needed = " ".join(f"'{requirement}'" for requirement in project["build-system"]["requires"])
+    assert f"pip install {needed}\n" in page
+
+
 def test_the_build_looks_for_the_versions_that_are_said() -> None:
     recipe = (ROOT / "cpp_ext" / "CMakeLists.txt").read_text(encoding="utf-8")
     oldest, newest = EIGEN_HEADERS
