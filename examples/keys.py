@@ -1,4 +1,7 @@
-"""Print the reference of all keys of a survey file and of a plan: python examples/keys.py > examples/keys.md"""
+"""Print the reference of all keys of a survey file and of a plan.
+
+The page is written by: python examples/keys.py > examples/keys.md
+"""
 
 from rangesfm.planning.settings import TABLES as PLAN_TABLES
 from rangesfm.survey.settings import KEYS, TABLES

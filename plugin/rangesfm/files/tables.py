@@ -294,7 +294,7 @@ def repeated(keys: Iterable[Hashable]) -> tuple[int, int] | None:
 
 
 def read_text(path: str | Path, *, errors: str = "strict") -> str:
-    """Read a whole UTF-8 file (or UTF-16 with its byte order mark), with ``\\n`` line endings and without the mark.
+    """Read a whole UTF-8 file (or UTF-16 with its byte order mark) with line feeds as line ends, without the mark.
 
     Args:
         errors: "strict": bytes that are not text raise an InputError; "replace": they are replaced.

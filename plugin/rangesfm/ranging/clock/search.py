@@ -261,8 +261,10 @@ class _Correlation:
         return np.asarray(rfft(values, self._size))
 
     def __call__(self, samples: npt.NDArray[np.complex128], cells: npt.NDArray[np.complex128]) -> Array:
-        """Return the correlation (num_offsets,) from both transforms; at the first offset the last cell is on the first
-        sample."""
+        """Return the correlation (num_offsets,) from both transforms.
+
+        At the first offset, the last cell is on the first sample.
+        """
         around = irfft(samples * np.conj(cells), self._size)
         return np.concatenate([around[self._size - self.num_cells + 1 :], around[: self.num_samples]])
 

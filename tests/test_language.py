@@ -1,0 +1,75 @@
+"""Docstrings begin with an imperative sentence or a noun phrase, so that a stranger understands their first words."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted(path for name in ("plugin", "tests", "examples") for path in (ROOT / name).rglob("*.py"))
+
+# A docstring that begins with one of these is a fragment ("Of features whose ...", "As they are", "Whether it is") or
+# hides what comes out. All of them can be avoided: "Photos by name" in place of "By name, the photos". Articles,
+# numbers ("One", "All", "Each") and shapes ("(n, 3) points") begin noun phrases, so they are allowed.
+_WORDS = "and as at but by for from how if in none not of on or that to what when where whether which with without"
+FRAGMENT_WORDS = frozenset(_WORDS.split())
+
+# Folders of the package that still have such docstrings. A folder leaves the list when it has none, and none is added.
+NOT_YET_SWEPT = frozenset(("ceres", "ranging/errors", "refine", "scale", "trust"))
+
+
+def docstrings(source: str) -> list[tuple[int, str]]:
+    """Return line and text of each docstring of a file: of modules, classes, functions and attributes."""
+    return [
+        (node.lineno, node.value.value)
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    ]
+
+
+def fragments(source: str) -> list[tuple[int, str]]:
+    """Return line and first words of each docstring that begins with a fragment word."""
+    first_words = ((line, text.split()) for line, text in docstrings(source))
+    return [
+        (line, " ".join(words[:8]))
+        for line, words in first_words
+        if words and words[0].rstrip(",.:;").lower() in FRAGMENT_WORDS
+    ]
+
+
+def folder_of(path: Path) -> str:
+    """Return the folder of a file, relative to the package if it is in that, with slashes."""
+    package = ROOT / "plugin" / "rangesfm"
+    return path.parent.relative_to(package if path.is_relative_to(package) else ROOT).as_posix()
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ('"""Of features."""', [(1, "Of features.")]),
+        ('x = 1\n"""As, for example, this."""', [(2, "As, for example, this.")]),
+        ('def f():\n    """None: it is not known."""', [(2, "None: it is not known.")]),
+        ('class A:\n    """What it is."""\n    def f(self):\n        """Off."""', [(2, "What it is.")]),
+        ('"""Offsets by name."""\nprint("of a string that is no docstring")', []),
+        ('def f():\n    """(n, 3) points."""', []),
+    ],
+)
+def test_a_fragment_is_recognised_by_its_first_word(source: str, found: list[tuple[int, str]]) -> None:
+    assert fragments(source) == found
+
+
+def test_docstrings_begin_with_no_fragment() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {words}"
+        for path in FILES
+        if folder_of(path) not in NOT_YET_SWEPT
+        for line, words in fragments(path.read_text(encoding="utf-8"))
+    ]
+    assert found == []
+
+
+def test_folders_that_have_no_fragment_have_left_the_list() -> None:
+    with_fragments = {folder_of(path) for path in FILES if fragments(path.read_text(encoding="utf-8"))}
+    assert NOT_YET_SWEPT - with_fragments == set()
