@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import importlib
 import logging
-import zlib as zlib  # before pycolmap 4.2.1: where its own copy of zlib is loaded first, Python's zlib aborts or hangs
+import zlib as zlib  # before pycolmap 4.2.1, because Python's zlib hangs or aborts if pycolmap's copy is loaded first
 from typing import Any
 
 __version__ = "0.1.0"

@@ -67,7 +67,7 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm run survey.toml --every_nth 3 --output_path out
     """
     survey = survey_from_arguments(args, progress)
-    if args.survey is not None and survey.source.path is None:  # a folder
+    if args.survey is not None and survey.source.path is None:  # the argument is a folder without a survey file
         from rangesfm.workflows.check import check_survey
 
         for fact in check_survey(survey).understood():

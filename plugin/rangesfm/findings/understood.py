@@ -19,7 +19,7 @@ from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.photos import usable_photos
 
-# Of several candidates for a key, one with such a name (without suffix, in lower case) is chosen.
+# A file or folder with such a name (without suffix, in lower case) is chosen among several candidates for a key.
 _USUAL_NAMES = {
     PHOTOS: ("images", "photos", "dcim", "rgb", "frames"),
     LOG: ("uwb", "ranges"),

@@ -157,7 +157,7 @@ def _advice(caption: str, ranked: Sequence[Advice]) -> Table:
         for k, each in enumerate(ranked, 1)
     ]
     columns = ["one change", "scale then ±", "that keyframe then ±"]
-    if ranked and np.isnan(ranked[0].place_stddev_m):  # in the first camera's frame
+    if ranked and np.isnan(ranked[0].place_stddev_m):  # the first camera's frame has no place
         rows, columns = [row[:2] for row in rows], columns[:2]
     return Table(caption, columns, rows, kind="settings")
 
