@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
+from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
@@ -88,6 +89,23 @@ def doubts_of_map(
         *_of_say(stage.observations),
         *_of_positions(stage.anchors),
         *_of_noise(stage.observations, noise_m),
+    )
+
+
+def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Doubt, ...]:
+    """Return a doubt for each part of a model that the photos hardly tie to the rest."""
+    advice = (
+        "match more pairs of photos across that gap ([mapper] matching, [mapper.pairing]) and reconstruct again, or "
+        "survey the parts apart and join them by their ranges (rangesfm join)"
+    )
+    return tuple(
+        Doubt(
+            f"the photos do not hold the map together: {len(piece.image_names)} of its {num_images} photos "
+            f"({piece.image_names[0]} to {piece.image_names[-1]}) share only {piece.num_shared} points with the "
+            "others, so that the two parts may differ in scale and place",
+            advice,
+        )
+        for piece in pieces
     )
 
 

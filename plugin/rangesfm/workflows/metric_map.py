@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
+from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.distances.ends import surveyed_distances
@@ -34,7 +35,7 @@ from rangesfm.scale.verdict import refuse_unknown
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.bent_path import bends_m, bent_to_ranges, estimate_by_bent
-from rangesfm.trust.finished_map import Doubt, doubts_of_map, place_of_map, why_broken
+from rangesfm.trust.finished_map import Doubt, doubts_of_map, doubts_of_pieces, place_of_map, why_broken
 from rangesfm.trust.lengths import trust_in_lengths
 from rangesfm.trust.linearized import RangesOnMap, ranges_on_map
 from rangesfm.trust.verdict import TrustVerdict, sentence, trust_in
@@ -258,13 +259,15 @@ def metric_map(
         GeometryError: the scale is not determined, or is less certain than asked for.
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
+    of_pieces = doubts_of_pieces(loose_pieces(path.sfm), path.sfm.num_reg_images())
+    journal.warn(*(doubt.reason for doubt in of_pieces))
     with journal.stage("scale"):
         metric = scale_by_survey(survey, inputs, path, offset, journal, is_a_start=refine)
     if refine:
         with journal.stage("refinement"):
             metric = refine_map(survey, inputs, metric, journal)
     with journal.timed("judgement"):
-        return judge_map(survey, metric, journal)
+        return judge_map(survey, metric, of_pieces, journal)
 
 
 def scale_by_survey(
@@ -473,10 +476,10 @@ def _at_rest(metric: MetricResult, rest: AtRest) -> MapWithRanges:
     )
 
 
-def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricResult:
+def judge_map(survey: Survey, metric: MetricResult, known_doubts: Sequence[Doubt], journal: Journal) -> MetricResult:
     """Judge the final map: add the final estimate of the scale, the tests of mistakes, all doubts and the place.
 
-    The doubts also go to the journal as warnings.
+    The doubts also go to the journal as warnings, except for those that were known before.
 
     Raises:
         GeometryError: the scale is less certain than asked for.
@@ -490,7 +493,7 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
         journal.warn(f"mistakes were not tested, because the ranges determine too little: {error}")
     journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *trust.reasons)
     log, by_rivals = metric.observations.log, () if metric.rivals is None else metric.rivals.doubts
-    doubts = []
+    doubts: list[Doubt] = []
     if metric.why_broken:
         reason = f"the refinement broke the map, so the scaled map is the result: {'; '.join(metric.why_broken)}"
         doubts.append(Doubt(reason, "check the model's points and cameras, clocks, lever arm and anchors"))
@@ -501,6 +504,7 @@ def judge_map(survey: Survey, metric: MetricResult, journal: Journal) -> MetricR
         noise_is_given=survey.ranges.range_stddev_m is not None or bool(np.isfinite(log.range_stddev_m).any()),
     )
     journal.warn(*(doubt.reason for doubt in doubts), *by_rivals)
+    doubts += known_doubts
     centers_m = metric.trajectory.as_in(metric.final).centers
     bent_by_m = np.zeros(0) if on_map is None else bends_m(on_map)
     place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, doubts, bent_by_m)

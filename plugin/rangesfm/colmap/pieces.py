@@ -1,0 +1,105 @@
+"""Find parts of a model that hardly any point holds together: each may have a scale and a place of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+
+from rangesfm.arrays import Indices, Mask
+from rangesfm.colmap.observations import seen_in
+
+# COLMAP takes two photos for a pair if this many matches agree on their geometry (min_num_inliers).
+MIN_NUM_SHARED = 15
+
+
+@dataclass(frozen=True)
+class LoosePiece:
+    """A part of a model that shares few points with the rest.
+
+    Attributes:
+        image_names: of its photos, in alphabetical order.
+        num_shared: points that photos of the part and photos of the rest both see.
+    """
+
+    image_names: tuple[str, ...]
+    num_shared: int
+
+
+def loose_pieces(model: pycolmap.Reconstruction) -> tuple[LoosePiece, ...]:
+    """Return the parts of a model that share fewer than MIN_NUM_SHARED points with the rest, without the largest part.
+
+    Photos of one rig frame belong together. A single frame is no part, because it has no scale of its own. A model
+    without points has no parts.
+    """
+    frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
+    sees = _frames_see(model, frame_ids)
+    if not sees.shape[1]:
+        return ()
+    labels = np.arange(len(frame_ids))
+    while True:
+        num_before = int(labels.max()) + 1
+        num, merged = connected_components(_held_together(_shared_by_parts(sees, labels)), directed=False)
+        labels = merged[labels]
+        if num == num_before:
+            break
+    num_frames = np.bincount(labels)
+    largest = int(num_frames.argmax())
+    names = _names_of_frames(model, frame_ids)
+    return tuple(
+        LoosePiece(
+            tuple(sorted(name for k in np.flatnonzero(labels == part) for name in names[k])),
+            _shared_with_rest(sees, labels == part),
+        )
+        for part in np.flatnonzero(num_frames > 1).tolist()
+        if part != largest
+    )
+
+
+def _frames_see(model: pycolmap.Reconstruction, frame_ids: Indices) -> csr_array:
+    """Return the sparse matrix (f, p) of which of p points each of f frames sees: positive where it does."""
+    row_of = {frame_id: row for row, frame_id in enumerate(frame_ids.tolist())}
+    rows, points = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        ids, _ = seen_in(image)
+        points.append(ids)
+        rows.append(np.full(len(ids), row_of[image.frame_id], dtype=np.int64))
+    row, (unique, column) = np.concatenate(rows), np.unique(np.concatenate(points), return_inverse=True)
+    return coo_array((np.ones(len(row)), (row, column)), shape=(len(frame_ids), len(unique))).tocsr()
+
+
+def _shared_by_parts(sees: csr_array, labels: Indices) -> csr_array:
+    """Return the sparse matrix (k, k) of the numbers of points that pairs of k parts both see."""
+    by_part = _sum_by_part(sees, labels)
+    return csr_array(by_part @ by_part.T)
+
+
+def _held_together(shared: csr_array) -> csr_array:
+    """Return the pairs of parts that share enough points, as a sparse matrix of ones."""
+    pairs = shared.tocoo()
+    enough = pairs.data >= MIN_NUM_SHARED
+    return csr_array(coo_array((pairs.data[enough], (pairs.row[enough], pairs.col[enough])), shape=shared.shape))
+
+
+def _sum_by_part(sees: csr_array, labels: Indices) -> csr_array:
+    """Return the sparse matrix (k, p) with a 1 where some frame of a part sees a point."""
+    of_part = coo_array((np.ones(len(labels)), (labels, np.arange(len(labels)))))
+    by_part = csr_array(of_part.tocsr() @ sees)
+    by_part.data[:] = 1.0
+    return by_part
+
+
+def _shared_with_rest(sees: csr_array, is_in_part: Mask) -> int:
+    return int(_shared_by_parts(sees, is_in_part.astype(np.int64))[0, 1])
+
+
+def _names_of_frames(model: pycolmap.Reconstruction, frame_ids: Indices) -> list[list[str]]:
+    names: dict[int, list[str]] = {frame_id: [] for frame_id in frame_ids.tolist()}
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        names[image.frame_id].append(image.name)
+    return list(names.values())

@@ -1,0 +1,64 @@
+"""Parts of a model that share hardly any points are found, and a model that its points hold together has none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import sequence_path
+
+from rangesfm.colmap.pieces import MIN_NUM_SHARED, loose_pieces
+
+NUM_PHOTOS, FIRST_OF_SECOND = 30, 19
+
+
+@pytest.fixture
+def model() -> pycolmap.Reconstruction:
+    """A chain of photos, each of which shares points with the next three only."""
+    times = np.arange(float(NUM_PHOTOS))
+    path = sequence_path(float(NUM_PHOTOS), seed=1)
+    walk = synthetic_model(
+        times, path.centers(times), path.world_from_cam(times), num_observations=80, max_track_length=4
+    )
+    return walk.reconstruction
+
+
+def shared_across(model: pycolmap.Reconstruction, first_of_second: int) -> list[int]:
+    """Return the ids of the points that photos on both sides of a gap see; ids of photos count from 1."""
+    return [
+        point_id
+        for point_id, point in model.points3D.items()
+        if len({element.image_id >= first_of_second for element in point.track.elements}) == 2
+    ]
+
+
+def with_neck(model: pycolmap.Reconstruction, num_points: int) -> pycolmap.Reconstruction:
+    """Return the model with only so many points seen on both sides of the gap."""
+    cut = pycolmap.Reconstruction(model)
+    for point_id in sorted(shared_across(model, FIRST_OF_SECOND))[num_points:]:
+        cut.delete_point3D(point_id)
+    return cut
+
+
+def test_a_chain_of_photos_that_share_points_is_one_piece(model: pycolmap.Reconstruction) -> None:
+    assert len(shared_across(model, FIRST_OF_SECOND)) > 2 * MIN_NUM_SHARED
+    assert loose_pieces(model) == ()
+
+
+@pytest.mark.parametrize("num_points", [0, 4, MIN_NUM_SHARED - 1])
+def test_a_neck_of_few_points_leaves_two_pieces(model: pycolmap.Reconstruction, num_points: int) -> None:
+    (piece,) = loose_pieces(with_neck(model, num_points))
+    assert piece.num_shared == num_points
+    assert piece.image_names == tuple(f"frame_{k:05d}.jpg" for k in range(FIRST_OF_SECOND, NUM_PHOTOS + 1))
+
+
+def test_enough_points_in_a_neck_hold_the_model_together(model: pycolmap.Reconstruction) -> None:
+    assert loose_pieces(with_neck(model, MIN_NUM_SHARED)) == ()
+
+
+def test_a_model_without_points_and_a_photo_that_sees_nothing_are_no_pieces(model: pycolmap.Reconstruction) -> None:
+    assert loose_pieces(pycolmap.Reconstruction()) == ()
+    for point_id in [point_id for point_id, p in model.points3D.items() if p.track.elements[0].image_id == 1]:
+        model.delete_point3D(point_id)
+    assert loose_pieces(model) == ()

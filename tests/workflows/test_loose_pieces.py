@@ -1,0 +1,37 @@
+"""A model of two pieces that hardly any point holds together is named by the commands that scale it."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pycolmap
+from tests.conftest import Command, WalkedSurvey
+
+
+def test_a_model_of_two_hardly_connected_pieces_is_named_as_such(
+    own_survey: WalkedSurvey, rangesfm_command: Command
+) -> None:
+    folder = own_survey.folder / "sparse" / "0"
+    model = pycolmap.Reconstruction(folder)
+    names = sorted(image.name for image in model.images.values())
+    second = set(names[25:])
+    across = [
+        point_id
+        for point_id, point in sorted(model.points3D.items())
+        if len({model.image(element.image_id).name in second for element in point.track.elements}) == 2
+    ]
+    for point_id in across[5:]:
+        model.delete_point3D(point_id)
+    model.write(folder)
+    flags = (*own_survey.flags, "--anchors", "anchors.csv", "--no_report", "--output_path", "out")
+    said = rangesfm_command("scale", *flags, cwd=own_survey.folder)
+    # A photo beside the gap may belong to either piece, or to none.
+    expected = re.compile(
+        r"the photos do not hold the map together: 1\d of its 40 photos \(frame_0002\d.jpg to frame_00040.jpg\) share "
+        r"only \d points with the others"
+    )
+    assert expected.search(said.stderr)
+    scale = json.loads((own_survey.folder / "out" / "result.json").read_text(encoding="utf-8"))["scale"]
+    assert scale["verdict"] == "doubtful"
+    assert any(expected.match(reason) for reason in scale["reasons"])
