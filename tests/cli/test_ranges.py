@@ -54,7 +54,8 @@ def test_speed_that_is_not_lights_is_refused(speed: str, capsys: pytest.CaptureF
     ("flag", "value", "said"),
     [
         ("--propagation_speed", "fast", "'fast' is neither air, vacuum nor a number"),
-        ("--stamp_bits", "33", "choose from 32, 40"),
+        ("--stamp_bits", "33", "'33' is not a choice, expected one of 32, 40"),
+        ("--stamp_bits", "many", "'many' is not a choice, expected one of 32, 40"),
         ("--ranging_interval_s", "0", "expected a number of seconds from 1e-06 to 1000000"),
         ("--separator", "ab", "expected one character"),
     ],

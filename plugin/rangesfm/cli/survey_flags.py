@@ -75,7 +75,7 @@ def _add_flag(group: argparse._ArgumentGroup, item: Key, flag: str) -> None:
         f"--{flag}",
         dest=item.dotted,
         action="append" if is_lever_arm else "store",
-        type=_lever_arm if is_lever_arm else type(choices[0]) if choices else _converter(item.type),
+        type=_lever_arm if is_lever_arm else _converter(item.type),
         choices=choices,
         help=meaning,
         metavar=None if choices else item.metavar or _metavar(item),
@@ -107,6 +107,8 @@ def _metavar(item: Key) -> str:
 def _converter(hint: Any) -> Callable[[str], Any]:
     """Return the function that converts the text of a flag to a value of a type. The key checks the value itself."""
     origin, args = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return partial(_choice, args)
     if origin in (Union, types.UnionType):
         words = [word for arg in args for word in get_args(arg) if isinstance(word, str)]
         return partial(_word_or_number, words) if words else int
@@ -115,6 +117,14 @@ def _converter(hint: Any) -> Callable[[str], Any]:
     if origin is dict:
         return _columns if args[1] is str else _options
     return str if hint is Path else hint
+
+
+def _choice(choices: tuple[str | int, ...], text: str) -> str | int:
+    # argparse would refuse the same values, but each version of Python has its own words for that.
+    for choice in choices:
+        if text == str(choice):
+            return choice
+    raise argparse.ArgumentTypeError(f"'{text}' is not a choice, expected one of {', '.join(map(str, choices))}")
 
 
 def _word_or_number(words: list[str], text: str) -> str | float:
