@@ -153,8 +153,8 @@ def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
         SolverError: the solver failed.
     """
     start = time.monotonic()
-    stillness = Stillness(problem.metric, problem.pixel_stddev, tolerance_m)
-    summary = ceres.solve(problem.adjuster, stillness.is_over)
+    monitor = ConvergenceMonitor(problem.metric, problem.pixel_stddev, tolerance_m)
+    summary = ceres.solve(problem.adjuster, monitor.is_over)
     if not summary.IsSolutionUsable():
         raise SolverError(f"the bundle adjustment with ranges failed: {summary.message}")
     return Solution(
@@ -163,16 +163,16 @@ def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
         final_cost=summary.final_cost,
         seconds=time.monotonic() - start,
         converged=summary.termination_type.name in ("CONVERGENCE", "USER_SUCCESS"),
-        is_still=stillness.is_still,
-        is_stuck=stillness.is_stuck,
-        message=_message(stillness, tolerance_m, summary.message),
+        is_still=monitor.is_still,
+        is_stuck=monitor.is_stuck,
+        message=_message(monitor, tolerance_m, summary.message),
     )
 
 
-def _message(stillness: Stillness, tolerance_m: float, of_solver: str) -> str:
-    if stillness.is_still:
+def _message(monitor: ConvergenceMonitor, tolerance_m: float, of_solver: str) -> str:
+    if monitor.is_still:
         return f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
-    if stillness.is_stuck:
+    if monitor.is_stuck:
         return "Some points or the lens allow small steps only, which do not get there."
     return of_solver
 
@@ -268,7 +268,7 @@ def _pixel_stddev(adjuster: pycolmap.CeresBundleAdjuster, num_residuals: int) ->
     return max(robust_stddev(residuals) * float(np.sqrt(num_residuals / degrees_of_freedom)), _MIN_PIXEL_STDDEV)
 
 
-class Stillness:
+class ConvergenceMonitor:
     """How far the keyframes go from step to step, and by how much the cost falls.
 
     Attributes:

@@ -6,17 +6,17 @@ import pytest
 from tests.simulated.model import SyntheticModel
 
 from rangesfm.ceres import Step
-from rangesfm.refine.bundle_adjustment import Stillness
+from rangesfm.refine.bundle_adjustment import ConvergenceMonitor
 
 FREE, TIMID = 1e10, 1e2
 
 
-def after(chain: SyntheticModel, *steps: Step) -> Stillness:
+def after(chain: SyntheticModel, *steps: Step) -> ConvergenceMonitor:
     """Return the state after these steps on a map that does not move."""
-    stillness = Stillness(chain.reconstruction, residual_stddev=0.5, tolerance_m=1e-3)
+    monitor = ConvergenceMonitor(chain.reconstruction, residual_stddev=0.5, tolerance_m=1e-3)
     for step in steps:
-        stillness.is_over(step)
-    return stillness
+        monitor.is_over(step)
+    return monitor
 
 
 def kept(radius: float, gain: float) -> Step:
@@ -27,7 +27,7 @@ def refused(radius: float, expected_gain: float) -> Step:
     return Step(False, radius, cost=1e12, gain=-1e12, expected_gain=expected_gain)
 
 
-def test_free_steps_that_gain_nothing_are_stillness(chain: SyntheticModel) -> None:
+def test_free_steps_that_gain_nothing_mean_convergence(chain: SyntheticModel) -> None:
     found = after(chain, kept(FREE, 1e-6))
     assert found.is_still
     assert not found.is_stuck
