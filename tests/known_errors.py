@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 
 Array = npt.NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from rangesfm.demo.ranges import Radio
 from rangesfm.demo.survey import ANCHORS_M, CAMERA_MODEL, TAG_IN_CAM_M
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import read_ranges, write_ranges_csv
 from rangesfm.result.places import path_in
 from rangesfm.survey.settings import KEYS

@@ -48,7 +48,7 @@ SLOW = (
     "tests/ranging/anchors/test_trilateration.py::test_ranges_that_say_how_noisy_they_are_weigh_accordingly",
     "tests/ranging/anchors/test_trilateration.py::test_study_in_small",
     "tests/ranging/anchors/test_trilateration.py::test_three_good_ranges_in_ten_decide",
-    "tests/ranging/errors/test_calibration.py",
+    "tests/ranging/errors/test_radio_calibration.py",
     "tests/ranging/errors/test_inlier_noise.py::test_without_outliers_it_is_the_standard_deviation",
     "tests/ranging/errors/test_learned.py::test_a_radio_with_far_more_noise_may_be_off_by_more_in_all_else",
     "tests/ranging/errors/test_learned.py::test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for",

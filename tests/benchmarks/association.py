@@ -21,7 +21,7 @@ from tests.simulated.path import loop_path
 
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 

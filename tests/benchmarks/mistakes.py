@@ -25,7 +25,7 @@ from tests.studies.erring_surveys import SITES
 
 from rangesfm.demo.ranges import Radio, simulate_ranges
 from rangesfm.progress import SilentProgress
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.refine.with_ranges import refine_with_ranges
 from rangesfm.survey.settings import Survey

@@ -32,7 +32,7 @@ from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_re
 from rangesfm.options import CameraOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.with_ranges import refine_with_ranges
 
 Array = npt.NDArray[np.float64]

@@ -33,7 +33,7 @@ from statistics import median
 import pycolmap
 from tests.vision.matches import content_of
 
-from rangesfm.colmap.log import colmap_log
+from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.database import clear_matches

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from rangesfm.ceres.doctor import Check
+from rangesfm.ceres.installation_checks import Check
 from rangesfm.cli import main
 from rangesfm.survey.settings import Survey
 
@@ -100,7 +100,7 @@ def test_doctor_fails_where_a_part_does_not_fit(
         Check("numpy", "2.0", "any", True),
         Check("pyceres", "1.0", "2.6", ok, "" if ok else "pip install pyceres==2.6"),
     ]
-    monkeypatch.setattr("rangesfm.ceres.doctor.diagnose", lambda: checks)
+    monkeypatch.setattr("rangesfm.ceres.installation_checks.diagnose", lambda: checks)
     assert main(["doctor"]) == status
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == (2 if ok else 3)

@@ -17,7 +17,7 @@ from rangesfm.demo.ranges import Radio, simulate_ranges
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.ranging.anchors.anchor import read_anchors
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.vision.image_times import read_image_times_csv
 

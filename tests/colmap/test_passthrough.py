@@ -7,7 +7,7 @@ from typing import Any
 import pycolmap
 import pytest
 
-from rangesfm.colmap.log import colmap_log
+from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rangesfm.distances.ends import distances_by_radio
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 
 def log_of(rows: list[tuple[str, str, float]], stddev_m: float | None = None) -> RangeLog:

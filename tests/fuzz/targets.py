@@ -19,9 +19,9 @@ from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
 from rangesfm.ranging.errors.error_curve import ErrorCurve, read_error_curve
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_summary import summarize_ranges
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, write_ranges_csv
-from rangesfm.ranging.summary import summarize_ranges
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey, read_survey

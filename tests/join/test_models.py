@@ -28,7 +28,7 @@ from rangesfm.progress import SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey

@@ -14,7 +14,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.expected import Expected
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 
 Array = npt.NDArray[np.float64]
 Place = tuple[float, float, float]

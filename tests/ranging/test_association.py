@@ -15,8 +15,8 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 
 Array = npt.NDArray[np.float64]
 TAG_IN_CAM_M = np.array([0.1, -0.2, 0.05])

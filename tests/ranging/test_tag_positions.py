@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference
 from rangesfm.ranging.association import tag_positions
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 TIMES = np.sort(np.random.default_rng(0).uniform(0.0, 60.0, 1200))
 

@@ -35,8 +35,8 @@ from rangesfm.ranging.errors.cells import cells
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine import with_ranges
 from rangesfm.refine.problem import RefinementProblem
 from rangesfm.refine.radio import predicted_ranges

@@ -12,7 +12,7 @@ from PIL import Image
 from tests.outputs import names_in
 
 from rangesfm.errors import InputError
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.report import write_report_pictures
 from rangesfm.report.chart import figure_spec, write_picture
 from rangesfm.report.figures_ranges import plot_ranges

@@ -16,8 +16,8 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.scale.initialize import initialize_scale
 
 Array = npt.NDArray[np.float64]

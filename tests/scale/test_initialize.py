@@ -16,8 +16,8 @@ from rangesfm.demo.ranges import Radio
 from rangesfm.distances.ends import LocatedDistances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeStatus, hold_out
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeStatus, hold_out
 from rangesfm.scale.initialize import initialize_scale
 
 if TYPE_CHECKING:

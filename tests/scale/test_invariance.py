@@ -19,7 +19,7 @@ from rangesfm.scale.initialize import initialize_scale
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
 
-    from rangesfm.ranging.log import RangeLog
+    from rangesfm.ranging.range_log import RangeLog
 
 SAME = 1e-9
 ANCHORS = ("A", "B", "C", "D", "E")

@@ -11,7 +11,7 @@ import pytest
 from rangesfm.demo.ranges import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.estimate import CutoffTest
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.sensitivity import scale_drift

@@ -19,8 +19,8 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.learned import usual_stddevs
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.lengths import BENDING
 
 Array = npt.NDArray[np.float64]

@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from rangesfm.demo.ranges import CameraPath, Radio, simulate_ranges
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.clock.estimate import estimate_time_offset
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.clock.time_offset import estimate_time_offset
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 

@@ -54,7 +54,7 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.components import population
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey

@@ -22,7 +22,7 @@ from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.bending import WalkBending
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.range_equation import RangeProblem, RangeState

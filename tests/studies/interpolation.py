@@ -32,7 +32,7 @@ from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.vision.image_times import read_image_times_csv

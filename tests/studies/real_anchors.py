@@ -15,7 +15,7 @@ from tests.studies.real_logs import MAX_GAP_S, read_set
 from rangesfm.geometry.reference import Reference
 from rangesfm.ranging.anchors.trilateration import AnchorPlacement, TrilaterationOptions, trilaterate_anchors
 from rangesfm.ranging.association import tag_positions
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 

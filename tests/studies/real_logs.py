@@ -35,11 +35,11 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.calibration import calibrate_ranges
 from rangesfm.ranging.errors.components import components, population
 from rangesfm.ranging.errors.error_curve import ErrorCurve, correct_ranges
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.errors.radio_calibration import calibrate_ranges
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.scale.initialize import initialize_scale
 

@@ -36,7 +36,7 @@ from tests.studies.simulated_survey import (
 )
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 

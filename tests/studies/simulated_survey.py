@@ -23,8 +23,8 @@ from rangesfm.options import CameraOptions, RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.noise import bias_whitening
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale

@@ -9,7 +9,7 @@ import pytest
 
 from rangesfm.errors import InputError
 from rangesfm.options import AnchorOptions, RangesOptions
-from rangesfm.ranging.log import RangeKind
+from rangesfm.ranging.range_log import RangeKind
 from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.settings import Survey
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.trust.before import notes_on_distances
 
 Array = npt.NDArray[np.float64]

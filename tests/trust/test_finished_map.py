@@ -15,7 +15,7 @@ from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.ranges import Radio
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.trust import finished_map

@@ -11,9 +11,9 @@ import pytest
 
 from rangesfm.errors import GeometryError
 from rangesfm.join.models import PathOfModel
-from rangesfm.ranging.clock.estimate import Rival, TimeOffset
 from rangesfm.ranging.clock.search import CostCurve
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.clock.time_offset import Rival, TimeOffset
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.workflows import metric_map
 
 VALUE_S, RIVAL_S = 1.0, 4.0

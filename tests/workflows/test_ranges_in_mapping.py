@@ -18,7 +18,7 @@ from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.observations import RangeStatus, hold_out
+from rangesfm.ranging.range_observations import RangeStatus, hold_out
 from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import read_image_times_csv

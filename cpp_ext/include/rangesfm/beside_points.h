@@ -11,8 +11,8 @@
 namespace rangesfm {
 
 // Two residuals that are always zero and only connect two parameter blocks. The reason why an anchor is connected to a
-// point is given at keep_from_elimination in plugin/rangesfm/ceres/problem.py. There are two residuals because a
-// reprojection has two, and Ceres' specialised kernels need residual blocks of one size for all points.
+// point is given at keep_from_elimination in plugin/rangesfm/ceres/adjuster_problem.py. There are two residuals because
+// a reprojection has two, and Ceres' specialised kernels need residual blocks of one size for all points.
 //
 // Blocks: any two, for example anchor_in_world (3) and a 3-D point (3).
 class ZeroTieCost final : public ceres::CostFunction {

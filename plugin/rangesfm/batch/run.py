@@ -17,7 +17,7 @@ from rangesfm.batch import workers
 from rangesfm.batch.course import BatchListener, Course, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
 from rangesfm.batch.page import render
-from rangesfm.ceres.doctor import versions
+from rangesfm.ceres.installation_checks import versions
 from rangesfm.errors import FAILED, Failure
 from rangesfm.files.atomic import sole_writer, write_text
 from rangesfm.files.records import write_json

@@ -18,8 +18,7 @@ pycolmap, pyceres and the compiled part exchange C++ objects, which works only b
 
 from typing import TYPE_CHECKING, Any
 
-from rangesfm.ceres.doctor import check_compatibility
-from rangesfm.ceres.problem import (
+from rangesfm.ceres.adjuster_problem import (
     PlacedRanges,
     RangeBlocks,
     Step,
@@ -31,6 +30,7 @@ from rangesfm.ceres.problem import (
     solve,
     tangent_jacobian,
 )
+from rangesfm.ceres.installation_checks import check_compatibility
 
 if TYPE_CHECKING:
     from rangesfm._cpp import direction_cost, distance_cost, interpolated_range_cost, joint_prior_cost, range_cost

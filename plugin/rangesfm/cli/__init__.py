@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # The matrices that numpy and scipy get here are small. Threads make them slower, much slower beside other work.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # COLMAP's log would go to the terminal and to files in the temporary folder of the system. Where it is wanted, it
-    # is turned on for a while (rangesfm.colmap.log). Code that calls COLMAP reports its failures itself.
+    # is turned on for a while (rangesfm.colmap.colmap_log). Code that calls COLMAP reports its failures itself.
     os.environ.setdefault("GLOG_minloglevel", "3")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a name that the locale cannot encode must not be an error

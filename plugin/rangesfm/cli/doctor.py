@@ -19,7 +19,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     example:
       rangesfm doctor
     """
-    from rangesfm.ceres.doctor import diagnose
+    from rangesfm.ceres.installation_checks import diagnose
     from rangesfm.files.tables import align_rows
 
     checks = diagnose()

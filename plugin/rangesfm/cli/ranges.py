@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from rangesfm.arrays import Array
     from rangesfm.ranging.anchors.anchor import Anchor
     from rangesfm.ranging.anchors.trilateration import AnchorPlacement
-    from rangesfm.ranging.errors.calibration import Calibration
-    from rangesfm.ranging.log import RangeLog
-    from rangesfm.ranging.summary import LinkSummary, RangeSummary
+    from rangesfm.ranging.errors.radio_calibration import Calibration
+    from rangesfm.ranging.range_log import RangeLog
+    from rangesfm.ranging.range_summary import LinkSummary, RangeSummary
 
 _Value = TypeVar("_Value")
 
@@ -220,8 +220,8 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
         --output_path ranges.csv
     """
     from rangesfm.ranging.anchors.anchor import read_anchors
+    from rangesfm.ranging.range_summary import summarize_ranges
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
-    from rangesfm.ranging.summary import summarize_ranges
 
     _require_apart(args, args.anchors)
     anchors = read_anchors(args.anchors) if args.anchors is not None else ()
@@ -312,8 +312,8 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
         --output_path curve.csv
     """
     from rangesfm.ranging.anchors.anchor import read_anchors
-    from rangesfm.ranging.errors.calibration import calibrate_ranges
     from rangesfm.ranging.errors.error_curve import write_error_curve
+    from rangesfm.ranging.errors.radio_calibration import calibrate_ranges
 
     _require_apart(args, args.anchors, args.positions)
     anchors = read_anchors(args.anchors)

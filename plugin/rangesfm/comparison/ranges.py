@@ -14,8 +14,8 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.clock.estimate import estimate_time_offset
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.clock.time_offset import estimate_time_offset
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.result.folder import ResultFolder
 from rangesfm.result.metric_result import USED
 from rangesfm.result.tables import RangesAsUsed

@@ -16,7 +16,7 @@ from rangesfm.distances.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import shared_stddev
-from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.range_log import RangeKind, RangeLog
 
 # Largest distance of a mark from its reprojected marker, as a fraction of the photo's longer side. A mark farther off
 # belongs to another point.

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from rangesfm.colmap.log import colmap_log
+from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap, registered_images

@@ -12,7 +12,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from rangesfm.colmap.calibration import colmap_camera
+from rangesfm.colmap.calibrated_cameras import colmap_camera
 from rangesfm.errors import InputError
 from rangesfm.files.tables import read_head
 

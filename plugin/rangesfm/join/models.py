@@ -14,7 +14,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, joined_trajectory
 from rangesfm.ranging.errors.bending import MapBending
-from rangesfm.ranging.observations import RangeObservations, each_on_one_path, joined_observations
+from rangesfm.ranging.range_observations import RangeObservations, each_on_one_path, joined_observations
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.model_placement import ScaledModel, place_models

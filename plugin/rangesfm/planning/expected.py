@@ -20,7 +20,7 @@ from rangesfm.ranging.errors.learned import LearnedErrors, usual_stddevs
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.place import shares_of_places
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.initialize import model_from_cam, placement_covariance

@@ -21,7 +21,7 @@ from rangesfm.option_model import Options, Told
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.learned import LearnedErrors
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.keyframe_graph import KeyframeGraph, linear_functions
 from rangesfm.refine.radio import antennas
 from rangesfm.refine.vision_information import Observations, Poses, VisionInformation, vision_information

@@ -15,8 +15,8 @@ from rangesfm.options import RangeModelOptions
 from rangesfm.planning.photos import PlannedPhotos
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.range_equation import RangeState
 

@@ -16,8 +16,8 @@ from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.noise import robust_stddev
-from rangesfm.ranging.log import RangeKind, RangeLog
-from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.range_log import RangeKind, RangeLog
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 
 # The early and the late half of a burst must agree to this many standard deviations for the camera to count as still.
 _MAX_STILL_DRIFT_STDDEVS = 2.0

@@ -13,8 +13,8 @@ import pycolmap
 from rangesfm import ceres
 from rangesfm.arrays import Array
 from rangesfm.ceres.linear_solver import dense_is_faster, max_num_images_direct
-from rangesfm.colmap.observations import overlaps_in
 from rangesfm.colmap.passthrough import apply_options
+from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.errors import SolverError
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import PhotosAlone
 from rangesfm.ceres.linear_solver import inverse_is_affordable
-from rangesfm.colmap.observations import overlaps_in
+from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import CameraOptions, RefineOptions

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from rangesfm import ceres
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import ResidualErrors
-from rangesfm.colmap.calibration import cameras_as_given
+from rangesfm.colmap.calibrated_cameras import cameras_as_given
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions

@@ -18,7 +18,7 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M, bias_whitening
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.bundle_adjustment import BundleAdjustment
 
 

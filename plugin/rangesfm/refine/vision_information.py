@@ -17,7 +17,7 @@ import pycolmap
 from scipy import sparse
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.colmap.observations import seen_in
+from rangesfm.colmap.point_observations import seen_in
 from rangesfm.errors import SolverError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of

@@ -13,7 +13,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
 from rangesfm.ceres.linear_solver import inverse_is_affordable
-from rangesfm.colmap.observations import overlaps_in
+from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.distances.ends import LocatedDistances, distances_by_radio
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
@@ -26,7 +26,7 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors, misfits
 from rangesfm.ranging.errors.robust_loss import RobustLoss
-from rangesfm.ranging.observations import RangeObservations, status_by_weight
+from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, Solution, solve, solve_until_still
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
 from rangesfm.refine.problem import RefinementProblem

@@ -7,9 +7,9 @@ import colorsys
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.ranging.errors.calibration import Calibration
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.errors.radio_calibration import Calibration
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.plot import (
     WIDE_SIZE,

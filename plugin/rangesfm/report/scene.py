@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.plot import every_nth
 from rangesfm.report.text import count

@@ -15,8 +15,8 @@ from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.join.models import ModelVerdict
 from rangesfm.options import AssociationOptions
-from rangesfm.ranging.log import RangeKind
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_log import RangeKind
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
 from rangesfm.scale.estimate import CutoffTest, ScaleSensitivity, ScaleUncertainty
 from rangesfm.scale.two_candidate import Branch

@@ -17,8 +17,8 @@ from rangesfm.geometry.similarity import Similarity, align_most
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import ModelVerdict
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.clock.estimate import TimeOffset
-from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.clock.time_offset import TimeOffset
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.at_map import MapWithRanges
 from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics

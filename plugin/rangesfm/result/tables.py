@@ -14,7 +14,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.files.tables import Table, read_table, write_table
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
 
 _Kind = TypeVar("_Kind", bound="TableFile")

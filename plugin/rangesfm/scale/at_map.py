@@ -15,7 +15,7 @@ from rangesfm.ranging.errors.bending import BendingOfCells, MapBending
 from rangesfm.ranging.errors.cells import Cells
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
 from rangesfm.scale.problem import ScaleProblem, first_camera_from

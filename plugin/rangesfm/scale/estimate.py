@@ -11,7 +11,7 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.lengths import LengthScale
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.solution import Solution

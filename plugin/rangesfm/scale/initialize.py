@@ -19,7 +19,7 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.observations import RangeObservations, RangeStatus, status_by_weight
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.estimate import ScaleByKind, ScaleEstimate, ScaleSensitivity, ScaleUncertainty
 from rangesfm.scale.lengths import LengthScale, scale_by_lengths

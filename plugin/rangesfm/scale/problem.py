@@ -18,7 +18,7 @@ from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import is_line, is_steep
 from rangesfm.scale.range_equation import RangeProblem
 

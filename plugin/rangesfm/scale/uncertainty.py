@@ -13,7 +13,7 @@ from rangesfm.ranging.errors.bending import BendingOfCells, MapBending, by_poses
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
 from rangesfm.ranging.errors.components import CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (

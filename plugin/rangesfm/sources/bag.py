@@ -17,7 +17,7 @@ import numpy.typing as npt
 from PIL import Image
 from scipy.ndimage import convolve
 
-from rangesfm.colmap.calibration import colmap_camera
+from rangesfm.colmap.calibrated_cameras import colmap_camera
 from rangesfm.errors import InputError
 from rangesfm.files.bags import messages_of, open_bag, stamp_s, type_name
 from rangesfm.sources.source import MAX_SIDE_PX, Frame, Source

@@ -21,7 +21,7 @@ from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import Site, local_site
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
-from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image_times_csv

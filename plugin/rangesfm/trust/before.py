@@ -12,7 +12,7 @@ import pycolmap
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 

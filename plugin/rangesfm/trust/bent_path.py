@@ -12,7 +12,7 @@ from rangesfm.geometry.similarity import rmse
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.errors.components import BENDS
-from rangesfm.ranging.observations import status_by_weight
+from rangesfm.ranging.range_observations import status_by_weight
 from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import state_after

@@ -17,7 +17,7 @@ from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate
 from rangesfm.scale.verdict import DOUBTFUL_ABOVE

@@ -15,8 +15,8 @@ from rangesfm.ranging.errors.cells import Cells, cells, noisiness
 from rangesfm.ranging.errors.components import PLACES
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
-from rangesfm.ranging.observations import OnPath, RangeObservations
 from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.ranging.range_observations import OnPath, RangeObservations
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
 from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (

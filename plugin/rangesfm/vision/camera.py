@@ -10,7 +10,7 @@ from typing import Any
 
 import pycolmap
 
-from rangesfm.colmap.calibration import calibrated_cameras
+from rangesfm.colmap.calibrated_cameras import calibrated_cameras
 from rangesfm.errors import InputError, nearest_known
 from rangesfm.options import CameraOptions
 from rangesfm.vision.photos import Photos, exif_tags

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.log import append_log
+from rangesfm.colmap.colmap_log import append_log
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import OptionError, ReconstructionError
 from rangesfm.files.atomic import scratch_folder

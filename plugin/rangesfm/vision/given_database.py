@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from rangesfm.colmap.log import colmap_log
+from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import scratch_folder
 from rangesfm.files.contents import sha256_of

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.calibration import cameras_as_given
-from rangesfm.colmap.log import append_log
+from rangesfm.colmap.calibrated_cameras import cameras_as_given
+from rangesfm.colmap.colmap_log import append_log
 from rangesfm.colmap.model_files import read_model, write_binary_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import OptionError, ReconstructionError

@@ -13,7 +13,7 @@ from typing import Any
 
 import pycolmap
 
-from rangesfm.colmap.log import append_log
+from rangesfm.colmap.colmap_log import append_log
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.files.atomic import scratch_folder

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.log import colmap_log
+from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.processes.supervision import MessagesToParent, work_for_parent
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rangesfm.colmap.log import colmap_log
+from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import ReconstructionError
 from rangesfm.files.records import write_json
 from rangesfm.progress import Progress

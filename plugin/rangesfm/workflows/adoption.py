@@ -10,7 +10,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.join.models import PathOfModel
 from rangesfm.progress import Journal
-from rangesfm.ranging.observations import RangeObservations, RangeStatus
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey

@@ -13,7 +13,7 @@ import numpy as np
 
 from rangesfm.errors import RangesfmError
 from rangesfm.progress import Journal, SilentProgress
-from rangesfm.ranging.log import RangeKind
+from rangesfm.ranging.range_log import RangeKind
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey

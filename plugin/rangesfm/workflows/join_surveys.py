@@ -22,8 +22,8 @@ from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
 from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.model_path import path_of_model
 from rangesfm.result.tables import RangesAsUsed

@@ -20,11 +20,11 @@ from rangesfm.geometry.trajectory import Trajectory, in_first_camera, trajectory
 from rangesfm.join.models import ModelVerdict, PathOfModel, estimate_scale, join_models
 from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.clock.estimate import REMEDY, TimeOffset, estimate_time_offset
+from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset, estimate_time_offset
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.ranging.log import RangeKind
-from rangesfm.ranging.observations import RangeObservations, RangeStatus, hold_out
+from rangesfm.ranging.range_log import RangeKind
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.refine.photo_bending import bending_of_model, by_photos
 from rangesfm.refine.radio import predicted_ranges
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, RefineSummary, refine_with_ranges

@@ -22,8 +22,8 @@ from rangesfm.files.contents import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import PathOfModel, estimate_scale
 from rangesfm.progress import Journal
-from rangesfm.ranging.clock.estimate import estimate_time_offset
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.clock.time_offset import estimate_time_offset
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.result.folder import RESULT_NAMES, places_for_photos, refuse_to_overwrite
 from rangesfm.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.sources.source import is_source

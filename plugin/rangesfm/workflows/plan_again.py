@@ -18,7 +18,7 @@ from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.folder import read_result_folder
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.model_path import path_of_model

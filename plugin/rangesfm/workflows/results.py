@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.ceres.doctor import versions
+from rangesfm.ceres.installation_checks import versions
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
 from rangesfm.distances.ends import locate_distances
 from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows

@@ -18,7 +18,7 @@ from rangesfm.files.atomic import sole_writer
 from rangesfm.join.models import PathOfModel
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress
-from rangesfm.ranging.clock.estimate import TimeOffset
+from rangesfm.ranging.clock.time_offset import TimeOffset
 from rangesfm.result.folder import refuse_to_overwrite, result_names
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import RangingInputs, times_of_model

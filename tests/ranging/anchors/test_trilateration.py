@@ -13,7 +13,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate, trilaterate_anchors
 from rangesfm.ranging.errors.cells import cells
 from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.ranging.clock import estimate
+from rangesfm.ranging.clock import time_offset
 from rangesfm.ranging.clock.fit import Timing, fit_at_offset, refine_offset
 from rangesfm.ranging.clock.search import PathSamples, TimedRanges
 
@@ -57,6 +57,6 @@ def test_of_two_offsets_one_is_as_much_likelier_as_the_other_is_less_likely(path
     ranges = ranges_at(path, 0.0, 0.02)
     best, rival = (fit_at_offset(ranges, path, offset_s) for offset_s in (0.0, -60.0))
     assert len(rival.losses) < len(best.losses)
-    odds = estimate._log_odds(best, rival, path)
+    odds = time_offset._log_odds(best, rival, path)
     assert odds > 0
-    assert odds == pytest.approx(-estimate._log_odds(rival, best, path), rel=1e-9)
+    assert odds == pytest.approx(-time_offset._log_odds(rival, best, path), rel=1e-9)

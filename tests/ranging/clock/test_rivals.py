@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.clock.estimate import Rival, TimeOffset, likely_offsets
 from rangesfm.ranging.clock.search import CostCurve
+from rangesfm.ranging.clock.time_offset import Rival, TimeOffset, likely_offsets
 
 
 def test_offsets_come_with_their_probabilities_the_likeliest_first_and_without_the_unlikely() -> None:

@@ -13,8 +13,8 @@ from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.bending import WalkBending, averaged, bent_path, by_poses, without_similarity
 from rangesfm.ranging.errors.cells import Cells, cells
-from rangesfm.ranging.observations import OnPath
 from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.ranging.range_observations import OnPath
 
 Array = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import pytest
 
 from rangesfm.errors import InputError
 from rangesfm.ranging.errors.error_curve import ErrorCurve, correct_ranges, read_error_curve, write_error_curve
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 CURVE = ErrorCurve(
     np.array([1.0, 2.0, 4.0]), np.array([-0.1, 0.0, 0.1]), np.array([0.03, 0.02, 0.02]), np.array([0.1, 0.1, 0.1])

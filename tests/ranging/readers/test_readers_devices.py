@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_summary import summarize_ranges
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, reader_names
-from rangesfm.ranging.summary import summarize_ranges
 
 LEC = (
     "DIST,4,AN0,022E,7.94,8.03,0.00,3.44,AN1,9280,7.95,0.00,0.00,5.68,AN2,DCAE,0.00,8.03,0.00,7.76,"

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 
 ANCHORS = {"A0": (0.0, 0.0, 2.0), "A1": (6.3, 0.2, 1.1), "A2": (5.9, 4.8, 2.3), "A3": (-0.4, 5.1, 0.4)}

@@ -28,7 +28,7 @@ from rangesfm.ranging.anchors.point_fit import (
 )
 from rangesfm.ranging.errors.noise import short_range_stddev
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, SAME_COST
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 # Three ranges determine a position, and a fourth one checks it.
 MIN_NUM_RANGES = 4

@@ -21,8 +21,8 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.squares import MIN_RANGE_M, rows_by_anchor
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeStatus
 
 # Time between samples of the path. Linear interpolation between them is off by less than a millimetre, even at an
 # acceleration of 10 m/s^2.

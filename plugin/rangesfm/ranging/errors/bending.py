@@ -16,8 +16,8 @@ from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, sim
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.cells import Cells
 from rangesfm.ranging.errors.components import BENDS, Component
-from rangesfm.ranging.observations import OnPath
 from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.ranging.range_observations import OnPath
 
 # A turn about a straight path is seen by how the cameras turn alone: by so little that elsewhere it has no say.
 _TURNS_COUNT = 1e-3

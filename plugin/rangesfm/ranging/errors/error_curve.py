@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import has_columns, read_table, write_table
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 COLUMNS = ("distance_m", "error_m", "stddev_m", "noise_stddev_m")
 # How fast a curve may run away beyond where it was learnt, for each e-fold of distance. The DW1000's own

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 # Radios read up to 0.15 m short below about 2 m, every anchor alike, by an amount that depends
 # on the antennas (Decawave application note APS011). An error common to all short ranges does

@@ -23,7 +23,7 @@ from rangesfm.ranging.errors.noise import (
 )
 from rangesfm.ranging.errors.place import place_labels, shares_by_residuals
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, RobustLoss
-from rangesfm.ranging.observations import RangeObservations
+from rangesfm.ranging.range_observations import RangeObservations
 
 _Errors = TypeVar("_Errors")
 _Fit = TypeVar("_Fit")

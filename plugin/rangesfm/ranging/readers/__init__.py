@@ -17,7 +17,7 @@ from rangesfm.files.tables import read_head
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import find_quantization_m, quantization_stddev_m
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import ros
 from rangesfm.ranging.readers.printed import PRINTED
 from rangesfm.ranging.readers.reader import Reader, ReadOptions, tell_roles

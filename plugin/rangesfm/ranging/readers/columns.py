@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.files.tables import Categories, Table, read_table
-from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
+from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout
 from rangesfm.ranging.readers.reader import ReadOptions, which_are_measured
 from rangesfm.ranging.readers.times import (

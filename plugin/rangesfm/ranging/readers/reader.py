@@ -18,7 +18,7 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.errors import InputError
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
+from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 
 # The largest value in a log means no measurement if it occurs at least _MIN_NUM_FAR times and exceeds the next largest
 # by the factor _FAR, and there are at least _MIN_NUM other values.

@@ -16,7 +16,7 @@ import numpy as np
 
 from rangesfm.errors import InputError, printable
 from rangesfm.files.tables import header_names, read_head, write_user_table
-from rangesfm.ranging.log import DEFAULT_TAG_ID, RangeLog
+from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns
 from rangesfm.ranging.readers.layout import Layout, find_layout, layout_without_header

@@ -8,8 +8,8 @@ import pytest
 
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.calibration import Calibration, calibrate_ranges
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.errors.radio_calibration import Calibration, calibrate_ranges
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 

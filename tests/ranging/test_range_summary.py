@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangesfm.ranging.errors.noise import estimate_noise_m, find_quantization_m
-from rangesfm.ranging.log import RangeLog
-from rangesfm.ranging.summary import summarize_ranges
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_summary import summarize_ranges
 
 Array = npt.NDArray[np.float64]
 

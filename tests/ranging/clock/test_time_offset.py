@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.clock.estimate import TimeOffset, estimate_time_offset
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.clock.time_offset import TimeOffset, estimate_time_offset
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 

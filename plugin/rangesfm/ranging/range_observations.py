@@ -14,7 +14,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import CheckOptions
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 
 class RangeStatus(IntEnum):

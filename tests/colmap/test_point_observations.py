@@ -8,7 +8,7 @@ import pytest
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import sequence_path
 
-from rangesfm.colmap.observations import overlaps_in, seen_in
+from rangesfm.colmap.point_observations import overlaps_in, seen_in
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from rangesfm.ranging.errors.error_curve import ErrorCurve
 from rangesfm.ranging.errors.noise import correlation_inflation, robust_stddev
 from rangesfm.ranging.errors.range_errors import fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import CAUCHY
-from rangesfm.ranging.log import RangeLog
+from rangesfm.ranging.range_log import RangeLog
 
 # Knots a sixth of an e-fold apart follow every curve that antennas and received power make.
 _LOG_SPACING = 1 / 6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers.reader import Sides, tell_roles
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.ranging.errors.noise import estimate_noise_m, find_quantization_m, quantization_stddev_m
-from rangesfm.ranging.log import RangeKind, RangeLog
+from rangesfm.ranging.range_log import RangeKind, RangeLog
 
 
 @dataclass(frozen=True)

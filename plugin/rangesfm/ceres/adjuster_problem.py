@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.sparse import csc_array, csr_array
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.doctor import check_compatibility
+from rangesfm.ceres.installation_checks import check_compatibility
 from rangesfm.processes.threads import num_threads
 
 if TYPE_CHECKING:

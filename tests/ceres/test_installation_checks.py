@@ -8,8 +8,8 @@ import sys
 import pytest
 from tests.installed import with_gpus, with_installed
 
-from rangesfm.ceres import doctor
-from rangesfm.ceres.doctor import Check, diagnose, versions
+from rangesfm.ceres import installation_checks
+from rangesfm.ceres.installation_checks import Check, diagnose, versions
 from rangesfm.errors import SolverError
 
 
@@ -96,7 +96,7 @@ def test_a_compiled_part_that_does_not_fit_is_reported_and_not_raised(monkeypatc
     def fail() -> None:
         raise SolverError("it does not fit; do this")
 
-    monkeypatch.setattr(doctor, "check_compatibility", fail)
+    monkeypatch.setattr(installation_checks, "check_compatibility", fail)
     check = check_named("compiled part")
     assert not check.ok
     assert check.remedy == "it does not fit; do this"
@@ -124,14 +124,16 @@ def test_versions_of_ceres_that_do_not_go_together_are_refused_before_anything_i
     where: str, version: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(where, version)
-    monkeypatch.setattr(doctor, "_costs_of_known_residual", lambda: pytest.fail("objects of two kinds have met"))
+    monkeypatch.setattr(
+        installation_checks, "_costs_of_known_residual", lambda: pytest.fail("objects of two kinds have met")
+    )
     check = check_named("compiled part")
     assert not check.ok
     assert said in check.remedy
 
 
 def test_a_python_that_is_not_listed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "PYTHONS", ("3.98", "3.99"))
+    monkeypatch.setattr(installation_checks, "PYTHONS", ("3.98", "3.99"))
     check = check_named("Python")
     assert not check.ok
     assert check.remedy == "use Python 3.98 to 3.99"

@@ -19,8 +19,8 @@ from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
 from rangesfm.ranging.clock.fit import OffsetFit, drift_note, fit_clocks, refine_offset
 from rangesfm.ranging.clock.search import CostCurve, PathSamples, TimedRanges, moving_path, ranges_on_path, scan_offsets
-from rangesfm.ranging.log import RangeKind, RangeLog
-from rangesfm.ranging.observations import RangeStatus
+from rangesfm.ranging.range_log import RangeKind, RangeLog
+from rangesfm.ranging.range_observations import RangeStatus
 
 REMEDY = "give the time offset (--ranges_time_offset)"
 # Offsets with a lower probability are discarded.
