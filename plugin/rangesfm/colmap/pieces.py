@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from rangesfm.arrays import Indices, Mask
-from rangesfm.colmap.observations import seen_in
+from rangesfm.colmap.point_observations import seen_in
 
 # COLMAP takes two photos for a pair if this many matches agree on their geometry (min_num_inliers).
 MIN_NUM_SHARED = 15
