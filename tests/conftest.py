@@ -139,7 +139,11 @@ def _checked(done: subprocess.CompletedProcess[str], status: int | None) -> subp
 @pytest.fixture(scope="session")
 def walked_survey(tmp_path_factory: pytest.TempPathFactory) -> WalkedSurvey:
     """A walk of 40 photos, one a second, and 20 ranges a second to four anchors. Tests must not write to it."""
-    folder = tmp_path_factory.mktemp("walked_survey")
+    return make_walked_survey(tmp_path_factory.mktemp("walked_survey"))
+
+
+def make_walked_survey(folder: Path) -> WalkedSurvey:
+    """Write the files of a ``WalkedSurvey`` into a folder."""
     path = loop_path(42.0, start_s=99.0, seed=3)
     times: Array = np.arange(100, 140, dtype=np.float64)
     made = synthetic_model(

@@ -7,18 +7,65 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 
 from rangesfm.errors import OptionError, nearest_known, printable, shown
 
+if TYPE_CHECKING:
+    from rangesfm.arrays import Array, Mask
+
 Same = TypeVar("Same", bound="Options")
 PathRole = Literal["file", "log", "photos", "model", "output"]
 _NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path", dict: "a table"}
 _TABLE_OF = "a table in which each value is "
 _UNITS = {"m_per_s": "metres a second", "m": "metres", "s": "seconds", "deg": "degrees"}
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The numbers that a quantity may have, wherever it is read.
+
+    Beyond them only a slip is meant, as another unit; and squares and quotients of what is inside are finite.
+
+    Attributes:
+        least, most: both may be reached.
+        or_zero: whether it may be 0 as well, as the standard deviation of what is exact.
+        unit: in words.
+    """
+
+    least: float
+    most: float
+    unit: str
+    or_zero: bool = False
+
+    @overload
+    def hold(self, values: float) -> bool: ...
+
+    @overload
+    def hold(self, values: Array) -> Mask: ...
+
+    def hold(self, values: Any) -> Any:
+        """Return for each of some numbers, or for one, whether it is within the bounds."""
+        return (self.least <= values) & (values <= self.most) | (self.or_zero & (values == 0))
+
+    def __str__(self) -> str:
+        zero = "0, or " if self.or_zero else ""
+        return f"{zero}a number of {self.unit} from {self.least:.10g} to {self.most:.10g}"
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ keys and the settings in ``result.json`` are made from them.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +16,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from rangesfm.errors import OptionError
 from rangesfm.mapper_options import MapperOptions as MapperOptions
-from rangesfm.option_model import Options, Told
+from rangesfm.option_model import Bounds, Options, Told
 
 DEFAULT_FORMATS = ("tum", "ply")
 # Relative stddev of a calibrated focal length: focus, temperature and another calibration board change it by this much.
@@ -29,20 +30,33 @@ TagDictionary = Literal[
 ]
 # fmt: on
 
-# Values beyond these bounds can only be mistakes, or would overflow when they are squared or divided by.
+# The bounds of numbers in survey files, tables, logs and flags. Values beyond them can only be mistakes, or would
+# overflow when they are squared or divided by.
+STDDEV_M = Bounds(1e-6, 1e3, "metres")
+STDDEV_OR_EXACT_M = replace(STDDEV_M, or_zero=True)
+LENGTH_M = Bounds(1e-6, 1e6, "metres")
+"""Ranges and distances. No radio reaches further."""
+BIAS_M = Bounds(-1e3, 1e3, "metres")
+"""Biases of ranges. A radio without its antenna delays reads some hundred metres too long."""
+COORDINATE_M = Bounds(-1e9, 1e9, "metres")
+LEVER_ARM_M = Bounds(-20, 20, "metres")
+"""Coordinates of a tag in the camera frame. No camera carries its tag further away."""
+TIME_S = Bounds(-1e10, 1e10, "seconds")
+DURATION_S = Bounds(0, 1e9, "seconds")
+PIXEL = Bounds(-1e6, 1e6, "pixels")
+
 _Count = Annotated[int, Field(ge=1, le=1_000_000)]
 _Zero = Annotated[float, Field(ge=0, le=0)]
-_Positive = Annotated[float, Field(ge=1e-6, le=1e3)]
+_Positive = Annotated[float, Field(ge=STDDEV_M.least, le=STDDEV_M.most)]
 _Uncertainty = _Zero | _Positive
-_Time = Annotated[float, Field(ge=-1e10, le=1e10)]
-_Duration = Annotated[float, Field(ge=0, le=1e9)]
+_Time = Annotated[float, Field(ge=TIME_S.least, le=TIME_S.most)]
+_Duration = Annotated[float, Field(ge=DURATION_S.least, le=DURATION_S.most)]
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Numbers = Annotated[tuple[_Number, ...], Field(strict=False)]
 _Times = Annotated[tuple[_Time, ...], Field(strict=False)]
 _Three = Annotated[tuple[_Number, _Number, _Number], Field(strict=False)]
 _Texts = Annotated[tuple[str, ...], Field(strict=False)]
-# In metres. No camera carries its tag further away than this, so a larger number is in a wrong unit.
-_OfLeverArm = Annotated[float, Field(ge=-20, le=20)]
+_OfLeverArm = Annotated[float, Field(ge=LEVER_ARM_M.least, le=LEVER_ARM_M.most)]
 _LeverArm = Annotated[tuple[_OfLeverArm, _OfLeverArm, _OfLeverArm], Field(strict=False)]
 _Place = Annotated[
     tuple[

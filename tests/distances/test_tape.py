@@ -44,7 +44,7 @@ def test_marks_are_gathered_by_marker(tmp_path: Path) -> None:
     [
         ("from,to,distance_m\n", "holds no distance"),
         ("from,to,distance_m\na,a,1\n", "d.csv:2: to is 'a', expected another end"),
-        ("from,to,distance_m\na,b,0\n", "d.csv:2: distance_m is 0, expected a number of metres greater than 0"),
+        ("from,to,distance_m\na,b,0\n", "d.csv:2: distance_m is 0, expected a number of metres from 1e-06 to 1000000"),
         ("from,to,distance_m,stddev_m\na,b,1,-1\n", "d.csv:2: stddev_m is -1, expected a number of metres"),
         ("from,to,distance_m,kind\na,b,1,chek\n", "d.csv:2: kind is 'chek', expected control or check"),
         ("from,to\na,b\n", "distance_m"),

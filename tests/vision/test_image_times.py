@@ -103,11 +103,17 @@ class TestCsv:
             ("", "images.csv: the file is empty"),
             ("image_name,timestamp_s\n", "images.csv: no rows below the header"),
             ("image_name,time_ms\na.jpg,1\n", "images.csv:1: no column timestamp_s; found image_name, time_ms"),
-            ("image_name,timestamp_s\na.jpg,noon\n", "images.csv:2: timestamp_s is 'noon', expected seconds"),
-            ("image_name,timestamp_s\na.jpg,1\n\nb.jpg,nan\n", "images.csv:4: timestamp_s is nan, expected seconds"),
-            ("image_name,timestamp_s\na.jpg,\n", "images.csv:2: timestamp_s is empty, expected seconds"),
+            (
+                "image_name,timestamp_s\na.jpg,noon\n",
+                "images.csv:2: timestamp_s is 'noon', expected a number",
+            ),
+            (
+                "image_name,timestamp_s\na.jpg,1\n\nb.jpg,nan\n",
+                "images.csv:4: timestamp_s is nan, expected a number",
+            ),
+            ("image_name,timestamp_s\na.jpg,\n", "images.csv:2: timestamp_s is empty, expected a number"),
             ("image_name,timestamp_s\n,1\n", "images.csv:2: image_name is empty"),
-            ("image_name,timestamp_s\na.jpg,1.4e18\n", "images.csv:2: timestamp_s is 1.4e18, expected seconds"),
+            ("image_name,timestamp_s\na.jpg,1.4e18\n", "images.csv:2: timestamp_s is 1.4e18, expected a number"),
             ("image_name,timestamp_s\na.jpg,1\na.jpg,2\n", "images.csv:3: a.jpg is in line 2 already"),
             (
                 "image_name,timestamp_s\na.jpg,1\nb.jpg,1.0\n",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -15,6 +16,7 @@ from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
     from rangesfm.arrays import Array
+    from rangesfm.option_model import Bounds
     from rangesfm.ranging.anchors.anchor import Anchor
     from rangesfm.ranging.anchors.trilateration import AnchorPlacement
     from rangesfm.ranging.errors.radio_calibration import Calibration
@@ -22,9 +24,6 @@ if TYPE_CHECKING:
     from rangesfm.ranging.range_summary import LinkSummary, RangeSummary
 
 _Value = TypeVar("_Value")
-
-# Largest time in seconds, the same as for times in a survey file.
-_MAX_TIME_S = 1e10
 
 _LOG_KEYS = (
     *("ranges.format", "ranges.columns", "ranges.timestamp_unit", "ranges.range_unit", "ranges.separator"),
@@ -55,15 +54,14 @@ def add_commands(commands: Commands) -> None:
     )
     _add_log_arguments(calibrate)
     calibrate.add_argument("--anchors", required=True, metavar="CSV", help="surveyed anchors: anchor_id,x_m,y_m,z_m")
-    _add_position_arguments(calibrate, max_interpolation_gap_s=0.2)
+    calibrate.later.append(partial(_add_position_arguments, max_interpolation_gap_s=0.2))
     calibrate.add_argument("--output_path", required=True, metavar="CSV", help="write the curve to this file")
     calibrate.add_argument(
         "--plot", metavar="FILE", help="draw the curve and the errors of the ranges into this file (PNG or SVG)"
     )
     trilaterate = commands.add("trilaterate", _trilaterate, "find anchor positions from ranges at known tag positions")
     _add_log_arguments(trilaterate)
-    _add_position_arguments(trilaterate, max_interpolation_gap_s=0.5)
-    _add_estimate_arguments(trilaterate)
+    trilaterate.later += [partial(_add_position_arguments, max_interpolation_gap_s=0.5), _add_estimate_arguments]
     trilaterate.add_argument(
         "--output_path", metavar="CSV", help="write the anchors to this file, for --anchors of other commands"
     )
@@ -82,6 +80,8 @@ def _add_log_arguments(parser: Parser) -> None:
 
 def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -> None:
     """Add the arguments about the known positions of the tag and how they belong to the log."""
+    from rangesfm.options import DURATION_S, TIME_S
+
     parser.add_argument(
         "--positions",
         required=True,
@@ -91,18 +91,22 @@ def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -
     )
     parser.add_argument(
         "--tag_in_cam",
-        type=position,
+        type=_lever_arm,
         default=(0.0, 0.0, 0.0),
         metavar="X,Y,Z",
         help="position of the tag's antenna in the frame whose poses are given, metres (default: 0,0,0)",
     )
     parser.add_argument("--tag_id", metavar="ID", help="the tag whose positions these are, if the log has several")
     parser.add_argument(
-        "--time_offset", type=_seconds, default=0.0, metavar="SECONDS", help="time of positions minus time of ranges"
+        "--time_offset",
+        type=_number_within(TIME_S),
+        default=0.0,
+        metavar="SECONDS",
+        help="time of positions minus time of ranges",
     )
     parser.add_argument(
         "--max_interpolation_gap_s",
-        type=_seconds,
+        type=_number_within(DURATION_S),
         default=max_interpolation_gap_s,
         metavar="S",
         help="longest time between known positions between which positions are interpolated "
@@ -111,6 +115,8 @@ def _add_position_arguments(parser: Parser, *, max_interpolation_gap_s: float) -
 
 
 def _add_estimate_arguments(parser: Parser) -> None:
+    from rangesfm.options import BIAS_M, STDDEV_M, STDDEV_OR_EXACT_M
+
     parser.add_argument(
         "--side",
         type=_side,
@@ -126,14 +132,14 @@ def _add_estimate_arguments(parser: Parser) -> None:
         help="known z of all anchors or of each; with it, the positions may be in a level plane",
     )
     add = parser.add_argument_group("estimate").add_argument
-    add("--range_stddev_m", type=_positive, metavar="M", help="standard deviation of a range (default: estimated)")
-    add(
-        "--range_bias_m", type=float, default=0.0, metavar="M", help="bias of the ranges, positive if they are too long"
-    )
+    stddev, stddev_or_exact = _number_within(STDDEV_M), _number_within(STDDEV_OR_EXACT_M)
+    add("--range_stddev_m", type=stddev, metavar="M", help="standard deviation of a range (default: estimated)")
+    too_long = "bias of the ranges, positive if they are too long"
+    add("--range_bias_m", type=_number_within(BIAS_M), default=0.0, metavar="M", help=too_long)
     uncertain = "standard deviation of the bias; 0 fixes it (default: 0.25)"
-    add("--range_bias_stddev_m", type=_not_negative, default=0.25, metavar="M", help=uncertain)
+    add("--range_bias_stddev_m", type=stddev_or_exact, default=0.25, metavar="M", help=uncertain)
     refused = "largest accepted standard deviation of an anchor's position in any direction (default: 1)"
-    add("--max_position_stddev_m", type=_positive, default=1.0, metavar="M", help=refused)
+    add("--max_position_stddev_m", type=stddev, default=1.0, metavar="M", help=refused)
 
 
 def _by_anchor(text: str) -> dict[str, str]:
@@ -150,33 +156,34 @@ def _side(text: str) -> dict[str, Sequence[float]]:
 
 
 def _heights(text: str) -> dict[str, float]:
-    return {
-        anchor_id: _number_of(word, math.isfinite, "a height in metres") for anchor_id, word in _by_anchor(text).items()
-    }
+    from rangesfm.options import COORDINATE_M
+
+    within = _number_within(COORDINATE_M)
+    return {anchor_id: within(word) for anchor_id, word in _by_anchor(text).items()}
 
 
-def _positive(text: str) -> float:
-    _not_negative(text)
-    return _number_of(text, lambda value: value > 0, "a length in metres, expected more than 0")
+def _lever_arm(text: str) -> list[float]:
+    from rangesfm.options import LEVER_ARM_M
+
+    numbers = position(text)
+    if not all(map(LEVER_ARM_M.hold, numbers)):
+        raise argparse.ArgumentTypeError(f"'{text}' is not three times {LEVER_ARM_M}")
+    return numbers
 
 
-def _not_negative(text: str) -> float:
-    return _number_of(text, lambda value: 0 <= value < math.inf, "a length in metres, expected 0 or more")
+def _number_within(bounds: Bounds) -> Callable[[str], float]:
+    """Return a type of argparse for numbers within bounds."""
 
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not bounds.hold(value):
+            raise argparse.ArgumentTypeError(f"'{text}' is not {bounds}")
+        return value
 
-def _seconds(text: str) -> float:
-    said = f"a time in seconds, expected at most {_MAX_TIME_S:g} of them"
-    return _number_of(text, lambda value: abs(value) <= _MAX_TIME_S, said)
-
-
-def _number_of(text: str, is_good: Callable[[float], bool], what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not is_good(value):
-        raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
-    return value
+    return number
 
 
 def _require_apart(args: argparse.Namespace, *inputs: str | Path | None) -> None:

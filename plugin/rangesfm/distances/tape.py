@@ -14,6 +14,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.tables import Table, read_table, repeated
+from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 
 CONTROL, CHECK = "control", "check"
 # Kind of a length that contradicts the map and was rejected.
@@ -129,16 +130,15 @@ def _distances(table: Table) -> tuple[TapedDistance, ...]:
             raise table.error(row, "to", "another end than 'from'")
         if kind not in (CONTROL, CHECK):
             raise table.error(row, "kind", f"{CONTROL} or {CHECK}")
-    metres = "a number of metres greater than 0"
-    lengths = table.numbers("distance_m", expected=metres, above=0.0)
-    stddevs = table.numbers("stddev_m", empty=DEFAULT_STDDEV_M, expected=f"{metres}, or nothing", above=0.0)
+    lengths = table.numbers("distance_m", bounds=LENGTH_M)
+    stddevs = table.numbers("stddev_m", empty=DEFAULT_STDDEV_M, bounds=STDDEV_M)
     rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
 
 
 def _markers(table: Table) -> dict[str, Marker]:
     names, image_names = table.text("marker"), table.text("image_name")
-    pixels = np.column_stack([table.numbers(column, expected="a number of pixels") for column in _PIXELS])
+    pixels = np.column_stack([table.numbers(column, bounds=PIXEL) for column in _PIXELS])
     rows_of: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         rows_of.setdefault(name, []).append(row)

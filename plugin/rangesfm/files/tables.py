@@ -28,7 +28,10 @@ import numpy.typing as npt
 
 from rangesfm.errors import InputError, printable
 from rangesfm.files.atomic import new_file
+from rangesfm.option_model import Bounds
 
+MAX_NUMBER = 1e100
+"""In any file: squares of it are finite."""
 _HEAD_BYTES = 1 << 16
 _GZIP_MARK = b"\x1f\x8b"
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -127,22 +130,21 @@ class Table:
         *,
         empty: float | None = None,
         missing: Collection[str] = ("",),
-        expected: str = "a number",
-        least: float = -np.inf,
-        above: float = -np.inf,
+        bounds: Bounds | None = None,
+        expected: str | None = None,
     ) -> npt.NDArray[np.float64]:
         """Return the cells as finite numbers (n,).
 
         Args:
             empty: value of empty cells and of a missing column; if it is None, empty cells are refused.
             missing: texts of a cell that counts as empty, in small letters.
-            expected: description of a valid cell, for messages.
-            least: smaller numbers are refused.
-            above: numbers that are not greater than this are refused.
+            bounds: bounds of valid numbers; None: every number that can be squared.
+            expected: description of a valid cell, for messages; None: by the bounds.
 
         Raises:
             InputError: a cell is not valid; the error gives the line.
         """
+        expected = expected or str(bounds or "a number") + ", or nothing" * (empty is not None)
         if column not in self and empty is not None:
             return np.full(len(self), empty)
         cells = self.cells[column]
@@ -153,7 +155,9 @@ class Table:
             if empty is None or raw[row].strip().lower() not in missing:
                 raise self.error(row, column, expected)
             values[row] = empty
-        self.refuse((values < least) | (values <= above), column, expected)
+        wrong = ~(np.abs(values) <= MAX_NUMBER if bounds is None else bounds.hold(values))
+        wrong[bad] = False
+        self.refuse(wrong, column, f"{expected}, at most {MAX_NUMBER:g}" if bounds is None else expected)
         return values
 
     def error(self, row: int, column: str, expected: str) -> InputError:

@@ -23,6 +23,7 @@ from rangesfm.files.tables import (
     write_table,
 )
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
+from rangesfm.options import COORDINATE_M, TIME_S
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
@@ -207,13 +208,13 @@ def _read_tum(path: Path) -> Table:
 def _from_table(table: Table, key: str) -> Reference:
     if len(table) == 0:
         raise InputError("no pose in the file, only its header row", table.path)
-    positions = np.column_stack([table.numbers(column) for column in POSITION_COLUMNS])
+    positions = np.column_stack([table.numbers(column, bounds=COORDINATE_M) for column in POSITION_COLUMNS])
     rotations = _rotations(table)
-    if again := repeated(table.text(key) if key == "image_name" else table.numbers(key).tolist()):
+    if again := repeated(table.text(key) if key == "image_name" else table.numbers(key, bounds=TIME_S).tolist()):
         raise table.error(again[0], key, "each one once")
     if key == "image_name":
         return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations)
-    times = table.numbers(key)
+    times = table.numbers(key, bounds=TIME_S)
     order = np.argsort(times)
     turns = None if rotations is None else rotations[order]
     return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns)
@@ -228,8 +229,7 @@ def _rotations(table: Table) -> Array | None:
             f"no column {missing[0]}; expected all of {', '.join(QUATERNION_COLUMNS)}, or none", table.path
         )
     quaternions = np.column_stack([table.numbers(column) for column in QUATERNION_COLUMNS])
-    with np.errstate(over="ignore"):
-        lengths = np.linalg.norm(quaternions, axis=1)
+    lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)
     if len(wrong):
         message = f"the quaternion qx,qy,qz,qw has length {lengths[wrong[0]]:.4g}, expected 1"

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-# No such radio reaches further, so a longer range has a wrong unit or is not a range.
-_MAX_RANGE_M = 1e6
 # Distance between two anchors over the sum of the ranges to them. It is at most 1 where all are in metres; above each
 # of these numbers, the anchors are in that unit.
 _UNITS_OF_ANCHORS = (("millimetres", 100.0), ("centimetres", 10.0))
@@ -82,7 +80,6 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         log = RangeLog.from_arrays([], [], image_name=[])
     else:
         log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
-        _check_lengths(log)
         log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
         _check_camera_is_heard(log)
     tag_in_cam_m = _lever_arms_of_log(log, survey)
@@ -193,13 +190,6 @@ def _lever_arms_of_log(log: RangeLog, survey: Survey) -> Array:
             )
         arms[k] = given[log.tag_ids[k]]
     return arms
-
-
-def _check_lengths(log: RangeLog) -> None:
-    if np.any(too_long := log.range_m > _MAX_RANGE_M):
-        first = int(np.argmax(too_long))
-        message = f"a range of {log.range_m[first]:g} m, expected at most {_MAX_RANGE_M:g}: is its unit right?"
-        raise InputError(message, log.source, int(log.line[first]))
 
 
 def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path | None) -> None:

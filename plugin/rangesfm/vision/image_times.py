@@ -18,6 +18,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
 from rangesfm.files.folders import walk
 from rangesfm.files.tables import Table, has_columns, read_table
+from rangesfm.options import TIME_S
 from rangesfm.vision.photos import exif_tags
 
 IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -25,7 +26,6 @@ IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _COLUMNS = ("image_name", "timestamp_s")
 _ALIASES = {"filename": "image_name", "timestamp": "timestamp_s"}
 _FINEST_RESOLUTION_S = 1e-3
-_MAX_TIMESTAMP_S = 1e11  # the year 5138; a larger number must be in another unit
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL = 0x9003, 0x9291, 0x9011
 # The years 2001 to 2096 in seconds since 1970. With this interval a time in ms, us or ns is never taken for a time in
 # another unit, and neither a frame number nor a date written as digits (20260131...) is taken for a time.
@@ -146,9 +146,7 @@ def read_image_times_csv(
     table = read_table(path, _COLUMNS, aliases=_ALIASES, separator=None)
     if not len(table):
         raise InputError("no rows below the header, expected one per photo", path)
-    image_names, times = table.text("image_name"), table.numbers("timestamp_s", expected="seconds")
-    for row in np.flatnonzero(np.abs(times) > _MAX_TIMESTAMP_S).tolist():
-        raise table.error(row, "timestamp_s", "seconds")
+    image_names, times = table.text("image_name"), table.numbers("timestamp_s", bounds=TIME_S)
     frames = frames or {}
     frame_of = {photo: first for first, photos in frames.items() for photo in photos}
     _refuse_repetitions(table, image_names, times.tolist(), frame_of)
@@ -274,8 +272,12 @@ def _exif_stamp(exif: Mapping[int, str], default_offset: timedelta) -> _Stamp | 
         local = datetime.strptime(exif.get(_DATE_TIME_ORIGINAL, ""), "%Y:%m:%d %H:%M:%S")
     except ValueError:  # a camera whose clock was never set writes zeros or blanks
         return None
-    offset = _utc_offset(exif)
-    seconds = (local.replace(tzinfo=timezone.utc) - (default_offset if offset is None else offset)).timestamp()
+    known = _utc_offset(exif)
+    offset = default_offset if known is None else known
+    # Numbers are subtracted here, because Python has no date before the year 1.
+    seconds = local.replace(tzinfo=timezone.utc).timestamp() - offset.total_seconds()
+    if not TIME_S.hold(seconds):
+        return None
     digits = exif.get(_SUB_SEC_TIME_ORIGINAL, "")
     fraction = f"0.{digits}" if digits.isdecimal() and digits.isascii() else "0"
     return _Stamp(seconds + float(fraction), _resolution(fraction))
@@ -290,12 +292,12 @@ def _utc_offset(exif: Mapping[int, str]) -> timedelta | None:
 
 
 def _name_stamp(name: str) -> _Stamp | None:
-    number = re.search(r"(\d+)(\.\d+)?$", os.path.splitext(name)[0])
+    number = re.search(r"(?<!\d)(\d{1,30})(\.\d+)?$", os.path.splitext(name)[0])
     if number is None:
         return None
     whole, decimals = int(number[1]), (number[2] or ".")[1:]
     if len(decimals) >= _MIN_DECIMALS:
-        return _Stamp(float(number[0]), _resolution(number[0]))
+        return _Stamp(float(number[0]), _resolution(number[0])) if TIME_S.hold(float(number[0])) else None
     for units_per_second in _UNITS_PER_SECOND:
         if not decimals and _EPOCH_S[0] <= whole / units_per_second < _EPOCH_S[1]:
             return _Stamp(whole / units_per_second, 1 / units_per_second)

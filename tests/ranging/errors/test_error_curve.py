@@ -54,10 +54,10 @@ def test_ranges_beyond_its_ends_are_counted_for_the_user() -> None:
     [
         ("1,0,0.1\n", "has 1 distances, expected two or more"),
         ("1,0,0.1\n1,0,0.1\n", ":3: distance_m is 1, expected more than the distance before it"),
-        ("0,0,0.1\n1,0,0.1\n", ":2: distance_m is 0, expected more than 0"),
-        ("1,0,0.1\n2,0,-0.1\n", ":3: stddev_m is -0.1, expected 0 or more"),
+        ("0,0,0.1\n1,0,0.1\n", ":2: distance_m is 0, expected a number of metres from 1e-06 to 1000000"),
+        ("1,0,0.1\n2,0,-0.1\n", ":3: stddev_m is -0.1, expected 0, or a number of metres from 1e-06 to 1000"),
         ("1,0,0.1\n2,-1.5,0.1\n", ":3: error_m is -1.5, expected one at which a longer distance gives a longer range"),
-        ("1,0,0.1\n2,x,0.1\n", ":3: error_m is 'x', expected a number"),
+        ("1,0,0.1\n2,x,0.1\n", ":3: error_m is 'x', expected a number of metres from -1000 to 1000"),
     ],
 )
 def test_a_curve_that_is_none_is_refused_with_its_line(tmp_path: Path, rows: str, message: str) -> None:

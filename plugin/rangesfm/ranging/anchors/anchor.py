@@ -11,6 +11,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import Table, read_table, repeated, write_user_table
+from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 
 _COORDINATES = ("x_m", "y_m", "z_m")
 _OPTIONAL = ("position_stddev_m", "range_bias_m", "range_bias_stddev_m")
@@ -85,10 +86,9 @@ def read_anchors(path: str | Path) -> tuple[Anchor, ...]:
         message = f"anchor {anchor_ids[row]} is in line {table.line[first]} already, expected each once"
         raise InputError(message, path, int(table.line[row]))
     positions = _positions(table)
-    expected = "a number of metres that is not negative, or nothing"
-    position_stddevs = table.numbers("position_stddev_m", empty=0.0, expected=expected, least=0.0)
-    biases = table.numbers("range_bias_m", empty=0.0)
-    bias_stddevs = table.numbers("range_bias_stddev_m", empty=np.nan, expected=expected, least=0.0)
+    position_stddevs = table.numbers("position_stddev_m", empty=0.0, bounds=STDDEV_OR_EXACT_M)
+    biases = table.numbers("range_bias_m", empty=0.0, bounds=BIAS_M)
+    bias_stddevs = table.numbers("range_bias_stddev_m", empty=np.nan, bounds=STDDEV_OR_EXACT_M)
     return tuple(
         Anchor(
             anchor_id=anchor_id,
@@ -122,9 +122,7 @@ def default_anchor_frame(anchors: Sequence[Anchor]) -> str:
 
 def _positions(table: Table) -> Array:
     """Return the positions (n, 3) in metres, with NaN for a row in which all three cells are empty."""
-    positions = np.column_stack(
-        [table.numbers(name, empty=np.nan, expected="a number of metres") for name in _COORDINATES]
-    )
+    positions = np.column_stack([table.numbers(name, empty=np.nan, bounds=COORDINATE_M) for name in _COORDINATES])
     unknown = np.isnan(positions)
     incomplete = unknown.any(axis=1) & ~unknown.all(axis=1)
     if np.any(incomplete):

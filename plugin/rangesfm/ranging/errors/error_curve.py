@@ -10,6 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.tables import has_columns, read_table, write_table
+from rangesfm.options import BIAS_M, LENGTH_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.range_log import RangeLog
 
 COLUMNS = ("distance_m", "error_m", "stddev_m", "noise_stddev_m")
@@ -88,12 +89,10 @@ def read_error_curve(path: str | Path) -> ErrorCurve:
     table = read_table(path, COLUMNS[:3], COLUMNS[3:], separator=None)
     if len(table) < 2:
         raise InputError(f"has {len(table)} distances, expected two or more", path)
-    distance, error = table.numbers("distance_m"), table.numbers("error_m")
-    stddev = table.numbers("stddev_m")
-    noise = table.numbers("noise_stddev_m", empty=0.0)
-    table.refuse(distance <= 0, "distance_m", "more than 0")
+    distance, error = table.numbers("distance_m", bounds=LENGTH_M), table.numbers("error_m", bounds=BIAS_M)
+    stddev = table.numbers("stddev_m", bounds=STDDEV_OR_EXACT_M)
+    noise = table.numbers("noise_stddev_m", empty=0.0, bounds=STDDEV_OR_EXACT_M)
     table.refuse(np.diff(distance, prepend=0.0) <= 0, "distance_m", "more than the distance before it")
-    table.refuse(stddev < 0, "stddev_m", "0 or more")
     too_steep = np.diff(distance + error, prepend=0.0) <= 0
     table.refuse(too_steep, "error_m", "one at which a longer distance gives a longer range")
     return ErrorCurve(distance, error, stddev, noise)

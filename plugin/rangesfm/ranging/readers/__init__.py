@@ -14,7 +14,7 @@ import numpy as np
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag_folder
 from rangesfm.files.tables import read_head
-from rangesfm.options import LogOptions
+from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.range_log import RangeLog
@@ -68,6 +68,8 @@ def read_ranges(
     reading = ReadOptions(**{**table, **said, "given": tuple(map(str, paths))})
     chosen = _choose_readers(paths, reading, reading.format or ("mapped" if reading.columns else None))
     logs = [reader.read(file, reading) for file, reader in chosen]
+    for one in logs:
+        _check_numbers(one)
     source = paths[0] if len(paths) == 1 else paths[0].parent
     log = logs[0] if len(logs) == 1 else _join_logs(logs, source)
     log = tell_roles(log, chosen[0][1].sides, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
@@ -90,7 +92,26 @@ def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str 
         InputError: the file is missing, empty, or of no known format.
     """
     chosen = _choose_readers(_paths(path), _NOTHING_SAID, format)
-    return tuple(anchor for file, reader in chosen for anchor in reader.read_anchors(file))
+    anchors = [(file, anchor) for file, reader in chosen for anchor in reader.read_anchors(file)]
+    for file, anchor in anchors:
+        if anchor.position_m is not None and not COORDINATE_M.hold(anchor.position_m).all():
+            raise InputError(f"the position of anchor {anchor.anchor_id} is not one, expected {COORDINATE_M}", file)
+    return tuple(anchor for _, anchor in anchors)
+
+
+def _check_numbers(log: RangeLog) -> None:
+    """Raise InputError for a number with which one cannot calculate; a standard deviation may be NaN, not known."""
+    numbers = {
+        "range_m": (log.range_m, LENGTH_M),
+        "range_stddev_m": (log.range_stddev_m, STDDEV_M),
+        "timestamp_s": (np.zeros(0) if log.timestamp_s is None else log.timestamp_s, TIME_S),
+    }
+    for name, (values, bounds) in numbers.items():
+        wrong = ~bounds.hold(values) & ~np.isnan(values)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            message = f"{name} is {values[row]:g}, expected {bounds}: is its unit right?"
+            raise InputError(message, log.source, int(log.line[row]))
 
 
 def _paths(path: str | Path | Sequence[str | Path]) -> list[Path]:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.files.tables import Categories, Table, read_table
+from rangesfm.options import TIME_S
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout
 from rangesfm.ranging.readers.reader import ReadOptions, which_are_measured
@@ -34,7 +35,6 @@ QUANTITIES = (
     *("los", "nlos", *STAMPS),
 )
 
-_MAX_TIME_S = 1e11  # three thousand years; a larger time is in another unit
 _TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
 
 
@@ -108,8 +108,7 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     per_metre = UNITS_PER_METRE[unit]
     stddevs, los = np.full(len(table), np.nan), _line_of_sight(table, name)
     if "range_stddev" in name:
-        expected = "a positive number or nothing"
-        stddevs = table.numbers(name["range_stddev"], empty=np.nan, expected=expected, above=0.0) / per_metre
+        stddevs = table.numbers(name["range_stddev"], empty=np.nan, expected="a number or nothing") / per_metre
     return RangeLog.from_arrays(
         anchor,
         ranges / per_metre,
@@ -215,7 +214,7 @@ def _timestamps(
     times = table.numbers(column, expected=f"a time in {said or 's'}")
     unit = said or time_unit(f"{column} {units.get(column, '')}".strip(), times, notes, ask)
     seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
-    table.refuse(np.abs(seconds) > _MAX_TIME_S, column, f"a time in {unit}")
+    table.refuse(~TIME_S.hold(seconds), column, f"a time in {unit}")
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
 
 
