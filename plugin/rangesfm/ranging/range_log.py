@@ -121,9 +121,19 @@ class RangeLog:
 
         Results computed in this order do not depend on the order of the log, neither by random draws nor by rounding.
         """
-        names = np.array(self.image_name or (), dtype=str)
-        when = np.unique(names, return_inverse=True)[1] if self.timestamp_s is None else self.timestamp_s
-        return np.lexsort((self.range_m, self.peer_index, self.tag_index, when, self.anchor_index))
+        return np.lexsort((self.range_m, self.peer_index, self.tag_index, self._when, self.anchor_index))
+
+    def in_time_order(self) -> RangeLog:
+        """Return the same ranges sorted by time or photo, anchor and tag; the order of the log makes no difference."""
+        of_twins = self.los, np.nan_to_num(self.range_stddev_m), self.range_m, self.peer_index
+        return self.subset(np.lexsort((*of_twins, self.tag_index, self.anchor_index, self._when)))
+
+    @property
+    def _when(self) -> Array | Indices:
+        """Numbers (n,) that sort the ranges by their times, or by the names of their photos."""
+        if self.timestamp_s is not None:
+            return self.timestamp_s
+        return np.unique(np.array(self.image_name or (), dtype=str), return_inverse=True)[1]
 
     @property
     def time_resolution_s(self) -> float:

@@ -96,7 +96,7 @@ def _values(table: Table, name: str, column: Column) -> Any:
 
 @dataclass(frozen=True)
 class RangesAsUsed(TableFile):
-    """Content of ``ranges.csv``: all n ranges of the log, in its order.
+    """Content of ``ranges.csv``: all n ranges of the log, in the order of their times.
 
     A range between two anchors or two tags has one id in the column of anchors and the other in that of tags. "Place"
     means the place on the camera's path.

@@ -43,8 +43,8 @@ class RangingInputs:
     """Inputs measured in metres: those of the radio, lengths, and true positions.
 
     Attributes:
-        log: ranges between the chosen tags and the chosen anchors, and those between two anchors or two tags; empty
-            without a radio.
+        log: ranges between the chosen tags and the chosen anchors, and those between two anchors or two tags, in the
+            order of their times, so that the order of the log changes nothing; empty without a radio.
         tag_in_cam_m: (num_tags, 3) lever arms in the order of ``log.tag_ids``; NaN for a tag that has ranges to tags
             only.
         anchors: all anchors of the log, and those of the file that the log does not have.
@@ -101,7 +101,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_reference(survey.report.reference)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
-    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes)
+    return RangingInputs(log.in_time_order(), tag_in_cam_m, anchors, frame, site, tape, reference, notes)
 
 
 def _check_rigs_are_metric(survey: Survey) -> None:
