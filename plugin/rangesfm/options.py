@@ -48,7 +48,7 @@ PIXEL = Bounds(-1e6, 1e6, "pixels")
 _Count = Annotated[int, Field(ge=1, le=1_000_000)]
 _Zero = Annotated[float, Field(ge=0, le=0)]
 _Positive = Annotated[float, Field(ge=STDDEV_M.least, le=STDDEV_M.most)]
-_Uncertainty = _Zero | _Positive
+Uncertainty = _Zero | _Positive
 _Time = Annotated[float, Field(ge=TIME_S.least, le=TIME_S.most)]
 _Duration = Annotated[float, Field(ge=DURATION_S.least, le=DURATION_S.most)]
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
@@ -132,7 +132,7 @@ class CameraOptions(Options, table="camera"):
     params: Annotated[_Numbers | None, Told(flag="camera_params")] = None
     """Parameters of the camera model in COLMAP's order, for photos of the most common size; they are rescaled for
     photos of another size and the same shape."""
-    focal_length_stddev_px: _Uncertainty | None = None
+    focal_length_stddev_px: Uncertainty | None = None
     """Standard deviation of the focal lengths in params, in pixels; those of the other parameters are derived from it.
     Mapping and refinement adjust the given parameters within it. 0 keeps them all exactly as given (default: 0.5 % of
     the focal length)."""
@@ -257,10 +257,10 @@ class RangeModelOptions(Options, table="ranges"):
 
     range_stddev_m: _Positive | None = None
     """Standard deviation of the noise of a range (default: estimated from the residuals)."""
-    range_bias_stddev_m: _Uncertainty = 0.01
+    range_bias_stddev_m: Uncertainty = 0.01
     """Standard deviation of the prior of each anchor's own constant bias, mean 0. It is small on purpose: a freer bias
     absorbs errors that depend on direction, and shifts the map."""
-    common_bias_stddev_m: _Uncertainty = 0.1
+    common_bias_stddev_m: Uncertainty = 0.1
     """Standard deviation of the prior of the bias that all anchors share (the tag's delay), mean 0."""
 
 
@@ -362,12 +362,12 @@ class RefineOptions(Options, table="refine"):
     """Largest number of iterations of the solver."""
     range_loss_scale: Annotated[float, Field(ge=1e-3, le=1e9)] = 3.46
     """Residual, in standard deviations, from which a range is down-weighted (Geman-McClure loss)."""
-    lever_arm_stddev_m: _Uncertainty = 0.0
+    lever_arm_stddev_m: Uncertainty = 0.0
     """Standard deviation of each coordinate of the lever arms. They are refined unless it is 0."""
-    time_offset_stddev_s: _Uncertainty = 0.0
+    time_offset_stddev_s: Uncertainty = 0.0
     """Standard deviation of the time offset, which is refined unless it is 0. An offset that the search finds only
     roughly is refined in any case, with the standard deviation of the search."""
-    short_range_stddev_m: _Uncertainty = 0.0
+    short_range_stddev_m: Uncertainty = 0.0
     """Standard deviation of an error of short ranges that all anchors share and that decays with a length of 1 m. It is
     refined unless this is 0; with 0, short ranges get less weight instead."""
     covariance: bool = True

@@ -193,7 +193,9 @@ def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], t
         raise wrong("is seen from one direction only, expected photos from different places")
     for k, view in zip(seen, views, strict=True):
         camera, seen_at = _camera(view), view.project_point(point)
-        off_px = np.inf if seen_at is None else float(np.linalg.norm(seen_at - marker.pixels[k]))
+        if seen_at is None:
+            raise wrong("is behind this photo's camera by the other photos: is it the same point?", k)
+        off_px = float(np.linalg.norm(seen_at - marker.pixels[k]))
         if off_px > _MAX_REPROJECTION * max(camera.width, camera.height):
             raise wrong(f"is {off_px:.0f} px from its position by the other photos: is it the same point?", k)
     return point

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import Options, Told
@@ -78,8 +79,15 @@ class PlannedPhotos(Options, table="photos"):
         return float(np.tan(np.deg2rad(self.field_of_view_deg / 2)))
 
     def information(self, path: Trajectory) -> VisionInformation:
-        """Return the information of the photos about the keyframes' poses, given the path."""
-        return vision_information(self.observations(path), Poses(path.world_from_cam, path.centers))
+        """Return the information of the photos about the keyframes' poses, given the path.
+
+        Raises:
+            GeometryError: no two photos see the same point.
+        """
+        observations = self.observations(path)
+        if not len(observations.point):
+            raise GeometryError("[photos] no two photos see the same point: expected a larger seen_m or photo_rate_hz")
+        return vision_information(observations, Poses(path.world_from_cam, path.centers))
 
     def observations(self, path: Trajectory) -> Observations:
         """Simulate observations, without errors, of points that fill each photo of a path.

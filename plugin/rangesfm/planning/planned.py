@@ -115,7 +115,7 @@ class PlannedSurvey:
         ids = [anchor.anchor_id for anchor in self.anchors]
         log = RangeLog.from_arrays([ids[k] for k in turn % num_anchors], np.ones(len(turn)), timestamp_s=times)
         places = associate(log, self.trajectory, self.tag_in_cam_m)
-        at = np.array([self._standing_m[ids.index(anchor_id)] for anchor_id in log.anchor_ids])
+        at = self._standing_m[[ids.index(anchor_id) for anchor_id in log.anchor_ids]]
         distances = np.linalg.norm(places.centers + places.tag_from_center - at[log.anchor_index], axis=1)
         curve = None if self.curve_stddev_m is None else np.full(len(log), self.curve_stddev_m)
         # A range without a position on the path is not used; it only needs a valid number.

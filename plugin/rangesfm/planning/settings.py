@@ -13,7 +13,7 @@ from rangesfm.errors import InputError, OptionError
 from rangesfm.files.atomic import path_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import Options, Told
-from rangesfm.options import RangeModelOptions, TagOptions
+from rangesfm.options import LENGTH_M, RangeModelOptions, TagOptions, Uncertainty
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
 from rangesfm.planning.photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
@@ -25,13 +25,12 @@ from rangesfm.survey.settings import parse_toml, refuse_unknown_tables
 _Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 _Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
 _Spot = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False)]
-_Stddev = Annotated[float, Field(ge=0, le=10)]
 _MAX_NUM_ANCHORS = 64
 _MAX_DURATION_S = 1e5
 
 
 def _going_somewhere(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-    if len(set(corners)) < 2:
+    if max(np.ptp(corners, axis=0), default=0.0) < LENGTH_M.least:
         raise ValueError("are one place")
     return corners
 
@@ -58,7 +57,7 @@ class PlannedAnchorOptions(Options, table="anchors"):
     """Positions x, y, z by anchor id, instead of path."""
     frame: Literal["site", "first_camera", "unknown"] = "site"
     """Knowledge of the positions in a run: surveyed in the site, in the first camera's frame, or not at all."""
-    position_stddev_m: _Stddev = 0.0
+    position_stddev_m: Uncertainty = 0.0
     """Standard deviation to which each coordinate in places will be known."""
     num_to_place: Annotated[int, Field(ge=1, le=_MAX_NUM_ANCHORS)] | None = None
     """Number of anchors to place where they help most, in the region or on the walls, instead of places and path."""

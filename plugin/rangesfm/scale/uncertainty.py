@@ -295,7 +295,8 @@ def expected_scale_uncertainty(
         bending_of_lengths: relative, of the scale by measured lengths.
     """
     summed = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    given = np.hypot(np.sqrt(_by_what_was_given(solution)[0, 0]), _say_of_lengths(solution) * bending_of_lengths)
+    of_given = max(float(_by_what_was_given(solution)[0, 0]), 0.0)  # rounding may leave less than nothing
+    given = np.hypot(np.sqrt(of_given), _say_of_lengths(solution) * bending_of_lengths)
     if given > 0:
         summed[GIVEN] = float(given)
     return ScaleUncertainty(solution.fit.log_scale_stddev, summed)

@@ -186,7 +186,7 @@ def files_of_log(path: Path) -> list[Path]:
         return [path]
     if not found:
         raise InputError("no file there, expected the files of a log", path)
-    return sorted(found, key=lambda file: [part.zfill(20) for part in re.split(r"(\d+)", file.name)])
+    return sorted(found, key=lambda file: ([part.zfill(20) for part in re.split(r"(\d+)", file.name)], file.name))
 
 
 def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: str | None = None) -> Reader:
