@@ -53,8 +53,10 @@ class MapperOptions(Options, table="mapper"):
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)], Told(expected="1 or more up to 4096, or -1 for all cores")
     ] = -1
-    """Number of threads; -1: one for each core. Matching on the processor runs this many processes with one thread
-    each, because pycolmap 4.2 loses matches with several threads; matcher.num_threads sets the threads of a process."""
+    """Number of threads; -1: one for each core. It does not change the result. Matching on the processor runs this many
+    processes with one thread each, because pycolmap 4.2 loses matches with several threads; matcher.num_threads sets
+    the threads of a process. Mapping adds up in one thread; with more, by pipeline.num_threads, each run gives another
+    map."""
 
     @property
     def num_cores(self) -> int:

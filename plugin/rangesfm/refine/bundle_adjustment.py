@@ -26,9 +26,9 @@ from rangesfm.refine.vision_information import model_poses
 _INITIAL_TRUST_REGION_RADIUS = 1e10
 # Relative, of the cost: all that rounding leaves. When it is enough, the keyframes tell, not the cost.
 _FUNCTION_TOLERANCE = 1e-12
-# Below this one thread does it: more add up in the order in which they happen to end, and the same command would give
-# other last digits each time.
-_MIN_NUM_RESIDUALS_FOR_THREADS = 1_000_000
+# One thread adds up whatever number of residuals there is. More add up in the order in which they happen to end: the
+# same command would give other last digits each time, and of a million residuals they save hardly any time.
+_MIN_NUM_RESIDUALS_FOR_THREADS = 2**31 - 1
 # No feature is located better; weighed against a smaller one, ranges lose all say in a model without noise.
 _MIN_PIXEL_STDDEV = 0.05
 _MAX_NUM_TIE_POINTS = 500
