@@ -45,9 +45,6 @@ _ROUNDING = 1e-12
 # A camera counts as being at the origin up to this fraction of the path's extent. Rounding stays below it even if the
 # world in which the path was computed was far from its own origin.
 _AT_ORIGIN = 1e-6
-# Points farther off than this multiple of the median distance are left out of an alignment, in this many rounds.
-_FAR_OFF = 5.0
-_NUM_TRIMMINGS = 5
 # Every unit vector has a coordinate above this size, which is far enough from 0 for its sign to be stable.
 _OF_SOME_SIZE = 0.3
 
@@ -89,21 +86,6 @@ def align_points(source: Array, target: Array, *, with_scale: bool = True) -> Si
     has_scale = with_scale and variance > rounding_of(source) ** 2
     scale = float(singular_values @ signs) / variance if has_scale else 1.0
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
-
-
-def align_most(source: Array, target: Array, start: Similarity) -> Similarity:
-    """Align points like ``align_points``, without those that do not follow the majority.
-
-    Args:
-        source, target: (n, 3) corresponding points.
-        start: approximate target_from_source of most of the points.
-    """
-    found = start
-    for _ in range(_NUM_TRIMMINGS):
-        off = np.linalg.norm(found.apply(source) - target, axis=1)
-        kept = off <= _FAR_OFF * np.median(off) + rounding_of(target)
-        found = align_points(source[kept], target[kept])
-    return found
 
 
 def similarity_motions(from_middle: Array) -> Array:

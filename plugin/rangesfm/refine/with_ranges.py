@@ -18,7 +18,7 @@ from rangesfm.distances.ends import LocatedDistances, distances_by_radio
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.similarity import Similarity, align_most, align_points
+from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
@@ -285,8 +285,7 @@ def _at_rest(problem: RefinementProblem, radio: RadioEstimate, errors: RangeErro
     ranges = problem.ranges
     path = ranges.trajectory.as_in(problem.metric)
     tags_m, centers_m = (places[ranges.rows] for places in ranges.places(path, radio))
-    before_m = ranges.trajectory.centers
-    scale = align_most(before_m, path.centers, align_points(before_m, path.centers)).scale
+    scale = align_points(ranges.trajectory.centers, path.centers).scale
     photos = problem.of_photos(problem.options.max_num_iterations)
     return AtRest(path, scale, tags_m, centers_m, radio.anchors, errors, photos)
 

@@ -13,7 +13,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.distances.tape import Tape
-from rangesfm.geometry.similarity import Similarity, align_most
+from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import ModelVerdict
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
@@ -147,14 +147,12 @@ class MetricResult:
 
     @property
     def refined_scale(self) -> float | None:
-        """Return metres per SfM unit after the refinement, from how most keyframe centres moved; None without one."""
+        """Return metres per SfM unit after the refinement, by least squares over all centres; None without one."""
         if self.refined is None:
             return None
         if self.refined_with_ranges is not None:
             return self.refined_with_ranges.solution.fit.state.metric_from_model.scale
-        return align_most(
-            self.trajectory.centers, self.trajectory.as_in(self.refined).centers, self.estimate.metric_from_sfm
-        ).scale
+        return align_points(self.trajectory.centers, self.trajectory.as_in(self.refined).centers).scale
 
     def moved(self, offset_m: Array) -> MetricResult:
         """Return the same result in a world whose coordinates are larger by ``offset_m`` (3,)."""
