@@ -78,7 +78,7 @@ def test_a_straight_path_leaves_the_roll_of_a_map_in_the_site_uncertain(make_sur
     centers = on_a_line() + 0.05 * np.sin(np.linspace(0.0, 9.0, 40))[:, None] * [0.0, 1.0, 0.7]
     survey = make_survey(centers_m=centers, radio=NOISE, num_epochs=3)
     estimate = survey.scale("site", "ABCDE")
-    assert any("rolled about it" in reason for reason in estimate.reasons)
+    assert any("roll about it" in reason for reason in estimate.reasons)
 
 
 def test_an_anchor_that_is_hardly_heard_is_named(make_survey: MakeSurvey) -> None:

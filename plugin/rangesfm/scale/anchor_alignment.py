@@ -17,25 +17,25 @@ from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.starts import each_once
 
-# Anchors of which triples are tried, the best placed ones: more make it slow, and no better.
+# Triples are tried among this many anchors, the best placed ones. More make it slower without a better result.
 _MAX_NUM_TRIED = 8
 _NUM_ROUNDS = 30
 _NUM_BEST = 6
-# A motion that costs so much more than the best is none to consider.
+# A motion whose robust cost exceeds the best one's by more than this is discarded.
 _MAX_COST_GAP = 50.0
-# Two motions that carry the path's places no further apart than this, in extents of the path, are one.
+# Two motions count as one if they carry the path to places no further apart than this, in extents of the path.
 _SAME_SHARE = 0.1
-# Distances in stddevs from which an anchor does not stand where it stood.
+# An anchor this many standard deviations from its place in the other frame is reported as standing elsewhere.
 _ELSEWHERE_STDDEVS = 5.0
 
 
 @dataclass(frozen=True)
 class PlacedAnchor:
-    """Where an anchor is in a metric frame.
+    """Position of an anchor in a metric frame, with its uncertainty.
 
     Attributes:
-        places_m: (1, 3), or (2, 3) with the mirror image that fits its ranges as well.
-        covariance_m2: (3, 3).
+        places_m: (1, 3) position, or (2, 3) with the mirror image that fits the ranges equally well.
+        covariance_m2: (3, 3) covariance of the position.
     """
 
     places_m: Array
@@ -43,30 +43,30 @@ class PlacedAnchor:
 
     @property
     def variance_m2(self) -> float:
-        """Of each coordinate, on average."""
+        """Mean variance of a coordinate, in square metres."""
         return float(np.trace(self.covariance_m2)) / 3
 
     @property
     def rank(self) -> tuple[int, float]:
-        """Better placed anchors first: those without a mirror image, then by variance."""
+        """Sort key that puts better placed anchors first: those without a mirror image, then by variance."""
         return len(self.places_m), self.variance_m2
 
     def moved(self, motion: Similarity) -> PlacedAnchor:
-        """The same in another frame."""
+        """Return the anchor carried into another frame by a rigid motion."""
         turned = motion.rotation @ self.covariance_m2 @ motion.rotation.T
         return PlacedAnchor(motion.apply(self.places_m), turned)
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """One anchor in both frames."""
+    """One anchor as both frames have it."""
 
     target: PlacedAnchor
     source: PlacedAnchor
 
     @property
     def sides(self) -> list[tuple[int, int]]:
-        """All combinations of its places."""
+        """All combinations of its places: (index in the target, index in the source)."""
         return list(itertools.product(range(len(self.target.places_m)), range(len(self.source.places_m))))
 
     @property
@@ -74,24 +74,24 @@ class _Pair:
         return self.target.variance_m2 + self.source.variance_m2
 
     def difference(self, motion: Similarity, side: tuple[int, int]) -> Array:
-        """(3,) source moved minus target."""
+        """Return the (3,) difference of positions, metres: the source's place moved, minus the target's."""
         return np.asarray(motion.apply(self.source.places_m[side[1]]) - self.target.places_m[side[0]])
 
     def information(self, motion: Similarity) -> Array:
-        """(3, 3) of the difference."""
+        """Return the (3, 3) inverse covariance of the difference."""
         turned = motion.rotation @ self.source.covariance_m2 @ motion.rotation.T
         return np.asarray(np.linalg.inv(self.target.covariance_m2 + turned), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class AnchorAlignment:
-    """A motion, and what it makes of the anchors.
+    """A rigid motion, and how well the anchors fit under it.
 
     Attributes:
-        target_from_source: rigid.
+        target_from_source: the motion.
         sides: by anchor id, which of its places in the target and in the source fit better, 0 or 1.
-        squared: of each anchor, the squared distance of these in stddevs.
-        elsewhere_m: by id, of anchors that do not fit, how far they are from where they should be.
+        squared: for each anchor, the squared distance between these two places, in standard deviations.
+        elsewhere_m: by id of each anchor that does not fit, how far it is from where it should be.
     """
 
     target_from_source: Similarity
@@ -120,14 +120,14 @@ class AnchorAlignment:
 def align_by_anchors(
     target: Mapping[str, PlacedAnchor], source: Mapping[str, PlacedAnchor], source_path_m: Array
 ) -> list[AnchorAlignment]:
-    """Find the motions that bring the anchors together, best first: robust, weighted by their covariances.
+    """Find the rigid motions that bring the anchors together, best first.
 
-    Both frames are right-handed, so that three anchors not on a line are enough; of an anchor with a mirror image
-    either place may be the true one.
+    Each anchor is weighted by its covariance, with a robust loss. Both frames are right-handed, so three anchors that
+    are not on a line determine a motion. Either place of an anchor with a mirror image may be the true one.
 
     Args:
         target, source: anchors by id.
-        source_path_m: (n, 3) places along the path that is to be carried over: motions that do the same to it are one.
+        source_path_m: (n, 3) places along the path to be carried over; motions that do the same to it count as one.
 
     Raises:
         GeometryError: the anchors are too few, or on a line.
@@ -139,7 +139,7 @@ def align_by_anchors(
 
 
 def _refuse_too_few(pairs: Mapping[str, _Pair]) -> None:
-    """Of two anchors or of a line nothing fixes the turn, whatever their sides."""
+    """Raise GeometryError for shared anchors that leave a turn open: fewer than three, or all on a line."""
     ids, names = list(pairs), ", ".join(pairs)
     if not ids:
         raise GeometryError("it shares no anchor with the others")
@@ -152,7 +152,7 @@ def _refuse_too_few(pairs: Mapping[str, _Pair]) -> None:
 
 
 def _distinct(pairs: Mapping[str, _Pair], path_m: Array) -> list[AnchorAlignment]:
-    """Refined fits from triples of anchors, best first, each once."""
+    """Return the refined fits that start from triples of anchors, best first, each different motion once."""
     tolerance = _SAME_SHARE * float(np.linalg.norm(path_shape(path_m).stddevs))
 
     def best(fits: Iterable[AnchorAlignment]) -> list[AnchorAlignment]:
@@ -176,7 +176,7 @@ def _triple_motions(pairs: Iterable[_Pair]) -> Iterator[Similarity]:
 
 
 def _refined(pairs: Mapping[str, _Pair], fit: AnchorAlignment) -> AnchorAlignment:
-    """Reweighted Gauss-Newton steps, each anchor at the places that fit better."""
+    """Refine a motion by reweighted Gauss-Newton steps, each anchor at the places that fit better."""
     for _ in range(_NUM_ROUNDS):
         middle = np.mean([fit.target_from_source.apply(pair.source.places_m[0]) for pair in pairs.values()], axis=0)
         normal, right = 1e-12 * np.eye(6), np.zeros(6)
@@ -186,7 +186,7 @@ def _refined(pairs: Mapping[str, _Pair], fit: AnchorAlignment) -> AnchorAlignmen
             weighted = weight * pair.information(fit.target_from_source)
             difference = pair.difference(fit.target_from_source, side)
             place = difference + pair.target.places_m[side[0]] - middle
-            jacobian = np.hstack([-cross_matrices(place), np.eye(3)])  # by a small turn and a shift
+            jacobian = np.hstack([-cross_matrices(place), np.eye(3)])  # by a small turn and a shift of the source
             normal = normal + jacobian.T @ weighted @ jacobian
             right = right - jacobian.T @ weighted @ difference
         step = np.linalg.solve(normal, right)

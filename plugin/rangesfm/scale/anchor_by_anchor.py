@@ -1,4 +1,4 @@
-"""Each anchor on its own: where it is, and what scale it alone would give."""
+"""Estimates for each anchor: its position, and the scale that its ranges alone would give."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_s
 
 _MIN_RANGES_ALONE = 8
 _MAX_RANGES_ALONE = 3000
-# An anchor that leaves the logarithm of the scale this open has no say of its own.
+# An anchor gives no scale of its own if the standard deviation of the scale's logarithm is larger than this.
 _MAX_LOG_SCALE_STDDEV = 0.5
 
 
 def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[str, float]:
-    """Scale from the ranges of one anchor at a time, by id.
+    """Estimate the scale from the ranges of one anchor at a time; by anchor id.
 
-    A known anchor stretches the path about its centre (about the first camera where that is
-    the frame's origin); an unknown one is estimated along with the scale.
+    With a known anchor the path is stretched about its centre, or about the first camera where that is the frame's
+    origin. An unknown anchor is estimated along with the scale.
     """
     problem, state, scales = solution.problem, solution.fit.state, {}
     middle = problem.centers.mean(axis=0) if problem.frame_is_free else np.zeros(3)
@@ -42,7 +42,11 @@ def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[st
 
 
 def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...], covariance: Array) -> tuple[AnchorEstimate, ...]:
-    """All anchors of the log, and mirror places; by the (p, p) covariance of all that the fit estimates."""
+    """Return the estimates of all anchors of the log, mirror places included.
+
+    Args:
+        covariance: (p, p) covariance of all parameters of the fit.
+    """
     problem, state = solution.problem, solution.fit.state
     of_anchors = solution.fit.of_anchors(covariance)
     stddev = np.sqrt(np.trace(of_anchors, axis1=1, axis2=2) / 3)
@@ -70,7 +74,7 @@ def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...], covariance
 
 
 def _common_bias(problem: RangeProblem, state: RangeState) -> float:
-    """What the free biases share, beyond their prior means: its most likely value given them."""
+    """Return the most likely bias, metres, that all free biases share, given their deviations from the prior means."""
     free = problem.bias_stddev_m > 0
     if not free.any() or problem.common_bias_stddev_m == 0:
         return 0.0
@@ -80,7 +84,7 @@ def _common_bias(problem: RangeProblem, state: RangeState) -> float:
 
 
 def _mirror_places(solution: Solution) -> dict[int, Array]:
-    """Unknown anchors that the ranges allow on the other side of the path's plane as well."""
+    """Return the mirror places, by index, of unknown anchors that may stand on either side of the path's plane."""
     problem, state = solution.problem, solution.fit.state
     _, rise = choose_sides(spread_subset(problem, _MAX_RANGES_ALONE), state)
     places: dict[int, Array] = {}

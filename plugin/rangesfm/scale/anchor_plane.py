@@ -1,4 +1,4 @@
-"""The plane of coplanar anchors, and the side of it on which the camera went."""
+"""The plane that coplanar anchors lie in, and the side of it on which the camera moved."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ from rangesfm.geometry.gravity import UP_IN_SITE
 from rangesfm.geometry.similarity import PathShape, Similarity, path_shape
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState
 
-# Extent of the anchors across their plane, in widths, below which it is one.
+# Anchors are coplanar if their extent across the plane is below this share of their second largest extent.
 _COPLANAR = 0.1
-# Anchors closer to a line than this share of their extent leave the turn about it open.
+# Anchors are on a line if their second largest extent is at most this share of the largest.
 _COLLINEAR = 0.02
 _MIN_OFF_VERTICAL_DEG = 20.0
-# Of the plane's normal against the vertical: of a steeper plane nothing is above.
+# Angle from the vertical, degrees. With a steeper normal, "above" and "below" have no meaning.
 _MAX_TILT_DEG = 60.0
-# Share of a path that makes a side its own.
+# Share of the path's places that must lie on one side for the path to count as on that side.
 _ON_ONE_SIDE = 0.9
-# Of the path's length: what is so near to the plane is in it, as far as any ranges tell, and on neither side.
+# Share of the path's length. Places nearer to the plane than this count as in it: ranges cannot tell their side.
 _IN_PLANE = 1e-3
 
 
 def anchor_plane(problem: RangeProblem) -> tuple[Array, Array] | None:
-    """A point of it (3,) and its normal (3,), upward; None if the given positions lie in none.
+    """Return a point (3,) and the upward unit normal (3,) of the anchors' plane; None if they have no common plane.
 
-    On a level line they do where gravity is known: in the one plane through it that is level across it.
+    Anchors on a line have one where gravity is known and the line is not steep: the plane that holds the line and is
+    level across it.
     """
     known = problem.anchor_mean_m[np.isfinite(problem.anchor_mean_m).all(axis=1)]
     if len(known) < 2:
@@ -45,20 +46,20 @@ def anchor_plane(problem: RangeProblem) -> tuple[Array, Array] | None:
 
 
 def is_line(anchors: PathShape) -> bool:
-    """Whether these positions leave a turn about their line open."""
+    """Return True if the positions leave a turn about their line open."""
     return bool(anchors.stddevs[1] <= _COLLINEAR * anchors.stddevs[0])
 
 
 def is_steep(anchors: PathShape) -> bool:
-    """Whether their line is so near the vertical that gravity does not fix the turn about it."""
+    """Return True if the positions' line is so near the vertical that gravity does not fix the turn about it."""
     return bool(abs(anchors.axes[:, 0] @ UP_IN_SITE) > np.cos(np.deg2rad(_MIN_OFF_VERTICAL_DEG)))
 
 
 def mirrored_map(problem: RangeProblem, state: RangeState) -> RangeState | None:
-    """The map on the other side of the anchors' plane; of a flat path, it fits as well. None without a plane.
+    """Return the map on the other side of the anchors' plane, or None if they have no plane.
 
-    The mirror image of a map is no map, as it is left-handed; reflected in the plane of its own path as well, it is,
-    and a flat path stays as it is by that.
+    The mirror image of a map is left-handed, so it is no map. It is therefore also reflected in the plane of its own
+    path, which leaves a flat path unchanged: such a path fits the ranges on both sides equally well.
     """
     plane = anchor_plane(problem)
     if plane is None:
@@ -73,7 +74,7 @@ def mirrored_map(problem: RangeProblem, state: RangeState) -> RangeState | None:
 
 
 def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
-    """ "above" or "below" the anchors' plane, or "on both sides of" it; None where they have none or it is the path's.
+    """Return "above", "below" or "on both sides of" the anchors' plane; None if there is no plane or the path is in it.
 
     Raises:
         GeometryError: the plane stands upright.
@@ -96,10 +97,10 @@ def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
 
 
 def on_side(problem: RangeProblem, fits: list[RangeFit], camera_side: str | None) -> list[RangeFit]:
-    """The fits whose path runs above or below the anchors' plane, as told, or in it; all of them where there is none.
+    """Return the fits whose path is on the given side of the anchors' plane or in it; all fits if there is no plane.
 
     Raises:
-        GeometryError: the plane stands upright, or no fit is on that side.
+        GeometryError: the plane is upright, or no fit is on that side.
     """
     if camera_side is None:
         return fits

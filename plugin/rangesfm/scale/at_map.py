@@ -1,4 +1,4 @@
-"""A metric map with the ranges on it, as a scale problem that is solved: what is learnt and known there."""
+"""A metric map with its ranges, treated as a solved scale problem: learnt errors and uncertainty at that map."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from rangesfm.scale.solution import Solution, weighted
 from rangesfm.scale.uncertainty import KnownMap, bending_of_cells, known_refined_map, learned_errors
 from rangesfm.scale.verdict import judge
 
-# What is learnt of the errors changes by less than a twentieth with twice as many (hall and laps of
-# ``tests.studies.drifting_maps``), and each costs a solution of the photos' normal equations.
+# With twice as many cells the learnt errors change by less than a twentieth (hall and laps of
+# ``tests.studies.drifting_maps``), and each cell costs one solution of the photos' normal equations.
 MAX_NUM_CELLS = 450
 
 
 @dataclass(frozen=True)
 class MapWithRanges:
-    """A map that photos and ranges hold together.
+    """A map estimated from photos and ranges together.
 
     Attributes:
-        posed: its ranges, in the first camera's frame and the unit of the unscaled model.
-        solution: where the map is. observations: of the ranges. trajectory: of the map, in that unit.
-        bending: of the map.
+        posed: the scale problem of its ranges, in the first camera's frame and the unit of the unscaled model.
+        solution: the state of the map, with its errors. observations: the ranges.
+        trajectory: of the map, in the unit of the unscaled model. bending: of the map.
     """
 
     posed: ScaleProblem
@@ -58,12 +58,12 @@ class MapWithRanges:
         errors: RangeErrors,
         bending: MapBending,
     ) -> MapWithRanges:
-        """Of the ranges that a scale was found by, on another map.
+        """Transfer the ranges of a scale estimate to another map.
 
         Args:
-            start: that scale. trajectory_m: the other map's, in the metric world.
-            scale: of it, metres per unit of the unscaled model.
-            tags_m, centers_m: (k, 3) where tag and camera were at each of the ranges.
+            start: the scale estimate. trajectory_m: of the other map, in the metric world.
+            scale: of the other map, metres per unit of the unscaled model.
+            tags_m, centers_m: (k, 3) positions of tag and camera at each of the k ranges.
             anchors_m: (m, 3). biases_m: (m,). errors: of the k ranges, as weighted.
         """
         assert start.problem is not None, "a map with ranges"
@@ -88,20 +88,20 @@ class MapWithRanges:
         return model_from_cam(self.observations, self.trajectory, self.posed)
 
     def learned(self) -> LearnedErrors:
-        """What is learnt of the ranges' errors, and of the map's."""
+        """Estimate the errors of the ranges and of the map from the residuals at this map."""
         velocities = camera_velocities(self.observations, self.trajectory, self.posed)
         return learned_errors(
             self.posed, self.solution, self.observations, self._rotations, velocities, self.bending, MAX_NUM_CELLS
         )
 
     def bending_factor(self, learned: LearnedErrors) -> float:
-        """By how much more than its photos' residuals let expect the map was bent; 1 where nobody looked at them."""
+        """Return the learnt bending over the bending expected from the photos' residuals; 1 if that is unknown."""
         bending = self._bending_of(learned.cells)
         mean_m = 0.0 if bending is None else float(np.sqrt(np.trace(bending.formal_m2) / len(learned.cells)))
         return learned.stddev_of_component["bending"] / mean_m if mean_m > 0 else 1.0
 
     def known(self, learned: LearnedErrors) -> KnownMap:
-        """How far off the map as a whole may be."""
+        """Return the uncertainty of the map as a whole: scale, placement and anchors."""
         return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.cells))
 
     def _bending_of(self, cells: Cells) -> BendingOfCells | None:
@@ -112,17 +112,17 @@ class MapWithRanges:
 def estimate_at(
     on_map: MapWithRanges, learned: LearnedErrors, start: ScaleEstimate, options: ScaleOptions
 ) -> ScaleEstimate:
-    """The scale of a map that was refined, judged there.
+    """Return the scale estimate of a refined map, judged at that map.
 
     Args:
-        start: where it began, of which all stays that is no judgement.
+        start: the estimate before the refinement; everything that is no judgement is taken from it.
 
     Raises:
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     known = on_map.known(learned)
     value = on_map.solution.fit.state.metric_from_model.scale
-    # Measured lengths say more of the scale than the refinement, in which many ranges outweigh them, lets them.
+    # The refinement lets many ranges outweigh the measured lengths, so its uncertainty would ignore what they tell.
     uncertainty = known.uncertainty if start.lengths is None else _about(start, value)
     judged = judge(on_map.posed, on_map.solution, uncertainty, {}, start.anchors, (), options)
     columns, placement = known.columns, None
@@ -143,5 +143,5 @@ def estimate_at(
 
 
 def _about(start: ScaleEstimate, value: float) -> ScaleUncertainty:
-    """What is known of a scale, as seen from another value of it."""
+    """Return the uncertainty of an estimate, shifted so that it refers to another value of the scale."""
     return replace(start.uncertainty, lean=start.uncertainty.lean + float(np.log(start.value / value)))

@@ -1,4 +1,4 @@
-"""How the scale came about, in tables to plot: the paper's candidates and consensus."""
+"""Tables to plot that show how the scale was found: the paper's candidates and the consensus over the scale."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from rangesfm.scale.two_candidate import two_candidate
 
 NUM_CURVE_POINTS = 601
 CURVE_FACTOR = 3.0
-"""The curve runs from the scale over this factor to the scale times it."""
+"""The curve runs from the scale divided by this factor to the scale times it."""
 
 
 @dataclass(frozen=True)
 class ScaleDiagnostics:
-    """Tables beside a ScaleEstimate, all scales in metres per SfM unit.
+    """Tables beside a ScaleEstimate; all scales are in metres per SfM unit.
 
     Attributes:
-        candidate_rows: (k,) ranges of the log that have candidates.
-        candidates: (k, 2) of each, the smaller and the larger.
-        curve_scales: (m,) increasing.
-        num_agreeing: (m,) ranges that agree with each.
+        candidate_rows: (k,) rows of the log whose ranges have candidates.
+        candidates: (k, 2) the smaller and the larger candidate of each.
+        curve_scales: (m,) increasing scales.
+        num_agreeing: (m,) number of ranges that agree with each scale.
     """
 
     candidate_rows: Indices
@@ -35,20 +35,20 @@ class ScaleDiagnostics:
 
 
 def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleDiagnostics:
-    """The tables of an estimate on its unscaled path, its anchors and its rotation taken as found."""
+    """Return the tables of an estimate on its unscaled path, with its anchors and its rotation held fixed."""
     observations, log, placed = estimate.observations, estimate.observations.log, estimate.metric_from_sfm
     anchors = np.array([anchor.position_m for anchor in estimate.anchors], dtype=np.float64)[log.anchor_index]
     rows = np.flatnonzero(np.isfinite(estimate.errors.stddev_m) & np.isfinite(anchors).all(axis=1))
     tags, range_m = observations.tag_from_center[rows] @ placed.rotation.T, log.range_m[rows]
 
     def about(held: Array) -> tuple[Array, Array]:
-        """Centres in SfM units and anchors in metres, along the metric axes about a place of the path."""
+        """Return centres in SfM units and anchors in metres, both along the metric axes and relative to a place."""
         return (observations.centers[rows] - held) @ placed.rotation.T, anchors[rows] - placed.apply(held)
 
-    # As in the paper: the first camera is the origin.
+    # In the paper the first camera is the origin.
     centers, anchor_m = about(trajectory.centers[0])
     table = two_candidate(centers, tags, anchor_m, range_m)
-    # The path stretches about what holds it: in a site its middle, else the first camera.
+    # The path is stretched about a fixed point: its middle in a site, otherwise the first camera.
     centers, anchor_m = about(trajectory.centers.mean(axis=0) if estimate.frame == "site" else trajectory.centers[0])
     bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
     tolerance = TOLERANCE_STDDEVS * estimate.errors.stddev_m[rows]

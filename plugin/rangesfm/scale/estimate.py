@@ -1,4 +1,4 @@
-"""ScaleEstimate: what the scale stage found."""
+"""ScaleEstimate: the result of the scale stage."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ NORMAL_95 = 1.96
 
 @dataclass(frozen=True)
 class ScaleUncertainty:
-    """Relative stddevs of the scale, by where they come from.
+    """Relative standard deviations of the scale, by their causes.
 
     Attributes:
-        formal: from the Jacobian, as if every range erred on its own (Cramer-Rao).
-        components: what each component of the ranges' errors does, by its name.
-        lean: how far the middle of the interval is from the estimate: of the scale's logarithm.
+        formal: from the Jacobian, as if all ranges erred independently (Cramer-Rao bound).
+        components: standard deviation due to each component of the ranges' errors, by its name.
+        lean: offset of the interval's middle from the estimate, in the logarithm of the scale.
     """
 
     formal: float
@@ -36,32 +36,32 @@ class ScaleUncertainty:
 
     @property
     def empirical(self) -> float:
-        """The honest one: all components together, and never less than the formal one."""
+        """Realistic standard deviation: all components together, and never less than the formal one."""
         return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
 
     def beside(self, name: str, stddev: float) -> ScaleUncertainty:
-        """With more of a component."""
+        """Return a copy with more of one component, added in quadrature."""
         return replace(
             self, components={**self.components, name: float(np.hypot(self.components.get(name, 0), stddev))}
         )
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Return the ends of the interval that holds the logarithm of the true scale over the estimate."""
+        """Bounds, with 95 % probability, of the logarithm of the true scale divided by the estimate."""
         return self.lean - self.half_width_95, self.lean + self.half_width_95
 
     @property
     def half_width_95(self) -> float:
-        """Return half the width of that interval."""
+        """Half the width of the 95 % interval, in the logarithm of the scale."""
         return NORMAL_95 * self.empirical
 
 
 @dataclass(frozen=True)
 class ScaleByKind:
-    """The scale by ranges alone, or by measured lengths alone, metres per SfM unit.
+    """The scale from ranges alone, or from measured lengths alone, in metres per SfM unit.
 
     Attributes:
-        stddev: by all that they get wrong; inf where they do not determine it.
+        stddev: with all error components; inf where the scale is not determined.
     """
 
     value: float
@@ -70,12 +70,12 @@ class ScaleByKind:
 
 @dataclass(frozen=True)
 class CutoffTest:
-    """The scale from ranges of at least some length, short ones weighing as much as others.
+    """The scale from ranges of at least some length, with short ranges weighted like the others.
 
     Attributes:
-        min_range_m: what is left out is shorter.
+        min_range_m: shorter ranges are left out.
         scale: metres per SfM unit.
-        stddev: metres per SfM unit, widened by the errors' correlation; not of the range model.
+        stddev: metres per SfM unit, widened for the correlation of the errors; errors of the range model are not in it.
     """
 
     min_range_m: float
@@ -85,12 +85,12 @@ class CutoffTest:
 
 @dataclass(frozen=True)
 class ScaleSensitivity:
-    """By how many percent the scale would change; where a bias is estimated, by what is left of it.
+    """Change of the scale, in percent, per error of the range model; estimated biases absorb their part of it.
 
     Attributes:
         common_bias_per_cm: if all ranges were a centimetre longer.
-        short_range_per_cm: if the ranges of the shorter half were.
-        anchor_bias_per_cm: if those of one anchor were, by id.
+        short_range_per_cm: if the shorter half of the ranges were a centimetre longer.
+        anchor_bias_per_cm: by anchor id, if the ranges to that anchor were a centimetre longer.
         range_slope_per_percent: if all ranges were one percent longer.
         lever_arm_per_cm: if the tag sat a centimetre further along x, y, z of the camera.
     """
@@ -104,31 +104,31 @@ class ScaleSensitivity:
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """The scale, its frame, and how far to trust it.
+    """The scale, its frame and its uncertainty.
 
     Attributes:
-        metric_from_sfm: world of the unscaled model to the metric world.
-        frame: "site" or "first_camera": the metric world.
-        method: "robust" or "two-candidate".
-        uncertainty: relative stddevs.
-        verdict: "good" or "doubtful" (a refusal is a GeometryError).
+        metric_from_sfm: similarity from the world of the unscaled model to the metric world.
+        frame: the metric world: "site" or "first_camera".
+        method: "robust", "two-candidate" or "lengths".
+        uncertainty: relative standard deviations of the scale.
+        verdict: "good" or "doubtful" (a refused scale is a GeometryError).
         reasons: why, in words.
-        advice: what to do about it, in words; of a finished survey too what would gain most next time.
-        cutoff_test: whether the scale moves as short ranges are left out.
-        sensitivity: to what the range model may have wrong.
-        per_anchor: scale from each anchor alone; anchors that do not determine one are missing.
-        two_candidate: the paper's table; None where no range has candidates.
-        anchors: in the order of the log.
-        observations: all ranges, with status by their final weight.
-        errors: of all n ranges of the log, as weighted; their inflation widens the formal stddev.
-        noise_stddev_m: stddev of a range away from all special cases.
-        problem, solution: from which all of this was found; None where there were no ranges.
-        placement: (7, 7) covariance of the logarithm of the scale, of a turn (rad) and of a shift (m) of the map about
-            where the first camera is, by what the ranges get wrong; None where the frame is the first camera's.
-        lengths: what measured lengths say by themselves; None: there are none between points of the map.
-        remarks: reasons among these that no refinement changes.
-        refined_value: scale of the map that was refined, which the uncertainty is then of; None of one that was not.
-        by_kind: "ranges" and "lengths", as far as there are any, where lengths took part.
+        advice: what to do about it, in words; for a finished survey also what would improve the next one most.
+        cutoff_test: how the scale changes as short ranges are left out.
+        sensitivity: change of the scale per error of the range model.
+        per_anchor: scale from each anchor alone, by id; anchors that do not determine one are missing.
+        two_candidate: the paper's table; None where too few ranges have candidates.
+        anchors: estimates in the order of the log.
+        observations: all ranges, with their status by final weight.
+        errors: of all n ranges of the log, as weighted; their inflation widens the formal standard deviation.
+        noise_stddev_m: standard deviation of an ordinary range.
+        problem, solution: what the estimate was computed from; None where there were no ranges.
+        placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
+            first camera, from all error components; None in the first camera's frame.
+        lengths: what the measured lengths alone say; None without lengths between points of the map.
+        remarks: those of the reasons that a refinement does not change.
+        refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
+        by_kind: scale by "ranges" and by "lengths", as far as available, where measured lengths were used.
     """
 
     metric_from_sfm: Similarity
@@ -156,21 +156,21 @@ class ScaleEstimate:
 
     @property
     def value(self) -> float:
-        """Metres per SfM unit, of the map that is delivered."""
+        """Scale of the delivered map, in metres per SfM unit."""
         return self.metric_from_sfm.scale if self.refined_value is None else self.refined_value
 
     @property
     def stddev_formal(self) -> float:
-        """Metres per SfM unit, as if every range erred on its own."""
+        """Standard deviation in metres per SfM unit, as if all ranges erred independently."""
         return self.value * self.uncertainty.formal
 
     @property
     def stddev_empirical(self) -> float:
-        """Metres per SfM unit, by all that ranges get wrong."""
+        """Standard deviation in metres per SfM unit, with all error components."""
         return self.value * self.uncertainty.empirical
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """Metres per SfM unit between which the scale is with 95 % probability."""
+        """Bounds of the scale with 95 % probability, in metres per SfM unit."""
         low, high = self.uncertainty.interval_95
         return self.value * float(np.exp(low)), self.value * float(np.exp(high))

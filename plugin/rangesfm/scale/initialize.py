@@ -1,4 +1,4 @@
-"""Scale initialisation: ranges and an unscaled path to metres per SfM unit, with its error."""
+"""Scale initialisation: metres per SfM unit, and their uncertainty, from ranges and an unscaled path."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ def initialize_scale(
     bending: MapBending | None = None,
     seed: int = 0,
 ) -> ScaleEstimate:
-    """Estimate scale and frame of an unscaled path from ranges, from measured lengths, or from both.
+    """Estimate scale and frame of an unscaled path from ranges, measured lengths, or both.
 
     Args:
-        observations: ranges on ``trajectory``; none where lengths alone have to do.
+        observations: ranges on ``trajectory``; may be empty if there are measured lengths.
         trajectory: the unscaled path.
-        anchors: every anchor of the log, with what is known of it.
-        anchor_frame: "site" (positions in a site frame: the map is carried there),
-            "first_camera" (positions in the first keyframe's camera frame, metres) or
-            "unknown" (positions are ignored; the map stays in the first camera's frame).
-        distances: taped ones in the model of ``trajectory``; its checks have no say.
-        bending: what is known of how the map is bent; None: it drifts as maps of poses do.
+        anchors: every anchor of the log, with its prior knowledge.
+        anchor_frame: "site" (positions in a site frame: the map is carried there), "first_camera" (positions in the
+            first keyframe's camera frame, metres) or "unknown" (positions are ignored; the map stays in the first
+            camera's frame).
+        distances: measured ones, located in the model of ``trajectory``; those that are only checks are not used.
+        bending: how the map is bent; None: it drifts as a map of poses does.
 
     Raises:
-        InputError: the log has an anchor that is not given.
+        InputError: an anchor of the log is not among ``anchors``.
         GeometryError: the scale is not determined.
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
@@ -136,7 +136,7 @@ def _by_lengths_alone(
     range_model: RangeModelOptions,
     options: ScaleOptions,
 ) -> ScaleEstimate:
-    """In the first camera's frame, with nothing to say of ranges."""
+    """Return the estimate in the first camera's frame from measured lengths; everything about ranges stays empty."""
     uncertainty = ScaleUncertainty(lengths.relative_stddev, lengths.components)
     judged = judge_lengths(lengths, uncertainty, options)
     first_camera_from_sfm = first_camera_from(trajectory)
@@ -162,7 +162,10 @@ def _by_lengths_alone(
 
 
 def _bent(problem: ScaleProblem, lengths: LengthScale) -> ScaleProblem:
-    """With the lengths as uncertain as they are: what the map bends is no reason to believe the ranges, in solving."""
+    """Return the problem with the lengths' uncertainty widened by the bending of the map.
+
+    The solver leaves the bending out, because it is no reason to trust the ranges more.
+    """
     if problem.ranges.distances is None:
         return problem
     distances = lengths.beside_ranges(problem.ranges.distances, with_bending=True)
@@ -174,7 +177,7 @@ def _by_lengths(lengths: LengthScale) -> dict[str, ScaleByKind]:
 
 
 def _by_ranges(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleByKind:
-    """From the solution on without lengths between points."""
+    """Estimate the scale again without lengths between points, starting from the solution."""
     posed = replace(posed, ranges=_without_lengths(posed.ranges))
     problem = _without_lengths(solution.problem)
     alone = replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
@@ -188,7 +191,7 @@ def _without_lengths(problem: RangeProblem) -> RangeProblem:
 
 
 def placement_covariance(solution: Solution, covariance: Array) -> Array | None:
-    """As ``ScaleEstimate.placement``."""
+    """Return ``ScaleEstimate.placement`` from the (p, p) covariance of all parameters of the fit."""
     columns = solution.fit.columns[0]
     if columns.frame < 0:
         return None
@@ -197,7 +200,7 @@ def placement_covariance(solution: Solution, covariance: Array) -> Array | None:
 
 
 def model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:
-    """(k, 3, 3) rotation at the keyframe nearest to each range, into the first camera's frame."""
+    """Return (k, 3, 3) rotations into the first camera's frame of the keyframe nearest to each range."""
     turned: Array = (
         problem.first_camera_from_sfm.rotation @ trajectory.world_from_cam[observations.nearest[problem.rows]]
     )
@@ -205,18 +208,22 @@ def model_from_cam(observations: RangeObservations, trajectory: Trajectory, prob
 
 
 def camera_velocities(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array | None:
-    """(k, 3) there, in the first camera's frame, model units per second; None where there is no one way in time."""
+    """Return the (k, 3) camera velocity at each range, in the first camera's frame, model units per second.
+
+    Returns:
+        None without times, or if the photos' times do not increase along the path.
+    """
     times = trajectory.timestamps_s
     if observations.log.timestamp_s is None or times is None or len(times) < 2:
         return None
-    if (np.diff(times) <= 0).any():  # two cameras at once
+    if (np.diff(times) <= 0).any():  # two photos at once, or a path that goes back in time
         return None
     velocities = np.gradient(trajectory.centers, times, axis=0)[observations.nearest[problem.rows]]
     return np.asarray(velocities @ problem.first_camera_from_sfm.rotation.T)
 
 
 def _paper_table(solution: Solution) -> TwoCandidate | None:
-    """The paper's duplets, with the anchors carried into the first camera's frame."""
+    """Return the paper's table, with the anchors carried into the first camera's frame."""
     state, problem = solution.fit.state, solution.problem
     placed = state.metric_from_model
     anchors = (state.anchors_m - placed.translation) @ placed.rotation
@@ -224,7 +231,7 @@ def _paper_table(solution: Solution) -> TwoCandidate | None:
 
 
 def _by_method(method: str, solution: Solution, table: TwoCandidate | None) -> Similarity:
-    """metric_from_first_camera, its scale by the method asked for."""
+    """Return metric_from_first_camera with the scale of the chosen method."""
     robust = solution.fit.state.metric_from_model
     if method == "robust":
         return robust

@@ -1,8 +1,8 @@
-"""The scale by measured lengths alone, which of them do not go with the others, and their residuals beside ranges.
+"""The scale from measured lengths alone, outliers among them, and residuals of lengths beside ranges.
 
-A length d between two points of a model, l apart there, errs by its measurement, by the marks of its ends and by the
-map's bending: the scale of a map varies from place to place, smoothly, and a length has its mean along the way. How
-much it varies is learnt from how the lengths disagree, on what maps let expect.
+A measured length d between two points of a model has three errors: of its measurement, of the marks of its ends, and
+of the map's bending. Bending means that the scale of a map varies smoothly from place to place; a length sees the mean
+along its way. The size of this variation is estimated from how the lengths disagree, with a prior from other maps.
 """
 
 from __future__ import annotations
@@ -19,29 +19,30 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.range_gradient import RangeGradient
 
-# By how much the scale of a map varies, and the stddev of the logarithm of that from map to map; within how much of
-# the path's extent it is alike. Of a room mapped from a hand-held camera, lengths of 0.5 to 5 m against the truth.
+# BENDING: relative variation of the scale within a map (stddev). _BENDING_SPREAD: stddev of its logarithm from map to
+# map. _ALIKE_WITHIN: correlation length of the variation, as a share of the path's extent. Source: lengths of 0.5 to
+# 5 m against the truth in a room mapped with a hand-held camera.
 BENDING = 0.008
 _BENDING_SPREAD, _ALIKE_WITHIN = 0.6, 0.25
 _NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 21, 8, 2
-# Of how many surveys one has an honest length set aside.
+# Share of surveys without any mistake in which a correct length is set aside.
 FALSE_ALARMS = 0.02
 _NUM_SUSPECTS = 3
 
 
 @dataclass(frozen=True)
 class LengthScale:
-    """What m lengths between points say of the scale.
+    """The scale from m lengths between points.
 
     Attributes:
         value: metres per SfM unit.
-        components: its relative stddevs, by where they come from.
-        rows: (m,) which of the distances they are.
-        is_kept: (m,) those that go with each other; the others have no say.
-        too_long_m, stddev_m: (m,) by how much each is longer than all kept others let expect, and how well that is
-            known; inf: nothing tells.
-        by_metre: (m,) relative change of the scale if one was a metre longer.
-        threshold: of the square of a length's error in stddevs, beyond which it is no chance.
+        components: relative standard deviations of the scale, by cause.
+        rows: (m,) rows of the lengths among the distances.
+        is_kept: (m,) True for lengths that agree with each other; the others are not used.
+        too_long_m, stddev_m: (m,) excess of each length over what all other kept lengths predict, and its standard
+            deviation; inf where nothing predicts it.
+        by_metre: (m,) relative change of the scale if the length was a metre longer.
+        threshold: squared error of a length, in standard deviations, above which it is an outlier.
     """
 
     value: float
@@ -59,14 +60,17 @@ class LengthScale:
 
     @property
     def statistic(self) -> Array:
-        """(m,) squared, in stddevs."""
+        """(m,) squared excess of each length, in standard deviations."""
         return (self.too_long_m / self.stddev_m) ** 2
 
     def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
-        """The distances with all lengths between points as the one that says the same of the scale.
+        """Return the distances with all lengths between points replaced by one that gives the same scale.
 
-        It weighs by how well it was measured: the bending widens the interval alone, as most of what radios get
-        wrong beyond their noise does.
+        Its standard deviation is that of the measurement and the marks. The bending is left out, because it should only
+        widen the interval, as most systematic errors of radios do.
+
+        Args:
+            with_bending: whether the standard deviation includes the bending after all.
         """
         unit = np.array([1.0])
         measured = float(np.hypot(self.components["tape"], self.components["marks"]))
@@ -76,13 +80,13 @@ class LengthScale:
 
 
 def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> LengthScale | None:
-    """The likeliest scale, lengths that cannot belong to it left out; None where there is no length between points.
+    """Estimate the scale with outlying lengths left out; None where there is no length between points.
 
     Args:
-        centers: (n, 3) of the path, in the model's unit.
+        centers: (n, 3) camera centres of the path, in the model's unit.
 
     Raises:
-        GeometryError: the points are in one place.
+        GeometryError: both ends of a length are in one place of the map.
     """
     if distances is None:
         return None
@@ -90,7 +94,7 @@ def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> Leng
     if not len(rows):
         return None
     lengths = _Lengths.of(distances, rows, float(np.linalg.norm(path_shape(centers).stddevs)))
-    # Of a squared Student's t, as the bending is learnt from the other lengths and the spread of maps.
+    # Threshold of a squared Student's t: the size of the bending is estimated from the other lengths and its prior.
     degrees_of_freedom = 1 / (2 * _BENDING_SPREAD**2) + max(len(rows) - 2, 0)
     threshold = float(special.stdtrit(degrees_of_freedom, FALSE_ALARMS / (2 * len(rows))) ** 2)
     kept = np.ones(len(rows), dtype=bool)
@@ -114,7 +118,13 @@ def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> Leng
 
 @dataclass(frozen=True)
 class _Fit:
-    """Scale, how much it varies from place to place, covariances of the lengths by cause, (k,) gain of each."""
+    """A least squares fit.
+
+    Attributes:
+        scale: metres per SfM unit. bending: relative variation of the scale.
+        parts: (k, k) covariances of the lengths by cause, square metres.
+        gains: (k,) derivatives of the scale by each length.
+    """
 
     scale: float
     bending: float
@@ -124,7 +134,11 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Lengths:
-    """m lengths: in the model, as measured, and the (m, m) covariances of both; that of bending for a share of 1."""
+    """Lengths in the model and as measured, (m,) each.
+
+    The (m, m) covariances are of the measurement (square metres), of the marks (square model units) and of the bending
+    (square model units, for a relative variation of 1).
+    """
 
     model: Array
     metric: Array
@@ -143,7 +157,7 @@ class _Lengths:
         places = np.swapaxes(start + shares * (end - start), 0, 1).reshape(-1, 3)
         squared = np.sum((places[:, None] - places) ** 2, axis=2) / (_ALIKE_WITHIN * extent) ** 2
         alike = np.exp(-0.5 * squared).reshape(len(rows), _NUM_PLACES, len(rows), _NUM_PLACES).mean(axis=(1, 3))
-        # Of lengths that are nobody knows where each has a scale of its own.
+        # Lengths at unknown places are taken as independent: each has a scale of its own.
         alike = np.where(np.isfinite(alike), alike, np.eye(len(rows)))
         bends = ~distances.is_everywhere[rows]
         alike *= np.outer(bends, bends)
@@ -164,8 +178,11 @@ class _Lengths:
         }
 
     def fit(self, chosen: Mask) -> _Fit:
-        """Generalised least squares, with the bending by its restricted likelihood: its mean square given the lengths
-        (its most likely size would be too small of few)."""
+        """Fit the scale by generalised least squares.
+
+        The size of the bending is the root of its mean square under its restricted likelihood. The most likely size
+        would be too small with few lengths.
+        """
         model, metric = self.model[chosen], self.metric[chosen]
         scale, bending = float(np.median(metric / model)), BENDING
         logs = np.linspace(-4 * _BENDING_SPREAD, 6 * _BENDING_SPREAD, _NUM_TRIED)
@@ -181,10 +198,10 @@ class _Lengths:
         return _Fit(scale, bending, parts, gains)
 
     def errors(self, kept: Mask, k: int, fit: _Fit | None = None) -> tuple[float, float]:
-        """By how much length k is too long for the kept ones, metres, and its stddev (Baarda's test of one).
+        """Return the excess of length k over the prediction by the kept ones, and its stddev, metres (Baarda's test).
 
         Args:
-            fit: of the kept; None: of these, which k is not among.
+            fit: of the kept lengths; None: fit them here (for a k that is not among them).
         """
         if (kept & (np.arange(len(kept)) != k)).sum() < 1:
             return 0.0, np.inf
@@ -202,7 +219,7 @@ def _total(parts: Mapping[str, Array]) -> Array:
 
 
 def _unlikeliness(covariance: Array, model: Array, metric: Array) -> float:
-    """Negative logarithm of the restricted likelihood, up to a constant."""
+    """Return the negative logarithm of the restricted likelihood, up to a constant."""
     whitened = np.linalg.solve(np.linalg.cholesky(covariance), np.column_stack([model, metric]))
     (information, right), (_, square) = whitened.T @ whitened
     determinant = np.linalg.slogdet(covariance)[1]
@@ -210,7 +227,7 @@ def _unlikeliness(covariance: Array, model: Array, metric: Array) -> float:
 
 
 def distance_residuals(distances: LocatedDistances, scale: float, anchors_m: Array) -> Array:
-    """(k,) in stddevs."""
+    """Return the (k,) residuals, predicted minus measured, in standard deviations."""
     return (distances.lengths_m(scale, anchors_m) - distances.distance_m) / distances.stddev_m
 
 
@@ -221,10 +238,10 @@ def distance_jacobian(
     anchor_column: Indices,
     num_columns: int,
 ) -> Array:
-    """(k, p) of the residuals.
+    """Return the (k, p) Jacobian of the residuals.
 
     Args:
-        anchor_column: (m,) where the three columns of each anchor begin; -1 where it is held.
+        anchor_column: (m,) first of the three columns of each anchor; -1 for an anchor that is held fixed.
         num_columns: p; the first column is the logarithm of the scale.
     """
     jacobian = np.zeros((len(distances), num_columns))

@@ -1,4 +1,4 @@
-"""Several models, each scaled on its own, laid into one metric world through the anchors that they share."""
+"""Placement of several models, each scaled on its own, in one metric world by the anchors that they share."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, so
 from rangesfm.scale.solution import MIN_COST_GAP
 from rangesfm.scale.starts import spread_subset
 
-# No range tells better where an anchor is: antennas err by as much.
+# Smallest standard deviation of an anchor's position: antennas err by as much, whatever the ranges say.
 _MIN_STDDEV_M = 0.02
 _MAX_RANGES_PER_ANCHOR = 300
-# Places of a path that lie no further apart, in its extents, are the same.
+# Two placements count as the same if the path's places are no further apart than this, in extents of the path.
 _SAME_SHARE = 0.1
-# Stddev of a path's places, in its extents, from which its place counts as open.
+# A model counts as not placed if its path's places have a larger standard deviation than this, in extents of the path.
 _MAX_OPEN = 0.25
 
 
 @dataclass(frozen=True)
 class ScaledModel:
-    """A model and what its own ranges say of it.
+    """A model with the scale estimate from its own ranges.
 
     Attributes:
         trajectory: of the unscaled model.
         estimate: of its scale, in a frame of its own or in the anchors' frame.
-        is_in_anchor_frame: whether that is the frame in which positions of anchors were given.
-        frame_is_given: whether it is the first camera's of this very model, in which they were given.
+        is_in_anchor_frame: whether the estimate is in the frame in which positions of anchors were given.
+        frame_is_given: whether these positions were given in the frame of this model's first camera.
     """
 
     trajectory: Trajectory
@@ -48,11 +48,11 @@ class ScaledModel:
 
 @dataclass(frozen=True)
 class Placements:
-    """Where the models lie in the unscaled world of the first.
+    """Places of the models in the unscaled world of the first.
 
     Attributes:
-        first_from_sfm: of each model; None where it has no place.
-        reasons: of each model, why it has none; empty if it has one.
+        first_from_sfm: for each model; None if it could not be placed.
+        reasons: for each model, why it could not be placed; empty if it was.
         notes: what does not fit.
     """
 
@@ -62,11 +62,11 @@ class Placements:
 
 
 def place_models(models: Sequence[ScaledModel]) -> Placements:
-    """Lay each model that the anchors hold into the world of the first, whichever models stand between.
+    """Place each model that the anchors determine in the world of the first, directly or through other models.
 
-    Every model has a scale and a place of its own, all have one set of anchors; where the anchors would let a model
-    lie in several ways, all ranges together decide, or it is left out. Each range weighs as it does where its model is
-    alone.
+    Every model has a scale and a place of its own; all share one set of anchors. Where the anchors alone allow several
+    places for a model, the ranges of all models decide; if they cannot, the model is left out. Each range keeps the
+    weight that it has in its model alone.
     """
     world = _World(models)
     reasons = [""] * len(models)
@@ -88,12 +88,12 @@ def place_models(models: Sequence[ScaledModel]) -> Placements:
 
 
 class _World:
-    """What is placed so far.
+    """The models placed so far.
 
     Attributes:
-        metric_from_sfm: of each placed model.
-        anchors: where they are, by id.
-        notes: of anchors that stand elsewhere for another model.
+        metric_from_sfm: of each placed model, by its index.
+        anchors: their positions in the metric world, by id.
+        notes: anchors that another model has in another place.
     """
 
     def __init__(self, models: Sequence[ScaledModel]):
@@ -103,12 +103,12 @@ class _World:
         self.notes: list[str] = []
 
     def add(self, k: int) -> None:
-        """Raises GeometryError where what is placed so far does not hold this model."""
+        """Place a model; raise GeometryError where the models placed so far do not determine its place."""
         model, anchors = self._models[k], _placed_anchors(self._models[k])
         own = model.estimate.metric_from_sfm
         path = model.trajectory.centers
         if any(self._models[j].is_in_anchor_frame and model.is_in_anchor_frame for j in self.metric_from_sfm):
-            # Both stand in the frame in which the anchors were given.
+            # Both are in the frame in which the anchors were given.
             starts, elsewhere_m = [(own, {**_chosen(anchors), **_chosen(self.anchors)})], {}
         else:
             found = align_by_anchors(self.anchors, anchors, own.apply(path))
@@ -134,7 +134,7 @@ class _World:
         self.notes += [f"anchor {id_} is {off:.2g} m elsewhere by another model" for id_, off in elsewhere_m.items()]
 
     def _best(self, k: int, starts: Sequence[tuple[Similarity, Mapping[str, Array]]]) -> RangeFit:
-        """The ranges of all models decide between the ways to lay one more; GeometryError if they cannot."""
+        """Choose among possible places of a model by the ranges of all; raise GeometryError if they cannot decide."""
         members = [*self.metric_from_sfm, k]
         group = _Group([self._models[j] for j in members], _MAX_RANGES_PER_ANCHOR)
         fits = sorted(
@@ -157,7 +157,7 @@ class _World:
         return best
 
     def solved(self) -> dict[int, Similarity]:
-        """metric_from_sfm of all placed models, by all their ranges."""
+        """Return metric_from_sfm of all placed models, estimated from all their ranges."""
         if len(self.metric_from_sfm) == 1:
             return self.metric_from_sfm
         group = _Group([self._models[k] for k in self.metric_from_sfm], None)
@@ -166,7 +166,7 @@ class _World:
 
 
 class _Group:
-    """The joint problem of some models, the first of which holds them all, unless given anchors do."""
+    """The joint problem of several models. The first model's frame is fixed, unless given anchors fix the frames."""
 
     def __init__(self, models: Sequence[ScaledModel], num_per_anchor: int | None):
         self._anchors = _common_anchors(models)
@@ -179,12 +179,12 @@ class _Group:
         self._parts = [replace(part, frame_is_free=not stays) for part, stays in zip(parts, held, strict=True)]
 
     def solve(self, metric_from_sfm: Sequence[Similarity], anchors_m: Mapping[str, Array]) -> RangeFit:
-        """From a start; anchors without a place in it take no part."""
+        """Solve from a start; anchors that have no place in it are left out."""
         start_m = np.array([anchors_m.get(a.anchor_id, np.full(3, np.nan)) for a in self._anchors]).reshape(-1, 3)
         has_place = np.isfinite(start_m).all(axis=1)
         first, *others = (part.subset(np.flatnonzero(has_place[part.anchor_index])) for part in self._parts)
         state = RangeState(metric_from_sfm[0], start_m, first.bias_mean_m, tuple(metric_from_sfm[1:]))
-        # As for a model alone: the wide loss leads there from further off, the bounded one decides.
+        # The wide loss converges from further away, then the bounded loss decides, as for a single model.
         for loss in (wider(self._loss), self._loss):
             fit = solve(first, state, others=others, loss=loss)
             state = fit.state
@@ -192,7 +192,11 @@ class _Group:
 
 
 def _path_stddev_m(fit: RangeFit, centers: Array) -> float:
-    """Formal, root mean square, of the places (n, 3; in the model's unit) of the last model, whose frame is free."""
+    """Return the formal standard deviation, root mean square, of places of the last model, in metres.
+
+    Args:
+        fit: of several models; the frame of the last is free. centers: (n, 3) places in its unit.
+    """
     similarity, first = fit.state.similarities[-1], fit.columns[-1].scale
     grown = similarity.scale * centers @ similarity.rotation.T
     identity = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
@@ -202,7 +206,7 @@ def _path_stddev_m(fit: RangeFit, centers: Array) -> float:
 
 
 def _common_anchors(models: Sequence[ScaledModel]) -> list[AnchorEstimate]:
-    """The anchors with what is known of them beforehand, each by a model that hears it if there is one."""
+    """Return the anchors with their priors, each from a model that has ranges to it if there is one."""
     in_frame = models[0].is_in_anchor_frame
     anchors = []
     for estimates in zip(*(model.estimate.anchors for model in models), strict=True):
@@ -220,10 +224,10 @@ def _common_anchors(models: Sequence[ScaledModel]) -> list[AnchorEstimate]:
 
 
 def _problem(model: ScaledModel, anchors: Sequence[AnchorEstimate]) -> RangeProblem:
-    """The ranges that its own estimate used, in the model's unit, weighed as there.
+    """Return the problem of the ranges that the model's own estimate used, in the model's unit, with its weights.
 
-    Models' errors hang together by different amounts, and the priors are common to all: so it is the ranges that weigh
-    less here, where in a model alone the priors gain.
+    Errors are correlated by different amounts in different models, while the priors are common to all. So the ranges
+    get less weight here; in a problem of one model, the priors get more instead.
     """
     observations, log = model.estimate.observations, model.estimate.observations.log
     rows = np.flatnonzero(observations.has_place & np.isfinite(model.estimate.errors.stddev_m))
@@ -253,7 +257,7 @@ def _placed_anchors(model: ScaledModel) -> dict[str, PlacedAnchor]:
         covariance = _MIN_STDDEV_M**2 * np.eye(3)
         if anchor.position_covariance_m2 is not None:
             covariance = covariance + anchor.position_covariance_m2
-        if anchor.prior_position_m is None:  # it may be off along with the model's scale
+        if anchor.prior_position_m is None:  # its position may be off together with the model's scale
             by_scale_m = relative * (anchor.position_m - path_m.mean(axis=0))
             covariance = covariance + np.outer(by_scale_m, by_scale_m)
         mirror = anchor.mirror_position_m
@@ -263,5 +267,5 @@ def _placed_anchors(model: ScaledModel) -> dict[str, PlacedAnchor]:
 
 
 def _chosen(anchors: Mapping[str, PlacedAnchor], sides: Mapping[str, int] | None = None) -> dict[str, Array]:
-    """(3,) place of each, the first unless told otherwise."""
+    """Return the (3,) place of each anchor: the first of its places unless ``sides`` names another."""
     return {id_: anchor.places_m[(sides or {}).get(id_, 0)] for id_, anchor in anchors.items()}

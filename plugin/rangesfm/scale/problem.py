@@ -1,4 +1,4 @@
-"""The range problem of a survey: observations and anchors in the first camera's frame."""
+"""The range problem of a survey: ranges and anchors in the first camera's frame."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from rangesfm.scale.range_equation import RangeProblem
 
 _MIN_RANGES = 8
 _MIN_KEYFRAMES = 4
-# A place of its own takes three numbers, and one range more to see that they fit.
+# A position has three unknowns; two more ranges check the fit.
 _MIN_RANGES_OF_UNKNOWN = 5
 
 
 @dataclass(frozen=True)
 class ScaleProblem:
-    """A RangeProblem and how it hangs on the survey.
+    """A RangeProblem and how it belongs to the survey.
 
     Attributes:
         ranges: the problem; its model world is the first camera's frame, unscaled.
-        errors: of its ranges, before anything is estimated.
-        observations: all of the log.
-        rows: (k,) which of the observations its ranges are.
+        errors: prior errors of its ranges, before anything is estimated.
+        observations: all ranges of the log.
+        rows: (k,) rows of the observations that its ranges are.
         first_camera_from_sfm: rigid motion from the world of the unscaled model.
-        frame: "site" or "first_camera": the metric world of the solution.
-        anchors_are_known: whether the scale can lean on given anchor positions.
+        frame: metric world of the solution: "site" or "first_camera".
+        anchors_are_known: whether given anchor positions are used.
         notes: why the map has no place in the site frame, for the user.
         left_out: anchors with too few ranges on the path to be placed.
-        order_given: ids of the anchors as they were given, which is the order of their file.
+        order_given: ids of the anchors in the order of their file.
     """
 
     ranges: RangeProblem
@@ -57,7 +57,7 @@ class ScaleProblem:
     order_given: tuple[str, ...]
 
     def placing_stddev_m(self, metres_per_unit: float) -> Array:
-        """Return the stddev (k,) of each coordinate of the antenna's place, metres, in a map of this scale."""
+        """Return the (k,) standard deviation of each coordinate of the antennas, metres, in a map of this scale."""
         return self.observations.placing_stddev_m(metres_per_unit)[self.rows]
 
 
@@ -72,16 +72,17 @@ def scale_problem(
     *,
     place_is_open: bool = False,
 ) -> ScaleProblem:
-    """Set up the estimation.
+    """Set up the range problem.
 
     Args:
-        distances: taped ones, with the anchors of the log in its order; those between anchors that the log holds
-            are added.
-        gravity: as somebody told it.
-        place_is_open: whether the map has no one place in the site: of surveyed anchors only their distances count.
+        distances: measured ones, with the anchors of the log in its order; distances measured by radio between anchors
+            are added from the log.
+        gravity: the upward direction, as given by the user.
+        place_is_open: whether the map has more than one possible place in the site. Then only the distances between
+            surveyed anchors are used, not their positions.
 
     Raises:
-        InputError: an anchor of the log has no place in ``anchors``.
+        InputError: an anchor of the log is not among ``anchors``.
         GeometryError: too few ranges have a place on the path.
     """
     log = observations.log
@@ -90,7 +91,7 @@ def scale_problem(
     rows, heard = _usable_ranges(observations, given)
     known, notes = _usable_positions(in_log, given & heard, anchor_frame, gravity is not None)
     known &= not place_is_open
-    # A surveyed anchor whose ranges are all held out keeps its place, to check them against.
+    # A surveyed anchor whose ranges are all held out keeps its position, so that they can be checked against it.
     placed = known | (given & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     first_camera_from_sfm = first_camera_from(trajectory)
@@ -135,7 +136,7 @@ def scale_problem(
 
 
 def _control(distances: LocatedDistances, has_place: Mask) -> LocatedDistances | None:
-    """Those that are to be kept to, between points or anchors that take part; None if there are none."""
+    """Return the distances to fit: no checks, and only between points or anchors in use; None if there are none."""
     takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1) & ~distances.is_check
     return distances.subset(takes_part) if takes_part.any() else None
 
@@ -157,7 +158,7 @@ def _bias_stddev(anchor: Anchor, range_model: RangeModelOptions) -> float:
 
 
 def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indices, Mask]:
-    """Rows that take part, and (m,) anchors that have enough of them."""
+    """Return the rows of the ranges in use, and a (m,) mask of the anchors that have enough of them."""
     rows = observations.placed_rows
     index = observations.log.anchor_index
     counts = np.bincount(index[rows], minlength=len(given))
@@ -173,13 +174,16 @@ def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indice
 
 
 def first_camera_from(trajectory: Trajectory) -> Similarity:
-    """Rigid motion from the world of a path to the frame of its first camera."""
+    """Return the rigid motion from the world of a path to the frame of its first camera."""
     rotation = trajectory.world_from_cam[0].T
     return Similarity(1.0, rotation, -rotation @ trajectory.centers[0])
 
 
 def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:
-    """(k, 3) of the first camera itself exactly 0, and not what rounding leaves: no scale moves it."""
+    """Return (k, 3) centres in the first camera's frame.
+
+    The first camera's own centre is set to exactly 0 and not to a rounding error, so that no scale moves it.
+    """
     off = centers - trajectory.centers[0]
     off[np.linalg.norm(off, axis=1) <= rounding_of(trajectory.centers)] = 0.0
     return np.asarray(off @ trajectory.world_from_cam[0])
@@ -188,7 +192,7 @@ def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:
 def _usable_positions(
     anchors: Sequence[Anchor], given: Mask, anchor_frame: str, gravity_is_known: bool
 ) -> tuple[Mask, list[str]]:
-    """(m,) anchors whose given positions can be used in this frame, and why others cannot."""
+    """Return a (m,) mask of anchors whose given positions can be used in this frame, and notes why others cannot."""
     num = int(given.sum())
     if anchor_frame != "site" or num == 0:
         return given, []
@@ -201,14 +205,14 @@ def _usable_positions(
         which = "2 surveyed anchors" if num == 2 else "surveyed anchors on one line"
         why = f"{which} leave the turn of the map about their line open"
     fix = "a third anchor off it" if num > 1 else "three anchors not on a line"
-    # About a plumb line gravity fixes nothing, and with one anchor no heading.
+    # Gravity does not fix the turn about a vertical line, and with one anchor it does not fix the heading.
     help_of_gravity = "" if gravity_is_known else " (two not above each other, with up_in_first_camera)"
     note = f"{why}: scale only, in the first camera's frame; {fix} would fix it{help_of_gravity}"
     return np.zeros(len(anchors), dtype=bool), [note]
 
 
 def _between_surveyed(anchors: Sequence[Anchor], given: Mask) -> list[LocatedDistances]:
-    """The distances between anchors with given positions, which hold in any frame; none where there are none."""
+    """Return the distances between anchors with given positions; they hold in any frame."""
     ids = [anchor.anchor_id for anchor in anchors]
     pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
     lengths_m, stddevs_m = np.array([[pair.distance_m, pair.stddev_m] for pair in pairs]).reshape(-1, 2).T

@@ -3,10 +3,10 @@
     predicted = || scale * R c + t + R r - a || + b
 
 c: camera centre in the model's unit; r: lever arm turned into the model's world, metres;
-R, t, scale: metric world from model world; a: anchor; b: range bias of the anchor.
-This is the model of Lee, Zhu, Giorgi and Günther (2018) with a bias and an anchor that may
-be unknown; the lever arm is metric and so never scaled. Several models, each with a metric world from model world of
-its own, may have one set of anchors and biases.
+R, t, scale: metric world from model world; a: anchor position; b: range bias of the anchor.
+This is the model of Lee, Zhu, Giorgi and Günther (2018), extended by a bias and by anchors that may be unknown. The
+lever arm is metric, so it is never scaled. Several models can share one set of anchors and biases; each has its own
+metric world from model world.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from rangesfm.scale.lengths import distance_jacobian, distance_residuals
 
 @dataclass(frozen=True)
 class RangeProblem:
-    """n ranges to m anchors, and what is known beforehand.
+    """n ranges to m anchors, and the prior knowledge about them.
 
     Attributes:
         centers: (n, 3) camera centres, model units.
         tag_from_center: (n, 3) lever arms turned into the model's world, metres.
         anchor_index: (n,) into the anchors.
-        range_m: (n,) measured.
-        stddev_m: (n,) noise.
+        range_m: (n,) measured ranges.
+        stddev_m: (n,) standard deviation of their noise.
         anchor_mean_m: (m, 3) prior positions in the metric world; NaN where unknown.
-        anchor_stddev_m: (m,) of the prior; 0: exact, inf: unknown.
-        bias_mean_m, bias_stddev_m: (m,) prior of each bias; stddev 0 fixes it.
-        common_bias_stddev_m: prior of what all (free) biases share, the tag's own delay.
-        frame_is_free: whether rotation and translation are estimated, or stay as started.
-        gravity: the upward direction, where somebody told it and the frame is free; None otherwise.
-        distances: taped ones that are to be kept to; their anchors are indices as ``anchor_index``.
-        share: (n,) by how much each range counts beside its noise, as ranges from one place err alike; None: 1.
+        anchor_stddev_m: (m,) of each prior coordinate; 0: exact, inf: unknown.
+        bias_mean_m, bias_stddev_m: (m,) prior of each bias; standard deviation 0 fixes it.
+        common_bias_stddev_m: prior of the bias that all free biases share, such as the tag's own delay.
+        frame_is_free: whether rotation and translation are estimated; otherwise they stay as started.
+        gravity: the upward direction, if given and the frame is free; None otherwise.
+        distances: measured ones to fit; they refer to anchors by index, like ``anchor_index``.
+        share: (n,) factor on the cost of each range, below 1 where ranges from one place err alike; None: 1.
     """
 
     centers: Array
@@ -71,17 +71,17 @@ class RangeProblem:
 
     @cached_property
     def uncertain(self) -> tuple[Indices, Indices]:
-        """Anchors, and biases, of which something is known, but not exactly."""
+        """Indices of the anchors, and of the biases, whose prior is neither exact nor unknown."""
         anchors, biases = (np.flatnonzero((s > 0) & np.isfinite(s)) for s in (self.anchor_stddev_m, self.bias_stddev_m))
         return anchors, biases
 
     @cached_property
     def bias_whitening(self) -> Array:
-        """As ``noise.bias_whitening``, of the uncertain biases; asked for at every step of a solve."""
+        """``noise.bias_whitening`` of the uncertain biases; cached because every step of a solve needs it."""
         return bias_whitening(self.bias_stddev_m[self.uncertain[1]], self.common_bias_stddev_m)
 
     def subset(self, rows: Indices) -> RangeProblem:
-        """The same problem with some of its ranges."""
+        """Return the problem with some of its ranges."""
         return replace(
             self,
             centers=self.centers[rows],
@@ -93,14 +93,18 @@ class RangeProblem:
         )
 
     def by_some(self, rows: Indices) -> RangeProblem:
-        """The same problem by some of its ranges, of each anchor at least one: they stand for the others too."""
+        """Return the problem with some of its ranges, reweighted to stand for all ranges of their anchors.
+
+        Args:
+            rows: at least one range of each anchor.
+        """
         part = self.subset(rows)
         num, taken = (np.bincount(each.anchor_index, minlength=self.num_anchors) for each in (self, part))
         share = np.ones(len(rows)) if part.share is None else part.share
         return replace(part, share=share * (num / np.maximum(taken, 1))[part.anchor_index])
 
     def of_anchor(self, k: int) -> RangeProblem:
-        """The ranges to one anchor alone, in a frame that stays."""
+        """Return the problem of the ranges to anchor k alone, with a fixed frame."""
         part, one = self.subset(np.flatnonzero(self.anchor_index == k)), slice(k, k + 1)
         return replace(
             part,
@@ -116,7 +120,13 @@ class RangeProblem:
 
 @dataclass(frozen=True)
 class RangeState:
-    """Values of all unknowns of a RangeProblem; with ``others``, the similarities of further models, of several."""
+    """Values of all unknowns of a RangeProblem.
+
+    Attributes:
+        metric_from_model: of the model; of the first one if there are several.
+        anchors_m: (m, 3). bias_m: (m,).
+        others: metric_from_model of the further models.
+    """
 
     metric_from_model: Similarity
     anchors_m: Array
@@ -125,30 +135,30 @@ class RangeState:
 
     @property
     def similarities(self) -> tuple[Similarity, ...]:
-        """metric_from_model of each."""
+        """The metric_from_model of each model."""
         return self.metric_from_model, *self.others
 
     @property
     def of_models(self) -> tuple[RangeState, ...]:
-        """As each model has it."""
+        """The state of each model, as a state of one model."""
         return tuple(RangeState(each, self.anchors_m, self.bias_m) for each in self.similarities)
 
 
 @dataclass(frozen=True)
 class RangeFit:
-    """A solution; of several models, the n ranges are those of each in turn.
+    """A solution of a RangeProblem; with several models, the n ranges are those of each model in turn.
 
     Attributes:
         state: the estimate.
         residuals_m: (n,) predicted minus measured.
-        weights: (n,) of the robust loss, 1 for a range that fits.
-        pulls: (n,) the same times the ranges' shares.
+        weights: (n,) of the robust loss; 1 for a range that fits.
+        pulls: (n,) weights times the ranges' shares.
         cost: half the robust sum of squares, priors included.
         information: (p, p) Gauss-Newton approximation with the robust weights, in the parameters of ``columns``.
-        gradients: (n, p) of each range's weighted residual, for resampling.
+        gradients: (n, p) Jacobian of the residuals in standard deviations, each row times its range's pull.
+        gradient: (p,) of the cost; 0 at the minimum.
         prior_information: (p, p) the part of ``information`` that comes from priors.
-        gradient: (p,) of the cost, which is 0 at the bottom.
-        columns: which of the p parameters is what, for each model; the very first is the logarithm of the scale.
+        columns: for each model, which of the p parameters is what; the very first is the logarithm of the scale.
     """
 
     state: RangeState
@@ -164,16 +174,16 @@ class RangeFit:
 
     @property
     def log_scale_stddev(self) -> float:
-        """Formal stddev of the logarithm of the scale, which is its relative error."""
+        """Formal standard deviation of the logarithm of the scale, which is the scale's relative error."""
         return float(np.sqrt(self.covariance[0, 0]))
 
     @property
     def covariance(self) -> Array:
-        """(p, p); directions that nothing determines count as infinitely uncertain, not as certain."""
+        """(p, p) formal covariance; undetermined directions get a huge variance."""
         return invert_information(self.information)
 
     def of_anchors(self, covariance: Array) -> Array:
-        """(m, 3, 3) the part of each anchor in a covariance (p, p); 0 of one that is not estimated."""
+        """Return the (m, 3, 3) parts of the anchors in a (p, p) covariance; 0 for anchors that are not estimated."""
         parts = np.zeros((len(self.state.anchors_m), 3, 3))
         for k, column in enumerate(self.columns[0].anchor):
             if column >= 0:
@@ -183,9 +193,10 @@ class RangeFit:
 
 @dataclass(frozen=True)
 class Columns:
-    """Where each unknown of a model stands in the parameter vector; -1: not estimated.
+    """Position of each unknown of a model in the parameter vector; -1 for an unknown that is not estimated.
 
-    First, of each model in turn, the logarithm of the scale and the frame (6); then the anchors (3 each), the biases.
+    The order is: for each model in turn, the logarithm of the scale and the frame (6: turn, shift); then the anchors
+    (3 each); then the biases.
     """
 
     scale: int
@@ -196,7 +207,7 @@ class Columns:
 
 
 def columns_of(parts: Sequence[RangeProblem]) -> tuple[Columns, ...]:
-    """Of all that one problem, or those of several models, leave open."""
+    """Return the columns of all unknowns of one problem, or of the joint problem of several models."""
     of_own, next_column = [], 0
     for part in parts:
         of_own.append((next_column, next_column + 1 if part.frame_is_free else -1))
@@ -211,25 +222,26 @@ def columns_of(parts: Sequence[RangeProblem]) -> tuple[Columns, ...]:
 
 
 def tag_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array:
-    """(n, 3) antenna in the metric world."""
+    """Return the (n, 3) antenna positions in the metric world."""
     turned: Array = problem.tag_from_center @ metric_from_model.rotation.T
     return metric_from_model.apply(problem.centers) + turned
 
 
 def range_gradient(problem: RangeProblem, state: RangeState) -> RangeGradient:
-    """Of the n distances."""
+    """Return the n distances between antenna and anchor, with their derivatives."""
     tags = tag_positions(problem, state.metric_from_model)
     return RangeGradient.of(tags - state.anchors_m[problem.anchor_index])
 
 
 def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
-    """(n,) metres."""
+    """Return the (n,) predicted ranges, biases included, in metres."""
     return range_gradient(problem, state).distance_m + state.bias_m[problem.anchor_index]
 
 
-# Of solutions that are kept; those to choose among need not be at the very bottom.
+# Tolerance for solutions that are kept; candidates to choose among need not be at the very minimum.
 _TIGHT = 1e-12
-# Squared, in stddevs of the parameters: where a step is nothing any more, and where the solver had not come to an end.
+# Expected decrease of the cost by a step (squared standard deviations of the parameters): below _NO_GAIN the step is
+# only rounding; above _NEAR_BOTTOM the solver has not converged, and its result is left as it is.
 _NO_GAIN, _NEAR_BOTTOM = 1e-24, 1e-6
 _MAX_NUM_SETTLING = 20
 
@@ -243,14 +255,14 @@ def solve(
     tolerance: float = 1e-12,
     max_num_evaluations: int = 100,
 ) -> RangeFit:
-    """Robust least squares from a start, by scipy's trust region solver with an analytic Jacobian.
+    """Solve by robust least squares, with scipy's trust region solver and an analytic Jacobian.
 
     Args:
-        others: of further models, each in its own unit, with its own say whether its frame is free. Anchors, biases and
-            what is known of anything beforehand are those of the first, and the same for all.
-        start: anchors that have no place have no ranges.
-        loss: of the ranges.
-        tolerance: relative change of cost and of parameters at which it stops.
+        others: problems of further models, each in its own unit and with its own ``frame_is_free``. Anchors, biases
+            and all priors are taken from the first problem.
+        start: initial values; an anchor without a position must have no ranges.
+        loss: robust loss of the ranges.
+        tolerance: relative change of cost and of parameters at which the solver stops.
     """
     columns = columns_of((problem, *others))
     system = _System((problem, *others), columns, start, loss)
@@ -271,19 +283,19 @@ def solve(
 
 
 def fit_at(problem: RangeProblem, state: RangeState, weights: Array) -> RangeFit:
-    """What a fit would be that ends at this state, before anything is measured.
+    """Return the fit that would end at this state, without solving.
 
     Args:
-        weights: (n,) of the ranges; how many it stands for, of one that stands for several.
+        weights: (n,) robust weights; larger than 1 for a range that stands for several.
     """
     return _System((problem,), columns_of((problem,)), state, CAUCHY).fit(state, 0.0, weights)
 
 
 def _settled(system: _System, x: Array) -> Array:
-    """The bottom itself, by steps that go by the gradient alone.
+    """Move to the exact minimum by Newton steps that use the gradient alone.
 
-    The trust region ends where rounding hides what a step gains: some 1e-9 beside the bottom, on a side that the last
-    digit of any input decides.
+    The trust region stops where rounding hides the decrease of the cost, some 1e-9 from the minimum. On which side it
+    stops depends on the last digit of the input.
     """
     for _ in range(_MAX_NUM_SETTLING):
         gradient, curvature = system.slope(state_after(system.columns, system.start, x))
@@ -297,7 +309,7 @@ def _settled(system: _System, x: Array) -> Array:
 
 @dataclass(frozen=True)
 class _System:
-    """Residuals and derivatives of one problem or several, as functions of a state."""
+    """Residuals and derivatives of one problem, or of the joint problem of several models, as functions of a state."""
 
     parts: tuple[RangeProblem, ...]
     columns: tuple[Columns, ...]
@@ -309,34 +321,36 @@ class _System:
         return np.concatenate([np.ones(len(p.range_m)) if p.share is None else p.share for p in self.parts])
 
     def rho_with_derivatives(self, z: Array) -> Array:
-        # Priors are believed as they are; only ranges have outliers.
+        # Priors have no robust loss: only ranges have outliers.
         rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
         share = self.share
         rho[:, : len(share)] = share * self.loss.rho(z[: len(share)])
         return rho
 
     def residuals(self, state: RangeState) -> tuple[Array, Array]:
-        """Of ranges and of priors, in stddevs."""
+        """Return the residuals of ranges and of priors, in standard deviations."""
         of_parts = zip(self.parts, state.of_models, strict=True)
         ranges = [(predicted_ranges(part, own) - part.range_m) / part.stddev_m for part, own in of_parts]
         return np.concatenate(ranges), prior_residuals(self.parts[0], self.columns[0], state)
 
     def jacobian(self, state: RangeState) -> tuple[Array, Array]:
-        """Likewise."""
+        """Return the Jacobians of the residuals of ranges and of priors."""
         of_parts = zip(self.parts, self.columns, self.start.of_models, state.of_models, strict=True)
         priors = prior_jacobian(self.parts[0], self.columns[0], self.start, state)
         return np.concatenate([range_jacobian(*each) for each in of_parts]), priors
 
     def slope(self, state: RangeState) -> tuple[Array, Array]:
-        """(p,) gradient and (p, p) curvature of the cost; a range beyond the loss's inflection has none, as scipy has
-        it."""
+        """Return the (p,) gradient and the (p, p) curvature of the cost.
+
+        As in scipy, a range beyond the inflection point of the loss adds no curvature.
+        """
         (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
         _, first, second = self.rho_with_derivatives(scaled**2)
         curvature = (jacobian * np.maximum(first + 2 * second * scaled**2, 0.0)[:, None]).T @ jacobian
         return jacobian.T @ (first * scaled) + of_priors.T @ off_priors, curvature + of_priors.T @ of_priors
 
     def fit(self, state: RangeState, cost: float, weights: Array | None = None) -> RangeFit:
-        """``weights``: (n,) None: by the loss."""
+        """Return the fit at a state; ``weights``: (n,), or None to take them from the loss."""
         (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
         weights, share = self.loss.weights(scaled) if weights is None else weights, self.share
         pulls, prior_information = share * weights, of_priors.T @ of_priors
@@ -356,7 +370,7 @@ class _System:
 
 
 def state_after(columns: Sequence[Columns], start: RangeState, x: Array) -> RangeState:
-    """The start moved by a parameter vector (p,)."""
+    """Return the start moved by a parameter vector (p,)."""
     anchors, bias = start.anchors_m.copy(), start.bias_m.copy()
     first, *others = (
         _moved(own.metric_from_model, each, x) for each, own in zip(columns, start.of_models, strict=True)
@@ -379,7 +393,7 @@ def _moved(similarity: Similarity, columns: Columns, x: Array) -> Similarity:
 
 
 def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
-    """(n, p) of the residuals, in stddevs, of one model's ranges."""
+    """Return the (n, p) Jacobian of the residuals of one model's ranges, in standard deviations."""
     similarity, index = state.metric_from_model, problem.anchor_index
     grown = similarity.scale * problem.centers @ similarity.rotation.T
     by = range_gradient(problem, state)
@@ -398,12 +412,15 @@ def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
 
 
 def _left_of_step(start: RangeState, state: RangeState) -> Array:
-    """The rotation vector acts before the start's rotation: its derivative away from zero is at the current one."""
+    """Return the left Jacobian of SO(3) at the rotation from start to state.
+
+    The rotation vector acts on the left of the start's rotation, so away from zero its derivative needs this factor.
+    """
     return left_jacobian(Rotation.from_matrix(state.metric_from_model.rotation @ start.metric_from_model.rotation.T))
 
 
 def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) -> Array:
-    """(r,) of anchors, biases, distances and gravity, in stddevs."""
+    """Return the (r,) residuals of anchors, biases, distances and gravity, in standard deviations."""
     anchors, biases = problem.uncertain
     off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
     off_bias = problem.bias_whitening @ (state.bias_m - problem.bias_mean_m)[biases]
@@ -416,13 +433,13 @@ def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) 
 
 
 def prior_cost(problem: RangeProblem, state: RangeState) -> float:
-    """Half the sum of squares of what priors, distances and gravity have against a state."""
+    """Return half the sum of squares of the residuals of priors, distances and gravity."""
     off = prior_residuals(problem, columns_of([problem])[0], state)
     return 0.5 * float(off @ off)
 
 
 def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
-    """(r, p) of the same."""
+    """Return the (r, p) Jacobian of ``prior_residuals``."""
     anchors, biases = problem.uncertain
     jacobian = np.zeros((3 * len(anchors) + len(biases), columns.num))
     for row, k in enumerate(anchors):
@@ -443,7 +460,7 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
 
 
 def invert_information(information: Array) -> Array:
-    """Inverse with unit-free conditioning; an undetermined direction gets a huge variance."""
+    """Invert an information matrix with unit-free conditioning; an undetermined direction gets a huge variance."""
     diagonal = np.sqrt(np.maximum(np.diag(information), 1e-200))
     values, vectors = np.linalg.eigh(information / np.outer(diagonal, diagonal))
     return np.asarray((vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal))

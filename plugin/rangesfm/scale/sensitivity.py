@@ -1,5 +1,7 @@
-"""How far the scale moves: for each centimetre or percent that the range model may have wrong, and as short ranges are
-left out, which tests the radio without any truth."""
+"""Sensitivity of the scale to errors of the range model and to leaving out short ranges.
+
+Leaving out short ranges tests the radio without any ground truth.
+"""
 
 from __future__ import annotations
 
@@ -15,23 +17,24 @@ from rangesfm.scale.starts import spread_subset
 from rangesfm.scale.uncertainty import scale_influence
 
 _CM = 0.01
-# Of all ranges from one distance, which rounding spreads, none is shorter than the others.
+# Ranges must be shorter than the median by this factor to count as the shorter half: rounding spreads equal ranges.
 _SHORTER = 1 - 1e-9
 _CUTOFFS_M = (0.0, 1.0, 1.5, 2.0, 2.5, 3.0)
 _MAX_RANGES_PER_ANCHOR = 1000
 _MIN_RANGES_PER_ANCHOR = 20
 _MIN_SHARE = 0.4
-# Of two-sided normal errors one in a hundred is larger.
+# Two-sided 99 % quantile of the normal distribution.
 _SIGNIFICANT = 2.58
-# Of the stddev that leaving out adds, in stddevs: robust weights make it less than certain.
+# Smallest standard deviation of a change of the scale, as a share of the standard deviation after leaving out ranges.
+# With robust weights the difference of two variances is uncertain, and may be too small.
 _MIN_NEW_SHARE = 0.2
 
 
 def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tuple[str, ...]) -> ScaleSensitivity:
-    """Percents by which the scale changes, to first order.
+    """Return the changes of the scale in percent, to first order.
 
     Args:
-        model_from_cam: (n, 3, 3) rotation of the camera at each range, into the world of the problem.
+        model_from_cam: (n, 3, 3) rotation of the camera at each range, into the problem's model world.
     """
     problem, state = solution.problem, solution.fit.state
 
@@ -50,20 +53,20 @@ def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tup
             anchor_id: percent(np.where(problem.anchor_index == k, _CM, 0.0)) for k, anchor_id in enumerate(anchor_ids)
         },
         range_slope_per_percent=percent(0.01 * distance),
-        # A tag further out lengthens the ranges; taken for nearer, they stretch the map.
+        # A tag further out than assumed lengthens the measured ranges, which then stretch the map.
         lever_arm_per_cm=(percent(_CM * along_x), percent(_CM * along_y), percent(_CM * along_z)),
     )
 
 
 def cutoff_test(solution: Solution) -> tuple[CutoffTest, ...]:
-    """The scale for each least range, as long as enough ranges are left.
+    """Estimate the scale for increasing minimum ranges, as long as enough ranges are left.
 
-    Short ranges weigh as much as others here, so that their error shows.
+    Short ranges are weighted like all others here, so that their error becomes visible.
     """
     noise = np.sqrt(np.maximum(solution.errors.stddev_m**2 - solution.errors.shared_m**2, 1e-18))
     problem = spread_subset(replace(solution.problem, stddev_m=noise), _MAX_RANGES_PER_ANCHOR)
     thinning = len(solution.problem.range_m) / len(problem.range_m)
-    # Thinned ranges are less correlated by as much as there are fewer of them.
+    # The squared inflation decreases with thinning by the same factor as the number of ranges.
     inflation = max(solution.errors.inflation / np.sqrt(thinning), 1.0)
     heard = np.unique(problem.anchor_index)
     tests: list[CutoffTest] = []
@@ -80,10 +83,10 @@ def cutoff_test(solution: Solution) -> tuple[CutoffTest, ...]:
 
 
 def scale_drift(tests: tuple[CutoffTest, ...]) -> CutoffTest | None:
-    """The test whose scale is farthest from that with all ranges, of those where it is by more than chance.
+    """Return the test whose scale differs most from that with all ranges; None if no difference is significant.
 
-    Ranges that both share make both err alike, so the variance of a difference is that of the variances
-    (Hausman, "Specification tests in econometrics", 1978).
+    The ranges that both estimates use make both err alike, so the variance of the difference is the difference of the
+    variances (Hausman, "Specification tests in econometrics", 1978).
     """
     drifted: list[tuple[float, CutoffTest]] = []
     for test in tests[1:]:

@@ -1,4 +1,4 @@
-"""The best solution of a survey's range problem, and the proof that it is the only one."""
+"""The best solution of a survey's range problem, and the check that no other solution fits as well."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from rangesfm.scale.starts import (
 )
 
 _SUBSET_PER_ANCHOR = 300
-# So many ranges of an anchor, spread over all, tell maps apart and show what ranges get wrong as well as more do.
+# This many ranges per anchor, spread over all of them, tell maps apart and show the errors as well as more would.
 _ENOUGH_OF_ANCHOR, _NUM_ROUNDS = 1000, 2
 _NUM_ALTERNATIVES = 4
 _SAME_LOG_SCALE = 0.03
 _SAME_ROTATION_DEG = 5.0
-# Of the path's middle, in extents of the path.
+# Largest shift of the path's middle between two equal maps, in extents of the path.
 _SAME_SHIFT = 0.05
-# Half of 3 stddevs squared: a rival this close in cost is not ruled out.
+# Half of 3 standard deviations squared: a rival whose cost is closer than this is not ruled out.
 MIN_COST_GAP = 4.5
-# Share of the ranges that a map must explain for another to be its rival; it is doubted where it explains less.
+# Share of the ranges that the best map must explain before rivals are compared; below it, the map is doubted anyway.
 _MIN_EXPLAINED = 0.7
 
 WHY_SCALE_IS_OPEN = {
@@ -60,11 +60,11 @@ WHY_SCALE_IS_OPEN = {
     "flat": ("the path is flat", "go up and down too, or add an anchor"),
     "general": ("the path is too short or runs round the anchor", "vary it, or add an anchor"),
 }
-"""By the kind of the path: what lets another scale fit, and what to do about it."""
+"""For each kind of path: why another scale fits as well, and what to do about it."""
 
 
 class OpenPlaceError(GeometryError):
-    """The map fits in another place of the site as well, and has the same scale there.
+    """The map also fits in another place of the site, with the same scale.
 
     Attributes:
         in_first_camera: the fit, carried into the first camera's frame.
@@ -80,13 +80,13 @@ class OpenPlaceError(GeometryError):
 
 @dataclass(frozen=True)
 class Solution:
-    """A fit whose noise level is its own.
+    """A fit weighted by the noise level that it shows itself.
 
     Attributes:
-        problem: with the final stddevs; the bias priors weigh as against independent errors.
+        problem: with the final standard deviations; its priors are scaled for ranges with independent errors.
         fit: the estimate.
-        errors: of the problem's ranges; every formal stddev is to be inflated.
-        noise_stddev_m: of a range without special cases, as the fit shows it.
+        errors: of the problem's ranges; every formal standard deviation must be multiplied by their inflation.
+        noise_stddev_m: standard deviation of an ordinary range, estimated from the fit.
     """
 
     problem: RangeProblem
@@ -96,13 +96,13 @@ class Solution:
 
 
 def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> Solution:
-    """Solve from all starts, estimate the noise, and refuse where two answers fit alike.
+    """Solve from all starts, estimate the noise, and refuse if two different maps fit equally well.
 
     Args:
-        camera_side: as of the scale options.
+        camera_side: the scale option of this name.
 
     Raises:
-        GeometryError: nothing fits, or two different maps do (OpenPlaceError: of one scale).
+        GeometryError: nothing fits, or two different maps fit (OpenPlaceError: they have the same scale).
     """
     problem, errors = posed.ranges, posed.errors
     camera_side = camera_side if problem.frame_is_free else None
@@ -120,13 +120,13 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
 
 
 def _unlikeliness(problem: RangeProblem, errors: RangeErrors, state: RangeState) -> float:
-    """Negative logarithm of the posterior, up to a constant."""
+    """Return the negative logarithm of the posterior, up to a constant."""
     residuals = predicted_ranges(problem, state) - problem.range_m
     return prior_cost(problem, state) - errors.noise_of_all(residuals).log_likelihood
 
 
 def _consensus_states(problem: RangeProblem) -> list[RangeState]:
-    """Where most ranges agree, as it stands: a fit that starts there may follow the outliers away."""
+    """Return the states with the highest consensus, not refined: a fit from there may be drawn away by outliers."""
     starts = first_camera_starts(_known_only(problem))[:_NUM_ALTERNATIVES]
     if np.isinf(problem.anchor_stddev_m).any():
         return [complete_unknown_anchors(problem, start) for start in starts]
@@ -134,7 +134,10 @@ def _consensus_states(problem: RangeProblem) -> list[RangeState]:
 
 
 def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) -> list[RangeFit]:
-    """Local minima, best first, each different map once: found on a thinned problem, ranked on one less thinned."""
+    """Return the local minima, best first, each different map once.
+
+    They are searched with few ranges per anchor and ranked with more.
+    """
     small = spread_subset(problem, _SUBSET_PER_ANCHOR)
     if not anchors_are_known:
         starts = unknown_anchor_starts(problem)
@@ -159,13 +162,13 @@ def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) ->
 
 
 def _each_once(problem: RangeProblem, fits: list[RangeFit]) -> list[RangeFit]:
-    """The best fits, best first, of each map one."""
+    """Return the best fits, best first, each different map once."""
     ranked = sorted(fits, key=lambda f: f.cost)
     return each_once(ranked, lambda a, b: _are_same(problem, a.state, b.state), _NUM_ALTERNATIVES)
 
 
 def _known_only(problem: RangeProblem) -> RangeProblem:
-    """Ranges to anchors with a given position; the others rest where they are."""
+    """Return the ranges to anchors with a given position; all other anchors are held fixed."""
     known, distances = np.isfinite(problem.anchor_stddev_m), problem.distances
     part = problem.subset(np.flatnonzero(known[problem.anchor_index]))
     return replace(
@@ -177,7 +180,7 @@ def _known_only(problem: RangeProblem) -> RangeProblem:
 
 
 def _are_same(problem: RangeProblem, first: RangeState, second: RangeState) -> bool:
-    """Whether two states are one map, not different ones."""
+    """Return True if two states are the same map, up to the tolerances above."""
     a, b = first.metric_from_model, second.metric_from_model
     scales_differ = bool(abs(np.log(a.scale / b.scale)) > _SAME_LOG_SCALE)
     if scales_differ or not problem.frame_is_free:
@@ -189,7 +192,7 @@ def _are_same(problem: RangeProblem, first: RangeState, second: RangeState) -> b
 
 
 def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
-    """Alternate between the fit and the errors it shows, from one start only; all ranges have a say in the last fit."""
+    """Alternate between fitting and estimating the errors, from one start; the last fit uses all ranges."""
     given = posed.ranges
     rows = spread_rows(given, _ENOUGH_OF_ANCHOR)
 
@@ -216,10 +219,10 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
 
 
 def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
-    """The problem as set up, weighted by the errors.
+    """Return the problem weighted by the errors.
 
-    Correlated errors are worth fewer ranges; the ranges keep their nominal weight among themselves and the priors gain
-    by as much instead.
+    Correlated ranges carry less information than independent ones. The ranges keep their nominal weights, and the
+    priors get more weight instead, by the square of the inflation.
     """
     distances, gravity, inflation = problem.distances, problem.gravity, errors.inflation
     return replace(
@@ -234,7 +237,10 @@ def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
 
 
 def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_side: str | None) -> None:
-    """GeometryError where the map of a rival fits as well; where none fits, the reason is another (see ``trust``)."""
+    """Raise GeometryError if the map of a rival fits as well.
+
+    Does nothing where even the best map explains too few ranges: then that is the reason to doubt it.
+    """
     problem = solution.problem
     if np.mean(solution.fit.weights > 0.1) < _MIN_EXPLAINED:
         return
@@ -258,7 +264,7 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
 
 
 def _another_place(solution: Solution) -> GeometryError:
-    """Why two maps of the same scale fit in the site frame."""
+    """Return the error for two maps of the same scale that fit in the site frame."""
     stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
         return GeometryError("the map fits the ranges turned about the path, which is nearly straight: walk a bend")

@@ -1,9 +1,8 @@
-"""Where the nonlinear range equation is started from, for each case of anchors.
+"""Starting points for the nonlinear range equation, for each case of known and unknown anchors.
 
-Squared and for a given scale, the range equation is linear in what places the anchors or the
-path, so a sweep over scales (and rotations) with a small robust linear solve at each finds
-every basin without a first guess. For anchors known in the frame of the path, maximum consensus over the scale
-is exact.
+For a given scale, the squared range equation is linear in the positions of the anchors or of the path. So a sweep over
+scales (and rotations), with a small robust linear solve at each, finds every basin without a first guess. For anchors
+known in the frame of the path, maximum consensus over the scale is exact.
 """
 
 from __future__ import annotations
@@ -34,26 +33,27 @@ _MAX_RANGES_PER_ANCHOR = 200
 _MAX_RANGES_FOR_ROTATIONS = 240
 _NUM_STARTS = 12
 _NUM_MINIMA = 4
-# Trials closer than this run into the same minimum.
+# Trials closer to each other than this converge to the same minimum.
 _BASIN_LOG_SCALE = 0.3
 _BASIN_ROTATION_RAD = 0.6
-# In radii: an anchor this near to the middle of a sphere has no distance from it that could be a radius.
+# In radii: an anchor this near to the centre of a sphere cannot exchange its distance from it with the radius.
 _IN_MIDDLE = 1e-6
-# A range agrees with a scale if it fits to this many stddevs of noise and bias together.
+# A range agrees with a scale if it fits within this many standard deviations of noise and bias together.
 TOLERANCE_STDDEVS = 2.5
-# Hills of agreement are told apart on a logarithmic grid of the scale; only those at least so high beside the best.
+# Maxima of the number of agreeing ranges are told apart on a logarithmic grid of the scale with this step. Maxima below
+# the given share of the highest one are dropped.
 _LOG_CELL = 0.02
 _MIN_SHARE_OF_BEST = 0.5
 _MAX_CANDIDATES = 12
 
 
 def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProblem:
-    """Evenly spaced ranges of each anchor, at most so many."""
+    """Return evenly spaced ranges of each anchor, at most ``max_num_per_anchor`` of each."""
     return problem.subset(spread_rows(problem, max_num_per_anchor))
 
 
 def spread_rows(problem: RangeProblem, max_num_per_anchor: int) -> Indices:
-    """Which ranges these are, ascending."""
+    """Return the ascending rows of evenly spaced ranges of each anchor, at most ``max_num_per_anchor`` of each."""
     rows = []
     for k in range(problem.num_anchors):
         of_anchor = np.flatnonzero(problem.anchor_index == k)
@@ -63,10 +63,13 @@ def spread_rows(problem: RangeProblem, max_num_per_anchor: int) -> Indices:
 
 
 def scale_candidates(problem: RangeProblem) -> Array:
-    """Scales to try, ascending. Raises GeometryError where no range changes along the path.
+    """Return scales to try, ascending.
 
-    A range changes by no more than the antenna moves, so differences of ranges over
-    differences of centres bound the scale from below; the upper quartile forgives outliers.
+    A range changes by no more than the antenna moves. So differences of ranges over differences of centres bound the
+    scale from below; the upper quartile tolerates outliers.
+
+    Raises:
+        GeometryError: no range changes along the path.
     """
     small = spread_subset(problem, 60)
     ratios = []
@@ -86,7 +89,7 @@ def scale_candidates(problem: RangeProblem) -> Array:
 
 
 def first_camera_starts(problem: RangeProblem) -> list[RangeState]:
-    """Starts where all anchors are known in the frame of the model: exact consensus over the scale."""
+    """Return starts for anchors that are all known in the frame of the model, by exact consensus over the scale."""
     return [
         RangeState(replace(IDENTITY, scale=scale), problem.anchor_mean_m.copy(), problem.bias_mean_m.copy())
         for scale in consensus_scales(problem)
@@ -94,7 +97,7 @@ def first_camera_starts(problem: RangeProblem) -> list[RangeState]:
 
 
 def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
-    """Starts where nothing is known of the anchors: a sweep over the scale, each anchor solved linearly."""
+    """Return starts for unknown anchors: a sweep over the scale, in which each anchor is solved linearly."""
     small = spread_subset(problem, _MAX_RANGES_PER_ANCHOR)
     scales = scale_candidates(problem)
     anchors, costs = _multilaterate_all(small, scales)
@@ -104,16 +107,16 @@ def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
 
 
 def _lowest_minima(costs: Array) -> list[int]:
-    """Where a sweep's costs are no higher than beside, lowest first; some of them."""
+    """Return indices of some local minima of a sweep's costs, lowest first."""
     padded = np.concatenate([[np.inf], costs, [np.inf]])
     minima = np.flatnonzero((costs <= padded[:-2]) & (costs <= padded[2:]))
     return [int(i) for i in minima[np.argsort(costs[minima], kind="stable")][:_NUM_MINIMA]]
 
 
 def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
-    """Starts where anchors are surveyed and the path's place among them is not known.
+    """Return starts for surveyed anchors when the path's place among them is unknown.
 
-    For a scale and a rotation the squared range equation is linear in the translation.
+    For given scale and rotation the squared range equation is linear in the translation.
     """
     known = np.flatnonzero(np.isfinite(problem.anchor_stddev_m))
     rows = np.flatnonzero(np.isin(problem.anchor_index, known))
@@ -143,7 +146,7 @@ def _in_one_basin(one: Similarity, other: Similarity) -> bool:
 
 
 def each_once(ranked: Iterable[_T], are_same: Callable[[_T, _T], bool], max_num: int) -> list[_T]:
-    """The first of all that are the same, at most so many."""
+    """Return the first of each group of equal items, at most ``max_num``."""
     kept: list[_T] = []
     for each in ranked:
         if len(kept) < max_num and not any(are_same(each, other) for other in kept):
@@ -152,11 +155,11 @@ def each_once(ranked: Iterable[_T], are_same: Callable[[_T, _T], bool], max_num:
 
 
 def sphere_swaps(problem: RangeProblem, state: RangeState) -> list[RangeState]:
-    """Maps that fit as well if the path lies on a sphere (a flat circle does) and all anchors are unknown.
+    """Return maps that fit as well if the path lies on a sphere (or a flat circle) and all anchors are unknown.
 
-    About the centre of a sphere rho^2 = scale^2 radius^2 + |a|^2 - 2 scale a.c: two terms that only
-    their sum tells apart, and one that depends on scale times a alone. So the radius of the path and
-    the distance of an anchor from its centre can change places.
+    About the centre of a sphere, rho^2 = scale^2 radius^2 + |a|^2 - 2 scale a.c. The ranges determine only the sum of
+    the first two terms, and the third depends on scale times a alone. So the radius of the path and the distance of an
+    anchor from its centre can be exchanged.
     """
     middle, radius = round_middle(problem.centers)
     placed = state.metric_from_model
@@ -170,11 +173,12 @@ def sphere_swaps(problem: RangeProblem, state: RangeState) -> list[RangeState]:
 
 
 def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, Array]:
-    """Put each unknown anchor on the better side of the path's plane, the scale kept; on the normal's if they tie.
+    """Put each unknown anchor on the side of the path's plane that fits better, with the scale held fixed.
+
+    If both sides fit equally well, the side of the plane's normal is taken.
 
     Returns:
-        the state, and (m,) by how much the robust cost is higher on the other side; inf for
-        anchors that are known.
+        the state, and (m,) by how much the robust cost is higher on the other side; inf for known anchors.
     """
     anchors, rise = state.anchors_m.copy(), np.full(problem.num_anchors, np.inf)
     shape = path_shape(state.metric_from_model.apply(problem.centers))
@@ -183,7 +187,7 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
         alone = anchor_alone(problem, int(k), state.metric_from_model)
         if not len(alone.range_m):
             continue
-        # On the plane itself both sides start alike and could never part.
+        # Starts on the plane itself would be equal for both sides and stay equal.
         height = abs(float((anchors[k] - shape.centroid) @ normal))
         height = max(height, 0.1 * float(np.median(alone.range_m)))
         on_plane = anchors[k] - ((anchors[k] - shape.centroid) @ normal) * normal
@@ -199,14 +203,14 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
 
 
 def mirrored(problem: RangeProblem, state: RangeState, k: int) -> Array:
-    """(3,) anchor k on the other side of the path's plane."""
+    """Return the (3,) position of anchor k mirrored in the path's plane."""
     shape = path_shape(state.metric_from_model.apply(problem.centers))
     normal = shape.axes[:, 2]
     return np.asarray(state.anchors_m[k] - 2 * ((state.anchors_m[k] - shape.centroid) @ normal) * normal)
 
 
 def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeState:
-    """Place the anchors of which nothing is known, the path being placed already."""
+    """Place the unknown anchors, given the place of the path."""
     anchors = state.anchors_m.copy()
     small = spread_subset(problem, _MAX_RANGES_PER_ANCHOR)
     for k in np.flatnonzero(np.isinf(problem.anchor_stddev_m)):
@@ -217,7 +221,7 @@ def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeS
 
 
 def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -> RangeProblem:
-    """The problem of one anchor with the path given: centres already metric, scale practically fixed."""
+    """Return the problem of one anchor with the path given: centres are already metric, and the scale has no effect."""
     part = problem.of_anchor(k)
     tags = tag_positions(part, metric_from_model)
     return replace(
@@ -230,10 +234,12 @@ def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -
 
 
 def _multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Array]:
-    """(s, m, 3) each anchor from the tag's positions at given scales; (2, s) the mean of robust residuals, two ways.
+    """Locate each anchor from the tag's positions, at each of s scales.
 
-    Those of the linear equation tell more where an anchor is badly placed; those of the distances where the path lies
-    on a sphere, which leaves the linear equation free to fit at any scale.
+    Returns:
+        (s, m, 3) anchors, and (2, s) means of two kinds of robust residuals. Residuals of the linear equation are more
+        informative if an anchor is badly placed. Residuals of the distances are needed if the path lies on a sphere,
+        where the linear equation can fit at any scale.
     """
     anchors, costs = np.zeros((len(scales), problem.num_anchors, 3)), np.zeros((2, len(scales)))
     unit = 3 * float(np.median(problem.stddev_m))
@@ -248,7 +254,7 @@ def _multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Arr
 
 
 def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tuple[Array, Array]:
-    """For each rotation the best translation and a robust cost.
+    """Return the best translation for each rotation, and a robust cost.
 
     With q = anchor - R (scale c + r): rho^2 = |t|^2 - 2 t.q + |q|^2 is linear in (t, |t|^2).
     """
@@ -277,9 +283,9 @@ def _translations(problem: RangeProblem, scale: float, rotations: Array) -> tupl
 
 
 def consensus_scales(problem: RangeProblem) -> list[float]:
-    """Scales that most ranges agree on, best first; the first is the exact maximum.
+    """Return the scales that most ranges agree on, best first.
 
-    The others are the tops of lower hills: local maxima of the number of ranges that agree.
+    The first is the exact maximum of the number of agreeing ranges; the others are lower local maxima.
 
     Raises:
         GeometryError: no positive scale explains any range.
@@ -295,7 +301,7 @@ def consensus_scales(problem: RangeProblem) -> list[float]:
 
 
 def _hilltops(scales: Array, counts: Indices) -> list[float]:
-    """Best first: scales with no better one in their cell of the grid or in the two beside it."""
+    """Return the highest scale of each local maximum on the grid, best first."""
     cells = np.floor(np.log(scales) / _LOG_CELL).astype(np.int64)
     first = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
     best = np.maximum.reduceat(counts, first)
@@ -304,7 +310,7 @@ def _hilltops(scales: Array, counts: Indices) -> list[float]:
     beside = np.diff(cells[first]) == 1
     lower = np.concatenate([[0], np.where(beside, best[:-1], 0)])
     higher = np.concatenate([np.where(beside, best[1:], 0), [0]])
-    # Of equal neighbours the first is the top.
+    # Of equal neighbouring cells the first counts as the maximum.
     tops = np.flatnonzero((best > lower) & (best >= higher) & (best >= _MIN_SHARE_OF_BEST * best.max()))
     tops = tops[np.argsort(-best[tops], kind="stable")][:_MAX_CANDIDATES]
     ends = np.append(first[1:], len(scales))
@@ -312,10 +318,10 @@ def _hilltops(scales: Array, counts: Indices) -> list[float]:
 
 
 def agreeing_intervals(centers: Array, offset: Array, ranges: Array, tolerance: Array) -> tuple[Array, Array]:
-    """Positive scales for which ``| ||scale c + offset|| - range | <= tolerance``, range by range.
+    """Return positive scales for which ``| ||scale c + offset|| - range | <= tolerance``, range by range.
 
-    The squared distance is a parabola in the scale, so the set is one interval, or two where
-    the path comes nearer to the anchor than the range and leaves again.
+    The squared distance is a parabola in the scale, so the set is one interval, or two where the path comes nearer to
+    the anchor than the range and then leaves again.
 
     Args:
         centers, offset: (n, 3). ranges, tolerance: (n,).
@@ -337,7 +343,7 @@ def agreeing_intervals(centers: Array, offset: Array, ranges: Array, tolerance: 
 
 
 def _roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, Mask]:
-    """Roots of ``a x^2 + 2 b x + c``, and where they are real. Without motion (a = 0) there are none."""
+    """Return the roots of ``a x^2 + 2 b x + c``, and a mask of where they are real and a is not 0 (there is motion)."""
     discriminant = b**2 - a * c
     real = (discriminant > 0) & (a > 0)
     root = np.sqrt(np.where(real, discriminant, 0.0))
@@ -346,16 +352,16 @@ def _roots(a: Array, b: Array, c: Array) -> tuple[Array, Array, Mask]:
 
 
 def local_maxima(starts: Array, ends: Array) -> tuple[Array, Indices]:
-    """Where more of the closed intervals overlap than just before and just after: the stretches' middles, and counts.
+    """Return the stretches where more closed intervals overlap than just before and just after.
 
-    Such a stretch lies between a start and the next end, without another start between them. O(n log n); starts and
-    ends are sorted apart, as sorting numbers is many times faster than sorting an index to them.
+    Such a stretch lies between a start and the next end, with no other start between them. The time is O(n log n).
+    Starts and ends are sorted separately, because sorting numbers is many times faster than sorting an index to them.
 
     Args:
-        starts, ends: (n,) n > 0.
+        starts, ends: (n,) of the intervals, n > 0.
 
     Returns:
-        (k,) ascending middles, and how many intervals hold each.
+        (k,) ascending middles of the stretches, and the number of intervals that contain each.
     """
     starts, ends = np.sort(starts), np.sort(ends)
     num_ended = np.searchsorted(ends, starts, side="left")

@@ -1,9 +1,9 @@
-"""The scale estimate of the paper: two candidates a range, the steadier branch wins.
+"""The scale estimate of the paper: two candidates per range, of which the branch with less scatter is chosen.
 
-Lee, Zhu, Giorgi and Günther, "Fusion of Monocular Vision and Radio-based Ranging for Global
-Scale Estimation and Drift Mitigation", 2018. Kept exactly, for comparison: on real radios it
-is far off (the candidates explode near the origin, and the right root changes sides along a
-path that first approaches and then leaves the anchor).
+Lee, Zhu, Giorgi and Günther, "Fusion of Monocular Vision and Radio-based Ranging for Global Scale Estimation and Drift
+Mitigation", 2018. It is kept exactly as published, for comparison. With real radios it is far off: the candidates grow
+without bound near the origin, and the correct root changes branches along a path that first approaches the anchor and
+then leaves it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import off_origin
 
-# Of what a discriminant is the difference of: less may be its rounding.
+# A discriminant below this share of the squared distance from the anchor (in model units) may be a rounding error of 0.
 _ONE_ROOT = 1e-12
 
 
 @dataclass(frozen=True)
 class Branch:
-    """One of the two roots over time."""
+    """Mean and standard deviation of one of the two roots over all ranges, metres per SfM unit."""
 
     mean: float
     std: float
@@ -29,14 +29,14 @@ class Branch:
 
 @dataclass(frozen=True)
 class TwoCandidate:
-    """The paper's table.
+    """The paper's table of both branches.
 
     Attributes:
-        alpha0, alpha1: the branches, smaller root and larger root.
-        chosen: "alpha0" or "alpha1", the one with the smaller standard deviation.
-        scale: its mean, metres per SfM unit.
+        alpha0, alpha1: branches of the smaller and of the larger roots.
+        chosen: "alpha0" or "alpha1", the branch with the smaller standard deviation.
+        scale: mean of the chosen branch, metres per SfM unit.
         duplets: (k, 2) both candidates of each range that has them.
-        rows: (k,) which ranges those are.
+        rows: (k,) rows of these ranges.
         num_without_root: ranges dropped for a negative discriminant or a camera at the origin.
     """
 
@@ -50,7 +50,7 @@ class TwoCandidate:
 
 
 def two_candidate(centers: Array, tag_from_center: Array, anchor_m: Array, range_m: Array) -> TwoCandidate | None:
-    """Both roots of the squared range equation for every range, and the paper's choice.
+    """Compute both roots of the squared range equation for every range, and the paper's choice.
 
     With A = |c|^2, B = c.(R^T l - a), C = |R^T l - a|^2 - rho^2, the candidates are
     -B/A -+ sqrt((B/A)^2 - C/A).
@@ -62,7 +62,7 @@ def two_candidate(centers: Array, tag_from_center: Array, anchor_m: Array, range
         range_m: (n,).
 
     Returns:
-        None if fewer than two ranges have candidates, so that there is nothing to compare.
+        None if fewer than two ranges have candidates: then there is no scatter to compare.
     """
     offset = tag_from_center - anchor_m
     a = np.sum(centers**2, axis=1)
@@ -70,7 +70,7 @@ def two_candidate(centers: Array, tag_from_center: Array, anchor_m: Array, range
     c = np.sum(offset**2, axis=1) - range_m**2
     with np.errstate(divide="ignore", invalid="ignore"):
         center, discriminant = -b / a, (b / a) ** 2 - c / a
-        # Where its ray is nearest to the anchor a camera has one candidate, which rounding must not take.
+        # Where its ray is nearest to the anchor, a camera has one candidate; rounding must not make it none.
         has_one = np.abs(discriminant) < _ONE_ROOT * np.sum(offset**2, axis=1) / a
     discriminant[has_one] = 0.0
     rows = np.flatnonzero(off_origin(centers) & (discriminant >= 0))

@@ -1,4 +1,4 @@
-"""How wrong the scale may be: what each component of the ranges' errors does to it."""
+"""Uncertainty of the scale: the effect of each component of the ranges' errors on it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from rangesfm.scale.range_equation import (
 )
 from rangesfm.scale.solution import Solution
 
-# Where ranges have no times: a path of so many metres is walked in a second.
+# Assumed walking speed where ranges have no times.
 _WALKING_M_PER_S = 1.0
 
 
@@ -44,12 +44,12 @@ def learned_errors(
     bending: MapBending | None = None,
     max_num_cells: int = MAX_NUM_CELLS,
 ) -> LearnedErrors:
-    """What the residuals of a solution say of the ranges' errors.
+    """Estimate the errors of the ranges from the residuals of a solution.
 
     Args:
-        bending: of the map; None: it is not bent.
-        model_from_cam: (n, 3, 3) rotation of the camera at each range, into the world of the problem.
-        velocities: (n, 3) of the camera there, model units per second; None: the clocks' offset does not matter.
+        bending: of the map; None: the map is not bent.
+        model_from_cam: (n, 3, 3) rotation of the camera at each range, into the problem's model world.
+        velocities: (n, 3) camera velocities, model units per second; None: the time offset's uncertainty is ignored.
     """
     linear, taken_off = _linear(posed, solution), observations.log.shared_stddev_m
     of_ranges = _cells(posed, solution, observations, model_from_cam, max_num_cells)
@@ -79,7 +79,7 @@ def bending_of_cells(
     observations: RangeObservations,
     model_from_cam: Array,
 ) -> BendingOfCells | None:
-    """As the ranges of a problem see it at a state; None of a map that is not bent."""
+    """Return the bending in the cells of a problem's ranges at a state; None for a map that is not bent."""
     if bending is None:
         return None
     problem, on_path = posed.ranges, observations.on_path(posed.rows)
@@ -89,7 +89,7 @@ def bending_of_cells(
 
 
 def _linear(posed: ScaleProblem, solution: Solution) -> LinearMap:
-    """Return what each of the ranges says about a solution; biases are among the errors here."""
+    """Return the linear equations of the single ranges about a solution; biases are among the errors here."""
     given, state = posed.ranges, solution.fit.state
     unbiased = replace(state, bias_m=given.bias_mean_m)
     only_map = replace(given, bias_stddev_m=np.zeros(given.num_anchors), stddev_m=np.ones(len(given.range_m)))
@@ -112,11 +112,11 @@ def errors_to_expect(
     max_num_cells: int = MAX_NUM_CELLS,
     bending: MapBending | None = None,
 ) -> LearnedErrors:
-    """The same before anything is measured, as radios let expect.
+    """Return the errors to expect before anything is measured, from what is usual for radios.
 
     Args:
-        stddevs: of components of which more is known, by name.
-        max_num_cells: fewer are coarser, and sooner computed.
+        stddevs: by name, standard deviations of components of which more is known.
+        max_num_cells: fewer cells are coarser and take less time.
     """
     taken_off, state = observations.log.shared_stddev_m, solution.fit.state
     of_ranges = _cells(posed, solution, observations, model_from_cam, max_num_cells)
@@ -130,7 +130,7 @@ def errors_to_expect(
 
 
 def _by_places(posed: ScaleProblem, solution: Solution, of_ranges: Cells) -> dict[str, Array]:
-    """Return what uncertain places of the antenna do to the cells, by name; nothing where places are certain."""
+    """Return the cells' covariance due to uncertain antenna places, by name; empty where places are certain."""
     placing_m = posed.placing_stddev_m(solution.fit.state.metric_from_model.scale)
     if not np.any(placing_m > 0):
         return {}
@@ -139,7 +139,7 @@ def _by_places(posed: ScaleProblem, solution: Solution, of_ranges: Cells) -> dic
 
 
 def ruled_out(problem: RangeProblem) -> list[str]:
-    """Components that are not there: biases of a stddev of 0."""
+    """Return the names of bias components that are absent, because their standard deviation is 0."""
     stddevs = {"bias": float(problem.bias_stddev_m.max()), "common_bias": problem.common_bias_stddev_m}
     return [name for name, stddev in stddevs.items() if stddev == 0]
 
@@ -167,7 +167,7 @@ def _cells(
 
 
 def times_of_ranges(posed: ScaleProblem, solution: Solution, observations: RangeObservations) -> Array:
-    """(n,) seconds; where the log names photos, by the way from photo to photo."""
+    """Return (n,) times of the ranges in seconds; where the log names photos, from the distance walked between them."""
     if observations.log.timestamp_s is not None:
         return observations.log.timestamp_s[posed.rows]
     _, first, of_range = np.unique(observations.before[posed.rows], return_index=True, return_inverse=True)
@@ -178,11 +178,11 @@ def times_of_ranges(posed: ScaleProblem, solution: Solution, observations: Range
 
 @dataclass(frozen=True)
 class KnownMap:
-    """How far off a map as a whole may be, and the anchors with it.
+    """Uncertainty of a map as a whole and of its anchors.
 
     Attributes:
         uncertainty: of the scale.
-        covariance: (p, p) of the scale's logarithm, the map's turn and shift, and the anchors, as ``columns`` has them.
+        covariance: (p, p) of the scale's logarithm, the map's turn and shift, and the anchors, as in ``columns``.
     """
 
     uncertainty: ScaleUncertainty
@@ -192,13 +192,13 @@ class KnownMap:
 
 @dataclass(frozen=True)
 class LinearMap:
-    """What c cells of ranges and r priors say of p unknowns of a map, linear about where the map is.
+    """Linear equations of c cells of ranges and r priors for p unknowns of a map, about the map's state.
 
     Attributes:
-        off_m: (c,) measured minus predicted, without any bias.
-        design: (c, p) by how much each predicted range grows with the unknowns.
-        prior_off, prior_design: (r,), (r, p) the same of the priors, in stddevs.
-        columns: which unknown is which.
+        off_m: (c,) measured minus predicted range, without any bias.
+        design: (c, p) derivatives of the predicted ranges by the unknowns.
+        prior_off, prior_design: (r,), (r, p) the same for the priors, in standard deviations.
+        columns: position of each unknown.
     """
 
     off_m: Array
@@ -210,19 +210,19 @@ class LinearMap:
     def known(
         self, learned: LearnedErrors, formal: float, variance_by_others: Array, change_by_others: Array | None = None
     ) -> KnownMap:
-        """Return what is known of the map, by the best weights for the errors and by the weights of another estimate.
+        """Combine the estimate with the best weights for the errors and the estimate with other weights.
 
-        Best weights (Gauss-Markov) are as good as the model of the errors, which real radios do not always keep to;
-        robust weights depend less on it. The truth is taken to be as likely where the one estimate has it as where the
-        other has it, which moves the middle of the interval by half of their difference and widens it by as much. The
-        variance of their difference is the difference of their variances (Hausman, "Specification tests in
-        econometrics", 1978): more than one stddev of that speaks against the model and is not followed.
+        Best weights (Gauss-Markov) are only as good as the model of the errors, which real radios do not always follow.
+        Robust weights depend less on the model. The truth is taken to be equally likely at either estimate: this moves
+        the middle of the interval by half of their difference and widens it by as much. The variance of the difference
+        is the difference of the variances (Hausman, "Specification tests in econometrics", 1978). A difference of more
+        than one standard deviation is evidence against the model, so only one standard deviation of it is used.
 
         Args:
-            formal: relative stddev of the scale, as if every range erred on its own.
-            variance_by_others: (p,) variances of the unknowns by the other weights.
-            change_by_others: (p,) how the other weights would change a map that is where the best ones have it; None:
-                the map is where the other weights have it.
+            formal: relative standard deviation of the scale, as if all ranges erred independently.
+            variance_by_others: (p,) variances of the unknowns with the other weights.
+            change_by_others: (p,) change from the estimate with the best weights, at which the map is, to the estimate
+                with the other weights; None: the map is at the estimate with the other weights.
         """
         best, of_cells, of_priors = best_estimate(learned.covariance_m2, self.design, self.prior_design)
         change = of_cells @ self.off_m + of_priors @ self.prior_off if change_by_others is None else change_by_others
@@ -239,11 +239,11 @@ class LinearMap:
 def known_map(
     posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
 ) -> KnownMap:
-    """Return what is known of a map that was scaled as one piece, by robust weights.
+    """Return the uncertainty of a map that was scaled as one piece, with robust weights.
 
     Args:
-        posed: measured lengths in it as uncertain as the map's bending makes them.
-        bending_of_lengths: relative, of the scale by measured lengths.
+        posed: its measured lengths must have the uncertainty that the map's bending gives them.
+        bending_of_lengths: relative standard deviation of the scale by measured lengths, due to the map's bending.
     """
     linear = _of_cells(_linear(posed, solution), learned.cells)
     variances = np.diag(parameter_covariance(solution, learned))[: linear.columns.num].copy()
@@ -254,10 +254,10 @@ def known_map(
 def known_refined_map(
     posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending: BendingOfCells | None
 ) -> KnownMap:
-    """Return what is known of a map that was refined, at that map.
+    """Return the uncertainty of a refined map.
 
     Args:
-        solution: weighted as the refinement was. bending: of the map, as its cells see it.
+        solution: at the refined map, weighted as in the refinement. bending: of the map, in its cells.
     """
     errors, cells, given = solution.errors, learned.cells, posed.ranges
     linear = _of_cells(_linear(posed, solution), cells)
@@ -277,7 +277,7 @@ def _of_cells(linear: LinearMap, cells: Cells) -> LinearMap:
 
 
 def best_estimate(covariance: Array, design: Array, prior_design: Array) -> tuple[Array, Array, Array]:
-    """(p, p) covariance of the best estimate with errors of some covariance, and its (p, c) and (p, r) weights."""
+    """Return the (p, p) covariance of the best estimate for given error covariance, and its (p, c) and (p, r) gains."""
     covariance = covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance))
     whitened = cho_solve(cho_factor(covariance), design)
     inverse = invert_information(design.T @ whitened + prior_design.T @ prior_design)
@@ -287,15 +287,15 @@ def best_estimate(covariance: Array, design: Array, prior_design: Array) -> tupl
 def expected_scale_uncertainty(
     solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
 ) -> ScaleUncertainty:
-    """What the errors do to the scale by its robust weights: before anything is measured, how far off it will be.
+    """Return the uncertainty to expect of the scale before anything is measured, with its robust weights.
 
-    A survey in which the best weights find much the same scale will state less.
+    The uncertainty after the survey is smaller if the best weights find much the same scale.
 
     Args:
-        bending_of_lengths: relative, of the scale by measured lengths.
+        bending_of_lengths: relative standard deviation of the scale by measured lengths, due to the map's bending.
     """
     summed = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    of_given = max(float(_by_what_was_given(solution)[0, 0]), 0.0)  # rounding may leave less than nothing
+    of_given = max(float(_by_what_was_given(solution)[0, 0]), 0.0)  # rounding may make it negative
     given = np.hypot(np.sqrt(of_given), _say_of_lengths(solution) * bending_of_lengths)
     if given > 0:
         summed[GIVEN] = float(given)
@@ -303,7 +303,7 @@ def expected_scale_uncertainty(
 
 
 def _say_of_lengths(solution: Solution) -> float:
-    """By how much the scale changes, relative to a change of all lengths between points."""
+    """Return the relative change of the scale per relative change of all lengths between points."""
     distances, fit = solution.problem.distances, solution.fit
     if distances is None:
         return 0.0
@@ -313,10 +313,10 @@ def _say_of_lengths(solution: Solution) -> float:
 
 
 def _by_what_was_given(solution: Solution) -> Array:
-    """(p, p) what taped distances, positions of anchors and the upward direction do by not being exact.
+    """Return the (p, p) covariance due to errors of measured distances, anchor positions and the upward direction.
 
-    Biases are among the ranges' errors. All priors weigh as against independent ranges: their stddevs were divided by
-    the inflation.
+    Biases are not in it, as they count as errors of the ranges. The standard deviations of all priors were divided by
+    the inflation, so the result is multiplied by its square.
     """
     fit = solution.fit
     given = fit.prior_information.copy()
@@ -327,22 +327,22 @@ def _by_what_was_given(solution: Solution) -> Array:
 
 
 def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
-    """(p, p) of all that a fit estimates, in the parameters of its columns, by what ranges get wrong and was given."""
+    """Return the (p, p) covariance of all parameters of a fit, from the errors of ranges and of given values."""
     of_cells = parameter_influence(solution.fit, solution.problem, learned)
     return of_cells @ learned.covariance_m2 @ of_cells.T + _by_what_was_given(solution)
 
 
 def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
-    """(p, c) change of all that a fit estimates for each metre by which the ranges of a cell are longer."""
+    """Return the (p, c) change of all parameters of a fit per metre by which the ranges of a cell are longer."""
     of_cells = [learned.cells.total(column / problem.stddev_m) for column in fit.gradients.T]
     return _inverse(fit) @ np.stack(of_cells)
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
-    """(n,) relative change of the scale for each metre by which a range is longer."""
+    """Return the (n,) relative change of the scale per metre by which each range is longer."""
     return np.asarray(fit.gradients @ _inverse(fit)[0] / problem.stddev_m)
 
 
 def _inverse(fit: RangeFit) -> Array:
-    """(p, p) of the information, where what nothing determines stays as it is."""
+    """Return the pseudo-inverse of a fit's information: undetermined directions get no variance."""
     return np.asarray(np.linalg.pinv(fit.information, rcond=1e-12, hermitian=True), dtype=np.float64)

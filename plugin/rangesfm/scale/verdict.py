@@ -1,4 +1,4 @@
-"""Good, doubtful or refused, and why, in words a surveyor understands."""
+"""The verdict on a scale, good, doubtful or refused, with reasons and advice in a surveyor's words."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.sensitivity import scale_drift
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
 
-# Half of the 95 % interval of the scale, relative, from which it is called doubtful.
+# A scale is doubtful if half of its relative 95 % interval is wider than this.
 DOUBTFUL_ABOVE = 0.04
-# Smaller changes with the least range are no news to a surveyor.
+# Relative change of the scale with the minimum range below which it is not mentioned.
 _MIN_DRIFT = 0.01
 _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
-# Relative stddev of a scale that may as well be nothing.
+# Relative standard deviation of the scale from which nothing is known about it.
 _NOTHING_KNOWN = 1.0
-# Scatter of the scales from one anchor each: more than antennas and short stretches of a path make of it.
+# Scatter of the scales from single anchors above which they disagree. Antennas and short paths alone cause less.
 _MAX_ANCHOR_SPREAD = 0.05
 CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to think of a scale.
+    """The verdict on a scale.
 
     Attributes:
         verdict: "good" or "doubtful".
-        reasons: why.
-        advice: what to do about faults; which change of the survey would gain most, its plan says.
+        reasons: in words.
+        advice: what to do about the faults, in words; what would improve the survey most is part of its plan.
     """
 
     verdict: str
@@ -62,10 +62,10 @@ def judge(
     cutoff_tests: tuple[CutoffTest, ...],
     options: ScaleOptions,
 ) -> Verdict:
-    """The verdict, by the 95 % interval and by what makes even that doubtful.
+    """Return the verdict by the 95 % interval, and by faults that make the interval itself doubtful.
 
     Raises:
-        GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
+        GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
     """
     half_width = uncertainty.half_width_95
     doubts = [*_doubts_of_survey(problem, solution, half_width), *_doubts_of_ranges(solution.fit, per_anchor)]
@@ -83,22 +83,22 @@ def judge(
 
 
 def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
-    """The same where there is nothing but measured lengths."""
+    """Return the verdict on a scale that was found from measured lengths alone."""
     another = "measure another length, far from the first and in another direction"
     doubts = []
     if len(lengths.rows) == 1:
-        reason = "the scale hangs on one length that nothing checks: a mistake in it is one of the whole map"
+        reason = "the scale depends on one length that nothing checks: a mistake in it changes the whole map"
         doubts.append(_Doubt(reason, another))
     if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
-        doubts.append(_Doubt("the lengths are short beside their stddevs", "measure more lengths, and longer ones"))
+        doubts.append(_Doubt("the lengths are short for their standard deviations", "measure more and longer lengths"))
     return _verdict(doubts, [], uncertainty.half_width_95, options)
 
 
 def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[str], options: ScaleOptions) -> None:
-    """GeometryError where a scale is less certain than was asked for, with the first of the reasons and of the advice.
+    """Raise GeometryError if a scale is less certain than allowed, with the first reason and the first advice.
 
     Args:
-        half_width: of the 95 % interval.
+        half_width: half of the 95 % interval of the scale, relative.
     """
     if half_width > NORMAL_95 * options.max_relative_stddev:
         planned = "plan it first, which says what would narrow it (rangesfm plan)"
@@ -124,11 +124,11 @@ def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, opt
 
 
 def _doubts_of_survey(posed: ScaleProblem, solution: Solution, half_width: float) -> Iterator[_Doubt]:
-    """Of what was walked and where the anchors are."""
+    """Return the faults of the path and of the anchors."""
     problem = solution.problem
     kind, heard = path_kind(problem.centers), np.unique(problem.anchor_index)
     is_round = kind in ("circular", "spherical") and not np.isfinite(problem.anchor_stddev_m[heard]).any()
-    # Why the scale is uncertain, where a longer walk of the same shape would not help.
+    # On these paths the scale is uncertain because of their shape: a longer walk of the same shape would not help.
     if half_width > DOUBTFUL_ABOVE and is_round:
         yield _Doubt(*WHY_SCALE_IS_OPEN[kind])
     elif half_width > NORMAL_95 * _NOTHING_KNOWN:
@@ -144,7 +144,7 @@ def _doubts_of_survey(posed: ScaleProblem, solution: Solution, half_width: float
         if np.isinf(problem.anchor_stddev_m).any():
             yield _Doubt("the path is nearly straight: an unknown anchor may stand anywhere on a circle around it")
         elif problem.frame_is_free:
-            yield _Doubt("the path is nearly straight: how far the map is rolled about it is uncertain")
+            yield _Doubt("the path is nearly straight: the map's roll about it is uncertain")
 
 
 def _doubts_of_ranges(fit: RangeFit, per_anchor: dict[str, float]) -> Iterator[_Doubt]:
@@ -163,21 +163,21 @@ def _doubts_of_ranges(fit: RangeFit, per_anchor: dict[str, float]) -> Iterator[_
 
 
 def _remarks(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
-    """What is open and does not touch the scale."""
+    """Return what is not determined but does not affect the scale."""
     stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[2] >= NEARLY_FLAT * stddevs[0] or all(a.mirror_position_m is None for a in anchors):
         return []
     reason = (
-        "the path is nearly flat: on which side of it the unknown anchors stand is open; the scale does not hang on it"
+        "the path is nearly flat: it is open on which side of it the unknown anchors stand; the scale is not affected"
     )
     return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
 
 
 def levelled_places(gravity: Gravity, surveyed: Sequence[Anchor], found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
-    """In words, what gravity adds where the site's anchors do not fix the map's heading.
+    """Describe in words where gravity puts the first camera if the site's anchors do not fix the map's heading.
 
     Args:
-        surveyed: in the site frame. found: in the first camera's frame.
+        surveyed: anchors in the site frame. found: anchors in the first camera's frame.
     """
     height_of = {anchor.anchor_id: anchor.position_m[2] for anchor in surveyed if anchor.position_m is not None}
     texts = []
@@ -190,7 +190,7 @@ def levelled_places(gravity: Gravity, surveyed: Sequence[Anchor], found: Sequenc
                 rise = float(place @ gravity.up_in_first_camera)
                 away = float(np.linalg.norm(place - rise * gravity.up_in_first_camera))
                 wheres.append(f"at site height {height_of[anchor.anchor_id] - rise:.2f} m, {away:.2f} m horizontally")
-        # On the path's plane an anchor is its own mirror image.
+        # An anchor on the path's plane is its own mirror image.
         where = " or ".join(dict.fromkeys(wheres))
         texts.append(
             f"the first camera was {where} from anchor {anchor.anchor_id}; in which direction is not determined"
