@@ -153,6 +153,42 @@ def test_full_device_for_a_file_is_one_line(
     assert done.stderr == b"rangesfm: error: standard output: No space left on device\n"
 
 
+@pytest.mark.parametrize(("stdout_is_full", "status"), [(False, 0), (True, 4)])
+def test_full_device_for_progress_and_messages_ends_no_run_and_loses_no_result(
+    stdout_is_full: bool,
+    status: int,
+    command: Callable[..., subprocess.CompletedProcess[bytes]],
+    own_survey: WalkedSurvey,
+) -> None:
+    with open("/dev/full", "wb") as full:
+        flags = ("scale", *quick_flags(own_survey), "--output_path", "out")
+        done = command(*flags, stderr=full, **({"stdout": full} if stdout_is_full else {}))
+    assert done.returncode == status
+    assert stdout_is_full or b"metric model:" in done.stdout
+    assert (own_survey.folder / "out" / "result.json").is_file()
+
+
+def test_full_device_for_messages_changes_no_exit_status(
+    command: Callable[..., subprocess.CompletedProcess[bytes]],
+) -> None:
+    with open("/dev/full", "wb") as full:
+        assert command("ranges", "none.csv", stderr=full).returncode == 2
+
+
+def test_message_goes_nowhere_where_its_stream_is_closed(
+    command: Callable[..., subprocess.CompletedProcess[bytes]],
+) -> None:
+    done = command("ranges", "none.csv", stderr=None, preexec_fn=lambda: os.close(2))
+    assert (done.returncode, done.stdout) == (2, b"")
+
+
+def test_no_file_takes_the_place_of_a_closed_stream(own_survey: WalkedSurvey) -> None:
+    said = "import os, sys; from rangesfm.cli import main; main(['--version']); file = open('uwb.csv'); "
+    program = said + "sys.exit(file.fileno())"
+    done = subprocess.run([sys.executable, "-c", program], cwd=own_survey.folder, preexec_fn=lambda: os.close(2))
+    assert done.returncode > 2
+
+
 def test_output_that_cannot_be_written_to_is_one_line(
     command: Callable[..., subprocess.CompletedProcess[bytes]],
 ) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from rangesfm.cli.arguments import Outcome, normalize, parse
-from rangesfm.cli.terminal import terminal_progress
+from rangesfm.cli.terminal import discard_output, terminal_progress
 from rangesfm.errors import INTERNAL_ERROR, InputError, failure_of, one_line
 from rangesfm.processes.threads import settle_num_threads
 
@@ -27,6 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # COLMAP's log would go to the terminal and to files in the temporary folder of the system. Where it is wanted, it
     # is turned on for a while (rangesfm.colmap.colmap_log). Code that calls COLMAP reports its failures itself.
     os.environ.setdefault("GLOG_minloglevel", "3")
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a name that the locale cannot encode must not be an error
             stream.reconfigure(errors="backslashreplace")
@@ -51,14 +52,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         _print(outcome.lines)
         return outcome.status
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # otherwise Python complains when it exits
+        discard_output(sys.stdout)
         return _BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
         failure = failure_of(error)
         if failure.exit_status == INTERNAL_ERROR and os.environ.get("RANGESFM_DEBUG"):
             traceback.print_exc()
-        print("rangesfm: error:", "\n  ".join([failure.message, *failure.advice]), file=sys.stderr)
+        try:
+            text = "\n  ".join([failure.message, *failure.advice])
+            print("rangesfm: error:", text, file=sys.stderr or io.StringIO(), flush=True)
+        except OSError:  # the exit status says enough
+            discard_output(sys.stderr)
         return failure.exit_status
+
+
+def _open_closed_streams() -> None:
+    """Let standard streams that the shell has closed lead nowhere.
+
+    Otherwise the first file that is opened gets the number of such a stream, and with it what libraries print there.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the smallest free number
 
 
 def _print(texts: Sequence[str]) -> None:
@@ -69,7 +86,7 @@ def _print(texts: Sequence[str]) -> None:
         raise
     except OSError as error:
         error.filename = "standard output"
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # otherwise Python tries again when it exits, and complains
+        discard_output(sys.stdout)
         raise
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.errors import one_line
@@ -16,6 +17,17 @@ if TYPE_CHECKING:
 
 _TERMINAL_INTERVAL_S = 0.1
 _PLAIN_INTERVAL_S = 10.0
+
+
+def discard_output(stream: TextIO | None) -> None:
+    """Discard what is written to a stream from now on, and what it has not been able to write.
+
+    Otherwise Python would try to write that again when it exits, and complain.
+    """
+    if stream is None:  # the shell has closed it
+        return
+    with suppress(OSError, ValueError):  # there is no file behind the stream
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 class Screen:
@@ -29,12 +41,13 @@ class Screen:
 
     def say(self, lines: Sequence[str]) -> None:
         """Print lines that stay; they replace the lines drawn below."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
-        if lines and not self._quiet:
-            self._stream.write("".join(f"{one_line(line)}\n" for line in lines))
-            self._stream.flush()
+        with self._going_on_without():
+            if self._live is not None:
+                self._live.stop()
+                self._live = None
+            if lines and not self._quiet:
+                self._stream.write("".join(f"{one_line(line)}\n" for line in lines))
+                self._stream.flush()
 
     def draw(self, lines: Sequence[str]) -> None:
         """Draw lines that stay until the next call, on a terminal only. Long lines are cut at its width."""
@@ -42,9 +55,21 @@ class Screen:
             return
         from rich.text import Text
 
-        if self._live is None:
-            self._live = _live(self._stream)
-        self._live.update(Text("\n".join(map(one_line, lines)), no_wrap=True, overflow="crop"), refresh=True)
+        with self._going_on_without():
+            if self._live is None:
+                self._live = _live(self._stream)
+            self._live.update(Text("\n".join(map(one_line, lines)), no_wrap=True, overflow="crop"), refresh=True)
+
+    @contextmanager
+    def _going_on_without(self) -> Iterator[None]:
+        """Say nothing more where the stream cannot be written to, as on a full disk: that must not end the work."""
+        try:
+            yield
+        except BrokenPipeError:
+            raise
+        except OSError:
+            self._quiet, self._live = True, None
+            discard_output(self._stream)
 
 
 def _live(stream: TextIO) -> Live:
