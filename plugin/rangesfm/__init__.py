@@ -40,6 +40,7 @@ _HOME = {
     "export_result": "rangesfm.workflows.export_result",
     "find_image_times": "rangesfm.vision.image_times",
     "initialize_scale": "rangesfm.scale.initialize",
+    "measure": "rangesfm.workflows.measure",
     "plan_survey": "rangesfm.planning.survey_plan",
     "read_anchors": "rangesfm.ranging.anchors.anchor",
     "read_image_times_csv": "rangesfm.vision.image_times",

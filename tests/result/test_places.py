@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rangesfm.result.folder import read_result_folder
-from rangesfm.result.places import is_within, path_in, photos_beside, recorded_path
+from rangesfm.result.places import input_beside, is_within, path_in, recorded_path
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
@@ -44,24 +44,24 @@ def site(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("recorded", ["../images", "photos", "..", "."])
-def test_photos_beside_the_result_are_its_own(recorded: str, site: Path) -> None:
-    assert photos_beside(site / "out", recorded) == path_in(site / "out", recorded)
+def test_inputs_beside_the_result_are_its_own(recorded: str, site: Path) -> None:
+    assert input_beside(site / "out", recorded) == path_in(site / "out", recorded)
     whole = str(path_in(site / "out", recorded))
-    assert photos_beside(site / "out", whole) == Path(whole)
+    assert input_beside(site / "out", whole) == Path(whole)
 
 
 @pytest.mark.parametrize(
     "recorded", ["../../private", "../linked", "../circle", "../..", "/", "../images/../../private"]
 )
 def test_photos_elsewhere_are_not(recorded: str, site: Path) -> None:
-    assert photos_beside(site / "out", recorded) is None
-    assert photos_beside(site / "out", str(path_in(site / "out", recorded))) is None
+    assert input_beside(site / "out", recorded) is None
+    assert input_beside(site / "out", str(path_in(site / "out", recorded))) is None
 
 
 def test_a_home_folder_is_no_survey(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(site))
-    assert photos_beside(site / "out", "../images") is None
-    assert photos_beside(site / "out", "photos") == site / "out" / "photos"
+    assert input_beside(site / "out", "../images") is None
+    assert input_beside(site / "out", "photos") == site / "out" / "photos"
 
 
 def test_links_lead_out_and_names_that_no_file_has_lead_nowhere(site: Path) -> None:

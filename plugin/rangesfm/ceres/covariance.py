@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
 from rangesfm.ceres.linear_solver import SingularError, factor, normal_matrix, resized
+from rangesfm.ceres.part_errors import PartSteps, map_errors
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
@@ -65,6 +67,7 @@ class JointCovariance:
         num_free_directions: how many motions of the whole map nothing holds (7 without ranges and gauge); along
             these, covariances are those of the map that moves least (inner constraints). Blocks that are held
             constant have covariance 0.
+        errors: how frames, cameras, sensors of rigs and anchors err together.
     """
 
     frame_ids: Indices
@@ -74,6 +77,7 @@ class JointCovariance:
     others: tuple[Array, ...]
     similarity: Array
     num_free_directions: int
+    errors: MapErrors
 
     @property
     def relative_scale_stddev(self) -> float:
@@ -89,6 +93,8 @@ def joint_covariance(
     others: Sequence[Array] = (),
     residual_stddev: float = 1.0,
     errors: ResidualErrors | None = None,
+    anchor_ids: Sequence[str] | None = None,
+    refined_params: Mapping[int, Sequence[int]] | None = None,
 ) -> JointCovariance:
     """Covariances at a problem's present parameters, by first order: the inverse of J^T J.
 
@@ -102,6 +108,9 @@ def joint_covariance(
         others: further blocks: biases, lever arms, a time shift.
         residual_stddev: of the residuals, which the covariances scale with: 1 if they are in stddevs.
         errors: of residuals that err otherwise; None: none does.
+        anchor_ids: names of the anchors in the map's errors; None: their numbers.
+        refined_params: which parameters of each camera the problem adjusts, by the camera's id; cameras that are
+            missing there are adjusted whole or not at all.
 
     Raises:
         ValueError: the problem has blocks that are neither the reconstruction's nor given.
@@ -118,14 +127,26 @@ def joint_covariance(
     poses = np.array([variance * columns.covariance(pose, blocks) for pose in columns.poses]).reshape(-1, 6, 6)
     turn = np.diag([2.0, 2, 2, 1, 1, 1])  # Ceres turns by twice its step
     to_center = np.array([_center_from_step(pose) for pose in columns.poses]).reshape(-1, 3, 6)
+    names = list(map(str, range(len(anchors)))) if anchor_ids is None else anchor_ids
+    parts = [*_parts(columns, reconstruction, dict(zip(names, anchors, strict=True)), refined_params or {})]
+    by_similarity = _similarity_gradients(columns, len(kept))
+    similarity = variance * inverse.of_functions(by_similarity) if len(frames) > 1 else np.full((7, 7), np.nan)
     return JointCovariance(
         frame_ids=frames,
         rig_from_world=turn @ poses @ turn,
         centers=to_center @ poses @ np.swapaxes(to_center, 1, 2),
         anchors=np.array([variance * columns.covariance(anchor, blocks) for anchor in anchors]).reshape(-1, 3, 3),
         others=tuple(variance * columns.covariance(block, blocks) for block in others),
-        similarity=variance * _similarity_covariance(columns, inverse, len(kept)),
+        similarity=similarity,
         num_free_directions=free.shape[1],
+        errors=map_errors(
+            parts,
+            len(kept),
+            lambda right: variance * inverse.covariance_times(right),
+            lambda start: variance * blocks[columns.index_at(start)],
+            by_similarity[:, 0],
+            float(np.sqrt(similarity[0, 0])),
+        ),
     )
 
 
@@ -236,6 +257,10 @@ class _Columns:
         index = self.index_of.get(_address(block))
         size = 6 if len(block) == 7 else len(block)
         return np.zeros((size, size)) if index is None else inverse_blocks[index]
+
+    def index_at(self, start: int) -> int:
+        """Return the place in ``variable`` of the block that begins at a column."""
+        return int(np.searchsorted(self.starts, start))
 
     def name(self, column: int) -> str:
         """What a column belongs to, for messages."""
@@ -372,6 +397,11 @@ class _Inverse:
                 blocks.append(solution[span, of_block] + solution[:, of_block].T @ excess[:, of_block])
         return blocks
 
+    def covariance_times(self, right: Array) -> Array:
+        """Return the covariance of all columns times (size, k)."""
+        solution = self.solve(right)
+        return solution + self.solve(self._excess(solution))
+
     def of_functions(self, gradients: Array) -> Array:
         """(k, k) of the linear functions with these (size, k) gradients."""
         solution = self.solve(gradients)
@@ -393,11 +423,9 @@ def _not_determined(columns: _Columns, column: int) -> GeometryError:
     return GeometryError(f"the residuals do not determine the problem's {columns.name(column)}: no covariance")
 
 
-def _similarity_covariance(columns: _Columns, inverse: _Inverse, num_rows: int) -> Array:
-    """(7, 7) of the similarity fitted, by least squares, to how the centres of all frames err."""
+def _similarity_gradients(columns: _Columns, num_rows: int) -> Array:
+    """(num_rows, 7) of the similarity fitted, by least squares, to how the centres of all frames err."""
     centers = np.array([-_matrix(pose).T @ pose[4:] for pose in columns.poses])
-    if len(centers) < 2:
-        return np.full((7, 7), np.nan)
     motions = similarity_motions(centers - centers.mean(axis=0))
     # Of lengths and angles alike: about a straight path no turn is seen, and none counts.
     size = float(np.linalg.norm(centers - centers.mean(axis=0)) / np.sqrt(len(centers))) or 1.0
@@ -409,7 +437,50 @@ def _similarity_covariance(columns: _Columns, inverse: _Inverse, num_rows: int) 
         index = columns.index_of.get(_address(pose))
         if index is not None:
             gradients[columns.span(index)] = _center_from_step(pose).T @ motion @ to_similarity
-    return inverse.of_functions(gradients)
+    return gradients
+
+
+def _parts(
+    columns: _Columns,
+    reconstruction: pycolmap.Reconstruction,
+    anchors: Mapping[str, Array],
+    refined_params: Mapping[int, Sequence[int]],
+) -> Iterator[PartSteps]:
+    """Yield the parts of the map that places of points depend on."""
+
+    def start(block: Array) -> int | None:
+        index = columns.index_of.get(_address(block))
+        return None if index is None else int(columns.starts[index])
+
+    size_m = _size_m(columns)
+    turn_and_shift = np.repeat([size_m, 1.0], 3)
+    for frame_id, pose in zip(columns.frames.tolist(), columns.poses, strict=True):
+        turn = np.column_stack([-2.0 * _matrix(pose).T, np.zeros((3, 3))])  # Ceres turns by twice its step
+        by_step = np.vstack([turn, _center_from_step(pose)])
+        yield PartSteps("frame", frame_id, start(pose), by_step, turn_and_shift)
+    for rig in reconstruction.rigs.values():
+        for sensor, sensor_pose in rig.non_ref_sensors.items():
+            if sensor_pose is not None:
+                at = start(sensor_pose.params)
+                yield PartSteps("sensor", sensor.id, at, np.diag([2.0, 2, 2, 1, 1, 1]), turn_and_shift)
+    num_params = max((len(camera.params) for camera in reconstruction.cameras.values()), default=0)
+    for camera_id, camera in reconstruction.cameras.items():
+        by_step = np.eye(num_params)[:, list(refined_params.get(camera_id, range(len(camera.params))))]
+        index = columns.index_of.get(_address(camera.params))
+        if index is not None and by_step.shape[1] != columns.starts[index + 1] - columns.starts[index]:
+            raise ValueError(f"camera {camera_id} is adjusted in part: expected the numbers of these parameters")
+        unit = np.full(num_params, size_m / camera.mean_focal_length())
+        yield PartSteps("camera", camera_id, start(camera.params), by_step, unit)
+    for anchor_id, position in anchors.items():
+        yield PartSteps("anchor", anchor_id, start(position), np.eye(3), np.ones(3))
+
+
+def _size_m(columns: _Columns) -> float:
+    """Return the typical distance of what the photos show: of points, else of other frames, from the middle."""
+    centers = np.array([-_matrix(pose).T @ pose[4:] for pose in columns.poses])
+    points = np.array(columns.variable[columns.num_kept_blocks :]).reshape(-1, 3)
+    seen = points if len(points) else centers
+    return float(np.median(np.linalg.norm(seen - centers.mean(axis=0), axis=1))) or 1.0
 
 
 def _center_from_step(pose: Array) -> Array:

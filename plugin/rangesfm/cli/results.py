@@ -1,14 +1,16 @@
-"""The commands that work on results of runs: ``export``, ``compare`` and ``report``."""
+"""The commands that work on results of runs: ``measure``, ``export``, ``compare`` and ``report``."""
 
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rangesfm.cli.arguments import Commands, Outcome, Parser
 from rangesfm.cli.survey_flags import add_flags, flags_given, overrides_from_arguments, survey_from_arguments
 from rangesfm.errors import InputError
+from rangesfm.files.atomic import require_apart
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
@@ -20,6 +22,23 @@ _WITHOUT_LOG = ("--distances", "--markers")
 
 
 def add_commands(commands: Commands) -> None:
+    measure = commands.add("measure", _measure, "measure distances and height differences in a map")
+    measure.add_argument("result", metavar="RESULT", help="output folder of a run")
+    measure.add_argument(
+        "points",
+        nargs="*",
+        metavar="POINT",
+        help="two or more points, all pairs of which are measured: photos, markers, printed tags (tag7) or their "
+        "corners (tag7.0), anchors, 3-D points of the model (point:1234)",
+    )
+    measure.add_argument("--pairs", type=Path, metavar="FILE", help="CSV from,to with further pairs of points")
+    measure.add_argument(
+        "--markers",
+        type=Path,
+        metavar="FILE",
+        help="CSV marker,image_name,x_px,y_px with marks in photos (default: the tags and markers of the run)",
+    )
+    measure.add_argument("--output_path", type=Path, metavar="FILE", help="also write the measurements as CSV")
     export = commands.add("export", _export, "write the metric model in other formats")
     _add_result_argument(export)
     add_flags(export, "export", by_own_names=True)
@@ -66,6 +85,31 @@ def _result_path(args: argparse.Namespace) -> Path:
     if args.result is not None and args.input_path is not None:
         raise InputError(f"two result folders are given, {args.result} and {args.input_path}; expected one")
     return Path(args.result or args.input_path or "out")
+
+
+def _measure(args: argparse.Namespace, progress: Progress) -> Outcome:
+    """Measure distances and height differences between points of a map. Their 95 % intervals count how the two points
+    err together: by the scale, by the map's bending, and by the photos that show them. Height differences need a site
+    frame, or a given upward direction.
+
+    example:
+      rangesfm measure out IMG_0001.jpg IMG_0020.jpg A1
+      rangesfm measure out --pairs pairs.csv --markers marks.csv --output_path measured.csv
+    """
+    from rangesfm.workflows.measure import measure, read_pairs
+
+    if again := {name for name in args.points if args.points.count(name) > 1}:
+        raise InputError(f"{min(again)} is given twice, expected different points")
+    if len(args.points) == 1 or not (args.points or args.pairs):
+        given = f"one point, {args.points[0]}" if args.points else "no point"
+        raise InputError(f"{given} is given, expected two or more (or --pairs FILE)")
+    pairs = [*itertools.combinations(args.points, 2), *(read_pairs(args.pairs) if args.pairs else ())]
+    found = measure(Path(args.result), pairs, markers=args.markers)
+    if args.output_path is None:
+        return Outcome([str(found)])
+    require_apart([path for path in (args.pairs, args.markers) if path is not None], args.output_path)
+    found.write(args.output_path)
+    return Outcome([str(found), f"table: {args.output_path}"])
 
 
 def _export(args: argparse.Namespace, progress: Progress) -> Outcome:

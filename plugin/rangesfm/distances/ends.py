@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -167,14 +168,23 @@ def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
 def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
     """Return the position (3,) of each marker that is an end of a length, by name; errors like ``locate_distances``."""
     images, ends = images_by_name(model), {name for taped in tape.distances for name in taped.ends}
-    return {name: _triangulate(name, marker, images, tape) for name, marker in tape.markers.items() if name in ends}
+    wanted = {name: marker for name, marker in tape.markers.items() if name in ends}
+    return {name: triangulate_marker(name, marker, images, tape.markers_path) for name, marker in wanted.items()}
 
 
-def _triangulate(name: str, marker: Marker, images: dict[str, pycolmap.Image], tape: Tape) -> Array:
-    """Return the position of a marker (3,) in the model's world, from the photos that are in the model."""
+def triangulate_marker(
+    name: str, marker: Marker, images: Mapping[str, pycolmap.Image], markers_path: Path | None
+) -> Array:
+    """Return the position of a marker (3,) in the model's world, from the photos that are in the model.
+
+    It is the point that is nearest to the rays of the marks.
+
+    Raises:
+        InputError: the marks are too few, seen from one direction only, or not of one point.
+    """
 
     def wrong(what: str, k: int = 0) -> InputError:
-        return InputError(f"marker {name!r} {what}", tape.markers_path, marker.lines[k])
+        return InputError(f"marker {name!r} {what}", markers_path, marker.lines[k])
 
     seen = [k for k, image_name in enumerate(marker.image_names) if image_name in images]
     if len(seen) < 2:
@@ -222,7 +232,7 @@ def locatable(tape: Tape, model: pycolmap.Reconstruction) -> Tape:
     images, lost = images_by_name(model), set[str]()
     for name, marker in tape.found_markers.items():
         try:
-            _triangulate(name, marker, images, tape)
+            triangulate_marker(name, marker, images, tape.markers_path)
         except InputError:
             lost.add(name)
     kept = (taped for taped in tape.distances if not (taped.is_printed and lost.intersection(taped.ends)))

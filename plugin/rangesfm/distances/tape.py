@@ -24,8 +24,8 @@ DEFAULT_STDDEV_M = 0.01
 DISTANCE_COLUMNS = ("from", "to", "distance_m")
 _PIXELS = ("x_px", "y_px")
 MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
-# Standard deviation of a coordinate of a mark set by hand.
-_CLICKED_STDDEV_PX = 1.0
+CLICKED_STDDEV_PX = 1.0
+"""Standard deviation of a coordinate of a mark set by hand."""
 FOUND_STDDEV_PX = 0.3
 """Standard deviation of a coordinate of a tag's corner that was found by OpenCV."""
 
@@ -70,7 +70,7 @@ class Marker:
     image_names: tuple[str, ...]
     pixels: Array
     lines: tuple[int, ...]
-    stddev_px: float = _CLICKED_STDDEV_PX
+    stddev_px: float = CLICKED_STDDEV_PX
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
         InputError: a file is not valid; the error gives the line.
     """
     distances = _distances(read_table(distances_path, DISTANCE_COLUMNS, ["stddev_m", "kind"]))
-    markers = {} if markers_path is None else _markers(read_table(markers_path, MARKER_COLUMNS))
+    markers = {} if markers_path is None else read_markers(markers_path)
     return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
 
 
@@ -136,7 +136,17 @@ def _distances(table: Table) -> tuple[TapedDistance, ...]:
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
 
 
-def _markers(table: Table) -> dict[str, Marker]:
+def read_markers(path: str | Path, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
+    """Read ``marker,image_name,x_px,y_px``.
+
+    Args:
+        path: the file.
+        stddev_px: standard deviation of each coordinate.
+
+    Raises:
+        InputError: the file is not valid; the error gives the line.
+    """
+    table = read_table(path, MARKER_COLUMNS)
     names, image_names = table.text("marker"), table.text("image_name")
     pixels = np.column_stack([table.numbers(column, bounds=PIXEL) for column in _PIXELS])
     rows_of: dict[str, list[int]] = {}
@@ -147,7 +157,7 @@ def _markers(table: Table) -> dict[str, Marker]:
         seen_in = tuple(image_names[row] for row in rows)
         if again := repeated(seen_in):
             raise table.error(rows[again[0]], "image_name", "each photo once for this marker")
-        markers[name] = Marker(seen_in, pixels[rows], tuple(table.line[rows].tolist()))
+        markers[name] = Marker(seen_in, pixels[rows], tuple(table.line[rows].tolist()), stddev_px)
     return markers
 
 

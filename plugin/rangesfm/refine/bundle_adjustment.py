@@ -92,6 +92,21 @@ class BundleAdjustment:
         residuals = np.asarray(self.adjuster.problem.evaluate_residuals())[: self.num_reprojections]
         return float(np.sqrt(2 * np.mean(residuals**2)))
 
+    @property
+    def refined_params(self) -> dict[int, list[int]]:
+        """Return which parameters of each camera are adjusted, where they are not constant, by the camera's id."""
+        options = self.adjuster.options
+        return {
+            camera_id: sorted(
+                [
+                    *(camera.focal_length_idxs() if options.refine_focal_length else ()),
+                    *(camera.principal_point_idxs() if options.refine_principal_point else ()),
+                    *(camera.extra_params_idxs() if options.refine_extra_params else ()),
+                ]
+            )
+            for camera_id, camera in self.metric.cameras.items()
+        }
+
     def keep_from_elimination(self, block: Array) -> None:
         """Have Ceres eliminate the map's points only; see ``keep_from_elimination`` of the costs."""
         tie_point = next(self.tie_points, None)

@@ -315,6 +315,8 @@ def _covariance(
             others=added.all_but_anchors,
             residual_stddev=bending_factor * bundle.pixel_stddev,
             errors=problem.residual_errors(added, errors, bending_factor),
+            anchor_ids=problem.ranges.observations.log.anchor_ids,
+            refined_params=bundle.refined_params,
         )
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)

@@ -17,10 +17,12 @@ from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, MetricMap, export_map, write_model
 from rangesfm.files.atomic import path_of, scratch_folder, sole_writer
 from rangesfm.geometry.georeference import Georeference
+from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.options import ExportOptions
+from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME, read_map_errors, write_map_errors
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.result.places import path_in, photos_beside
+from rangesfm.result.places import input_beside, path_in
 from rangesfm.result.summary import ResultSummary
 from rangesfm.result.tables import TABLES, PhotoTimes, TableFile
 from rangesfm.survey.settings import Survey
@@ -34,7 +36,10 @@ PHOTOS_NAMES = ("photos", "photos_2")
 them while those of a new result are made."""
 REFERENCE_NAME = "reference.csv"
 MODEL_NAMES = ("sparse_scaled", "sparse_metric")
-RESULT_FILES = (ResultSummary.NAME, REPORT_NAME, REFERENCE_NAME, *(table.NAME for table in TABLES))
+RESULT_FILES = (
+    *(ResultSummary.NAME, REPORT_NAME, REFERENCE_NAME, JOINT_COVARIANCE_NAME),
+    *(table.NAME for table in TABLES),
+)
 RESULT_NAMES = (*RESULT_FILES, *MODEL_NAMES)
 """Names of all files and folders of a result. The first one is written last: where it is there, the result is whole."""
 
@@ -133,6 +138,8 @@ def write_models_and_tables(
         table = kind.of(found)
         if table is not None:
             table.write(folder)
+    if found.map_errors is not None:
+        write_map_errors(found.map_errors, folder)
     times = PhotoTimes.of(found)
     map_ = MetricMap(
         found.final,
@@ -185,7 +192,7 @@ class ResultFolder:
     def images_path(self) -> Path | None:
         """Return the folder of the run's photos; None without one, or if it is not in the folder around the result."""
         recorded = self.summary.settings.images.path
-        return None if recorded is None else photos_beside(self.path, recorded)
+        return None if recorded is None else input_beside(self.path, recorded)
 
     @property
     def anchors_path(self) -> Path | None:
@@ -202,6 +209,10 @@ class ResultFolder:
     def read(self, table: type[_Table]) -> _Table | None:
         """Read one of ``TABLES``; None if its file is not there."""
         return table.read(self.path)
+
+    def read_map_errors(self) -> MapErrors | None:
+        """Read how the parts of the refined map err together; None if that is not known."""
+        return read_map_errors(self.path)
 
     def read_reference(self) -> Reference | None:
         """Read the reference positions of the photos, in the world of the metric models; None if there are none."""

@@ -13,6 +13,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.distances.tape import Tape
+from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.models import ModelVerdict
@@ -139,6 +140,12 @@ class MetricResult:
             return {}
         index = np.searchsorted(found.frame_ids, self.trajectory.frame_ids)
         return dict(zip(self.trajectory.image_names, found.centers[index], strict=True))
+
+    @property
+    def map_errors(self) -> MapErrors | None:
+        """Return how the parts of the refined map err together; None if that is not known."""
+        found = None if self.kept_refinement is None else self.kept_refinement.covariance
+        return None if found is None else found.errors
 
     @cached_property
     def diagnostics(self) -> ScaleDiagnostics:

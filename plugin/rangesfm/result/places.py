@@ -47,8 +47,8 @@ def recorded_inputs(entries: list[dict[str, Any]], survey: Survey) -> list[dict[
     return [{**entry, "path": recorded_path(path_of(entry["path"]), survey.output.path)} for entry in entries]
 
 
-def photos_beside(folder: Path, recorded: str) -> Path | None:
-    """Return the recorded folder of photos if it is in the result folder or in the folder around it, else None.
+def input_beside(folder: Path, recorded: str) -> Path | None:
+    """Return the recorded path of an input if it is in the result folder or in the folder around it, else None.
 
     A result of a stranger could name any folder of the reader, whose photos would then be in a page that the reader
     gives to others. For the same reason, the folder around the result does not count if it is the home folder or the

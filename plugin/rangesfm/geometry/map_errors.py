@@ -1,0 +1,108 @@
+"""How the parts of a map err together: what is needed for the precision of one point relative to another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from rangesfm.arrays import Array
+
+Kind = Literal["frame", "camera", "sensor", "anchor"]
+Part = tuple[Kind, int | str]
+"""A part of a map: its kind, and its COLMAP id or the id of the anchor. A sensor has the id of its camera."""
+
+
+@dataclass(frozen=True)
+class PartErrors:
+    """How k parts of one kind err, each in d numbers.
+
+    The numbers of a frame are a turn of its rig about the axes of the world (rotation vector, radians) and a shift of
+    the rig's origin (metres). Those of a sensor are a turn (left rotation vector) and a shift of sensor_from_rig, those
+    of a camera its parameters, those of an anchor a shift (metres).
+
+    Attributes:
+        ids: (k,) COLMAP ids, or ids of anchors.
+        modes: (k, d, r) change by one standard deviation of each of r independent causes, which all parts share.
+        rests: (k, d, d) covariance of what no cause explains; it is independent from part to part.
+        by_scale: (k, d) expected change where the logarithm of the map's scale changes by 1.
+    """
+
+    ids: tuple[int, ...] | tuple[str, ...]
+    modes: Array
+    rests: Array
+    by_scale: Array
+
+    @cached_property
+    def row_of(self) -> dict[int | str, int]:
+        """Return the row of each part by its id."""
+        ids: tuple[int | str, ...] = self.ids
+        return {id_: row for row, id_ in enumerate(ids)}
+
+
+@dataclass(frozen=True)
+class PointErrors:
+    """How a point of a map errs.
+
+    Attributes:
+        by_part: (3, d) change of the point, in metres, by each part that it depends on.
+        own_m2: (3, 3) covariance of the error that only this point has.
+    """
+
+    by_part: Mapping[Part, Array]
+    own_m2: Array
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """How all parts of a map err together.
+
+    The covariance of all numbers of all parts is ``modes @ modes.T``, with the modes of all parts as rows, plus the
+    rests on its diagonal.
+
+    Attributes:
+        parts: by kind.
+        scale_stddev: standard deviation of the logarithm of the map's scale in this covariance.
+    """
+
+    parts: Mapping[Kind, PartErrors]
+    scale_stddev: float
+
+    def relative(self, first: PointErrors, second: PointErrors, scale_stddev: float) -> tuple[Array, Array]:
+        """Return how a point errs relative to another one.
+
+        Args:
+            first, second: the points.
+            scale_stddev: standard deviation of the logarithm of the map's scale as it is stated. It replaces the one
+                that this covariance implies; how the map errs at a given scale stays as it is.
+
+        Returns:
+            (3, 3) covariance of second minus first in square metres, and (3,) its expected change where the logarithm
+            of the scale changes by 1.
+        """
+        slopes = _difference(first.by_part, second.by_part)
+        covariance = first.own_m2 + second.own_m2
+        by_mode, by_scale = np.zeros((3, self._num_modes)), np.zeros(3)
+        for (kind, id_), slope in slopes.items():
+            errors = self.parts[kind]
+            row, num = errors.row_of[id_], slope.shape[1]  # cameras of other models have more parameters
+            by_mode += slope @ errors.modes[row, :num]
+            by_scale += slope @ errors.by_scale[row, :num]
+            covariance = covariance + slope @ errors.rests[row, :num, :num] @ slope.T
+        covariance = covariance + by_mode @ by_mode.T
+        covariance += (scale_stddev**2 - self.scale_stddev**2) * np.outer(by_scale, by_scale)
+        return covariance, by_scale
+
+    @property
+    def _num_modes(self) -> int:
+        return int(next(iter(self.parts.values())).modes.shape[2])
+
+
+def _difference(first: Mapping[Part, Array], second: Mapping[Part, Array]) -> dict[Part, Array]:
+    slopes = dict(second)
+    for part, slope in first.items():
+        slopes[part] = slopes[part] - slope if part in slopes else -slope
+    return slopes

@@ -1,0 +1,71 @@
+"""The file ``joint_covariance.npz`` of a result: how all parts of the refined map err together."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import InputError
+from rangesfm.files.atomic import new_file
+from rangesfm.geometry.map_errors import Kind, MapErrors, PartErrors
+
+JOINT_COVARIANCE_NAME = "joint_covariance.npz"
+_KINDS: tuple[Kind, ...] = get_args(Kind)
+_SCALE_STDDEV = "relative_scale_stddev"
+
+
+def write_map_errors(errors: MapErrors, folder: Path) -> None:
+    """Write the file into a folder: for each kind of part ``frame_ids``, ``frame_modes`` and so on; see MapErrors.
+
+    Modes have single precision, which is a relative error of the covariance of 1e-7.
+    """
+    arrays = {_SCALE_STDDEV: np.array(errors.scale_stddev)}
+    for kind, parts in errors.parts.items():
+        arrays[f"{kind}_ids"] = np.array(parts.ids)
+        arrays[f"{kind}_modes"] = parts.modes.astype(np.float32)
+        arrays[f"{kind}_rests"] = parts.rests
+        arrays[f"{kind}_by_scale"] = parts.by_scale
+    with new_file(folder / JOINT_COVARIANCE_NAME) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+
+def read_map_errors(folder: Path) -> MapErrors | None:
+    """Read the file of a folder; None if it is not there.
+
+    Raises:
+        InputError: the file was not written by a run.
+    """
+    path = folder / JOINT_COVARIANCE_NAME
+    if not path.is_file():
+        return None
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+            scale_stddev = float(arrays[_SCALE_STDDEV])
+            parts = {kind: _part_errors(arrays, kind) for kind in _KINDS if f"{kind}_ids" in arrays}
+    except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise InputError("is damaged, expected the file as a run wrote it", path) from error
+    if not parts or len({of.modes.shape[2] for of in parts.values()}) > 1:
+        raise InputError("is damaged, expected the file as a run wrote it", path)
+    return MapErrors(parts, scale_stddev)
+
+
+def _part_errors(arrays: Mapping[str, Array], kind: Kind) -> PartErrors:
+    """Return the errors of the parts of one kind.
+
+    Raises:
+        ValueError: the arrays do not belong together, or hold other values than finite numbers.
+    """
+    ids, modes = arrays[f"{kind}_ids"].tolist(), arrays[f"{kind}_modes"].astype(np.float64)
+    rests, by_scale = (arrays[f"{kind}_{name}"].astype(np.float64) for name in ("rests", "by_scale"))
+    num, size = modes.shape[:2] if modes.ndim == 3 else (-1, -1)
+    if (len(ids), rests.shape, by_scale.shape) != (num, (num, size, size), (num, size)):
+        raise ValueError("arrays of different lengths")
+    if not all(np.isfinite(values).all() for values in (modes, rests, by_scale)):
+        raise ValueError("not finite")
+    return PartErrors(tuple(ids), modes, rests, by_scale)
