@@ -95,7 +95,7 @@ def test_ranges_off_the_path_are_no_fault_of_their_anchor(estimate: ScaleEstimat
 def test_an_anchor_away_from_where_it_was_surveyed_is_named(estimate: ScaleEstimate) -> None:
     place_m = known(estimate.anchors[3].prior_position_m)
     (reason,) = doubts(with_anchor(estimate, 3, position_m=place_m - [0.0, 0.12, 0.01]))
-    assert reason == "anchor D fits 0.12 m from where it was surveyed (along y), 6 of its stddevs"
+    assert reason == "anchor D fits best 0.12 m from its surveyed position (along y), 6 of its stddevs"
     assert doubts(with_anchor(estimate, 3, position_m=place_m - [0.0, 0.06, 0.01])) == []
 
 
@@ -103,7 +103,7 @@ def test_noise_that_no_radio_has_is_said_unless_somebody_said_it_first(estimate:
     errors = estimate.errors
     noisy = replace(estimate, errors=replace(errors, stddev_m=np.full_like(errors.stddev_m, 0.55)))
     (reason,) = doubts(noisy)
-    assert reason == "the ranges scatter by 0.55 m, where UWB radios do by 0.02 to 0.3 m"
+    assert reason == "the ranges scatter by 0.55 m; UWB radios scatter by 0.02 to 0.3 m"
     assert doubts(noisy, noise_is_given=True) == []
     of_one = np.where(estimate.observations.log.anchor_index == 4, 4.2, errors.stddev_m)
     (reason,) = doubts(replace(estimate, errors=replace(errors, stddev_m=of_one)))

@@ -1,1 +1,1 @@
-"""How far to trust what was given and what was found: each mistake said, with its size and what to do."""
+"""Tests for mistakes in the input and faults of the map, each reported with its size and a remedy."""

@@ -1,4 +1,4 @@
-"""Mistakes that cannot be a little wrong: labels swapped, axes mixed up, another unit. Each is tried as such."""
+"""Mistakes that have no size: swapped labels, mixed-up axes, another unit. Each is tried as a whole."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _AXES_OF_LEVER_ARM = {
 
 @dataclass(frozen=True)
 class Alternative:
-    """A mistake as it is corrected, and its words, as of a Hypothesis."""
+    """A mistake without a size, with its correction; the texts are as in a Hypothesis."""
 
     name: str
     subject: str
@@ -58,12 +58,12 @@ class Alternative:
 
 
 def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
-    """All that there are of a map."""
+    """Yield all alternatives that a map can have."""
     given_m, heard = on_map.problem.anchor_mean_m, np.unique(on_map.problem.anchor_index)
     given = {on_map.anchor_ids[k]: given_m[k] for k in heard if np.isfinite(given_m[k]).all()}
     yield from _of_labels([name for name in on_map.order_given if name in given], given)
     yield from _of_coordinates(given)
-    if on_map.velocity is not None:  # as where their order was taken from names that count down
+    if on_map.velocity is not None:  # as where the photos' order was taken from names that count down
         times = on_map.time_s
         yield Alternative(
             "photos reversed",
@@ -81,7 +81,7 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
 
 
 def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Alternative]:
-    """Two anchors' labels, or their lines in the file, are swapped; or all are off by a line."""
+    """Yield swapped pairs of anchors' labels (or of lines in their file), and coordinates shifted by one line."""
     remedy = "compare the labels on the devices with the anchors' file"
     for one, other in combinations(given, 2):
         words = f"anchors {one} and {other} bear each other's label"
@@ -95,7 +95,7 @@ def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Alt
 
 
 def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Alternative]:
-    """Other axes; feet, and ranges that are twice as long."""
+    """Yield other axes of the anchors' coordinates, coordinates in feet, and ranges of the way there and back."""
     remedy = "compare the anchors' file with a sketch of the site"
     for axes_words, axes in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
         words = f"in the anchors' coordinates {axes_words}"
@@ -111,7 +111,10 @@ def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Alternative]:
 
 
 class Refits:
-    """Solutions of corrected problems, each found from where the map itself sees the anchors."""
+    """Solutions of corrected problems, each started from where the map itself sees the anchors.
+
+    They use at most ``_NUM_PER_ANCHOR`` ranges of each anchor.
+    """
 
     def __init__(self, on_map: RangesOnMap, scatter_m: float):
         self._on_map = on_map
@@ -124,7 +127,7 @@ class Refits:
         return replace(thin, stddev_m=np.full(len(thin.range_m), self._scatter_m))
 
     def start(self, correction: Correction) -> tuple[float, RangesOnMap]:
-        """The cost of thinned ranges before any fit, and the map there."""
+        """Return the cost of the thinned ranges before any fit, and the corrected map with its best starting state."""
         right = corrected(self._on_map, correction)
         thin, seen = self._thinned(right), self._seen
         if np.any(correction.time_shift_s):
@@ -134,14 +137,14 @@ class Refits:
         return cost, replace(right, state=state)
 
     def of(self, start: RangesOnMap) -> tuple[float, RangesOnMap]:
-        """The cost of their best fit, and the map at it."""
+        """Return the cost of the best fit of the thinned ranges, and the map at that fit."""
         fit = solve(
             self._thinned(start), start.state, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS
         )
         return fit.cost, replace(start, state=fit.state)
 
     def _starts(self, problem: RangeProblem, placed: Similarity, seen_m: Array) -> Iterator[RangeState]:
-        """As the map lies; and by where it sees the anchors (m, 3), lying as they are seen from."""
+        """Yield starting states: the map as it is, and moved to where it sees the anchors (``seen_m``, (m, 3))."""
         known = np.asarray(np.isfinite(problem.anchor_mean_m).all(axis=1))
         anchors_m = np.where(known[:, None], problem.anchor_mean_m, self._on_map.state.anchors_m)
         yield replace(self._on_map.state, anchors_m=anchors_m)
@@ -160,7 +163,7 @@ def _cost(problem: RangeProblem, state: RangeState) -> float:
 
 
 def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
-    """How the map lies, and where it sees the anchors (m, 3), if nothing is said of them."""
+    """Estimate how the map lies and where it sees the anchors (m, 3) if nothing is known of them beforehand."""
     unknown = replace(
         problem,
         anchor_mean_m=np.full_like(problem.anchor_mean_m, np.nan),
@@ -175,7 +178,7 @@ def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
 
 
 def _multilaterated(problem: RangeProblem, scale: float) -> RangeState:
-    """The anchors from the tag's places, the map being so much larger than it is thought to be."""
+    """Locate the anchors from the tag's positions, in a map enlarged by a given scale."""
     tags = scale * problem.centers + problem.tag_from_center
     anchors_m = np.full((problem.num_anchors, 3), np.nan)
     for k in np.unique(problem.anchor_index):
@@ -185,6 +188,6 @@ def _multilaterated(problem: RangeProblem, scale: float) -> RangeState:
 
 
 def _lever_arms_m(on_map: RangesOnMap) -> Mapping[str, Array]:
-    """As given, by the first range of each tag."""
+    """Return the lever arms as given, in the camera's frame, by tag id; the median over each tag's ranges."""
     arms = np.einsum("nji,nj->ni", on_map.model_from_cam, on_map.problem.tag_from_center)
     return {on_map.tag_ids[k]: np.median(arms[on_map.tag_index == k], axis=0) for k in np.unique(on_map.tag_index)}

@@ -1,4 +1,4 @@
-"""What can be known from files alone, said before the long work: each note with what was found and what to do."""
+"""Checks of the input files before the long work; each note says what was found and what to do."""
 
 from __future__ import annotations
 
@@ -16,25 +16,26 @@ from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 
-# No surveyor measures the heights of three anchors to be the same to a millimetre, nor puts two into one place.
+# No survey finds the same height for three anchors to within a millimetre, and no two anchors are in one place.
 _SAME_HEIGHT_M, _SAME_PLACE_M = 1e-3, 0.01
 _MIN_ANCHORS_ALIKE = 3
-# UWB radios reach some 200 m.
+# UWB radios reach some 200 m. The unit is doubted if this share of the ranges is longer than the limit.
 _FAR_M, _FAR_SHARE = 300.0, 0.95
-# Of an anchor's ranges that are one and the same value, and of the others': a tag that stands still repeats all.
+# An anchor is stuck if one value makes up the first share of its ranges, while in the other anchors' ranges (median)
+# the commonest value stays below the second share. If the tag stands still, all anchors repeat their values.
 _STUCK_SHARE, _MOVING_SHARE, _MIN_RANGES = 0.5, 0.2, 20
-# Of the median gap between photos: between two walks.
+# A gap between photos longer than this many median gaps is a pause between two walks.
 _PAUSE = 30.0
-# Clocks that count seconds since 1970 have passed this.
+# Clocks that count seconds since 1970 show more than this.
 _SINCE_1970_S = 1e9
 _LONG_GAP_S = 60.0
 _MIN_SHARE_OF_TIME = 0.5
 _MAX_SHARE_BETWEEN_FAR_PHOTOS = 0.3
-# Ranges this close in time are of one place, up to how far a tag comes meanwhile.
+# Ranges this close in time are taken from one place, up to the way that a tag moves meanwhile.
 _SAME_MOMENT_S, _MAX_SPEED_M_PER_S = 0.2, 5.0
-# What a radio without calibration may be off: a delay, and a share of the distance.
+# Largest error of a radio without calibration: a constant delay, and a share of the distance.
 _MAX_ERROR_M, _MAX_ERROR_SHARE = 0.5, 0.1
-# Of the triangles of two anchors; blocked paths spoil some of them.
+# Share of the triangles of two anchors that may be wrong, as blocked paths spoil some, and the fewest triangles.
 _MAX_SPOILT, _MIN_TRIANGLES = 0.3, 10
 _MAX_NUM_TRIANGLES = 20_000
 _MAX_NUM_NAMED = 2
@@ -49,11 +50,11 @@ _UNITS = {
 
 
 def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
-    """Of the radio's side of a survey, in words for its user; nothing where all seems right."""
+    """Return notes for the user on ranges and anchors of a survey; empty if nothing seems wrong."""
     if len(inputs.log) and not {"tag_in_cam_m", "lever_arms_m"} & survey.tag.model_fields_set:
         yield (
-            "the tag's place on the camera is not given and taken to be the lens itself: ranges are off by as much as "
-            "it is away; measure from the lens to the antenna, right, down and forward (--tag_in_cam X,Y,Z)"
+            "the tag's place on the camera is not given, so it is taken to be at the lens: ranges are wrong by up to "
+            "its distance from there; measure from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
         )
     yield from _on_ranges(inputs.log)
     if inputs.anchor_frame == "unknown":
@@ -98,14 +99,14 @@ def _on_ranges(log: RangeLog) -> Iterator[str]:
 
 
 def _share_of_one_value(ranges_m: Array) -> float:
-    """How many of an anchor's ranges are the commonest one; 0 of a few."""
+    """Return the share of an anchor's ranges that have the commonest value; 0 for too few ranges."""
     if len(ranges_m) < _MIN_RANGES:
         return 0.0
     return float(np.unique(ranges_m, return_counts=True)[1].max() / len(ranges_m))
 
 
 def notes_on_times(radio_s: Array, photos_s: Array) -> Iterator[str]:
-    """Of two clocks whose offset is to be searched for.
+    """Return notes on two clocks whose offset is to be searched for.
 
     Args:
         radio_s, photos_s: times of ranges and photos, each by its own clock, in any order.
@@ -128,11 +129,11 @@ def notes_on_times(radio_s: Array, photos_s: Array) -> Iterator[str]:
 
 
 def notes_on_gaps(photos_s: Array, max_gap_s: float) -> Iterator[str]:
-    """Of keyframes too far apart for the ranges between them, within a walk.
+    """Return a note if keyframes within a walk are too far apart for the ranges between them.
 
     Args:
-        photos_s: times, ascending.
-        max_gap_s: farther apart, ranges between two have no place.
+        photos_s: times of the keyframes, ascending.
+        max_gap_s: ranges between keyframes farther apart than this are left out.
     """
     gaps_s = np.diff(np.unique(photos_s))
     gaps_s = gaps_s[gaps_s <= _PAUSE * np.median(gaps_s)] if len(gaps_s) else gaps_s
@@ -145,7 +146,7 @@ def notes_on_gaps(photos_s: Array, max_gap_s: float) -> Iterator[str]:
 
 
 def notes_on_model(model: pycolmap.Reconstruction) -> Iterator[str]:
-    """Of a model that was brought along."""
+    """Return notes on a model that the user supplied."""
     errors = point_errors(model)
     if not errors.fit:
         yield f"{errors.apart('the model', 'its photos')}: {MISMATCHED}"
@@ -162,11 +163,11 @@ def notes_on_model(model: pycolmap.Reconstruction) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class _Triangles:
-    """n pairs of ranges, and the two anchors of each; in a pair of an anchor range, one side is 0.
+    """Bounds on distances between pairs of anchors, from n pairs of ranges or ranges between two anchors.
 
     Attributes:
-        pair: (n, 2) anchors.
-        shortest_m, longest_m: (n,) between which their distance is.
+        pair: (n, 2) indices of the two anchors.
+        shortest_m, longest_m: (n,) bounds on the distance between them.
     """
 
     pair: Indices
@@ -174,7 +175,11 @@ class _Triangles:
     longest_m: Array
 
     def bad_pairs(self, positions_m: Array) -> Mask:
-        """(m, m) upper triangle: which two of m anchors (m, 3) are not where the ranges have them."""
+        """Return an (m, m) mask, upper triangle, of anchor pairs whose distance contradicts the ranges.
+
+        Args:
+            positions_m: (m, 3) of the anchors.
+        """
         num, (first, second) = len(positions_m), self.pair.T
         distance_m = np.linalg.norm(positions_m[first] - positions_m[second], axis=1)
         error_m = _MAX_ERROR_SHARE * distance_m
@@ -188,10 +193,10 @@ class _Triangles:
 
 
 def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor]) -> Iterator[str]:
-    """Whether anchors stand as far from each other as the ranges allow: the likeliest reason if not, and what to do.
+    """Return a note if distances between anchors contradict the ranges: the likeliest reason and what to do.
 
-    Two ranges of one tag at one moment and the distance between their anchors make a triangle: neither is the distance
-    longer than both ranges together, nor shorter than their difference. Ranges between two anchors say it itself.
+    Two simultaneous ranges of one tag and the distance between their anchors form a triangle: the distance is at most
+    the sum of the ranges, and at least their difference. Ranges between two anchors measure the distance directly.
     """
     surveyed = [anchor for anchor in anchors if anchor.position_m is not None and anchor.anchor_id in log.anchor_ids]
     if len(surveyed) < 2:
@@ -207,11 +212,11 @@ def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor]) -> Iterator[str
     causes = list(_causes(triangles, ids, positions_m, bad))
     named = " and ".join(f"{ids[i]} and {ids[k]}" for i, k in np.argwhere(bad)[:_MAX_NUM_NAMED].tolist())
     likeliest = f"probably {' or '.join(causes)}" if causes else f"look at {named} first"
-    yield f"{found}: {likeliest}; check labels, coordinates and units, or the map takes on what is wrong"
+    yield f"{found}: {likeliest}; check labels, coordinates and units, or the map will be wrong too"
 
 
 def _causes(triangles: _Triangles, ids: Sequence[str], positions_m: Array, bad: Mask) -> Iterator[str]:
-    """What alone would explain all that is wrong."""
+    """Yield each single mistake that would explain all contradictions."""
     in_pairs = bad.sum(axis=0) + bad.sum(axis=1)
     if in_pairs.max() == bad.sum():
         ends = [ids[k] for k in np.flatnonzero(in_pairs == bad.sum()).tolist()]
@@ -223,18 +228,18 @@ def _causes(triangles: _Triangles, ids: Sequence[str], positions_m: Array, bad: 
         order[[i, k]] = k, i
         if not triangles.bad_pairs(positions_m[order]).any():
             swaps.append(f"the labels {ids[i]} and {ids[k]} are swapped")
-    # Where many a swap explains it, none of them is a finding.
+    # If many swaps explain the contradictions, none of them is reported.
     yield from swaps if len(swaps) <= _MAX_NUM_NAMED else ()
 
 
 def _triangles(log: RangeLog, ids: Sequence[str]) -> _Triangles:
-    """Of ranges taken at one moment, and of ranges between anchors."""
+    """Collect the bounds from simultaneous ranges and from ranges between anchors."""
     index_of = {anchor_id: k for k, anchor_id in enumerate(ids)}
     own = np.array([index_of.get(anchor_id, -1) for anchor_id in log.anchor_ids])
     parts = [*_at_one_moment(log, own)]
     between = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
     ends = own[between.ends].reshape(-1, 2)
-    # As many copies as it takes to be believed: each says more than a triangle.
+    # A range between anchors says more than a triangle, so it is repeated as often as is needed to be believed.
     known, ranges_m = np.repeat(ends, _MIN_TRIANGLES, axis=0), np.repeat(log.range_m[between.rows], _MIN_TRIANGLES)
     parts.append(_Triangles(known, ranges_m - _MAX_ERROR_M, ranges_m + _MAX_ERROR_M))
     pair = np.concatenate([part.pair for part in parts])
@@ -245,13 +250,13 @@ def _triangles(log: RangeLog, ids: Sequence[str]) -> _Triangles:
 
 
 def _at_one_moment(log: RangeLog, own: Indices) -> Iterator[_Triangles]:
-    """One part for each number of ranges by which two of a tag are apart.
+    """Yield the bounds from pairs of ranges of one tag, separately for each lag (number of ranges between the two).
 
     Args:
-        own: (num_anchors,) number of each anchor of the log among those that are compared; -1: it is not.
+        own: (num_anchors,) index of each anchor of the log among the compared ones; -1 for an anchor not compared.
     """
     names = np.array(log.image_name or (), dtype=str)
-    # Photos are moments far apart.
+    # Ranges of different photos are not simultaneous, so photos get times that are far apart.
     times_s = np.unique(names, return_inverse=True)[1] * 1e6 if log.timestamp_s is None else log.timestamp_s
     rows = np.flatnonzero(log.kind == RangeKind.TAG_ANCHOR)
     rows = rows[np.lexsort((times_s[rows], log.tag_index[rows]))]

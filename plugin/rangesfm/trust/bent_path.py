@@ -1,4 +1,4 @@
-"""A path of poses alone, bent back by the ranges on it, so that it is judged where it probably was."""
+"""Correction of a drifting path of poses by its ranges, so that tests see it where it probably was."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from rangesfm.trust.linearized import Linearized, RangesOnMap, linearized, slope
 from rangesfm.trust.testing import Factorization
 
 _MAX_NUM_ROUNDS = 8
-# Of the noise of single ranges: where another round moves less, it is the last.
+# Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
 _STILL = 0.1
 
 
 def bent_to_ranges(on_map: RangesOnMap) -> RangesOnMap:
-    """The map where ranges and random walks together have it, by Gauss-Newton steps; the same if it is of no walk.
+    """Return the map where ranges and the random-walk model of drift together put it, by Gauss-Newton steps.
 
-    However far a path has drifted, what is learnt and tested there is linear about where it was.
+    A map that does not drift as a random walk is returned unchanged. The steps make the linear tests valid even for a
+    path that has drifted far.
     """
     for _ in range(_MAX_NUM_ROUNDS if isinstance(on_map.bending, WalkBending) else 0):
         problem = learnt_at(on_map)
@@ -41,7 +42,7 @@ def bent_to_ranges(on_map: RangesOnMap) -> RangesOnMap:
 
 
 def bends_m(on_map: RangesOnMap) -> Array:
-    """(k,) how far the ranges have bent each pose from where the path came with it; of no walk nothing, (0,)."""
+    """Return (k,) how far the ranges moved each pose from the given path, metres; (0,) for a map that is no walk."""
     walk, scale = on_map.bending, on_map.state.metric_from_model.scale
     if not isinstance(walk, WalkBending) or walk.steps is None:
         return np.zeros(0)
@@ -49,14 +50,16 @@ def bends_m(on_map: RangesOnMap) -> Array:
 
 
 def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: ScaleOptions) -> ScaleEstimate:
-    """The similarity that brings a path nearest to where ranges have bent it back; the same where they have bent it by
-    less than they scatter, so that it is as good as rigid.
+    """Return the estimate with the similarity that brings the path nearest to where the ranges bend it.
+
+    The estimate is returned unchanged if the bending is smaller than the scatter of the ranges, as a rigid path then
+    fits as well.
 
     Args:
-        estimate: of the path as one piece. on_map: as bent back.
+        estimate: of the path as one piece. on_map: the path bent to the ranges.
 
     Raises:
-        GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
+        GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
     """
     posed, solution, bent_by_m = estimate.problem, estimate.solution, bends_m(on_map)
     if posed is None or solution is None or not len(bent_by_m):
@@ -90,7 +93,7 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
 
 
 def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
-    """Return what is known of a path that is where the best weights have it, beside simple weights."""
+    """Return the uncertainty of a path at the estimate with the best weights, compared with simple weights."""
     errors, given, index = problem.errors, posed.ranges, problem.cells.anchor_index
     simple = errors.without(*(set(errors.names) - {"white", *BENDS})).covariance_m2
     simple += given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
@@ -102,7 +105,7 @@ def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
 
 
 def learnt_at(on_map: RangesOnMap) -> Linearized:
-    """Linearised at the map, with the errors that are learnt if no mistake was made."""
+    """Return the linearised map, with the errors learnt under the assumption that no mistake was made."""
     problem = linearized(on_map)
     nothing = np.zeros((len(problem.residual_m), 0)), np.zeros((problem.num_priors, 0))
     return problem.with_learnt_errors(*nothing)
@@ -122,7 +125,7 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
 
 
 def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> RangesOnMap:
-    """The ranges where they were taken on another path."""
+    """Return the ranges moved along from one path to another."""
     at, problem = on_map.on_path, on_map.problem
     moved = after.path.centers - before.path.centers
     turned = after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)

@@ -1,4 +1,4 @@
-"""The catalogue of mistakes: each hypothesis in one place. One that is added here is tested, named and told."""
+"""The catalogue of mistakes that last for the whole survey. Every hypothesis added here is tested and reported."""
 
 from __future__ import annotations
 
@@ -23,31 +23,32 @@ from rangesfm.trust.hypothesis import (
 from rangesfm.trust.linearized import Linearized
 
 _SAME_HEIGHT_M = 1e-3
-# Of an anchor's ranges: where they follow the distance by less, they hardly change at all.
+# Growth of an anchor's ranges per metre of distance below which they hardly change with the distance.
 _STUCK = 0.3
-# Along a camera; of an anchor, beside what is drawn on any sketch of the site.
+# Largest mistakes, in metres, that nobody notices: along a camera, and of an anchor on a sketch of the site.
 MISMEASURED_M, UNSEEN_MOVE_M = 0.2, 1.0
-# Seconds a second: a quartz of either device is good to 100 ppm over its temperatures and its years.
+# Largest clock drift, seconds per second. A quartz stays within 100 ppm over temperature and age, and there are two.
 _MOST_CLOCK_DRIFT = 2e-4
-# Of all distances, of an anchor's, and of coordinates: feet, and ranges of both ways, are tried as such.
+# Largest errors proportional to the distance, for all ranges and for one anchor's, as shares. The first also limits the
+# scale of coordinates. Larger factors, as from feet or two-way ranges, are tried as alternatives.
 _MOST_SHARE, _MOST_SHARE_OF_ANCHOR = 0.5, 2.0
-# Of anything that is carried or driven, from the lens to where a tag may sit.
+# Largest distance between the lens and a tag on anything that is carried or driven.
 _LARGEST_RIG_M = 3.0
-# By which a radio's delays wander as it warms up, far beyond any that was seen.
+# Largest change of a radio's delay as it warms up, far more than was ever seen.
 _MOST_WARMING_M = 5.0
-# Of whoever carries the camera: the way round a body, and the weak signal's late detection.
+# Largest excess of a range past the person with the camera: the way round the body, and a weak signal found late.
 _MOST_BODY_M = 2.0
 _MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
 
 
 def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
-    """An anchor is not where its coordinates say."""
+    """Yield for each given anchor: it is not where its coordinates say."""
     return (_anchor_place(problem, k) for k in problem.heard if is_given(problem, k))
 
 
 def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     name, at = problem.on_map.anchor_ids[k], problem.on_map.problem.anchor_mean_m[k]
-    # It is within its ranges of the path, wherever it is said to be.
+    # The anchor must be within its ranges of the path, wherever its coordinates put it.
     most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.cells.anchor_index == k]))
 
     def unknown(_: Array) -> Correction:
@@ -87,7 +88,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
 
 
 def anchor_biases(problem: Linearized) -> Iterator[Hypothesis]:
-    """The ranges of one anchor, or of all, are off by a constant, by more than is usual."""
+    """Yield for each anchor and for all together: ranges have a constant error, larger than usual."""
     for k in problem.heard if len(problem.heard) > 1 else []:
         yield _bias(problem, [k], "anchor bias", problem.on_map.anchor_ids[k], f"anchor {problem.on_map.anchor_ids[k]}")
     yield _bias(problem, problem.heard, "common bias", "", "every anchor")
@@ -108,7 +109,7 @@ def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whos
 
 
 def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
-    """Ranges grow by more or less than the distance does."""
+    """Yield for all ranges and for each anchor's: they grow by more or less than the distance does."""
     distance_m = problem.on_map.problem.range_m
     yield Hypothesis(
         "range share",
@@ -132,7 +133,7 @@ def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
 
     def words(size: Array) -> str:
         if 1 + size[0] < _STUCK:
-            return f"the ranges to anchor {name} hardly change with the distance: it reads nearly the same always"
+            return f"the ranges to anchor {name} hardly change with the distance: they are always nearly the same"
         return f"the ranges to anchor {name} grow by {1 + size[0]:.2f} m for each metre of distance"
 
     def level(size: Array) -> Correction:
@@ -155,7 +156,7 @@ def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
 
 
 def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
-    """The anchors' coordinates are in a unit that is not quite the metre."""
+    """Yield: the anchors' coordinates are in a unit that is not quite the metre."""
     given_m, ids = problem.on_map.problem.anchor_mean_m, problem.on_map.anchor_ids
     known = np.flatnonzero(np.isfinite(given_m).all(axis=1)).tolist()
     if len(known) < 2 or not any(is_given(problem, k) for k in known):
@@ -180,7 +181,7 @@ def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
 
 
 def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
-    """All anchors are given one height, and do not have it."""
+    """Yield: the anchors were all given the same height, which is not true."""
     given_m, ids = problem.on_map.problem.anchor_mean_m, problem.on_map.anchor_ids
     known = [k for k in problem.heard if np.isfinite(given_m[k]).all()]
     if len(known) < 3 or np.ptp(given_m[known, 2]) > _SAME_HEIGHT_M or not all(is_given(problem, k) for k in known):
@@ -190,7 +191,7 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
         "anchor heights",
         Effect.of_all([of_anchor_place(problem, k, up[:, None]) for k in known]),
         words=lambda size: (
-            f"the anchors are all given a height of {given_m[known[0], 2]:g} m where heights fit that "
+            f"all anchors are given the same height, {given_m[known[0], 2]:g} m, but the ranges fit heights that "
             f"differ by {np.ptp(size):.1f} m"
         ),
         remedy="measure the heights of the antennas",
@@ -202,17 +203,17 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
 
 
 def to_other_side_m(lever_arm_m: float) -> float:
-    """Return how far it is from a tag to the other side of its camera, for a hand that measures or a tag that slips."""
+    """Return the distance from a tag to the other side of its camera, plus an error of measurement, in metres."""
     return MISMEASURED_M + 2 * lever_arm_m
 
 
 def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
-    """The tag is elsewhere on the camera."""
+    """Yield for each tag: it is elsewhere on the camera."""
     return (_lever_arm(problem, k) for k in np.unique(problem.cells.tag_index).tolist())
 
 
 def lever_arm_m(problem: Linearized, tag: int | None = None) -> float:
-    """Return the length of a tag's lever arm as it is given, or that of the longest one."""
+    """Return the given length, metres, of a tag's lever arm, or of the longest one."""
     on_map = problem.on_map
     arms_m = np.linalg.norm(on_map.problem.tag_from_center, axis=1)
     tags = np.unique(on_map.tag_index) if tag is None else [tag]
@@ -244,7 +245,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
 
 
 def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
-    """The radio's delay grows or shrinks all the time, by more than radios drift."""
+    """Yield: the radio's delay changes steadily, by more than radios drift."""
     of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
     lasts, unit = float(np.ptp(of_ranges)), "s" if problem.by_time is not None else "m of the path"
 
@@ -264,7 +265,7 @@ def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
 
 
 def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
-    """Whoever carries the camera stands between the tag and the anchors behind."""
+    """Yield: a person who carries the camera blocks the signals of anchors behind."""
     on_map = problem.on_map
     is_behind = np.sum(on_map.from_anchor_m * on_map.world_from_cam[:, :, 2], axis=1) > 0
     yield Hypothesis(
@@ -280,7 +281,7 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
 
 
 def clocks(problem: Linearized) -> Iterator[Hypothesis]:
-    """The clocks of camera and radio differ otherwise than assumed."""
+    """Yield: the offset or the rate between the clocks of camera and radio differs from what is assumed."""
     if problem.by_time is None:
         return
     of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()

@@ -1,6 +1,7 @@
-"""What speaks against a finished map, whatever its scale's interval says; and how far to trust its place.
+"""Faults of a finished map that its scale's interval does not show, and the uncertainty of its place.
 
-A refined map is first compared with the scaled one that the refinement began with: it may have broken it.
+A refined map is first compared with the scaled map that the refinement started from, because the refinement may have
+broken it.
 """
 
 from __future__ import annotations
@@ -22,27 +23,27 @@ from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate
 from rangesfm.scale.verdict import DOUBTFUL_ABOVE
 
-# Prior stddevs that a coordinate may be off: by chance one in two thousand is.
+# Largest deviation of an anchor's coordinate, in prior standard deviations: chance exceeds it once in two thousand.
 _MAX_STDDEVS = 3.5
-# Noise of UWB radios in the open is 0.02 to 0.3 m.
+# Largest noise of ranges, metres. UWB radios in the open have 0.02 to 0.3 m.
 _MAX_NOISE_M = 0.4
-# Share of an anchor's ranges below which it had no say, and how many it takes to speak of a share.
+# An anchor is reported if less than this share of its ranges was used, and it has at least this many ranges.
 _MIN_USED, _MIN_RANGES = 0.5, 10
 _CHECK_ANCHOR = "measure the anchors again, and see that each stands in the open and has its own label"
-# What the solver may pay in pixels is bounded (see ``_max_growth``); that bound is of sums of squares, and compared are
-# medians, which know nothing of a few large ones.
+# Allowance for comparing medians: ``_max_growth`` bounds sums of squares, while medians ignore a few large errors.
 _OF_MEDIANS = 1.5
-# In errors typical before: of one that is large. Of so many more points, it is not a matter of a few.
+# An error is large if it exceeds this many typical errors before the refinement. An increase of the share of points
+# with large errors by more than the second number is not due to a few points.
 _LARGE, _MANY_MORE = 10.0, 0.05
-# Of the median distance of the points from the middle of the path.
+# Largest growth of the median distance of the points from the middle of the path.
 _MAX_POINTS_GROWTH = 2.0
-# Of the median residual of the ranges, or of their stddev: a refinement brings them nearer.
+# Largest growth of the median residual of the ranges, or of their standard deviation; a refinement should reduce it.
 _MAX_RESIDUAL_GROWTH = 2.0
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """What speaks against a map, and what to do about it."""
+    """A fault of a map, and what to do about it."""
 
     reason: str
     advice: str
@@ -50,14 +51,14 @@ class Doubt:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the map is in the site's frame, and how far to trust that.
+    """The map's place in the site's frame, with its uncertainty.
 
     Attributes:
         verdict: "good" or "doubtful".
         reasons: why, in words.
-        stddev_m: (3,) of the map's middle, in x, y, z.
-        heading_stddev_deg: of the map's turn about z.
-        worst_keyframe_stddev_m: of the keyframe whose position is least certain: root of its summed variances.
+        stddev_m: (3,) standard deviations of the map's middle in x, y, z.
+        heading_stddev_deg: standard deviation of the map's rotation about z.
+        worst_keyframe_stddev_m: of the keyframe with the least certain position: root of its summed variances.
     """
 
     verdict: str
@@ -74,13 +75,13 @@ def doubts_of_map(
     *,
     noise_is_given: bool,
 ) -> tuple[Doubt, ...]:
-    """What speaks against a finished map, each with its numbers; empty if nothing does.
+    """Return the faults of a finished map, each with its numbers; empty if there are none.
 
     Args:
         estimate: of the scale.
         summary: of the refinement; None for a map that is only scaled.
         points: of the final model.
-        noise_is_given: somebody said how much the ranges scatter.
+        noise_is_given: whether the user gave the scatter of the ranges.
     """
     stage = estimate if summary is None else summary
     noise_m = np.full(len(stage.observations.log), np.nan) if noise_is_given else stage.errors.stddev_m
@@ -110,7 +111,7 @@ def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Dou
 
 
 def _surveyed(anchors: Sequence[AnchorEstimate]) -> Iterator[tuple[str, Array, float]]:
-    """Of anchors that were measured, and not exactly: the id, how far each went from there (3,), and its stddev."""
+    """Yield surveyed anchors that may move: id, displacement from the surveyed position (3,), standard deviation."""
     for anchor in anchors:
         prior_m, stddev_m = anchor.prior_position_m, anchor.prior_position_stddev_m
         if prior_m is not None and 0 < stddev_m < np.inf:
@@ -118,7 +119,7 @@ def _surveyed(anchors: Sequence[AnchorEstimate]) -> Iterator[tuple[str, Array, f
 
 
 def _of_fit(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doubt]:
-    """Of points that do not fit the photos, and of the solver."""
+    """Yield doubts about points that do not fit the photos, and about the convergence of the refinement."""
     if not points.fit:
         yield Doubt(points.apart("the map"), MISMATCHED)
     if summary is not None and not summary.converged:
@@ -129,7 +130,7 @@ def _of_fit(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doub
 
 
 def _of_say(observations: RangeObservations) -> Iterator[Doubt]:
-    """Anchors of whose ranges most were left out."""
+    """Yield doubts about anchors most of whose ranges were left out."""
     log, took_part = observations.log, observations.has_place
     for k, anchor_id in enumerate(log.anchor_ids):
         of_anchor = took_part & (log.anchor_index == k)
@@ -143,7 +144,7 @@ def _of_positions(anchors: Sequence[AnchorEstimate]) -> Iterator[Doubt]:
         worst = int(np.argmax(np.abs(moved_m)))
         if abs(moved_m[worst]) > _MAX_STDDEVS * stddev_m:
             reason = (
-                f"anchor {anchor_id} fits {abs(moved_m[worst]):.2f} m from where it was surveyed (along "
+                f"anchor {anchor_id} fits best {abs(moved_m[worst]):.2f} m from its surveyed position (along "
                 f"{'xyz'[worst]}), {abs(moved_m[worst]) / stddev_m:.2g} of its stddevs"
             )
             yield Doubt(reason, _CHECK_ANCHOR)
@@ -161,7 +162,7 @@ def _of_noise(observations: RangeObservations, noise_m: Array) -> Iterator[Doubt
     if not noisy:
         return
     whose = "the ranges" if len(noisy) == len(of_anchors) else f"the ranges to {', '.join(noisy)}"
-    reason = f"{whose} scatter by {max(noisy.values()):.2f} m, where UWB radios do by 0.02 to 0.3 m"
+    reason = f"{whose} scatter by {max(noisy.values()):.2f} m; UWB radios scatter by 0.02 to 0.3 m"
     remedy = "check the unit of the ranges and the radio's calibration (rangesfm ranges calibrate)"
     yield Doubt(reason, f"{remedy}; if this radio is so coarse, say so (range_stddev_m)")
 
@@ -173,13 +174,13 @@ def place_of_map(
     doubts: Sequence[Doubt],
     bent_by_m: Array,
 ) -> Place | None:
-    """How far to trust the place of a map in the site's frame; None where its frame is the first camera's.
+    """Return the map's place in the site's frame with its uncertainty; None if the frame is the first camera's.
 
     Args:
         summary: of the refinement; None for a map that is only scaled.
-        centers_m: (n, 3) of the keyframes in the final map, the first in time first.
-        doubts: of the map; its place is no better.
-        bent_by_m: (n,) how far ranges would bend each keyframe of a map that is only scaled; (0,) if nobody looked.
+        centers_m: (n, 3) keyframe centres in the final map, the first in time first.
+        doubts: about the map; with any of them its place is doubtful too.
+        bent_by_m: (n,) how far the ranges would bend each keyframe of a map that is only scaled; (0,) if unknown.
     """
     if estimate.placement is None:
         return None
@@ -196,7 +197,7 @@ def place_of_map(
         f"the map's place is known to {np.linalg.norm(stddevs[4:]):.2g} m, its heading to {heading_deg:.2g} deg, each "
         f"keyframe to {worst_m:.2g} m or better (1 stddev)"
     )
-    # The scale's own limit, of the site's size and of a radian: no length in the map and no place in it is worse.
+    # The scale's own limit, applied to the site's size and to a radian: then no length and no place is less certain.
     is_wide = NORMAL_95 * worst_m > DOUBTFUL_ABOVE * size_m or NORMAL_95 * stddevs[3] > DOUBTFUL_ABOVE
     reasons = (*((summary_of_place,) if is_wide or not doubts else ()), *(doubt.reason for doubt in doubts))
     x_m, y_m, z_m = stddevs[4:].tolist()
@@ -204,7 +205,7 @@ def place_of_map(
 
 
 def by_similarity(placement: Array, centers_m: Array) -> tuple[Array, Array]:
-    """(7, 7) about the middle of the centres and (n, 3, 3) of each, of a map that is one piece."""
+    """Return the covariance (7, 7) about the middle of the centres and (n, 3, 3) of each, for a rigid map."""
     from_first = similarity_motions(centers_m - centers_m[0])
     to_middle = np.eye(7)
     to_middle[4:] = from_first.mean(axis=0)
@@ -219,12 +220,12 @@ def why_broken(
     summary: RefineSummary,
     range_loss_scale: float,
 ) -> tuple[str, ...]:
-    """What a refined map cannot be; empty if nothing speaks against it.
+    """Return the signs that a refinement broke the map; empty if there are none.
 
     Args:
-        scaled, refined: before and after, in the same metric world.
+        scaled, refined: the map before and after, in the same metric world.
         trajectory: of the keyframes, in any world.
-        range_loss_scale: of the refinement's options.
+        range_loss_scale: as in the refinement's options.
     """
     before, after = point_errors(scaled), point_errors(refined)
     old, new = (trajectory.as_in(model).centers for model in (scaled, refined))
@@ -236,10 +237,10 @@ def why_broken(
 
 
 def _max_growth(scaled: pycolmap.Reconstruction, summary: RefineSummary, range_loss_scale: float) -> float:
-    """By how much the typical reprojection error may grow.
+    """Return the factor by which the typical reprojection error may grow.
 
-    The solver only goes down, and the loss of a range is bounded by half the square of its scale c: so n ranges can pay
-    for at most n c^2 in squared pixel stddevs, which spread over the 2 N coordinates of N observations.
+    The solver only reduces the cost, and the loss of a range is bounded by half the square of its scale c. So n ranges
+    can outweigh at most n c^2 in squared pixel standard deviations, spread over the 2 N coordinates of N observations.
     """
     num_ranges = int(np.count_nonzero(summary.observations.status <= RangeStatus.OUTLIER))
     num_coordinates = 2 * max(scaled.compute_num_observations(), 1)
@@ -265,20 +266,20 @@ def _out_of_line(before: PointErrors, after: PointErrors, summary: RefineSummary
 
 
 def _elsewhere(old_points: Array, new_points: Array) -> Iterator[str]:
-    """Points, from the path's middle."""
-    # Those on the horizon may go where they like, half of all may not.
+    """Yield a reason if points moved away; both sets are relative to the path's middle, metres."""
+    # Points near the horizon may move far, but not half of all points.
     old_m, new_m = (np.median(np.linalg.norm(of, axis=1)) if len(of) else 0.0 for of in (old_points, new_points))
     if len(old_points) and new_m > _MAX_POINTS_GROWTH * old_m:
         yield f"the points were thrown away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
 
 
 def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:
-    """Ranges that were lost, and surveyed anchors that ended elsewhere altogether: by more than the path is large."""
+    """Yield reasons if the ranges no longer fit, or a surveyed anchor moved by more than the extent of the path."""
     if estimate.solution is not None:
         old_m = float(np.median(np.abs(estimate.solution.fit.residuals_m)))
         new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
         if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
-            yield f"ranges and map are {new_m:.2g} m apart (median), where they were {old_m:.2g} m"
+            yield f"the difference of ranges and map grew from {old_m:.2g} to {new_m:.2g} m (median)"
     size_m = float(np.linalg.norm(path_shape(path_m).stddevs))
     for anchor_id, moved_m, stddev_m in _surveyed(summary.anchors):
         if (far_m := float(np.linalg.norm(moved_m))) > max(size_m, 10 * stddev_m):

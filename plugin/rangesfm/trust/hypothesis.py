@@ -1,4 +1,4 @@
-"""Hypothesis: one mistake that may have been made, all that is to be said of it, and what would correct it."""
+"""Hypothesis: one possible mistake, its effect on the residuals, its texts and its correction."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from rangesfm.arrays import Array, Mask
 from rangesfm.trust.linearized import Linearized, RangesOnMap
 
-# In the unit of a hypothesis: for a slope between two of its sizes.
+# Step, in the unit of a hypothesis, of the difference quotient for its effect.
 _SMALL = 1e-4
 
 
 @dataclass(frozen=True)
 class Correction:
-    """How the input is to be changed if a mistake was made.
+    """Changes of the input that undo a mistake.
 
     Attributes:
-        anchors_m: other positions by id; None: the anchor counts as unknown.
-        tag_moves_m: by which lever arms are longer, by id.
-        time_shift_s: that the ranges were taken later.
-        left_out: (n,) ranges of the map that do not count.
-        longer_m: (n,) by how much they read too long.
+        anchors_m: corrected positions, (3,) by id; None: the anchor counts as unknown.
+        tag_moves_m: (3,) additions to lever arms in the camera's frame, by tag id.
+        time_shift_s: addition to the times of the ranges, one for all or (n,).
+        left_out: (n,) mask of ranges that are not used.
+        longer_m: (n,) amounts by which the ranges are too long.
     """
 
     anchors_m: Mapping[str, Array | None] = field(default_factory=dict)
@@ -35,11 +35,11 @@ class Correction:
 
 @dataclass(frozen=True)
 class Effect:
-    """What k numbers change.
+    """Derivatives of the residuals by the k numbers of a mistake.
 
     Attributes:
-        columns: (c, k) how the residuals of the cells differ for one unit of each.
-        priors: (r, k) likewise, of what is known beforehand.
+        columns: (c, k) for the residuals of the cells, metres per unit.
+        priors: (r, k) for the residuals of the priors, in standard deviations per unit.
     """
 
     columns: Array
@@ -47,34 +47,33 @@ class Effect:
 
     @classmethod
     def of_all(cls, parts: Sequence[Effect]) -> Effect:
-        """Each with numbers of its own."""
+        """Join effects that have numbers of their own."""
         return cls(np.hstack([part.columns for part in parts]), np.hstack([part.priors for part in parts]))
 
     @classmethod
     def of_sum(cls, parts: Sequence[Effect]) -> Effect:
-        """All by the same numbers."""
+        """Add effects that share the same numbers."""
         return cls(np.sum([part.columns for part in parts], axis=0), np.sum([part.priors for part in parts], axis=0))
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake that k numbers describe.
+    """A mistake described by k numbers.
 
     Attributes:
-        name: the same for all of one kind. subject: which of them; an anchor's id, a time.
+        name: of its kind. subject: which one of the kind, such as an anchor's id; may be empty.
         effect: on the residuals.
-        words: of an estimate (k,): what is probably the case.
+        words: returns for an estimate (k,) what is probably the case.
         remedy: what to measure or to change.
-        correction: of an estimate, what undoes it.
-        most: the largest size that can happen, the length of the vector of numbers, in their unit. An estimate beyond
-            it is not this mistake.
+        correction: returns for an estimate the changes that undo the mistake.
+        most: largest possible size, as the length of the vector of numbers. A larger estimate is not this mistake.
         unit: of the numbers.
-        adoption: what takes its place where the mistake is adopted; None: the correction itself.
-        unawares: beyond which nobody makes it without seeing it, in its unit: a larger one need not be feared.
-        finer: the same at times between those that are looked at; None: it is of no time.
-        narrower: of fewer numbers, which explain as much if the mistake was of their kind.
+        adoption: returns the changes to make if the mistake is adopted; None: those of ``correction``.
+        unawares: a mistake larger than this is noticed without a test, so it need not be feared.
+        finer: yields the same mistake at times between those that are searched; None if it has no time.
+        narrower: hypotheses with fewer numbers, which explain as much if the mistake was of their kind.
         is_linear: whether one step finds its size, however large it is.
-        is_in_interval: whether the scale's interval counts how large it usually is, or it changes what a metre is.
+        is_in_interval: whether the scale's interval already includes its usual size, or it changes the unit of length.
     """
 
     name: str
@@ -93,7 +92,7 @@ class Hypothesis:
     is_in_interval: bool = False
 
     def at_size(self, problem: Linearized, sizes: Array) -> Hypothesis:
-        """With its effect about an estimate, by what would correct it: that of a large mistake is not linear."""
+        """Return the hypothesis with its effect linearised about an estimate, as large mistakes are not linear."""
         longer_m = self.correction(sizes).longer_m
         if longer_m is None:
             return self
@@ -102,12 +101,12 @@ class Hypothesis:
         return replace(self, effect=of_cells(problem, -problem.cells.mean(np.stack(slopes, axis=1))))
 
     def can_be(self, sizes: Array) -> bool:
-        """Return whether a mistake of this size (k,) can happen."""
+        """Return True if a mistake of this size (k,) is possible."""
         return bool(np.linalg.norm(sizes) <= self.most)
 
     @property
     def most_unnoticed(self) -> float:
-        """The largest size that can happen and that nobody sees without a test."""
+        """Largest possible size that nobody notices without a test."""
         return min(self.most, self.unawares)
 
     @property
@@ -120,21 +119,21 @@ class Hypothesis:
 
 
 def of_cells(problem: Linearized, columns: Array) -> Effect:
-    """What a mistake changes that has no part in what is known beforehand."""
+    """Return an effect on the cells alone, without a part in the priors."""
     columns = columns.reshape(len(problem.residual_m), -1)
     return Effect(columns, np.zeros((problem.num_priors, columns.shape[1])))
 
 
 def is_given(problem: Linearized, anchor: int) -> bool:
-    """Whether somebody said where an anchor is."""
+    """Return True if an anchor's position was given."""
     given = problem.on_map.problem
     return bool(np.isfinite(given.anchor_mean_m[anchor]).all() and np.isfinite(given.anchor_stddev_m[anchor]))
 
 
 def longest_m(problem: Linearized, anchor: int | None = None) -> float:
-    """Return the longest range to an anchor, or of all.
+    """Return the longest range to one anchor, or to any.
 
-    No range reads longer by more than itself, and no radio reaches twice as far as it was ever heard.
+    It bounds the errors of ranges and positions: no range is too long by more than itself.
     """
     given = problem.on_map.problem
     is_of = slice(None) if anchor is None else given.anchor_index == anchor
@@ -142,12 +141,12 @@ def longest_m(problem: Linearized, anchor: int | None = None) -> float:
 
 
 def duration_s(problem: Linearized) -> float:
-    """Return how long there are ranges: clocks that differ by more have no moment in common."""
+    """Return the time between the first and the last range; clocks that differ by more have no moment in common."""
     return float(np.ptp(problem.on_map.time_s))
 
 
 def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effect:
-    """That an anchor whose place is given is off by numbers times directions (3, k), towards where it is."""
+    """Return the effect of an anchor that is off its given position along directions (3, k), towards its true place."""
     stddev_m = problem.on_map.problem.anchor_stddev_m
     if problem.columns.anchor[anchor] < 0:
         is_of = (problem.cells.anchor_index == anchor)[:, None]
@@ -160,7 +159,7 @@ def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effe
 
 
 def longer(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:
-    """What undoes that some ranges read longer by a constant."""
+    """Return the function that corrects some ranges for a constant error, given its size."""
     return lambda size: Correction(longer_m=np.where(rows(), size[0], 0.0))
 
 
@@ -173,7 +172,7 @@ def in_axes(shift: Array) -> str:
 
 
 def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
-    """The same ranges, with anchors, lever arms, times and lengths as they would be; none is left out."""
+    """Return the ranges with anchors, lever arms, times and lengths corrected; ``left_out`` is not applied."""
     problem, mean_m = on_map.problem, on_map.problem.anchor_mean_m.copy()
     anchors_m = on_map.state.anchors_m.copy()
     for name, position in correction.anchors_m.items():
@@ -195,7 +194,10 @@ def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
 
 
 def _taken_later(on_map: RangesOnMap, shift_s: Array, velocity: Array) -> RangesOnMap:
-    """Each range where the one was taken that is nearest to its own time, and on by the velocity (n, 3) there."""
+    """Return the ranges moved along the path to later times.
+
+    Each takes the place of the range nearest to its new time, extrapolated by the velocity (n, 3) there.
+    """
     problem, taken_s = on_map.problem, on_map.time_s + shift_s
     order = np.argsort(on_map.time_s, kind="stable")
     rising_s = on_map.time_s[order]

@@ -17,10 +17,10 @@ _MEASURE_AGAIN = "look whether it was mistyped, or measure it again"
 
 
 def trust_in_lengths(estimate: ScaleEstimate, tape: Tape | None) -> TrustVerdict:
-    """What is found of them; nothing where there are none.
+    """Return the tests of measured lengths; empty if there are none.
 
     Args:
-        tape: as the scale was estimated with, with the rows of ``estimate.lengths``.
+        tape: the lengths that the scale was estimated with; ``estimate.lengths`` refers to its rows.
     """
     lengths = estimate.lengths
     if lengths is None or tape is None:
@@ -36,7 +36,7 @@ def trust_in_lengths(estimate: ScaleEstimate, tape: Tape | None) -> TrustVerdict
     either = [f"either {'; or '.join(open_words)}: {_MEASURE_AGAIN}"] if open_words else []
     against = list(_against_ranges(estimate))
     reasons = (*left_out, *either, *(f"{row.words}: {row.remedy}" for row in against if row.rejected))
-    # Of printed tags only what was found: their sides are as many as they are alike.
+    # Printed tags are shown only if something was found: their sides are many and alike.
     told = [row for row, one in zip(rows, taped, strict=True) if row.rejected or not one.is_printed]
     told.sort(key=lambda row: row.threshold - row.statistic)
     return TrustVerdict((*told, *against), reasons)
@@ -53,8 +53,8 @@ def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[Mista
             between,
             float(lengths.statistic[k]),
             lengths.threshold,
-            words=f"the length from {between}, given as {one.distance_m:.3f} m, is {size_m:+.3f} m off what the others "
-            f"make of it, {one.distance_m - size_m:.3f} m",
+            words=f"the length from {between} is given as {one.distance_m:.3f} m, but the other lengths give "
+            f"{one.distance_m - size_m:.3f} m ({size_m:+.3f} m)",
             remedy=_MEASURE_AGAIN,
             unit="m",
             size=size_m if is_known else None,
@@ -65,7 +65,7 @@ def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[Mista
 
 
 def _against_ranges(estimate: ScaleEstimate) -> Iterator[MistakeTest]:
-    """The scale by both kinds."""
+    """Yield the test that compares the scale from lengths with the scale from ranges."""
     ranges, lengths = (estimate.by_kind.get(kind) for kind in ("ranges", "lengths"))
     if ranges is None or lengths is None:
         return
@@ -77,8 +77,8 @@ def _against_ranges(estimate: ScaleEstimate) -> Iterator[MistakeTest]:
         "",
         (apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
         float(special.chdtri(1, FALSE_ALARMS)),
-        words=f"by the measured lengths the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the ranges, which "
-        f"both together explain to {100 * stddev:.1f} % (1 stddev)",
+        words=f"by the measured lengths the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the ranges; their "
+        f"errors together explain {100 * stddev:.1f} % (1 stddev)",
         remedy="measure a length again, and calibrate the radio (rangesfm ranges calibrate)",
         unit="1",
         size=apart,

@@ -1,4 +1,4 @@
-"""RangesOnMap, the ranges of a survey on its scaled map, and Linearized: what every test of a mistake looks at."""
+"""RangesOnMap, the ranges of a survey on its scaled map, and Linearized, the linear problem that all tests use."""
 
 from __future__ import annotations
 
@@ -32,19 +32,21 @@ from rangesfm.scale.range_equation import (
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.uncertainty import ruled_out, times_of_ranges
 
-# The tests learn the errors many times over: fewer cells than an interval has.
+# Fewer cells than for an interval, because the tests learn the errors many times.
 _MAX_NUM_CELLS = 160
 _NUM_NEIGHBOURS = 8
-# In stddevs from the median of its neighbours, of which the noise is at least this: what is further off is an outlier
-# among them. A radio may repeat itself to a centimetre and err by ten from one place to the next.
+# A range farther than this many standard deviations from the median of its neighbours is an outlier among them. For
+# this the noise counts as _LEAST_SCATTER_M or more: a radio may repeat itself to a centimetre and still err by ten from
+# one place to the next.
 _OUTLYING = 3.0
 _LEAST_SCATTER_M = 0.08
 _NO_WEIGHT = 1e-6
-# What the ranges to each anchor, and those to all, drift by in a minute, as hands and bodies move, however little a
-# survey shows of the radio's own drift (a component that is learnt, to nothing where steps are allowed to explain it):
-# too slow to be told from a step that is looked for.
+# Standard deviation and correlation time of a slow wandering of the ranges, for each anchor and for all, as hands and
+# bodies move. It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where
+# steps may explain it. It is too slow to be confused with a step.
 _WANDERING_M, _WANDERING_S = 0.025, 60.0
-# In spreads over radios: what errs by more than that is no radio but a mistake, which shall not pass for noise.
+# Limit on learnt errors, in standard deviations of their spread over radios: more is a mistake and must not pass for
+# noise.
 _MOST_UNUSUAL = 3.0
 
 
@@ -53,17 +55,18 @@ class RangesOnMap:
     """n ranges that took part in an estimate, and its state.
 
     Attributes:
-        problem: with stddevs of 1, so that its residuals and Jacobians are in metres.
+        problem: with standard deviations of 1, so that its residuals and Jacobians are in metres.
         state: the estimate.
-        model_from_cam: (n, 3, 3) into the model's world.
-        velocity: (n, 3) of the camera there, model units per second; None where ranges have no times.
-        time_s: (n,) on the radio's clock; where the log names photos, the way along the path in metres.
-        tag_index: (n,). tag_ids, anchor_ids: by index. order_given: of the anchors in their file.
-        rows: (n,) of the log.
-        weights: (n,) robust weights by which the estimate took them.
-        placing_m: (n,) stddev of each coordinate of the antenna's place. gap: (n,) the gap that each range is from.
-        curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
-        on_path: where they were taken. bending: of the map; None: it is not bent.
+        model_from_cam: (n, 3, 3) rotations into the model's world.
+        velocity: (n, 3) camera velocities, model units per second; None where ranges have no times.
+        time_s: (n,) on the radio's clock; where the log names photos, from the distance walked (see
+            ``uncertainty.times_of_ranges``).
+        tag_index: (n,). tag_ids, anchor_ids: by index. order_given: anchors in the order of their file.
+        rows: (n,) rows of the log.
+        weights: (n,) robust weights in the estimate.
+        placing_m: (n,) standard deviation of each coordinate of the antenna. gap: (n,) the keyframe gap of each range.
+        curve_stddev_m: (n,) of a learnt error curve that was subtracted from the ranges; None if none was.
+        on_path: where the ranges were taken. bending: of the map; None: the map is not bent.
     """
 
     problem: RangeProblem
@@ -85,19 +88,19 @@ class RangesOnMap:
 
     @property
     def world_from_cam(self) -> Array:
-        """(n, 3, 3) in the metric world."""
+        """(n, 3, 3) rotations of the cameras into the metric world."""
         turned: Array = np.einsum("ij,njk->nik", self.state.metric_from_model.rotation, self.model_from_cam)
         return turned
 
     @property
     def residual_m(self) -> Array:
-        """(n,) predicted minus measured, with biases as they are known beforehand."""
+        """(n,) predicted minus measured range, metres, with the prior means of the biases."""
         biases_m = self.problem.bias_mean_m[self.problem.anchor_index]
         return np.asarray(np.linalg.norm(self.from_anchor_m, axis=1) + biases_m - self.problem.range_m)
 
     @property
     def from_anchor_m(self) -> Array:
-        """(n, 3) from each range's anchor to its tag, in the metric world."""
+        """(n, 3) vectors from each range's anchor to its tag, in the metric world."""
         tags_m = tag_positions(self.problem, self.state.metric_from_model)
         return np.asarray(tags_m - self.state.anchors_m[self.problem.anchor_index])
 
@@ -109,7 +112,7 @@ def ranges_on_map(
     trajectory: Trajectory,
     bending: MapBending | None,
 ) -> RangesOnMap:
-    """At a solution, on the path as its problem has it."""
+    """Collect the ranges of a problem at its solution."""
     log, rows = observations.log, posed.rows
     return RangesOnMap(
         problem=replace(posed.ranges, stddev_m=np.ones(len(rows)), share=None),
@@ -133,20 +136,20 @@ def ranges_on_map(
 
 @dataclass(frozen=True)
 class Linearized:
-    """c cells of ranges and r priors, by p parameters. What ranges are off by for each anchor's sake is random.
+    """The linear problem of c cells of ranges and r priors with p parameters; the anchors' biases are random errors.
 
     Attributes:
-        residual_m: (c,) predicted minus measured, where the photos alone would have the map.
-        design: (c, p) its derivative.
-        prior_residual, prior_design: (r,) and (r, p), in stddevs; first those of the anchors' places.
-        columns: which of the p parameters is what; the first is the logarithm of the scale.
-        place: (c, 3, p) derivative of the camera's place in each cell.
-        cells: how ranges form them. time_s: (c,) as of the ranges.
+        residual_m: (c,) predicted minus measured, on the map as the photos alone would have it.
+        design: (c, p) Jacobian of the residuals.
+        prior_residual, prior_design: (r,) and (r, p), in standard deviations; first those of the anchors' positions.
+        columns: position of each parameter; the first is the logarithm of the scale.
+        place: (c, 3, p) derivative of the camera's position in each cell.
+        cells: how ranges are averaged. time_s: (c,) mean times.
         gradient: of the c distances.
-        by_lever_arm: (c, 3) derivative of the residual by the tag's place in the camera.
-        by_time: (c,) by the clocks' offset; None without clocks.
-        on_map: the ranges. scatter_m: stddev of one among its neighbours.
-        expected: of the errors, before anything is measured. errors: what is assumed random.
+        by_lever_arm: (c, 3) derivative of the residual by the lever arm in the camera's frame.
+        by_time: (c,) derivative by the clocks' offset; None without times.
+        on_map: the ranges. scatter_m: standard deviation of a range among its neighbours.
+        expected: errors to expect before anything is measured. errors: the errors assumed random.
     """
 
     residual_m: Array
@@ -171,13 +174,17 @@ class Linearized:
 
     @property
     def heard(self) -> list[int]:
-        """The anchors that there are ranges to."""
+        """Indices of the anchors that have ranges."""
         anchors: list[int] = np.unique(self.cells.anchor_index).tolist()
         return anchors
 
     def with_learnt_errors(self, columns: Array, priors: Array) -> Linearized:
-        """With what is left random when (c, k) columns and (r, k) priors explain what they can."""
-        # At the place where nothing speaks against what is known beforehand, of the map as it is.
+        """Return the problem with the errors learnt while given mistakes explain what they can.
+
+        Args:
+            columns, priors: (c, k) and (r, k) effects of the mistakes.
+        """
+        # Residuals are taken where the priors' residuals are smallest, with the map as it is.
         back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
         learnt = self.expected.learnt(
             off_m=self.design @ back - self.residual_m + self.expected.shift_m,
@@ -189,16 +196,16 @@ class Linearized:
         return replace(self, errors=learnt)
 
     def with_usual_errors(self) -> Linearized:
-        """As radios and maps have them that scatter like this."""
+        """Return the problem with the errors usual for radios and maps with this scatter."""
         return replace(self, errors=self.expected.usual({"white": self.scatter_m}))
 
 
 def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Linearized:
-    """At the map's own state, with the errors that are usual.
+    """Linearise at the map's own state, with the usual errors.
 
     Args:
-        cells_of_ranges: of ranges that do not scatter; None: they are found by the residuals, of whatever is not far
-            from its neighbours, however far from the map.
+        cells_of_ranges: for ranges without noise; None: cells are formed from the ranges that agree with their
+            neighbours, however far they are from the map.
     """
     found, scatter_m = _cells(on_map) if cells_of_ranges is None else (cells_of_ranges, 0.0)
     towards = RangeGradient.of(on_map.from_anchor_m).by_tag
@@ -210,12 +217,12 @@ def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Lin
 
 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
-    """The same cells and the same errors, linearised elsewhere, or of corrected ranges."""
+    """Linearise the problem at another state or for corrected ranges, with the same cells and errors."""
     return _linearized(on_map, problem.expected, problem.scatter_m, problem.errors)
 
 
 def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float, errors: LearnedErrors) -> Linearized:
-    # What ranges are off by for each anchor's sake is random.
+    # The anchors' biases are random errors here, not parameters.
     problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
     state, placed = on_map.state, on_map.state.metric_from_model
     columns, gradient, mean = columns_of([problem])[0], RangeGradient.of(on_map.from_anchor_m), expected.cells.mean
@@ -253,7 +260,7 @@ def _bending(on_map: RangesOnMap, cells_of_ranges: Cells) -> BendingOfCells | No
 
 
 def slopes_by_poses(on_map: RangesOnMap) -> csr_array:
-    """(n, 6 k) of the distances, by the path's poses."""
+    """Return the (n, 6 k) derivatives of the distances by the path's k poses."""
     gradient, placed = RangeGradient.of(on_map.from_anchor_m), on_map.state.metric_from_model
     return by_poses(gradient, placed, on_map.model_from_cam, on_map.problem.tag_from_center, on_map.on_path)
 
@@ -284,12 +291,16 @@ def _cells(on_map: RangesOnMap) -> tuple[Cells, float]:
 
 
 def near_m(scatter_m: float) -> float:
-    """How far from its neighbours a range may be that scatters like this."""
+    """Return how far from its neighbours a range with this scatter may be, in metres."""
     return _OUTLYING * max(scatter_m, _LEAST_SCATTER_M)
 
 
 def _off_neighbours(values: Array, anchor_index: Indices) -> tuple[Array, float]:
-    """(n,) from the lower median of a few that follow each other, and the stddev of a value; all in order."""
+    """Return (n,) differences from the lower median of a few consecutive values, and the stddev of a value.
+
+    Args:
+        values: in order of time within each anchor. anchor_index: (n,), equal values together.
+    """
     begins: Mask = np.diff(anchor_index, prepend=-1) != 0
     since = np.arange(len(values)) - np.maximum.accumulate(np.where(begins, np.arange(len(values)), 0))
     labels = np.cumsum(begins | (since % _NUM_NEIGHBOURS == 0)) - 1

@@ -1,4 +1,4 @@
-"""Which mistakes were made: the noise is learnt, every hypothesis tested, the likeliest one named."""
+"""Search for the mistakes that were made: learn the noise, test every hypothesis and name the likeliest cause."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ from rangesfm.trust.linearized import Linearized, RangesOnMap, at_state, lineari
 from rangesfm.trust.scanning import SCANNING
 from rangesfm.trust.testing import Factorization, Test, overlap
 
-# Explanations that are tried with the noise that each of them leaves.
+# Numbers of explanations that are tried, each with the noise that it leaves: in all, of one kind, and when no test
+# exceeds its threshold.
 _NUM_TRIED, _NUM_OF_KIND, _NUM_NEARLY = 6, 2, 3
-# Alternatives that are fitted: where the map itself sees the anchors, the right one begins near its end.
+# Number of alternatives that are fitted. The right one starts near its minimum, where the map itself sees the anchors.
 _NUM_FITTED = 12
-# Of two that differ by less in twice the logarithm of their likelihood, neither is named alone.
+# Smallest difference of scores (twice a log-likelihood, less a penalty) that tells two explanations apart.
 _AS_LIKELY = 6.0
 _SAME = 0.95
 _MAX_NUM_RIVALS = 2
 _NUM_SETTLING, _SETTLED = 6, 0.05
-# Steps in a row that are longer than the one before: the first may fall short, as of a large mistake.
+# Consecutive growing steps that count as divergence. One may be too short at first, with a large mistake.
 _NUM_LONGER = 2
-# Of what is not linear.
+# Largest number of steps for a nonlinear hypothesis.
 _NUM_STEPS = 10
 
 
 @dataclass(frozen=True)
 class Cause(Alternative):
-    """An explanation that beats chance; its words are with the size that was found.
+    """An explanation that is more likely than chance; its words include the size that was found.
 
     Attributes:
-        gain: by how much it makes the ranges likelier, as twice a logarithm, with the noise that it leaves.
-        penalty: for what it may choose.
-        state: the likeliest with it.
+        gain: increase of twice the log-likelihood of the ranges, with the errors that are left with it.
+        penalty: for the numbers or alternatives to choose from.
+        state: the likeliest state of the map with it.
         test: None for an alternative.
     """
 
@@ -52,17 +53,18 @@ class Cause(Alternative):
         return self.gain - self.penalty
 
     def undone(self, on_map: RangesOnMap) -> RangesOnMap:
-        """The ranges as they would be without it."""
+        """Return the ranges as they would be without the mistake."""
         correction = self.correction if self.test is None else self.test.hypothesis.correction(self.test.sizes)
         return corrected(replace(on_map, state=self.state), correction)
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found of one map.
+    """The results for one map.
 
     Attributes:
-        tests: of each kind and subject the one that fits best, the likeliest first.
+        problem: with the errors that are left with the likeliest cause.
+        tests: for each kind and subject the one that fits best, the likeliest first.
         causes: the likeliest, and those that cannot be told from it; empty if nothing was found.
     """
 
@@ -72,10 +74,11 @@ class Findings:
 
 
 def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
-    """Test all hypotheses with the noise that is left when those that stand explain what they can.
+    """Test all hypotheses with the noise that is left when all lasting mistakes explain what they can.
 
-    A mistake that does not stand, as a step, may have passed for noise instead: where nothing is found, the likeliest
-    are believed that make the ranges likelier with the noise that each of them leaves.
+    A mistake with a time, such as a step, may have been learnt as noise instead. So if no test exceeds its threshold,
+    the likeliest hypotheses are tried again, each with the noise that it leaves, and kept if they make the ranges
+    likelier by enough.
     """
     problem = linearized(on_map)
     standing = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
@@ -92,13 +95,13 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
 
 
 def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized:
-    """With the errors that are left when some mistakes explain what they can."""
+    """Return the problem with the errors learnt while some mistakes explain what they can."""
     effects = Effect.of_all([of_cells(problem, problem.design[:, :0]), *(h.effect for h in explaining)])
     return problem.with_learnt_errors(effects.columns, effects.priors)
 
 
 def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) -> list[Cause]:
-    """The likeliest explanation, and those as good; none if even that is no better than chance."""
+    """Return the likeliest explanation and those as good; empty if none is better than chance."""
     before = Factorization(_learnt(_settled(problem), [])).deviance()
     num = len(problem.residual_m)
     causes = []
@@ -107,8 +110,8 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
         again, deviance, state = _settled_test(problem, _at_best_time(factorized, test.hypothesis))
         gain = before - deviance
         is_found = again.is_possible and bool(np.isfinite(deviance))
-        # What is not linear was tested by its first step, which says little of a large mistake. What the errors explain
-        # as well, where they need not share with all other mistakes, is none.
+        # The first step of a nonlinear hypothesis says little about a large mistake, so it needs more than the penalty.
+        # An explanation fails if the errors alone explain as much once no other mistake takes part of it.
         penalty = _penalty(again, num)
         enough = penalty if is_sure and test.hypothesis.is_linear else test.threshold
         if is_found and gain > enough:
@@ -122,7 +125,7 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
 
 
 def _at_best_time(factorized: Factorization, hypothesis: Hypothesis) -> Hypothesis:
-    """Ranges between the true time of a step and the one that was looked at fit neither way."""
+    """Return a hypothesis at the time that fits best; ranges between its true time and a tried one fit neither way."""
     if hypothesis.finer is None:
         return hypothesis
     tests = factorized.estimates([hypothesis, *hypothesis.finer()])
@@ -130,7 +133,7 @@ def _at_best_time(factorized: Factorization, hypothesis: Hypothesis) -> Hypothes
 
 
 def _varied(tests: Sequence[Test]) -> list[Test]:
-    """The first ones, of each kind a few."""
+    """Return the first tests, at most a few of each kind."""
     kinds = [test.hypothesis.name for test in tests]
     return [test for k, test in enumerate(tests) if kinds[:k].count(kinds[k]) < _NUM_OF_KIND][:_NUM_TRIED]
 
@@ -144,12 +147,12 @@ def _is_rival(best: Cause, other: Cause) -> bool:
 def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, float, RangeState]:
     """Return the test of a hypothesis, its deviance and its state, with the errors that it leaves.
 
-    Where steps diverge the deviance is infinite: there is no size that fits.
+    The deviance is infinite if the steps diverge: then no size fits.
     """
     found = (_linear_settled if hypothesis.is_linear else _settled_in_steps)(problem, hypothesis)
     factorized = Factorization(_learnt(found.at, [found.hypothesis]))
     [test] = factorized.estimates([found.hypothesis])
-    # What a step promises counts only where steps keep what they promise.
+    # The next step's gain is only counted if the steps have converged.
     sizes = found.sizes + test.sizes if found.is_settled else found.sizes
     deviance = np.inf if found.diverges else factorized.deviance(test if found.is_settled else None)
     return replace(test, hypothesis=hypothesis, sizes=sizes), deviance, found.at.on_map.state
@@ -157,13 +160,13 @@ def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, fl
 
 @dataclass(frozen=True)
 class _Settled:
-    """Where steps to the likeliest size of a mistake ended.
+    """The end of the steps to the likeliest size of a mistake.
 
     Attributes:
-        at: with the ranges corrected by the size, and the state that is likeliest then.
-        hypothesis: as it is there. sizes: (k,) by which the ranges are corrected.
+        at: the problem with the ranges corrected by ``sizes``, at the state that is then likeliest.
+        hypothesis: linearised there. sizes: (k,) by which the ranges are corrected.
         is_settled: whether the next step is short.
-        diverges: whether steps grow, or lead beyond what can happen.
+        diverges: whether steps grow, or lead to impossible sizes.
     """
 
     at: Linearized
@@ -174,20 +177,20 @@ class _Settled:
 
 
 class _Steps:
-    """Whether steps shrink: twice in a row longer than the one before, they lead nowhere."""
+    """Detection of steps that do not shrink."""
 
     def __init__(self) -> None:
         self._last, self._num_longer = np.inf, 0
 
     def grow(self, step: float) -> bool:
-        """Return whether steps grow, after one more of this length."""
+        """Add a step of this length, and return True if the last ``_NUM_LONGER`` steps each were longer than before."""
         self._num_longer = self._num_longer + 1 if step > self._last or not np.isfinite(step) else 0
         self._last = step
         return self._num_longer >= _NUM_LONGER
 
 
 def _linear_settled(problem: Linearized, hypothesis: Hypothesis) -> _Settled:
-    """At the likeliest state if the mistake was made, of whatever size it has there."""
+    """Find the likeliest state with a linear mistake, whose size is left free."""
     at, before, nothing, steps = problem, np.zeros(hypothesis.num), np.zeros(hypothesis.num), _Steps()
     for _ in range(_NUM_SETTLING):
         factorized = Factorization(at)
@@ -202,7 +205,7 @@ def _linear_settled(problem: Linearized, hypothesis: Hypothesis) -> _Settled:
 
 
 def _settled_in_steps(problem: Linearized, original: Hypothesis) -> _Settled:
-    """Where the ranges are corrected by the likeliest size; where little holds a mistake, steps may grow instead."""
+    """Find the likeliest size of a mistake by repeated correction; the steps may diverge if the data hardly fix it."""
     at, hypothesis, sizes, steps = problem, original, np.zeros(original.num), _Steps()
     for _ in range(_NUM_STEPS):
         factorized = Factorization(at)
@@ -221,13 +224,13 @@ def _settled_in_steps(problem: Linearized, original: Hypothesis) -> _Settled:
 
 
 def _stepped(at: Linearized, factorized: Factorization, hypothesis: Hypothesis, sizes: Array) -> RangesOnMap:
-    """The ranges with the map as it is likeliest if a mistake of some size was made."""
+    """Return the ranges on the map that is likeliest with a mistake of some size."""
     step = factorized.step((hypothesis.effect, sizes))
     return replace(at.on_map, state=state_after((at.columns,), at.on_map.state, step))
 
 
 def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
-    """The one of fewer numbers that does as well, if there is one."""
+    """Return a cause with fewer numbers if one explains as much; otherwise the cause itself."""
     if cause.test is None or not cause.test.hypothesis.narrower:
         return cause
     tried = [_settled_test(problem, h) for h in cause.test.hypothesis.narrower]
@@ -247,7 +250,7 @@ def _cause(test: Test, state: RangeState, gain: float, penalty: float) -> Cause:
 
 
 def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
-    """Those that make the ranges likelier than chance would."""
+    """Yield the alternatives that make the ranges likelier than chance would."""
     on_map = problem.on_map
     tried = list(alternatives(on_map))
     if not tried:
@@ -265,7 +268,7 @@ def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
 
 
 def _settled(problem: Linearized) -> Linearized:
-    """At the likeliest state, if a step of the linearised problem leads there: from far away it does not."""
+    """Move to the likeliest state if a linear step improves it; from far away it does not."""
     here = Factorization(problem.with_usual_errors())
     state = state_after((problem.columns,), problem.on_map.state, here.step())
     there = at_state(problem, replace(problem.on_map, state=state))
@@ -273,11 +276,11 @@ def _settled(problem: Linearized) -> Linearized:
 
 
 def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:
-    """Of each kind and subject the one that fits best; the likeliest first."""
+    """Return for each kind and subject the test that fits best, the likeliest first."""
     of_key: dict[tuple[str, str], list[Test]] = {}
     for test in tests:
         of_key.setdefault(test.hypothesis.key, []).append(test)
-    # Whoever makes such a mistake does not choose the time at which it is found best.
+    # The smallest detectable size is the median over all times, because a mistake does not happen at the best time.
     best = {
         key: replace(
             max(group, key=lambda test: (test.is_possible, test.statistic)),
@@ -290,5 +293,5 @@ def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:
 
 
 def _penalty(test: Test, num: int) -> float:
-    """Each number that a hypothesis may choose costs (Schwarz, 1978)."""
+    """Return the cost of the numbers that a hypothesis may choose (Schwarz, 1978)."""
     return test.num * float(np.log(num))

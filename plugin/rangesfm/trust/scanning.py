@@ -1,4 +1,4 @@
-"""Mistakes that begin or end at a time that nobody knows: looked for everywhere, each found once."""
+"""Mistakes that begin or end at an unknown time: each is searched for over the whole survey."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from rangesfm.trust.catalogue import MISMEASURED_M, UNSEEN_MOVE_M, lever_arm_m, 
 from rangesfm.trust.hypothesis import Correction, Hypothesis, duration_s, in_axes, longer, longest_m, of_cells, too_long
 from rangesfm.trust.linearized import Linearized
 
-# A step is best found where it was: the ranges between the true time and the one that is tried fit neither way.
+# Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.
 _NUM_TIMES = 32
 _NUM_FINER = 17
-# Of the survey, on either side: what begins later or ends sooner lasts as good as always.
+# Share of the survey that must be before and after a change; otherwise it is as good as a lasting mistake.
 _LEAST_SHARE = 1 / 12
 # Shares of the survey that a stretch may last.
 _STRETCHES = (1 / 4, 1 / 8, 1 / 16)
-# Of fewer cells on either side nothing can be said.
+# Fewest cells before and after a change.
 _MIN_NUM_CELLS = 3
-# What is elsewhere from some time on: in words of whose, when and by how much, what to do, and what nobody overlooks.
+# Kinds of moves at some time: text for whose, when and by how much; remedy; largest unnoticed size, metres.
 _MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
     "anchor moved": (
         lambda whose, when, size: (
@@ -51,24 +51,24 @@ _MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
 
 
 def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
-    """An anchor was moved at some time."""
+    """Yield for each anchor: it was moved at some time."""
     for k in problem.heard:
-        # Within reach before and after.
+        # The anchor must be within reach before and after.
         most_m = 2 * longest_m(problem, k)
         yield from _elsewhere(problem, k, "anchor moved", most_m, lambda: -np.eye(3), -problem.gradient.by_tag)
 
 
 def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
-    """From some time on the map lies elsewhere, as after a wrong match."""
-    # Parts that break apart are as far from each other as the map is large, at most.
+    """Yield: after some time the map is elsewhere, as after a wrong match."""
+    # Two parts of a map cannot be farther apart than the map is large.
     tags_m = tag_positions(problem.on_map.problem, problem.on_map.state.metric_from_model)
     extent_m = float(np.linalg.norm(np.ptp(tags_m, axis=0)))
     return _elsewhere(problem, None, "map break", extent_m, lambda: np.eye(3), problem.gradient.by_tag)
 
 
 def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
-    """From some time on the tag sits elsewhere on the camera."""
-    # It is still on the camera.
+    """Yield: after some time the tag is elsewhere on the camera."""
+    # The tag is still on the camera.
     most_m = to_other_side_m(lever_arm_m(problem))
     return _elsewhere(problem, None, "tag slipped", most_m, lambda: problem.on_map.world_from_cam, problem.by_lever_arm)
 
@@ -82,13 +82,13 @@ def _elsewhere(
     by_shift: Array,
     around: float | None = None,
 ) -> Iterator[Hypothesis]:
-    """From some time on tags are elsewhere, as seen from an anchor, or from all.
+    """Yield moves at unknown times, relative to one anchor or to all.
 
     Args:
-        name: of the kind, of ``_MOVES``. most_m: the farthest that can happen.
-        axes: along which they are shifted, (3, 3), or (n, 3, 3) for each range.
-        by_shift: (c, 3) by how much the predicted ranges grow along these.
-        around: as of ``_changes``.
+        name: kind of the move, a key of ``_MOVES``. most_m: largest possible move.
+        axes: axes of the move, (3, 3), or (n, 3, 3) for each range.
+        by_shift: (c, 3) derivatives of the predicted ranges along these axes.
+        around: as in ``_changes``.
     """
     words, remedy, unawares = _MOVES[name]
     whose = _name(problem, anchor)
@@ -114,7 +114,7 @@ def _elsewhere(
 
 
 def steps(problem: Linearized) -> Iterator[Hypothesis]:
-    """From some time on ranges read longer, those of one anchor or of all."""
+    """Yield: after some time the ranges of one anchor, or of all, read longer or shorter."""
     for k in _each_and_all(problem):
         yield from _steps(problem, k)
 
@@ -141,7 +141,7 @@ def _steps(problem: Linearized, anchor: int | None, around: float | None = None)
 
 
 def stretches(problem: Linearized) -> Iterator[Hypothesis]:
-    """For a while ranges read longer."""
+    """Yield: for some time the ranges of one anchor, or of all, read longer or shorter."""
     windows = list(_windows(problem))
 
     def words(name: str, when: str, size: Array) -> str:
@@ -168,7 +168,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
 
 
 def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hypothesis]:
-    """The clocks' offset jumped at some time."""
+    """Yield: the clocks' offset jumped at some time."""
     if problem.by_time is None:
         return
 
@@ -197,12 +197,12 @@ def _name(problem: Linearized, anchor: int | None) -> str:
 
 
 def _each_and_all(problem: Linearized) -> list[int | None]:
-    """Anchors, if there are several, and None for all of them."""
+    """Return the anchors, if there are several, and None for all together."""
     return [*(problem.heard if len(problem.heard) > 1 else []), None]
 
 
 def _later(problem: Linearized, anchor: int | None, start: float, end: float = np.inf) -> Mask:
-    """(n,) ranges to an anchor, or to all, from between two times."""
+    """Return an (n,) mask of the ranges to one anchor, or to all, between two times."""
     on_map = problem.on_map
     return _is_of(on_map.problem.anchor_index, anchor) & (on_map.time_s > start) & (on_map.time_s <= end)
 
@@ -212,18 +212,20 @@ def _left_out(rows: Callable[[], Mask], _: Array) -> Correction:
 
 
 def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
-    """Of one anchor, or of all."""
+    """Return a mask of the ranges of one anchor, or of all if None."""
     return np.ones(len(anchor_index), dtype=bool) if anchor is None else np.asarray(anchor_index == anchor)
 
 
 def _changes(
     problem: Linearized, anchor: int | None, least: int, around: float | None = None
 ) -> Iterator[tuple[float, Callable[[], Mask], Array]]:
-    """Times away from the ends, with the ranges to an anchor, or to all, that are from later, and (c,) shares of the
-    cells that are; as many cells as that at least on either side.
+    """Yield times away from the ends of the survey, with what follows them.
+
+    Each comes with a function that returns the later ranges of one anchor, or of all, and with (c,) shares of the cells
+    that are later.
 
     Args:
-        around: only times about this one, closer to each other.
+        least: fewest cells before and after. around: try only times near this one, more closely spaced.
     """
     ends = _LEAST_SHARE, 1 - _LEAST_SHARE
     of_ranges = _is_of(problem.on_map.problem.anchor_index, anchor)
@@ -239,7 +241,7 @@ def _changes(
 
 
 def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
-    """Begin and end, and (c,) shares of the cells that are from in between."""
+    """Yield begin, end and the (c,) shares of the cells in between, for stretches of several lengths."""
     starts = [(start, share) for share in _STRETCHES for start in np.arange(0.0, 1.0 - share + 1e-9, share / 2)]
     ends = np.quantile(problem.on_map.time_s, [(start, min(start + share, 1.0)) for start, share in starts])
     times, rows = np.unique(ends, return_inverse=True)
@@ -249,7 +251,7 @@ def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
 
 
 def _shares_after(problem: Linearized, times: Array) -> Array:
-    """(t, c) of the ranges of each cell, as they are averaged, those that are from later than (t,) rising times."""
+    """Return (t, c) the share of each cell's weight that is later than each of (t,) increasing times."""
     cells, num = problem.cells, len(times) + 1
     of_span = cells.of_range * num + np.searchsorted(times, problem.on_map.time_s)
     worth = np.bincount(of_span, cells.weight, len(cells) * num).reshape(len(cells), num)

@@ -1,8 +1,9 @@
 """Tests of hypotheses: how much better each explains the observations than chance would (Baarda; Teunissen).
 
-With residuals e, their covariance Q, the design A and a mistake's columns H, all whitened and projected off A:
-T = e'H (H'H)^-1 H'e, chi-square with as many degrees of freedom as columns, and the size of the mistake is
-(H'H)^-1 H'e (Teunissen, Network Quality Control, 2024). One Cholesky decomposition and one QR serve all.
+Let e be the residuals, A the design and H the columns of a mistake, all whitened by the residuals' covariance and
+projected off A. The statistic is T = e'H (H'H)^-1 H'e; without a mistake it is chi-square distributed with as many
+degrees of freedom as H has columns. The size of the mistake is estimated as (H'H)^-1 H'e (Teunissen, Network Quality
+Control, 2024). One Cholesky and one QR decomposition serve all tests.
 """
 
 from __future__ import annotations
@@ -20,24 +21,24 @@ from rangesfm.trust.hypothesis import Effect, Hypothesis
 from rangesfm.trust.linearized import Linearized
 
 FALSE_ALARMS = 0.02
-# Baarda's: of the smallest mistake that is to be found, how often a single test at alpha misses it.
+# Baarda's significance level of a single test, and the probability that it misses a mistake of the smallest size.
 _ALPHA, _BETA = 0.001, 0.2
 _NUM_DRAWS = 1000
-# Of what a mistake changes, squared: what is left of less once the unknowns have taken their part is rounding.
+# Squared share of an effect below which what the unknowns leave of it is only rounding.
 _NOTHING_LEFT = 1e-7
 
 
 @dataclass(frozen=True)
 class Test:
-    """What the observations say of one hypothesis.
+    """The result of the test of one hypothesis.
 
     Attributes:
-        statistic: chi-square with ``num`` degrees of freedom if the mistake was not made; of whatever size.
-        threshold: for having looked at all hypotheses.
-        sizes, stddevs: (k,) estimate of its numbers.
-        smallest_detectable: in the direction in which it is found worst; inf: nothing can find it.
-        effect_on_log_scale, effect_on_place_m: the most that such a mistake would do unfound.
-        basis: (c + r, num) orthonormal, of what it explains.
+        statistic: chi-square distributed with ``num`` degrees of freedom if there is no such mistake of any size.
+        threshold: for all hypotheses together.
+        sizes, stddevs: (k,) estimate of the mistake's numbers.
+        smallest_detectable: minimal detectable bias in the worst direction; inf: it cannot be detected.
+        effect_on_log_scale, effect_on_place_m: largest effect of an undetected mistake of that size.
+        basis: (c + r, num) orthonormal basis of the effect, whitened and projected.
     """
 
     hypothesis: Hypothesis
@@ -53,12 +54,12 @@ class Test:
 
     @property
     def is_possible(self) -> bool:
-        """Whether a mistake of the estimated size can happen."""
+        """True if a mistake of the estimated size is possible."""
         return self.hypothesis.can_be(self.sizes)
 
     @property
     def is_rejected(self) -> bool:
-        """Whether chance alone is out of the question, and the mistake is not."""
+        """True if the estimated size is possible and chance alone does not explain the observations."""
         return self.is_possible and self.statistic > self.threshold
 
 
@@ -67,15 +68,15 @@ class MistakeTest:
     """One hypothesis on one survey, as a row of the table.
 
     Attributes:
-        name, subject: of which kind, and of what; an anchor's id, or nothing.
-        statistic, threshold: the mistake was made, or something that looks like it, where the first is larger; 0 where
-            none that can happen is so large.
+        name, subject: its kind, and what it is about: an anchor's id, or nothing.
+        statistic, threshold: a larger statistic than the threshold means that the mistake, or one that looks like it,
+            was made. The statistic is 0 if its estimated size is impossible.
         words: what is the case if it was made. remedy: what to do then.
-        unit: of ``size``, ``stddev`` and ``smallest_detectable``; "1": a share.
-        size, stddev: of the mistake, as estimated; the length of a vector. None: not estimated, or larger than can be.
-        smallest_detectable: that would have been found, in four cases of five; None: no such mistake is ever found.
-        effect_on_scale: relative, effect_on_place_m: root mean square along the path: the most that a mistake of that
-            size does; None: there is no limit to it.
+        unit: of ``size``, ``stddev`` and ``smallest_detectable``; "1": a ratio.
+        size, stddev: of the mistake, estimated; the length of a vector. None: not estimated, or impossible.
+        smallest_detectable: a mistake of this size is found in four cases of five; None: it cannot be detected.
+        effect_on_scale, effect_on_place_m: largest effect of a mistake of that size, relative and as root mean square
+            along the path; None: unlimited.
     """
 
     name: str
@@ -93,12 +94,12 @@ class MistakeTest:
 
     @property
     def rejected(self) -> bool:
-        """Whether chance alone does not explain it."""
+        """True if chance alone does not explain the statistic."""
         return self.statistic > self.threshold
 
 
 class Factorization:
-    """The factorisation that all tests share."""
+    """The matrix decompositions that all tests share."""
 
     def __init__(self, problem: Linearized):
         self.problem = problem
@@ -106,7 +107,7 @@ class Factorization:
         self._basis, triangle = np.linalg.qr(self._whitened(problem.design, problem.prior_design))
         scale = np.maximum(np.abs(np.diag(triangle)), 1e-12)
         self._triangle = triangle + np.diag(np.where(np.abs(np.diag(triangle)) < 1e-9, 1e-9, 0.0) * scale)
-        # Of the path's mean square displacement, by the unknowns.
+        # Quadratic form of the path's mean square displacement in the unknowns.
         place = problem.place.reshape(-1, problem.columns.num)
         self._place = place.T @ place / len(problem.place)
         self.residual = self._off(self._whitened(problem.residual_m[:, None], problem.prior_residual[:, None]))[:, 0]
@@ -115,20 +116,20 @@ class Factorization:
         return np.vstack([solve_triangular(self._factor, cells, lower=True), priors])
 
     def _off(self, whitened: Array) -> Array:
-        """Without what the unknowns can take."""
+        """Project off what the unknowns can explain."""
         left: Array = whitened - self._basis @ (self._basis.T @ whitened)
         return left
 
     def deviance(self, made: Test | None = None) -> float:
-        """-2 times the logarithm of the likelihood, up to a constant, of the errors too; if a mistake was made.
+        """Return -2 times the log-likelihood of observations and errors, up to a constant; with a mistake if given.
 
-        Two explanations of the same cells, each with the errors that it leaves, are compared by it.
+        It compares two explanations of the same cells, each with the errors that it leaves.
         """
         squares = float(self.residual @ self.residual) - (made.statistic if made else 0.0)
         return squares + 2 * float(np.sum(np.log(np.diag(self._factor)))) + self.problem.errors.unlikeliness
 
     def step(self, made: tuple[Effect, Array] | None = None) -> Array:
-        """(p,) from the state to the likeliest one, if a mistake of some size (k,) was made."""
+        """Return the (p,) step from the state to the likeliest one, given a mistake of some size (k,)."""
         cells, priors = self.problem.residual_m, self.problem.prior_residual
         if made is not None:
             effect, sizes = made
@@ -139,13 +140,13 @@ class Factorization:
         return np.asarray(solve_triangular(self._triangle, self._basis.T @ whitened))
 
     def test(self, hypotheses: Sequence[Hypothesis], seed: int) -> list[Test]:
-        """All of them, with thresholds that hold for all together."""
+        """Test all hypotheses, with thresholds that hold for all together."""
         tests = self.estimates(hypotheses)
         thresholds = _thresholds([t.basis for t in tests], np.array([t.num for t in tests]), seed)
         return [replace(t, threshold=threshold) for t, threshold in zip(tests, thresholds.tolist(), strict=True)]
 
     def estimates(self, hypotheses: Sequence[Hypothesis]) -> list[Test]:
-        """The same without a threshold."""
+        """Test all hypotheses without thresholds."""
         effects = Effect.of_all([h.effect for h in hypotheses])
         whitened = self._whitened(effects.columns, effects.priors)
         left = self._off(whitened)
@@ -161,7 +162,7 @@ class Factorization:
     def _test(self, hypothesis: Hypothesis, left: Array, basis: Array, by_unknowns: Array) -> Test:
         values, vectors = np.linalg.eigh(left.T @ left)
         is_seen = values > _NOTHING_LEFT * values[-1]
-        # Of the inverse, without what is not seen.
+        # Root of the inverse, without the directions that cannot be seen.
         root = vectors[:, is_seen] / np.sqrt(values[is_seen])
         inverse = root @ root.T
         is_whole = basis.shape[1] == left.shape[1]
@@ -169,7 +170,7 @@ class Factorization:
         if is_whole:
             needed = noncentrality(basis.shape[1])
             worst = float(np.sqrt(needed / values[is_seen][0]))
-            # Of all mistakes on the edge of being found, the one that does most.
+            # The mistake with the largest effect among those that are just detectable.
             of_unit = by_unknowns @ root
             on_scale = float(np.sqrt(needed) * np.linalg.norm(of_unit[0]))
             on_place = float(np.sqrt(needed * max(np.linalg.eigvalsh(of_unit.T @ self._place @ of_unit)[-1], 0.0)))
@@ -189,7 +190,7 @@ class Factorization:
 
 @cache
 def noncentrality(num: int) -> float:
-    """By which a mistake of so many numbers must raise the statistic to be found (Baarda's lambda_0)."""
+    """Return the noncentrality at which a mistake of ``num`` numbers is found (Baarda's lambda_0)."""
     critical = special.chdtri(num, _ALPHA)
     low, high = 0.0, 1000.0
     for _ in range(60):
@@ -199,7 +200,7 @@ def noncentrality(num: int) -> float:
 
 
 def _basis_of(left: Array, whitened: Array) -> Array:
-    """(c + r, k') orthonormal, of what is left of columns."""
+    """Return a (c + r, k') orthonormal basis of an effect after projection, without what is only rounding."""
     sizes = np.maximum(np.linalg.norm(whitened, axis=0), 1e-12)
     if left.shape[1] == 1:
         length = np.linalg.norm(left)
@@ -209,9 +210,9 @@ def _basis_of(left: Array, whitened: Array) -> Array:
 
 
 def _thresholds(bases: Sequence[Array], nums: Array, seed: int) -> Array:
-    """(h,) for each its own, so that all together alarm as seldom as they should (Westfall and Young, 1993).
+    """Return thresholds (h,) with which all tests together keep their false alarm rate (Westfall and Young, 1993).
 
-    Drawn: of residuals without a mistake, the smallest of all p-values.
+    It comes from random residuals without a mistake, and the smallest p-value of all tests for each.
     """
     draws = np.random.default_rng(seed).standard_normal((_NUM_DRAWS, len(bases[0])))
     projected = (draws @ np.hstack(bases)) ** 2
@@ -227,14 +228,14 @@ def _thresholds(bases: Sequence[Array], nums: Array, seed: int) -> Array:
 
 
 def overlap(first: Test, second: Test) -> float:
-    """How much of the one with fewer numbers the other can explain: 1: all of it, and nothing tells them apart."""
+    """Return how much of the smaller hypothesis the other explains; 1: all of it, so that nothing tells them apart."""
     if not first.num or not second.num:
         return 0.0
     return float(np.linalg.norm(first.basis.T @ second.basis) / np.sqrt(min(first.num, second.num)))
 
 
 def row_of(test: Test) -> MistakeTest:
-    """Return the row of the table: an estimate that cannot be is told as such, without its size."""
+    """Return the row of the table; an impossible estimate is shown without its size."""
     if not test.is_possible:
         row = row_of(replace(test, statistic=0.0, sizes=np.zeros_like(test.sizes)))
         name, unit = " ".join(test.hypothesis.key).strip(), test.hypothesis.unit.replace("1", "")
@@ -259,5 +260,5 @@ def row_of(test: Test) -> MistakeTest:
 
 
 def finite(value: float) -> float | None:
-    """None for what has no limit."""
+    """Return the value, or None if it is infinite."""
     return float(value) if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""What the tests of a map say, for people: the table, with what is no mistake of one size, and the likeliest cause."""
+"""Results of a map's tests for people: the table, faults that are no mistake of one size, and the likeliest cause."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ from rangesfm.trust.linearized import Linearized, RangesOnMap, linearized, near_
 from rangesfm.trust.mistakes import Cause, Findings, find_mistakes
 from rangesfm.trust.testing import MistakeTest, Test, row_of
 
-# Real radios show 0.03 to 0.15 m beside outliers, old ones 0.2 m: of a stddev beyond that something else is the cause.
+# Largest standard deviations, metres, of noise and of lasting errors. Real radios show 0.03 to 0.15 m beside outliers,
+# old ones 0.2 m; more has another cause.
 _MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
-# In metres for a metre of distance: a radio on 70 m is noisier than one in a room.
+# Addition to both limits per metre of distance: a radio over 70 m is noisier than in a room.
 _NOISE_BY_DISTANCE = 0.005
 _LASTING = ("time", "place", "view")
 _LEAST_USED, _MOST_OUTLYING = 0.4, 0.35
-# Of ranges far from their neighbours, those as long as to one other anchor; of fewer it is chance.
+# Share of an anchor's outliers that must fit one other anchor to be taken for its ranges, and the fewest outliers.
 _MOST_OF_OTHER, _MIN_NUM_OUTLYING = 0.5, 10
 _FEW_OBSTRUCTED = "place the anchors where nothing stands between them and the path"
 
 _MIXED_UP = "anchor mixed up"
-# What is seen of ranges beside those right before and after.
+# Faults that show in single ranges, compared with those right before and after.
 _OF_SINGLE_RANGES = ("range noise", "anchor's outliers", _MIXED_UP)
 
 
 @dataclass(frozen=True)
 class TrustVerdict:
-    """What was tested, and what speaks against the map.
+    """The tests of a map and the mistakes that they found.
 
     Attributes:
-        tests: the table; what was found first.
-        reasons: sentences, the likeliest cause first; empty if nothing was found.
-        causes: the likeliest, and those that cannot be told from it.
-        rows: (n,) of the log, the ranges that corrections are of.
+        tests: rows of the table; what was found comes first.
+        reasons: sentences, the likeliest cause first; without any, at most a mistake that could stay hidden.
+        causes: the likeliest cause, and those that cannot be told from it.
+        rows: (n,) rows of the log to which the corrections refer.
     """
 
     tests: tuple[MistakeTest, ...]
@@ -46,14 +47,14 @@ class TrustVerdict:
     rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def with_more(self, more: TrustVerdict) -> TrustVerdict:
-        """With tests that were made of something else than ranges."""
+        """Return the verdict with tests of something other than ranges added."""
         tests = (*more.tests, *self.tests)
         return replace(self, tests=tests, reasons=(*self.reasons, *more.reasons))
 
 
 @with_one_blas_thread
 def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
-    """Test all that may be wrong with the ranges on a map."""
+    """Test for all mistakes that ranges on a map can show."""
     found = find_mistakes(on_map, seed=seed)
     shown = list(_evidence(found.problem))
     before = _before_causes(found, shown)
@@ -68,9 +69,10 @@ def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:
-    """What single ranges show that the likeliest cause leaves, and which may look like it: blocked ranges as a step.
+    """Return faults of single ranges that the likeliest cause does not explain, but that may explain the cause.
 
-    Of an anchor if the cause is one of its own; of all if they scatter by more than the cause changes them.
+    Blocked ranges, for instance, may look like a step. A fault counts if it is of the cause's own anchor, or if it is
+    of all ranges and they scatter by more than the cause changes them.
     """
     about_ranges = [row for row in shown if row.rejected and row.name in _OF_SINGLE_RANGES]
     if not about_ranges or not found.causes:
@@ -88,7 +90,7 @@ def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[Mistak
 
 
 def sentence(causes: Sequence[Cause]) -> str:
-    """The likeliest cause with what to do; several that nothing tells apart are all named."""
+    """Return the likeliest cause with its remedy as a sentence; causes that cannot be told apart are all named."""
     sure = f"{np.sqrt(_statistic(causes[0])):.0f} stddevs"
     if len(causes) == 1:
         return f"probably {causes[0].words} ({sure}): {causes[0].remedy}"
@@ -98,7 +100,7 @@ def sentence(causes: Sequence[Cause]) -> str:
 
 
 def _what_could_hide(found: Findings) -> Iterator[str]:
-    """A mistake that would not have been found and does more than a good scale may be off by."""
+    """Yield the worst mistake that could stay hidden, if it changes the scale by more than a good scale may be off."""
     hidden = [t for t in found.tests if not t.hypothesis.is_in_interval and np.isfinite(t.effect_on_log_scale)]
     worst = max(hidden, key=_hidden_effect, default=None)
     if worst is not None and _hidden_effect(worst) > DOUBTFUL_ABOVE:
@@ -109,30 +111,30 @@ def _what_could_hide(found: Findings) -> Iterator[str]:
 
 
 def _hidden_effect(test: Test) -> float:
-    """On the logarithm of the scale, of the largest that neither test nor surveyor would see."""
+    """Return the change of the scale's logarithm by the largest mistake that neither test nor surveyor would notice."""
     return test.effect_on_log_scale * min(1.0, test.hypothesis.most_unnoticed / test.smallest_detectable)
 
 
 def _row_of_cause(cause: Cause) -> MistakeTest:
-    """With the statistic by which it was found: how much likelier it makes the ranges."""
+    """Return the row of a cause, with the statistic by which it was found."""
     if cause.test is None:
         return MistakeTest(cause.name, cause.subject, cause.gain, cause.penalty, cause.words, cause.remedy)
     return row_of(replace(cause.test, statistic=_statistic(cause)))
 
 
 def _statistic(cause: Cause) -> float:
-    """Return by how much a cause makes the ranges likelier, with the errors that are left or as its test has it."""
+    """Return how much likelier a cause makes the ranges, by its test or by the errors that are left with it."""
     return cause.gain if cause.test is None else max(cause.test.statistic, cause.gain)
 
 
 def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
-    """What is no mistake of one size, of the noise as learnt beside the likeliest one and of each anchor's ranges."""
+    """Yield faults that are no mistake of one size: noise and lasting errors of all ranges, faults of each anchor."""
     far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
     for kind, what, stddev_m, most_m in (
-        ("range noise", "scatter", problem.scatter_m, _MOST_NOISE_M + far),
-        ("lasting errors", "err for seconds", _lasting_m(problem), _MOST_LASTING_M + far),
+        ("range noise", "scatter by", problem.scatter_m, _MOST_NOISE_M + far),
+        ("lasting errors", "have errors that last for seconds, of", _lasting_m(problem), _MOST_LASTING_M + far),
     ):
-        words = f"the ranges {what} by {stddev_m:.2f} m, which no radio does in the open ({most_m:.2f} m at most)"
+        words = f"the ranges {what} {stddev_m:.2f} m; radios in the open reach {most_m:.2f} m at most"
         yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")
     on_map, cells = problem.on_map, problem.cells
     index = on_map.problem.anchor_index
@@ -152,7 +154,7 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
 
 
 def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTest:
-    """Whether an anchor's ranges that are far from their neighbours are another's."""
+    """Return the test whether an anchor's outliers are ranges of another anchor."""
     on_map = problem.on_map
     anchors_m, index = on_map.state.anchors_m, on_map.problem.anchor_index[outlying]
     tags_m = on_map.from_anchor_m[outlying] + anchors_m[index]
@@ -169,7 +171,7 @@ def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTes
 
 
 def _lasting_m(problem: Linearized) -> float:
-    """Root mean square over cells."""
+    """Return the root mean square of the lasting errors over the cells, metres."""
     lasting = np.isin(problem.errors.names, _LASTING)
     variances = np.trace(problem.errors.covariances_m2[lasting].sum(axis=0))
     return float(np.sqrt(variances / len(problem.cells)))
