@@ -19,7 +19,7 @@ import pycolmap
 from scipy.spatial import KDTree
 
 from rangesfm.export import write_points
-from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.result_folder import ResultFolder, read_result_folder
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from rangesfm.export import MetricMap
 from rangesfm.export.metric_map import in_frame
 from rangesfm.options import ExportOptions
-from rangesfm.result.folder import read_result_folder
+from rangesfm.result.result_folder import read_result_folder
 
 Array = npt.NDArray[np.float64]
 

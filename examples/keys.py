@@ -3,7 +3,7 @@
 The page is written by: python examples/keys.py > examples/keys.md
 """
 
-from rangesfm.planning.settings import TABLES as PLAN_TABLES
+from rangesfm.planning.plan_file import TABLES as PLAN_TABLES
 from rangesfm.survey.settings import KEYS, TABLES
 
 HEAD = """# Keys of a survey file

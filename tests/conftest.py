@@ -27,7 +27,7 @@ from tests.simulated.path import loop_path
 from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.cli import main
-from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.demo.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
 from rangesfm.demo.survey import DemoSurvey
 from rangesfm.geometry.reference import Reference, write_reference

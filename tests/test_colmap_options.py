@@ -27,7 +27,7 @@ from rangesfm.vision.features import feature_options
 from rangesfm.vision.mapping import mapping_options, pipeline_options
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.own_process import MatchingShare
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import NO_RIGS
 
 SEED = 3

@@ -23,7 +23,7 @@ from tests.outputs import paths_below
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.colmap.model_files import read_model
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.demo.survey import ANCHORS_M, CAMERA_MODEL, TAG_IN_CAM_M
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction

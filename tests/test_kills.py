@@ -37,9 +37,9 @@ sys.exit(main(argv))
 """
 IN_MATCHING = ("rangesfm.vision.matching", "append_log", 0)
 IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
-AMONG_TABLES = ("rangesfm.result.tables", "write_table", 2)
-BEFORE_THE_RESULT = ("rangesfm.workflows.results", "input_hashes", 0)
-BEFORE_THE_REPORT = ("rangesfm.workflows.results", "write_report_of", 0)
+AMONG_TABLES = ("rangesfm.result.result_tables", "write_table", 2)
+BEFORE_THE_RESULT = ("rangesfm.workflows.run_results", "input_hashes", 0)
+BEFORE_THE_REPORT = ("rangesfm.workflows.run_results", "write_report_of", 0)
 AMONG_RENAMES = ("rangesfm.files.output_folder", "_rename", 9)
 
 

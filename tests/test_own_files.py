@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 from tests.outputs import names_in, paths_below
 
-from rangesfm.result import folder as result_folder
+from rangesfm.result import result_folder as result_folder
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey

@@ -44,7 +44,7 @@ _HOME = {
     "plan_survey": "rangesfm.planning.survey_plan",
     "read_anchors": "rangesfm.ranging.anchors.anchor",
     "read_image_times_csv": "rangesfm.vision.image_times",
-    "read_plan": "rangesfm.planning.settings",
+    "read_plan": "rangesfm.planning.plan_file",
     "read_ranges": "rangesfm.ranging.readers",
     "read_reference": "rangesfm.geometry.reference",
     "read_survey": "rangesfm.survey.settings",

@@ -23,7 +23,7 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 from tests.studies.erring_surveys import SITES
 
-from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
@@ -112,8 +112,10 @@ def main() -> None:
             write_ranges_csv(replace(log, range_m=log.range_m + longer_m * late), folder / "uwb.csv")
             tests, refinement = list[float](), list[float]()
             with (
-                mock.patch("rangesfm.workflows.metric_map.trust_in", timed(trust_in, tests)),
-                mock.patch("rangesfm.workflows.metric_map.refine_with_ranges", timed(refine_with_ranges, refinement)),
+                mock.patch("rangesfm.workflows.make_metric_map.trust_in", timed(trust_in, tests)),
+                mock.patch(
+                    "rangesfm.workflows.make_metric_map.refine_with_ranges", timed(refine_with_ranges, refinement)
+                ),
             ):
                 summary = refine_model(survey, progress=SilentProgress()).summary
             found = ", ".join(f"{test.name} {test.subject}".strip() for test in summary.tests if test.rejected)

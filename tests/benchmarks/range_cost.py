@@ -26,7 +26,7 @@ from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import sequence_path
 
 from rangesfm import ceres
-from rangesfm.demo.ranges import CameraPath, Radio, simulate_ranges
+from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions

@@ -39,7 +39,7 @@ from rangesfm.progress import SilentProgress
 from rangesfm.vision.database import clear_matches
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.matching import match_features, matching_options
-from rangesfm.vision.photos import usable_photos
+from rangesfm.vision.photo_files import usable_photos
 from rangesfm.vision.reconstruct import reconstruct
 
 STAGES = ("features", "matching", "mapping")

@@ -13,7 +13,7 @@ import pytest
 from tests.simulated.path import loop_path
 
 from rangesfm.cli import main
-from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.ranging.anchors.anchor import read_anchors

@@ -14,7 +14,7 @@ from tests.export.models import synthesized
 from tests.result_document import result_document
 
 from rangesfm.comparison.before_after import compare_folder, compare_models
-from rangesfm.comparison.models import reprojection_rms_px
+from rangesfm.comparison.many_models import reprojection_rms_px
 from rangesfm.comparison.with_reference import (
     compare,
     format_table,
@@ -25,7 +25,7 @@ from rangesfm.comparison.with_reference import (
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.result.tables import RangesAsUsed
+from rangesfm.result.result_tables import RangesAsUsed
 
 Array = npt.NDArray[np.float64]
 

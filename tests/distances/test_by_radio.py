@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.distances.ends import distances_by_radio
+from rangesfm.distances.locate_lengths import distances_by_radio
 from rangesfm.ranging.range_log import RangeLog
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.distances.ends import surveyed_distances
+from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.distances.tape import CONTROL
 from rangesfm.ranging.anchors.anchor import Anchor
 

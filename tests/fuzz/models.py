@@ -43,7 +43,7 @@ def make_survey(folder: Path) -> None:
     from tests.simulated.model import synthetic_model
     from tests.simulated.path import loop_path
 
-    from rangesfm.demo.ranges import Radio, simulate_ranges
+    from rangesfm.demo.simulated_radio import Radio, simulate_ranges
     from rangesfm.ranging.readers import write_ranges_csv
 
     anchors_m = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}

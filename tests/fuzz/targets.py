@@ -22,7 +22,7 @@ from rangesfm.ranging.errors.error_curve import ErrorCurve, read_error_curve
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_summary import summarize_ranges
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, write_ranges_csv
-from rangesfm.result.folder import ResultFolder, read_result_folder
+from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, read_image_times_csv

@@ -21,8 +21,8 @@ from tests.studies.scale_breakdown import spoilt
 
 from rangesfm import ceres
 from rangesfm.colmap.transform import rescale
-from rangesfm.demo.ranges import CameraPath, Radio, simulate_ranges
-from rangesfm.distances.ends import locate_distances
+from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
+from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
 from rangesfm.errors import InputError, SolverError
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity

@@ -25,7 +25,7 @@ from tests.rendering.photos import PhotoCamera, develop, render
 from tests.rendering.scene import Scene
 from tests.simulated.path import loop_path
 
-from rangesfm.demo.ranges import CameraPath
+from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.demo.survey import CAMERA_PARAMS, NUM_ROWS_AROUND, PATH_FILE, PHOTOS
 
 FloatArray = npt.NDArray[np.float64]

@@ -20,7 +20,7 @@ from rangesfm.errors import InputError
 from rangesfm.report import write_report
 from rangesfm.report.content import Content
 from rangesfm.report.scene import scene_of, thumbnails, view_of
-from rangesfm.result.folder import read_result_folder
+from rangesfm.result.result_folder import read_result_folder
 
 if TYPE_CHECKING:
     from tests.conftest import Command

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rangesfm.result.folder import read_result_folder
 from rangesfm.result.places import input_beside, is_within, path_in, recorded_path
+from rangesfm.result.result_folder import read_result_folder
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey

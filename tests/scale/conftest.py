@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.demo.ranges import Radio, SimulatedRanges
+from rangesfm.demo.simulated_radio import Radio, SimulatedRanges
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import Anchor

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from tests.simulated.path import loop_path
 
-from rangesfm.demo.ranges import CameraPath, Radio, simulate_ranges
+from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor

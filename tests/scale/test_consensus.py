@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.scale.range_equation import RangeProblem
 from rangesfm.scale.starts import agreeing_intervals, consensus_scales, local_maxima

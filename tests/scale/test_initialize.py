@@ -12,8 +12,8 @@ import pytest
 from scipy.spatial.distance import pdist
 from tests.simulated.path import orbit_path
 
-from rangesfm.demo.ranges import Radio
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.demo.simulated_radio import Radio
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
 from rangesfm.ranging.range_log import RangeLog

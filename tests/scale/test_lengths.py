@@ -9,7 +9,7 @@ import pytest
 from tests.known import known
 
 from rangesfm.arrays import Array
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.scale.lengths import LengthScale, scale_by_lengths
 

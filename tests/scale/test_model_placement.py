@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.scale.conftest import MakeSurvey
 
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.scale import model_placement
 from rangesfm.scale.model_placement import ScaledModel
 from rangesfm.scale.range_equation import solve

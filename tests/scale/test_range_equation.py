@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.scale import range_equation

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.geometry.similarity import IDENTITY, path_shape
 from rangesfm.options import RangeModelOptions
 from rangesfm.scale.problem import scale_problem

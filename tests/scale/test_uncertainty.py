@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 from scipy.sparse import csr_array
 
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.bending import BendingOfCells

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from rangesfm.demo.ranges import CameraPath
+from rangesfm.demo.simulated_radio import CameraPath
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.demo.ranges import Radio, SimulatedRanges, measure_ranges
+from rangesfm.demo.simulated_radio import Radio, SimulatedRanges, measure_ranges
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.planned import PlannedSurvey

@@ -7,7 +7,7 @@ import pytest
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import orbit_path, sequence_path
 
-from rangesfm.demo.ranges import CameraPath
+from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.simulated.path import lap_path, look_at, loop_path, orbit_path, sequence_path
 
-from rangesfm.demo.ranges import CameraPath
+from rangesfm.demo.simulated_radio import CameraPath
 
 PATHS = {
     "loop": loop_path(40.0, start_s=1e9, seed=3),

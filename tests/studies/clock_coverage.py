@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rangesfm.demo.ranges import CameraPath, Radio, simulate_ranges
+from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.clock.time_offset import estimate_time_offset

@@ -36,7 +36,7 @@ from rangesfm.survey.inputs import read_ranging_inputs, times_of_model
 from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.reconstruct import reconstruct
-from rangesfm.workflows.photos import AdjustmentWithRanges
+from rangesfm.workflows.map_photos import AdjustmentWithRanges
 from rangesfm.workflows.run import refine_model
 
 # A tolerance small enough that the solver runs to convergence.

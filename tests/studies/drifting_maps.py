@@ -44,11 +44,11 @@ from tests.studies.simulated_survey import MIN_TRI_ANGLE_DEG, TAG_IN_CAM_M, mapp
 from tests.studies.simulated_survey import Survey as Truth
 
 from rangesfm.colmap.transform import rescale
-from rangesfm.demo.ranges import CameraPath
+from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.join.models import PathOfModel
+from rangesfm.join.join_models import PathOfModel
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site

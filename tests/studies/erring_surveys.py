@@ -14,7 +14,7 @@ from tests.simulated.path import loop_path
 from tests.simulated.surveys import LASTING_S, error_curve, lasting
 
 from rangesfm.colmap.reprojection import PointErrors
-from rangesfm.demo.ranges import CameraPath
+from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera

@@ -34,7 +34,7 @@ from tests.simulated.small_demo import make_small_demo
 from rangesfm.demo.survey import TIME_OFFSET_S
 from rangesfm.export import EXPORTED_NAMES
 from rangesfm.files.output_folder import PRIVATE_NAME
-from rangesfm.result.folder import PHOTOS_NAMES, RESULT_NAMES
+from rangesfm.result.result_folder import PHOTOS_NAMES, RESULT_NAMES
 from rangesfm.vision.steps import RECONSTRUCTION_NAMES
 
 STATUSES = (0, 2, 3, 4, -signal.SIGKILL)

@@ -32,13 +32,13 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 from tests.studies.simulated_database import write_database
 
-from rangesfm.demo.ranges import Radio, simulate_ranges
+from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.geometry.reference import Reference, read_reference, write_reference
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.vision.mapping import map_photos, mapping_options, read_models
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import NO_RIGS
 from rangesfm.vision.steps import Workspace
 

@@ -32,8 +32,8 @@ from tests.studies.simulated_survey import (
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.planning.expected import Expected, expect
-from rangesfm.planning.photos import PlannedPhotos
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import COMPONENTS
 

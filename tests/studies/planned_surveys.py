@@ -23,7 +23,7 @@ from tests.simulated.path import lap_path, loop_path, sequence_path
 from tests.simulated.surveys import METRES_PER_UNIT, Measured, measured
 from tests.studies.kept_runs import Row, Study, spread, study
 
-from rangesfm.demo.ranges import CameraPath
+from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions

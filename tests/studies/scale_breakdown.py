@@ -31,7 +31,7 @@ import numpy.typing as npt
 from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions

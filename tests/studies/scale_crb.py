@@ -30,7 +30,7 @@ from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.colmap.transform import rescale
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions

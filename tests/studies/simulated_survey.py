@@ -16,7 +16,7 @@ from tests.simulated.ranges import simulate_ranges_at
 from rangesfm.ceres.covariance import joint_covariance
 from rangesfm.colmap.transform import rescale
 from rangesfm.costs import add_residual_block, joint_prior_cost, range_cost
-from rangesfm.demo.ranges import CameraPath, Radio
+from rangesfm.demo.simulated_radio import CameraPath, Radio
 from rangesfm.geometry.similarity import IDENTITY, rmse
 from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions

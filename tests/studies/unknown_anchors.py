@@ -22,7 +22,7 @@ import numpy.typing as npt
 from tests.simulated.path import loop_path, orbit_path
 from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory

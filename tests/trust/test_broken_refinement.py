@@ -15,11 +15,11 @@ from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import SolverError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
-from rangesfm.result.folder import read_result_folder
-from rangesfm.result.tables import RangesAsUsed
+from rangesfm.result.result_folder import read_result_folder
+from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import refine_model, scale_model
+from rangesfm.workflows.run_results import RunResult
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey

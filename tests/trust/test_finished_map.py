@@ -12,7 +12,7 @@ from tests.known import known
 from tests.scale.conftest import MakeSurvey, Survey, make_survey
 
 from rangesfm.colmap.reprojection import PointErrors
-from rangesfm.demo.ranges import Radio
+from rangesfm.demo.simulated_radio import Radio
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.range_observations import RangeStatus

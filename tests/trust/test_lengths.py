@@ -9,7 +9,7 @@ import pytest
 from tests.known import known
 from tests.studies.erring_surveys import SITES, run, surveyed
 
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.scale.lengths import scale_by_lengths
 from rangesfm.trust.lengths import trust_in_lengths

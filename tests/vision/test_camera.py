@@ -13,7 +13,7 @@ from PIL import Image
 from rangesfm.errors import InputError, OptionError
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.vision.camera import cameras_of_photos
-from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.photo_files import Photos, usable_photos
 from rangesfm.vision.reconstruct import reconstruct
 
 if TYPE_CHECKING:

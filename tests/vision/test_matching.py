@@ -21,7 +21,7 @@ from rangesfm.vision.database import create_database
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.matching import match_features, matching_options
 from rangesfm.vision.own_process import MatchingShare
-from rangesfm.vision.photos import Photos, usable_photos
+from rangesfm.vision.photo_files import Photos, usable_photos
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room

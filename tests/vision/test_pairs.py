@@ -12,7 +12,7 @@ from tests.outputs import unfinished
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.vision.pairs import pairing_options, pairs_to_match, read_pairs
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.reconstruct import reconstruct
 
 NAMES = tuple(f"{index}.png" for index in range(4))

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 from tests.known import known as known_scale
 
-from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
@@ -23,7 +23,7 @@ from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.scale.lengths import scale_by_lengths
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import read_image_times_csv
-from rangesfm.vision.photos import usable_photos
+from rangesfm.vision.photo_files import usable_photos
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 

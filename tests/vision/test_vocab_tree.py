@@ -19,7 +19,7 @@ from rangesfm.vision.database import create_database
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.pairs import pairing_options, pairs_to_match
-from rangesfm.vision.photos import usable_photos
+from rangesfm.vision.photo_files import usable_photos
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Room

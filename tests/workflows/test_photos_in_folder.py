@@ -19,10 +19,10 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.options import CameraOptions
 from rangesfm.progress import Journal, SilentProgress
-from rangesfm.result.folder import read_result_folder
+from rangesfm.result.result_folder import read_result_folder
 from rangesfm.survey.settings import Survey, survey_from_tables
 from rangesfm.workflows.check import check_survey
-from rangesfm.workflows.photos import with_photos_in_folder
+from rangesfm.workflows.map_photos import with_photos_in_folder
 
 IMAGE = raw(np.arange(48, dtype=np.uint8).reshape(6, 8, 1), "mono8")
 INFO = camera_info((8, 6), (9, 9, 4, 3), ())

@@ -22,7 +22,7 @@ from rangesfm.ranging.range_observations import RangeStatus, hold_out
 from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import read_image_times_csv
-from rangesfm.workflows.photos import AdjustmentWithRanges
+from rangesfm.workflows.map_photos import AdjustmentWithRanges
 from rangesfm.workflows.run import run_survey
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey, survey_from_tables
-from rangesfm.workflows import photos
-from rangesfm.workflows.photos import find_keyframes, map_keyframes
+from rangesfm.workflows import map_photos
+from rangesfm.workflows.map_photos import find_keyframes, map_keyframes
 from rangesfm.workflows.run import refine_model
 
 LEFT, RIGHT = "camera000001_", "camera000002_"
@@ -157,6 +157,6 @@ def test_a_frame_is_one_keyframe_with_the_time_of_its_photos_and_all_of_them_are
         mapped.extend(chosen)
         return summary
 
-    monkeypatch.setattr(photos, "reconstruct", reconstruct)
+    monkeypatch.setattr(map_photos, "reconstruct", reconstruct)
     map_keyframes(survey, keyframes[1:], journal, restart=False, deferred=False)
     assert mapped == names[2:]

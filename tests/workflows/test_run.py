@@ -26,13 +26,13 @@ from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.places import path_in, recorded_path
+from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus
 from rangesfm.result.summary import ResultSummary
-from rangesfm.result.tables import ScaleCandidates, ScaleConsensus
 from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
 from rangesfm.workflows import run
 from rangesfm.workflows.export_result import export_result
-from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import refine_model, scale_model
+from rangesfm.workflows.run_results import RunResult
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey

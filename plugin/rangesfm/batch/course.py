@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from rangesfm.batch.jobs import Job
 from rangesfm.comparison.with_reference import text_or_dash
 from rangesfm.errors import FAILED, INTERNAL_ERROR, one_line
-from rangesfm.files.tables import align_rows
+from rangesfm.files.text_tables import align_rows
 from rangesfm.result.summary import ResultSummary
 
 

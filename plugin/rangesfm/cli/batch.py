@@ -80,7 +80,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         raise InputError("rangesfm batch needs Dask: python -m pip install 'rangesfm[batch]'") from None
     from rangesfm.batch.course import exit_status_of, format_rows
     from rangesfm.batch.jobs import BatchOptions, read_jobs
-    from rangesfm.batch.run import PAGE_NAME, TABLE_NAME, run_batch
+    from rangesfm.batch.run_batch import PAGE_NAME, TABLE_NAME, run_batch
 
     output_path = Path(args.output_path)
     jobs = read_jobs(args.surveys, overrides_from_arguments(args), output_path)

@@ -20,7 +20,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm doctor
     """
     from rangesfm.ceres.installation_checks import diagnose
-    from rangesfm.files.tables import align_rows
+    from rangesfm.files.text_tables import align_rows
 
     checks = diagnose()
     rows = []

@@ -30,7 +30,7 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
         raise InputError("expected either the file of a plan or --from RESULT")
     from rangesfm.files.atomic import require_apart
     from rangesfm.planning.placement import place_anchors
-    from rangesfm.planning.settings import read_plan
+    from rangesfm.planning.plan_file import read_plan
     from rangesfm.planning.survey_plan import plan_survey
     from rangesfm.report.plan_page import write_plan
 

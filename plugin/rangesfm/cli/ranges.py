@@ -255,7 +255,7 @@ def _notes_of(log: RangeLog) -> list[str]:
 
 
 def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
-    from rangesfm.files.tables import align_rows
+    from rangesfm.files.text_tables import align_rows
 
     step_m = summary.quantization_m
     between = {"anchor": 0, "tag": 0}
@@ -338,7 +338,7 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _calibrated(calibration: Calibration, num_in_log: int) -> list[str]:
-    from rangesfm.files.tables import align_rows
+    from rangesfm.files.text_tables import align_rows
 
     curve, share = calibration.curve, f"{100 * calibration.outlier_share:.1f} % do not fit"
     columns = (curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m)
@@ -406,7 +406,7 @@ def _of_anchors(flag: str, given: dict[str, _Value], log: RangeLog) -> dict[str,
 
 
 def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
-    from rangesfm.files.tables import align_rows
+    from rangesfm.files.text_tables import align_rows
 
     rows: list[Sequence[str]] = [("anchor", "ranges", "fit", "x m", "y m", "z m", "stddev m", "bias m", "noise m")]
     notes = [""]

@@ -141,7 +141,7 @@ def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
         return []
     if options.frame == "enu" and options.origin_anchor is None:
         return ["up is perpendicular to the ellipsoid, by the anchors' coordinates"]
-    from rangesfm.result.folder import read_result_folder
+    from rangesfm.result.result_folder import read_result_folder
 
     if options.up == "auto" and read_result_folder(result_folder).summary.frame == "site":
         return ["up is z of the site"]
@@ -176,8 +176,8 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
-    from rangesfm.comparison.models import compare_many, read_models
-    from rangesfm.comparison.ranges import ranges_of_survey
+    from rangesfm.comparison.many_models import compare_many, read_models
+    from rangesfm.comparison.model_ranges import ranges_of_survey
     from rangesfm.comparison.with_reference import compare, format_table
     from rangesfm.distances.tape import read_tape
     from rangesfm.geometry.reference import read_reference
@@ -199,7 +199,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
         trajectories = {model.name: model.path for model in comparison.models}
         lines += ["", format_table(compare(trajectories, read_reference(args.reference), frame=None))]
     if args.output_path is not None:
-        from rangesfm.comparison.page import write_comparison
+        from rangesfm.comparison.comparison_page import write_comparison
 
         lines += ["", f"page: {write_comparison(comparison, Path(args.output_path))}"]
     return Outcome(lines)
@@ -216,7 +216,7 @@ def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm report results/monday --images photos
     """
     from rangesfm.report import write_report, write_report_pictures
-    from rangesfm.result.folder import read_result_folder
+    from rangesfm.result.result_folder import read_result_folder
 
     source = _result_path(args)
     if args.images is not None and not args.images.is_dir():

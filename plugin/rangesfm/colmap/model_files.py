@@ -17,7 +17,7 @@ import pycolmap
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
-from rangesfm.files.tables import read_text
+from rangesfm.files.text_tables import read_text
 
 MAX_COORDINATE = 1e12
 """Largest accepted coordinate of points and poses, in any unit; its square is still exact enough as a double."""

@@ -9,17 +9,17 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.comparison.models import Length, common_photos, lengths_along, reprojection_rms_px
+from rangesfm.comparison.many_models import Length, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import format_table, papers_table
 from rangesfm.errors import InputError
-from rangesfm.files.tables import align_rows
+from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.entries import ComparisonRow, median, rms
-from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.model_path import path_of_model
-from rangesfm.result.tables import RangesAsUsed
+from rangesfm.result.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.result_tables import RangesAsUsed
 
 _Pair = tuple[float, ...]
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.tables import align_rows
+from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.similarity import Similarity, align_points, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.demo.ranges import CameraPath, Radio, SimulatedRanges, simulate_ranges
+from rangesfm.demo.simulated_radio import CameraPath, Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import new_folder, sole_writer, write_text
 from rangesfm.files.output_folder import PRIVATE_NAME

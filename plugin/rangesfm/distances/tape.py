@@ -13,7 +13,7 @@ from pydantic import AliasChoices, Field
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
-from rangesfm.files.tables import Table, read_table, repeated
+from rangesfm.files.text_tables import Table, read_table, repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 
 CONTROL, CHECK = "control", "check"

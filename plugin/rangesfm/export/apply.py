@@ -21,7 +21,7 @@ from rangesfm.export.colmap import write_model
 from rangesfm.export.ply import transform_ply
 from rangesfm.files.atomic import make_output_folder, require_apart, write_text
 from rangesfm.files.records import read_json, write_json
-from rangesfm.files.tables import read_text
+from rangesfm.files.text_tables import read_text
 from rangesfm.geometry.similarity import Similarity, align_points, overflow_raised, rmse
 
 Json = Any

@@ -15,7 +15,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
 from rangesfm.files.atomic import new_file
-from rangesfm.files.tables import write_table
+from rangesfm.files.text_tables import write_table
 from rangesfm.geometry.trajectory import Trajectory
 
 # Formats that need covariances.

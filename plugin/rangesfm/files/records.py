@@ -11,7 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, InstanceOf, Strict,
 
 from rangesfm.errors import InputError, one_line
 from rangesfm.files.atomic import write_text
-from rangesfm.files.tables import read_text
+from rangesfm.files.text_tables import read_text
 
 _Kind = TypeVar("_Kind", bound="Record")
 _MAX_SHOWN = 60

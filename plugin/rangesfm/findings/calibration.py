@@ -14,7 +14,7 @@ from ruamel.yaml.error import YAMLError
 
 from rangesfm.colmap.calibrated_cameras import colmap_camera
 from rangesfm.errors import InputError
-from rangesfm.files.tables import read_head
+from rangesfm.files.text_tables import read_head
 
 _COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: [-+.\deE]+)+)", re.ASCII)
 

@@ -12,7 +12,7 @@ from rangesfm.distances.tape import DISTANCE_COLUMNS, MARKER_COLUMNS
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, is_bag_folder
 from rangesfm.files.folders import LEFT_BY_RUNS, walk
-from rangesfm.files.tables import has_columns, read_head
+from rangesfm.files.text_tables import has_columns, read_head
 from rangesfm.findings.calibration import Calibration, read_calibrations
 from rangesfm.geometry.reference import is_reference_file
 from rangesfm.ranging.anchors.anchor import ANCHOR_ALIASES, ANCHOR_COLUMNS
@@ -21,7 +21,7 @@ from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.sources.bag import has_images
 from rangesfm.sources.source import is_video
 from rangesfm.vision.image_times import IMAGE_EXTENSIONS, is_image_times_file
-from rangesfm.vision.photos import MIN_NUM_PHOTOS
+from rangesfm.vision.photo_files import MIN_NUM_PHOTOS
 
 PHOTOS, MODEL, LOG = "images.path", "images.model", "ranges.path"
 _NOT_READ = {

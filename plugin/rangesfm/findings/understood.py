@@ -17,7 +17,7 @@ from rangesfm.ranging.readers import read_ranges
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
 from rangesfm.vision.image_times import list_images
-from rangesfm.vision.photos import usable_photos
+from rangesfm.vision.photo_files import usable_photos
 
 # A file or folder with such a name (without suffix, in lower case) is chosen among several candidates for a key.
 _USUAL_NAMES = {

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
-from rangesfm.files.tables import (
+from rangesfm.files.text_tables import (
     Table,
     has_columns,
     header_names,

@@ -11,8 +11,8 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import in_first_camera
 from rangesfm.options import ScaleOptions
-from rangesfm.planning.photos import PlannedMap
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.planned_photos import PlannedMap
 from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.errors.cells import MAX_NUM_CELLS
 from rangesfm.ranging.errors.components import BENDS

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions
-from rangesfm.planning.photos import PlannedPhotos
+from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog

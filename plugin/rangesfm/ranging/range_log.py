@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.files.tables import Categories
+from rangesfm.files.text_tables import Categories
 
 DEFAULT_TAG_ID = "tag"
 # Two ranges between the same nodes cannot have the same time. If at least this share of successive ranges has, the

@@ -10,7 +10,7 @@ import pycolmap
 
 from rangesfm import ceres
 from rangesfm.arrays import Array
-from rangesfm.distances.ends import LocatedDistances, images_by_name, triangulate_markers
+from rangesfm.distances.locate_lengths import LocatedDistances, images_by_name, triangulate_markers
 from rangesfm.distances.tape import Tape
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate

@@ -14,7 +14,7 @@ from rangesfm.arrays import Array
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
 from rangesfm.ceres.linear_solver import inverse_is_affordable
 from rangesfm.colmap.point_observations import overlaps_in
-from rangesfm.distances.ends import LocatedDistances, distances_by_radio
+from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_radio
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity

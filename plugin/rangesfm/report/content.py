@@ -14,9 +14,9 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.export.metric_map import points_of
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.result.folder import ResultFolder
 from rangesfm.result.model_path import path_of_model
-from rangesfm.result.tables import RangesAsUsed
+from rangesfm.result.result_folder import ResultFolder
+from rangesfm.result.result_tables import RangesAsUsed
 
 DEFAULT_FOLDER = "out"
 MAX_KEYFRAME_SHARE = 0.1

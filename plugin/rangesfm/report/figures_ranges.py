@@ -24,7 +24,7 @@ from rangesfm.report.plot import (
     running_median,
     time_axis,
 )
-from rangesfm.result.tables import RangesAsUsed
+from rangesfm.result.result_tables import RangesAsUsed
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48

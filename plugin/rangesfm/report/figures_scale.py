@@ -7,7 +7,7 @@ import numpy as np
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, every_nth, figure_of, from_zero, time_axis
 from rangesfm.report.text import signed
-from rangesfm.result.tables import ScaleCandidates, ScaleConsensus, TimeOffsetCurve
+from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus, TimeOffsetCurve
 
 MAX_NUM_CANDIDATES = 3000
 CANDIDATE_AXIS = (-1.0, 4.0)

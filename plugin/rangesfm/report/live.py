@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rangesfm.files.atomic import make_output_folder
 from rangesfm.progress import Progress
-from rangesfm.report.page import render, write_page
+from rangesfm.report.report_page import render, write_page
 from rangesfm.report.text import duration
 
 PAGE_NAME = "live.html"

@@ -15,9 +15,9 @@ from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan
 from rangesfm.ranging.errors.components import component_words
-from rangesfm.report.page import Section, render, write_page
 from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
-from rangesfm.report.tables import Table
+from rangesfm.report.report_page import Section, render, write_page
+from rangesfm.report.report_tables import Table
 from rangesfm.report.text import count, duration, fixed, percent, rough
 from rangesfm.trust.testing import MistakeTest
 

@@ -22,8 +22,8 @@ from rangesfm.report.plot import every_nth
 from rangesfm.report.text import count
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.places import is_within
-from rangesfm.result.tables import USED_LABELS
-from rangesfm.vision.photos import UNREADABLE, opened_image
+from rangesfm.result.result_tables import USED_LABELS
+from rangesfm.vision.photo_files import UNREADABLE, opened_image
 
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000

@@ -13,7 +13,7 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.join.models import ModelVerdict
+from rangesfm.join.join_models import ModelVerdict
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.ranging.range_observations import RangeStatus

@@ -16,7 +16,7 @@ from rangesfm.distances.tape import Tape
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.join.models import ModelVerdict
+from rangesfm.join.join_models import ModelVerdict
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.clock.time_offset import TimeOffset
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus

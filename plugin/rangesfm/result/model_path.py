@@ -6,8 +6,8 @@ import pycolmap
 
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.result.folder import ResultFolder
-from rangesfm.result.tables import PhotoTimes
+from rangesfm.result.result_folder import ResultFolder
+from rangesfm.result.result_tables import PhotoTimes
 
 
 def path_of_model(model: pycolmap.Reconstruction, result: ResultFolder) -> Trajectory:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY, Similarity

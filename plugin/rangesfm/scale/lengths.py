@@ -14,7 +14,7 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.range_gradient import RangeGradient

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.distances.ends import LocatedDistances, distances_by_radio, surveyed_distances
+from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_radio, surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of

@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.distances.ends import LocatedDistances
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import left_jacobian
 from rangesfm.geometry.similarity import Similarity

@@ -11,7 +11,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.atomic import new_folder
 from rangesfm.files.contents import state_and_sha256
 from rangesfm.files.records import Record
-from rangesfm.files.tables import write_table
+from rangesfm.files.text_tables import write_table
 from rangesfm.progress import Progress
 from rangesfm.sources.source import Frame, Source, open_source
 

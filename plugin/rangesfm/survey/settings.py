@@ -92,7 +92,7 @@ def parse_toml(path: Path) -> tuple[dict[str, Any], Source]:
     Raises:
         InputError: it cannot be read or is not TOML; the text names the line.
     """
-    from rangesfm.files.tables import read_text
+    from rangesfm.files.text_tables import read_text
 
     text = read_text(path)
     try:

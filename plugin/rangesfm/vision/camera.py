@@ -13,7 +13,7 @@ import pycolmap
 from rangesfm.colmap.calibrated_cameras import calibrated_cameras
 from rangesfm.errors import InputError, nearest_known
 from rangesfm.options import CameraOptions
-from rangesfm.vision.photos import Photos, exif_tags
+from rangesfm.vision.photo_files import Photos, exif_tags
 from rangesfm.vision.rigs import NO_RIGS, Rigs
 
 # EXIF tags that tell one camera from another: make, model, serial number, focal length.

@@ -17,7 +17,7 @@ from rangesfm.progress import Progress
 from rangesfm.vision.database import num_photos_with_features
 from rangesfm.vision.device import refuse_missing_gpu, uses_gpu
 from rangesfm.vision.own_process import MODULE, FeatureExtraction
-from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
+from rangesfm.vision.photo_files import MIN_NUM_PHOTOS, Photos
 
 # A photo with fewer features is reported as poor. COLMAP starts from pairs with 100 matches and adds photos that see
 # 30 known points.

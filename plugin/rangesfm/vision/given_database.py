@@ -19,7 +19,7 @@ from rangesfm.files.atomic import scratch_folder
 from rangesfm.files.contents import sha256_of
 from rangesfm.vision.camera import PhotoCameras
 from rangesfm.vision.database import copy_features, copying
-from rangesfm.vision.photos import MIN_NUM_PHOTOS, Photos
+from rangesfm.vision.photo_files import MIN_NUM_PHOTOS, Photos
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
 from rangesfm.files.folders import walk
-from rangesfm.files.tables import Table, has_columns, read_table
+from rangesfm.files.text_tables import Table, has_columns, read_table
 from rangesfm.options import TIME_S
-from rangesfm.vision.photos import exif_tags
+from rangesfm.vision.photo_files import exif_tags
 
 IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 

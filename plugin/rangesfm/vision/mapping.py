@@ -24,7 +24,7 @@ from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.device import uses_gpu
 from rangesfm.vision.mapping_loop import GlobalAdjustment, adjust_whole, incremental_mapping
 from rangesfm.vision.own_process import MODULE, WholeMapping, WholePipelineOptions
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot
 from rangesfm.vision.steps import Workspace

@@ -26,7 +26,7 @@ from rangesfm.vision.device import refuse_missing_gpu, uses_gpu
 from rangesfm.vision.features import refuse_learned
 from rangesfm.vision.own_process import MODULE, MatchingShare
 from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photo_files import Photos
 
 _MIN_NUM_PAIRS = 100  # with fewer pairs, a second process is not worth its start
 _MAX_NUM_PAIRS = 2000  # pairs of one share; its database then holds some hundred photos at most

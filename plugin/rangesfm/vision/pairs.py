@@ -13,7 +13,7 @@ from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.options import MapperOptions
 from rangesfm.vision.database import named_by_place
-from rangesfm.vision.photos import Photos
+from rangesfm.vision.photo_files import Photos
 
 _MAX_NUM_EXHAUSTIVE = 60  # photos, which make 1770 pairs; with more photos the number of pairs grows too large
 

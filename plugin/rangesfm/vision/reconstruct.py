@@ -19,7 +19,7 @@ from rangesfm.vision.given_database import opened
 from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_models
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matching import matching_options
-from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
+from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase
 from rangesfm.vision.rigs import NO_RIGS, Rigs
 from rangesfm.vision.steps import LOG_NAME, Workspace, fingerprint

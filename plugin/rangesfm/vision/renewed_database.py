@@ -27,7 +27,7 @@ from rangesfm.vision.features import extract_features
 from rangesfm.vision.given_database import GivenDatabase
 from rangesfm.vision.matching import MatchingOptions, match_features, verify_matches
 from rangesfm.vision.pairs import pairs_to_match
-from rangesfm.vision.photos import Photos, exif_position
+from rangesfm.vision.photo_files import Photos, exif_position
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.steps import Workspace, fingerprint
 

@@ -15,7 +15,7 @@ from rangesfm.arrays import Array
 from rangesfm.distances.tape import CONTROL, FOUND_STDDEV_PX, Marker, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
-from rangesfm.vision.photos import UNREADABLE, opened_image
+from rangesfm.vision.photo_files import UNREADABLE, opened_image
 
 # The centre of the first pixel is (0, 0) in OpenCV and (0.5, 0.5) in COLMAP.
 _CENTRE_PX = 0.5

@@ -8,7 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
-from rangesfm.join.models import PathOfModel
+from rangesfm.join.join_models import PathOfModel
 from rangesfm.progress import Journal
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.result.metric_result import MetricResult
@@ -16,7 +16,7 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.trust.hypothesis import Correction
 from rangesfm.trust.verdict import TrustVerdict
-from rangesfm.workflows.metric_map import metric_map, ranges_on_path
+from rangesfm.workflows.make_metric_map import metric_map, ranges_on_path
 
 
 def with_likeliest_cause(

@@ -22,9 +22,9 @@ from rangesfm.vision.features import feature_options
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.matching import matching_options
-from rangesfm.vision.photos import Photos, contents_of_masks, usable_photos
+from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.rigs import read_rigs
-from rangesfm.workflows.photos import checked_keyframes, read_inputs, read_registered
+from rangesfm.workflows.map_photos import checked_keyframes, read_inputs, read_registered
 
 # Largest number of photo sizes and of cameras that are listed.
 _MAX_NUM_SIZES = 4

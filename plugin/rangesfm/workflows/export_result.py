@@ -11,9 +11,9 @@ from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats,
 from rangesfm.export.metric_map import in_frame
 from rangesfm.files.atomic import sole_writer
 from rangesfm.options import ExportOptions
-from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.model_path import path_of_model
-from rangesfm.result.tables import CenterCovariances
+from rangesfm.result.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.result_tables import CenterCovariances
 from rangesfm.vision.steps import DATABASE_NAME
 
 

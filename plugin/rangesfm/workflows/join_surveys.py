@@ -16,7 +16,7 @@ from rangesfm.export import check_formats
 from rangesfm.files.atomic import require_apart, sole_writer
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
-from rangesfm.join.models import PathOfModel
+from rangesfm.join.join_models import PathOfModel
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
@@ -24,13 +24,13 @@ from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.model_path import path_of_model
-from rangesfm.result.tables import RangesAsUsed
+from rangesfm.result.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.results import RunResult
 from rangesfm.workflows.run import map_in_metres
+from rangesfm.workflows.run_results import RunResult
 
 # In metres. The files of two surveys may round the position of the same anchor differently.
 _SAME_PLACE_M = 1e-3

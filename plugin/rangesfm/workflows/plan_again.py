@@ -19,10 +19,10 @@ from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.result.folder import read_result_folder
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.model_path import path_of_model
-from rangesfm.result.tables import RangesAsUsed
+from rangesfm.result.result_folder import read_result_folder
+from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.scale.verdict import CALIBRATE
 
 # Assumed rate of photos without times.

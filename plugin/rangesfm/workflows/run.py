@@ -11,29 +11,29 @@ from dataclasses import replace
 
 import pycolmap
 
-from rangesfm.distances.ends import locatable
+from rangesfm.distances.locate_lengths import locatable
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer
-from rangesfm.join.models import PathOfModel
+from rangesfm.join.join_models import PathOfModel
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.clock.time_offset import TimeOffset
-from rangesfm.result.folder import refuse_to_overwrite, result_names
+from rangesfm.result.result_folder import refuse_to_overwrite, result_names
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.adoption import with_likeliest_cause
-from rangesfm.workflows.metric_map import (
+from rangesfm.workflows.make_metric_map import (
     find_time_offset,
     join_by_survey,
     metric_map,
     path_with_times,
     ranges_on_paths,
 )
-from rangesfm.workflows.photos import (
+from rangesfm.workflows.map_photos import (
     AdjustmentWithRanges,
     check_times,
     checked_keyframes,
@@ -46,7 +46,7 @@ from rangesfm.workflows.photos import (
     with_tags,
 )
 from rangesfm.workflows.plan_again import with_advice
-from rangesfm.workflows.results import RunResult, write_results
+from rangesfm.workflows.run_results import RunResult, write_results
 
 
 def metric_map_of(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rangesfm.comparison.models import compare_many, read_models
-from rangesfm.comparison.page import write_comparison
+from rangesfm.comparison.comparison_page import write_comparison
+from rangesfm.comparison.many_models import compare_many, read_models
 
 if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser

@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, read_table, repeated, write_user_table
+from rangesfm.files.text_tables import Table, read_table, repeated, write_user_table
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 
 _COORDINATES = ("x_m", "y_m", "z_m")

@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.tables import has_columns, read_table, write_table
+from rangesfm.files.text_tables import has_columns, read_table, write_table
 from rangesfm.options import BIAS_M, LENGTH_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.range_log import RangeLog
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag_folder
-from rangesfm.files.tables import read_head
+from rangesfm.files.text_tables import read_head
 from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import find_quantization_m, quantization_stddev_m

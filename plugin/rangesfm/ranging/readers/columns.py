@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array
-from rangesfm.files.tables import Categories, Table, read_table
+from rangesfm.files.text_tables import Categories, Table, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout

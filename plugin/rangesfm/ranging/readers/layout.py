@@ -19,7 +19,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, read_head, read_text
+from rangesfm.files.text_tables import Table, read_head, read_text
 from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 

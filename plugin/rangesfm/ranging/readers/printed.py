@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError
-from rangesfm.files.tables import read_text
+from rangesfm.files.text_tables import read_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID
 from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, Sides, reader_of_readings

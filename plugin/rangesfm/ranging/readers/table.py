@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError, printable
-from rangesfm.files.tables import header_names, read_head, write_user_table
+from rangesfm.files.text_tables import header_names, read_head, write_user_table
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns

@@ -7,7 +7,7 @@ import pytest
 from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.demo.ranges import CameraPath, Radio, SimulatedRanges, simulate_ranges
+from rangesfm.demo.simulated_radio import CameraPath, Radio, SimulatedRanges, simulate_ranges
 
 PATH = loop_path(100.0, start_s=50.0)
 ANCHORS = {"east": (9.0, 1.0, 0.5), "north": (0.0, 8.0, 2.0), "up": (-3.0, -2.0, 4.0)}

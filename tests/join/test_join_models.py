@@ -19,11 +19,11 @@ from tests.simulated.ranges import simulate_ranges_at
 from rangesfm.cli import main
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale, without_photos
-from rangesfm.demo.ranges import CameraPath, Radio
+from rangesfm.demo.simulated_radio import CameraPath, Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.join.models import JoinedModels, PathOfModel, join_models
+from rangesfm.join.join_models import JoinedModels, PathOfModel, join_models
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import local_site
@@ -182,7 +182,7 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
     def reconstruct(*_: Any, **__: Any) -> ReconstructionSummary:
         return ReconstructionSummary(models, len(names), HALF, {}, tmp_path / "mapper.log")
 
-    monkeypatch.setattr("rangesfm.workflows.photos.reconstruct", reconstruct)
+    monkeypatch.setattr("rangesfm.workflows.map_photos.reconstruct", reconstruct)
     survey = exact.write(tmp_path).changed({"images.path": tmp_path / "photos"})
     result = run_survey(survey, progress=SilentProgress()).summary
     path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))

@@ -13,9 +13,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.comparison.models import ModelsComparison, compare_many, read_models
-from rangesfm.comparison.page import write_comparison
-from rangesfm.comparison.ranges import ranges_of_survey
+from rangesfm.comparison.comparison_page import write_comparison
+from rangesfm.comparison.many_models import ModelsComparison, compare_many, read_models
+from rangesfm.comparison.model_ranges import ranges_of_survey
 from rangesfm.distances.tape import read_tape
 from rangesfm.errors import InputError
 from rangesfm.progress import SilentProgress

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import GeometryError
-from rangesfm.join.models import PathOfModel
+from rangesfm.join.join_models import PathOfModel
 from rangesfm.ranging.clock.search import CostCurve
 from rangesfm.ranging.clock.time_offset import Rival, TimeOffset
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.workflows import metric_map
+from rangesfm.workflows import make_metric_map
 
 VALUE_S, RIVAL_S = 1.0, 4.0
 
@@ -26,13 +26,13 @@ class Scales:
     by_offset_s: dict[float, float | None]
 
     def by_rivals(self, monkeypatch: pytest.MonkeyPatch, probability: float) -> tuple[tuple[str, ...], float]:
-        monkeypatch.setattr(metric_map, "ranges_on_path", lambda *given: float(np.mean(given[3])))
-        monkeypatch.setattr(metric_map, "estimate_scale", self.estimate)
+        monkeypatch.setattr(make_metric_map, "ranges_on_path", lambda *given: float(np.mean(given[3])))
+        monkeypatch.setattr(make_metric_map, "estimate_scale", self.estimate)
         log = RangeLog.from_arrays(["A"] * 3, [1.0] * 3, timestamp_s=[0.0, 1.0, 2.0])
         inputs: Any = SimpleNamespace(log=log, anchor_frame="unknown")
         offset = time_offset(probability, (Rival(RIVAL_S, 1 - probability),))
         unused: Any = None
-        return metric_map.scale_by_rivals(unused, inputs, PathOfModel("", unused, unused, unused), offset, 2.0)
+        return make_metric_map.scale_by_rivals(unused, inputs, PathOfModel("", unused, unused, unused), offset, 2.0)
 
     def estimate(self, survey: object, inputs: object, path: Any) -> SimpleNamespace:
         scale = self.by_offset_s[path.observations]

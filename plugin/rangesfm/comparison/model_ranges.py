@@ -16,9 +16,9 @@ from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.time_offset import estimate_time_offset
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.result.folder import ResultFolder
 from rangesfm.result.metric_result import USED
-from rangesfm.result.tables import RangesAsUsed
+from rangesfm.result.result_folder import ResultFolder
+from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.survey.inputs import RangingInputs, times_of_model
 from rangesfm.survey.settings import Survey

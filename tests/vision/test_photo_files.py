@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from rangesfm.vision.photos import MAX_PIXELS, exif_position, exif_tags, image_size, usable_photos
+from rangesfm.vision.photo_files import MAX_PIXELS, exif_position, exif_tags, image_size, usable_photos
 
 SIZE = (20_000, 10_000)
 

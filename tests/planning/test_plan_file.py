@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
-from rangesfm.planning.settings import read_plan
+from rangesfm.planning.plan_file import read_plan
 
 ANCHORS = "[anchors.places]\nA = [0, 0, 2]\nB = [6.0, 0, 2.5]\nC = [3, 5, 1]\n"
 PATH = "[path]\nwaypoints = [[1, 1, 1.5], [5, 1, 1.5], [3, 3, 1.5]]\nspeed_m_per_s = 0.5\n"

@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.ceres.installation_checks import versions
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
-from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
 from rangesfm.geometry.reference import write_reference
@@ -17,15 +17,15 @@ from rangesfm.progress import Journal
 from rangesfm.report import write_report_of
 from rangesfm.report.content import Content
 from rangesfm.result.entries import ComparisonRow
-from rangesfm.result.folder import (
+from rangesfm.result.metric_result import MetricResult
+from rangesfm.result.places import recorded_inputs, recorded_settings
+from rangesfm.result.result_folder import (
     REFERENCE_NAME,
     REPORT_NAME,
     new_result,
     read_result_folder,
     write_models_and_tables,
 )
-from rangesfm.result.metric_result import MetricResult
-from rangesfm.result.places import recorded_inputs, recorded_settings
 from rangesfm.result.summary import ResultSummary
 from rangesfm.scale.lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes

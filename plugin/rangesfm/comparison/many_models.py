@@ -12,19 +12,19 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
-from rangesfm.comparison.ranges import ModelRanges, ranges_of_result
+from rangesfm.comparison.model_ranges import ModelRanges, ranges_of_result
 from rangesfm.comparison.with_reference import known_keyframes, similarity_onto, text_or_dash
-from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
-from rangesfm.files.tables import align_rows
+from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import Similarity, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.report.tables import Table
+from rangesfm.report.report_tables import Table
 from rangesfm.result.entries import rms
-from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.model_path import path_of_model
+from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 
 Length = tuple[str, str, tuple[float, ...]]

@@ -11,7 +11,7 @@ import pytest
 
 from rangesfm.batch.course import Course, Status
 from rangesfm.batch.jobs import Job
-from rangesfm.batch.run import write_results
+from rangesfm.batch.run_batch import write_results
 from rangesfm.errors import Failure
 from rangesfm.options import OutputOptions
 from rangesfm.survey.settings import Survey

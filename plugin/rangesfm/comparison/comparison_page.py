@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.comparison.models import ModelsComparison, carried_by
+from rangesfm.comparison.many_models import ModelsComparison, carried_by
 from rangesfm.export.metric_map import points_of
 from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.report.page import Section, render, write_page
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
+from rangesfm.report.report_page import Section, render, write_page
 from rangesfm.report.scene import Scene, ScenePath, view_of
 
 COLORS = ("after", "before", "third", "fourth")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rangesfm.files.tables import align_rows
+from rangesfm.files.text_tables import align_rows
 
 
 def test_first_columns_begin_alike_and_others_end_alike() -> None:

@@ -9,10 +9,10 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from rangesfm.batch.course import Course, Status, SurveyRow
-from rangesfm.report import page
-from rangesfm.report.tables import Table
+from rangesfm.report import report_page
+from rangesfm.report.report_tables import Table
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain
-from rangesfm.result.folder import REPORT_NAME
+from rangesfm.result.result_folder import REPORT_NAME
 
 RELOAD_S = 5
 _HEADER = (
@@ -41,7 +41,7 @@ def render(course: Course, folder: Path) -> str:
         folder: folder of the page, to which its links are relative.
     """
     heading = f"{len(course.rows)} surveys"
-    return page.render(
+    return report_page.render(
         "batch.html",
         title=f"{heading} – rangesfm batch",
         heading=heading,
@@ -68,7 +68,7 @@ def _row(row: SurveyRow, folder: Path) -> list[str]:
     scale = fixed(row.scale, decimals)
     return [
         _name(row, folder),
-        Markup("{} {}").format(page.light(_light(row)), row.verdict or row.status.value),
+        Markup("{} {}").format(report_page.light(_light(row)), row.verdict or row.status.value),
         scale if row.scale_stddev is None else f"{scale} ± {fixed(row.scale_stddev, decimals)}",
         count(row.num_photos),
         f"{count(row.num_ranges_used)} of {count(row.num_ranges)}" if row.num_ranges is not None else plain(None),

@@ -20,11 +20,11 @@ from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.export import check_formats
 from rangesfm.files.contents import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.join.models import PathOfModel, estimate_scale
+from rangesfm.join.join_models import PathOfModel, estimate_scale
 from rangesfm.progress import Journal
 from rangesfm.ranging.clock.time_offset import estimate_time_offset
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.result.folder import RESULT_NAMES, places_for_photos, refuse_to_overwrite
+from rangesfm.result.result_folder import RESULT_NAMES, places_for_photos, refuse_to_overwrite
 from rangesfm.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.sources.source import is_source
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
@@ -36,7 +36,7 @@ from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
-from rangesfm.workflows.metric_map import path_of_model, ranges_on_path, refine_by_survey
+from rangesfm.workflows.make_metric_map import path_of_model, ranges_on_path, refine_by_survey
 
 # A path of fewer keyframes has too little shape for ranges to determine its scale.
 _MIN_NUM_KEYFRAMES = 5

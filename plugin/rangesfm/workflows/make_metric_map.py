@@ -12,12 +12,12 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
-from rangesfm.distances.ends import surveyed_distances
+from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera, trajectory_from_reconstruction
-from rangesfm.join.models import ModelVerdict, PathOfModel, estimate_scale, join_models
+from rangesfm.join.join_models import ModelVerdict, PathOfModel, estimate_scale, join_models
 from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset, estimate_time_offset

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.colmap.transform import joined_model, rescale
-from rangesfm.distances.ends import distances_within, locatable, locate_distances
+from rangesfm.distances.locate_lengths import distances_within, locatable, locate_distances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, joined_trajectory

@@ -15,9 +15,9 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import Options, Told
 from rangesfm.options import LENGTH_M, RangeModelOptions, TagOptions, Uncertainty
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
-from rangesfm.planning.photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
 from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
 from rangesfm.survey.settings import parse_toml, refuse_unknown_tables

@@ -13,13 +13,13 @@ from tests.outputs import names_in, paths_in
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
-from rangesfm.result.folder import (
+from rangesfm.result.result_folder import (
     RESULT_FILES,
     new_result,
     read_result_folder,
     refuse_to_overwrite,
 )
-from rangesfm.result.tables import TABLES, RangesAsUsed
+from rangesfm.result.result_tables import TABLES, RangesAsUsed
 from rangesfm.survey.settings import Survey, survey_from_tables
 
 PAGE = (Path(__file__).parents[2] / "examples" / "results.md").read_text(encoding="utf-8")

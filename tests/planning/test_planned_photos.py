@@ -9,7 +9,7 @@ import pytest
 from tests.planning.surveys import FIVE_ANCHORS_M, loop, planned
 
 from rangesfm.planning.expected import Expected, expect
-from rangesfm.planning.photos import PlannedPhotos
+from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.ranging.errors.components import BENDS
 
 OPEN = PlannedPhotos(num_points=60, feature_stddev=0.001)

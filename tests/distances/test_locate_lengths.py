@@ -10,7 +10,7 @@ import pytest
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
-from rangesfm.distances.ends import locate_distances
+from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance, disagreements, distance_rows
 from rangesfm.errors import InputError
 

@@ -14,14 +14,14 @@ from distributed import Client, Future, KilledWorker, wait
 from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch import workers
+from rangesfm.batch.batch_page import render
 from rangesfm.batch.course import BatchListener, Course, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
-from rangesfm.batch.page import render
 from rangesfm.ceres.installation_checks import versions
 from rangesfm.errors import FAILED, Failure
 from rangesfm.files.atomic import sole_writer, write_text
 from rangesfm.files.records import write_json
-from rangesfm.files.tables import write_table
+from rangesfm.files.text_tables import write_table
 
 _POLL_INTERVAL_S = 0.2
 _NUM_RETRIES = 2  # for a survey whose process was killed; Dask itself counts attempts whose worker was killed

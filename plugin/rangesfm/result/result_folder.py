@@ -23,8 +23,8 @@ from rangesfm.options import ExportOptions
 from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME, read_map_errors, write_map_errors
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.places import input_beside, path_in
+from rangesfm.result.result_tables import TABLES, PhotoTimes, TableFile
 from rangesfm.result.summary import ResultSummary
-from rangesfm.result.tables import TABLES, PhotoTimes, TableFile
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.steps import RECONSTRUCTION_NAMES
 

@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from rangesfm.files.atomic import new_file
-from rangesfm.report import figures_mistakes, figures_path, figures_ranges, figures_scale, tables, text
+from rangesfm.report import figures_mistakes, figures_path, figures_ranges, figures_scale, report_tables, text
 from rangesfm.report.chart import ASSETS, css, page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
@@ -34,25 +34,26 @@ class Section(NamedTuple):
     id: str
     title: str
     figures: Sequence[Figure] = ()
-    tables: Sequence[tables.Table] = ()
+    tables: Sequence[report_tables.Table] = ()
 
 
 # Sections of the report: title, and the functions that make its figures and tables.
-_SECTIONS: dict[str, tuple[Callable[[Content], Figure | tables.Table | None], ...]] = {
-    "Path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale, tables.comparison),
+_SECTIONS: dict[str, tuple[Callable[[Content], Figure | report_tables.Table | None], ...]] = {
+    "Path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale, report_tables.comparison),
     "Scale": (
         *(figures_scale.scale_per_anchor, figures_scale.consensus, figures_scale.clock_curve, figures_scale.candidates),
-        *(tables.scale_by_kind, tables.error_budget, tables.two_candidates, tables.sensitivity),
+        *(report_tables.scale_by_kind, report_tables.error_budget),
+        *(report_tables.two_candidates, report_tables.sensitivity),
     ),
     "Ranges": (
         *(figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
-        *(tables.range_statuses, tables.ranges_per_anchor),
+        *(report_tables.range_statuses, report_tables.ranges_per_anchor),
     ),
-    "Mistakes": (figures_mistakes.mistakes, tables.mistakes),
-    "Anchors": (tables.anchors, tables.distances),
+    "Mistakes": (figures_mistakes.mistakes, report_tables.mistakes),
+    "Anchors": (report_tables.anchors, report_tables.distances),
     "Run": (
-        *(tables.stages, tables.refinement, tables.versions),
-        *(tables.intrinsics, tables.inputs, tables.settings),
+        *(report_tables.stages, report_tables.refinement, report_tables.versions),
+        *(report_tables.intrinsics, report_tables.inputs, report_tables.settings),
     ),
 }
 STYLES = ("page.css", "view.css")
@@ -70,7 +71,7 @@ def sections_of(content: Content) -> list[Section]:
         made = [make(content) for make in makers]
         figures = [each for each in made if isinstance(each, Figure)]
         sections.append(
-            Section(title.lower(), title, figures, [each for each in made if isinstance(each, tables.Table)])
+            Section(title.lower(), title, figures, [each for each in made if isinstance(each, report_tables.Table)])
         )
     return sections
 

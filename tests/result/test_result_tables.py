@@ -10,7 +10,14 @@ import pytest
 from tests.outputs import names_in
 
 from rangesfm.errors import InputError
-from rangesfm.result.tables import TABLES, CenterCovariances, PhotoTimes, ScaleConsensus, TableFile, TimeOffsetCurve
+from rangesfm.result.result_tables import (
+    TABLES,
+    CenterCovariances,
+    PhotoTimes,
+    ScaleConsensus,
+    TableFile,
+    TimeOffsetCurve,
+)
 
 
 def example(kind: type[TableFile], num_rows: int) -> TableFile:

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.files.tables import Table, header_names, read_table, read_text, write_table
+from rangesfm.files.text_tables import Table, header_names, read_table, read_text, write_table
 
 
 def write(folder: Path, content: str | bytes) -> Path:
@@ -243,7 +243,7 @@ class TestFastWay:
 
     def test_it_is_taken(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         path = write(tmp_path, "a,other,b\r\n-1.5,x,7\r\n2e3,,8\r\n")
-        monkeypatch.setattr("rangesfm.files.tables._table_of_texts", lambda *_: pytest.fail("it is not"))
+        monkeypatch.setattr("rangesfm.files.text_tables._table_of_texts", lambda *_: pytest.fail("it is not"))
         table = read_table(path, ["a", "b"], text=["b"])
         np.testing.assert_array_equal(table.numbers("a"), [-1.5, 2000])
         assert table.text("b") == ["7", "8"]

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.files.tables import Table, read_table, write_table
+from rangesfm.files.text_tables import Table, read_table, write_table
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
 
