@@ -30,7 +30,7 @@ TESTS = (
     "tests/ranging/test_range_gradient.py",
     "tests/refine/test_carry.py",
     "tests/refine/test_keyframe_graph.py",
-    "tests/refine/test_unbend.py",
+    "tests/refine/test_graph_presolve.py",
     "tests/refine/test_vision_information.py",
     "tests/scale/test_anchor_alignment.py",
     "tests/scale/test_consensus.py",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rangesfm.batch.course import Course, Status
+from rangesfm.batch.batch_state import Course, Status
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.run_batch import write_results
 from rangesfm.errors import Failure

@@ -24,12 +24,12 @@ from tests.simulated.path import loop_path
 from tests.studies.erring_surveys import SITES
 
 from rangesfm.demo.simulated_radio import Radio, simulate_ranges
+from rangesfm.diagnostics.diagnosis import trust_in
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.refine.with_ranges import refine_with_ranges
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.verdict import trust_in
 from rangesfm.workflows.run import refine_model
 
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)

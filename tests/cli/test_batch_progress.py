@@ -7,7 +7,7 @@ import io
 import pytest
 from tests.cli.screen import Clock, Terminal
 
-from rangesfm.batch.course import Course, Status
+from rangesfm.batch.batch_state import Course, Status
 from rangesfm.batch.jobs import Job
 from rangesfm.cli.batch import BatchTerminal
 from rangesfm.survey.settings import Survey

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from tests.planning.surveys import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned, turned_out
 
+from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.planning.expected import expect
 from rangesfm.planning.paths import path_through
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.lengths import BENDING
-from rangesfm.trust.finished_map import by_similarity
+from rangesfm.scale.scale_by_lengths import BENDING
 
 
 @pytest.mark.parametrize(

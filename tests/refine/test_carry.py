@@ -7,7 +7,7 @@ from tests.refine.conftest import bent, poses_and_rays
 from tests.simulated.model import SyntheticModel
 
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.refine.unbend import carry_model
+from rangesfm.refine.graph_presolve import carry_model
 from rangesfm.refine.vision_information import model_poses, project, ray_residuals
 
 

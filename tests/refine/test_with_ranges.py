@@ -31,16 +31,16 @@ from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_re
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.cells import cells
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import shared_stddev
+from rangesfm.ranging.errors.range_bins import cells
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine import with_ranges
-from rangesfm.refine.problem import RefinementProblem
+from rangesfm.refine.graph_presolve import Unbent, unbend_again
 from rangesfm.refine.radio import predicted_ranges
-from rangesfm.refine.unbend import Unbent, unbend_again
+from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import Observations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale

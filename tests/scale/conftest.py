@@ -20,8 +20,8 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 Array = npt.NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from rangesfm.scale.initialize import initialize_scale
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
 
-    from rangesfm.scale.estimate import ScaleEstimate
+    from rangesfm.scale.scale_estimate import ScaleEstimate
 
 Array = npt.NDArray[np.float64]
 

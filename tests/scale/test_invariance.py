@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.association import associate
-from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey

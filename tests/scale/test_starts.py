@@ -10,8 +10,8 @@ import pytest
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.geometry.similarity import IDENTITY, path_shape
 from rangesfm.options import RangeModelOptions
-from rangesfm.scale.problem import scale_problem
 from rangesfm.scale.range_equation import RangeProblem, RangeState
+from rangesfm.scale.scale_problem import scale_problem
 from rangesfm.scale.starts import choose_sides, sphere_swaps
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ from rangesfm.demo.simulated_radio import Radio
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.bending import BendingOfCells
-from rangesfm.ranging.errors.cells import Cells
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.scale.estimate import ScaleEstimate, ScaleUncertainty
+from rangesfm.ranging.errors.range_bins import Cells
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.uncertainty import expected_scale_uncertainty, known_map
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.learned import usual_stddevs
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.lengths import BENDING
+from rangesfm.scale.scale_by_lengths import BENDING
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]

@@ -15,6 +15,10 @@ from tests.simulated.surveys import LASTING_S, error_curve, lasting
 
 from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.simulated_radio import CameraPath
+from rangesfm.diagnostics.bent_path import bent_to_ranges, estimate_by_bent
+from rangesfm.diagnostics.diagnosis import TrustVerdict, trust_in
+from rangesfm.diagnostics.finished_map import by_similarity, doubts_of_map
+from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
@@ -23,13 +27,9 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.range_equation import RangeProblem, RangeState
-from rangesfm.trust.bent_path import bent_to_ranges, estimate_by_bent
-from rangesfm.trust.finished_map import by_similarity, doubts_of_map
-from rangesfm.trust.linearized import RangesOnMap, ranges_on_map
-from rangesfm.trust.verdict import TrustVerdict, trust_in
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 Array = npt.NDArray[np.float64]
 

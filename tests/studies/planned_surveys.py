@@ -33,8 +33,8 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import stddevs_in
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.range_equation import RangeState
+from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
 from rangesfm.scale.solution import solution_from
 
 Array = npt.NDArray[np.float64]

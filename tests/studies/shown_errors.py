@@ -21,8 +21,8 @@ from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.components import components
 from rangesfm.ranging.errors.learned import learn_errors
 from rangesfm.scale.initialize import model_from_cam
-from rangesfm.scale.problem import scale_problem
 from rangesfm.scale.range_equation import predicted_ranges
+from rangesfm.scale.scale_problem import scale_problem
 from rangesfm.scale.solution import solve_scale
 from rangesfm.scale.uncertainty import errors_to_expect
 

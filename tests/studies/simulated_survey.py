@@ -26,8 +26,8 @@ from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
-from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 Array = npt.NDArray[np.float64]
 

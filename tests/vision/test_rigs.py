@@ -20,7 +20,7 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.scale.lengths import scale_by_lengths
+from rangesfm.scale.scale_by_lengths import scale_by_lengths
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import read_image_times_csv
 from rangesfm.vision.photo_files import usable_photos

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from rangesfm.batch.course import Course, Status, SurveyRow
+from rangesfm.batch.batch_state import Course, Status, SurveyRow
 from rangesfm.report import report_page
 from rangesfm.report.report_tables import Table
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain

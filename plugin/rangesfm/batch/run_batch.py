@@ -15,7 +15,7 @@ from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch import workers
 from rangesfm.batch.batch_page import render
-from rangesfm.batch.course import BatchListener, Course, Status, SurveyRow
+from rangesfm.batch.batch_state import BatchListener, Course, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
 from rangesfm.ceres.installation_checks import versions
 from rangesfm.errors import FAILED, Failure

@@ -17,7 +17,7 @@ def _run(given: tuple[Survey, bool], worker: MessagesToParent) -> dict[str, Any]
     survey, restart = given
     # The lock of the output folder names this command to other processes.
     sys.argv = ["rangesfm", "batch", str(survey.source.path)]
-    from rangesfm.batch.course import figures_of
+    from rangesfm.batch.batch_state import figures_of
     from rangesfm.workflows.run import metric_map_of
 
     summary = metric_map_of(survey, progress=worker, restart=restart).summary

@@ -18,7 +18,7 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress, duration
 
 if TYPE_CHECKING:
-    from rangesfm.batch.course import Course, SurveyState
+    from rangesfm.batch.batch_state import Course, SurveyState
 
 
 # Keys without a flag here: each survey has its own photos and output, and the workers share the threads.
@@ -78,7 +78,7 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
         import distributed  # noqa: F401
     except ImportError:
         raise InputError("rangesfm batch needs Dask: python -m pip install 'rangesfm[batch]'") from None
-    from rangesfm.batch.course import exit_status_of, format_rows
+    from rangesfm.batch.batch_state import exit_status_of, format_rows
     from rangesfm.batch.jobs import BatchOptions, read_jobs
     from rangesfm.batch.run_batch import PAGE_NAME, TABLE_NAME, run_batch
 

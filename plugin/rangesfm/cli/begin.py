@@ -41,9 +41,9 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     from rangesfm.files.atomic import write_text
     from rangesfm.files.output_folder import free_output
-    from rangesfm.findings.survey_file import NAME, survey_text
-    from rangesfm.findings.understood import understand
     from rangesfm.survey.settings import read_survey
+    from rangesfm.survey_discovery.survey_file import NAME, survey_text
+    from rangesfm.survey_discovery.understood import understand
     from rangesfm.workflows.check import check_survey
 
     folders = [Path(folder) for folder in args.folders]

@@ -221,8 +221,8 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
     Raises:
         InputError: the file cannot be read, or a key or a flag is wrong.
     """
-    from rangesfm.findings.survey_file import NAME
     from rangesfm.survey.settings import read_survey, survey_from_tables
+    from rangesfm.survey_discovery.survey_file import NAME
 
     overrides = overrides_from_arguments(args)
     path = None if getattr(args, "survey", None) is None else Path(args.survey)
@@ -231,7 +231,7 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
         return survey_from_tables({}, Path.cwd(), overrides)
     if path.is_dir():
         from rangesfm.files.output_folder import free_output
-        from rangesfm.findings.understood import understand
+        from rangesfm.survey_discovery.understood import understand
 
         understood = understand([path], {"output.path": free_output(path.absolute()), **overrides})
         if progress is not None:

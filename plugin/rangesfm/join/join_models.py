@@ -15,9 +15,9 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, joined_trajectory
 from rangesfm.ranging.errors.bending import MapBending
 from rangesfm.ranging.range_observations import RangeObservations, each_on_one_path, joined_observations
-from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.model_placement import ScaledModel, place_models
+from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 

@@ -17,7 +17,7 @@ from rangesfm.planning.placement import spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import BENDS, COMPONENTS
-from rangesfm.scale.verdict import CALIBRATE
+from rangesfm.scale.scale_verdict import CALIBRATE
 
 # Changes of an anchor's height that are tried, metres.
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import in_first_camera
@@ -14,19 +15,20 @@ from rangesfm.options import ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedMap
 from rangesfm.ranging.errors.bending import WalkBending
-from rangesfm.ranging.errors.cells import MAX_NUM_CELLS
 from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.learned import LearnedErrors, usual_stddevs
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.place import shares_of_places
+from rangesfm.ranging.errors.range_bins import MAX_NUM_CELLS
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
-from rangesfm.scale.estimate import ScaleUncertainty
 from rangesfm.scale.initialize import model_from_cam, placement_covariance
-from rangesfm.scale.lengths import BENDING
-from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import RangeFit, RangeState, fit_at, range_jacobian, tag_positions
+from rangesfm.scale.scale_by_lengths import BENDING
+from rangesfm.scale.scale_estimate import ScaleUncertainty
+from rangesfm.scale.scale_problem import ScaleProblem
+from rangesfm.scale.scale_verdict import Verdict, judge
 from rangesfm.scale.solution import Solution, refuse_ambiguity, weighted
 from rangesfm.scale.uncertainty import (
     errors_to_expect,
@@ -34,8 +36,6 @@ from rangesfm.scale.uncertainty import (
     parameter_covariance,
     parameter_influence,
 )
-from rangesfm.scale.verdict import Verdict, judge
-from rangesfm.trust.finished_map import by_similarity
 
 # Rounds in which the noise that the run will see and the weights of its ranges are made consistent.
 _NUM_NOISE_ROUNDS = 2

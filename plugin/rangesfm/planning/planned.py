@@ -17,8 +17,8 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.problem import ScaleProblem, scale_problem
 from rangesfm.scale.range_equation import RangeState
+from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
 
 # Offset of anchors with unknown positions, metres. In practice no anchor is exactly in line with a path or in its
 # plane. In a plan it may be, and the linearized problem would then miss what is not determined.

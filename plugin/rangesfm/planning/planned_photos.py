@@ -26,7 +26,7 @@ from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.keyframe_graph import KeyframeGraph, linear_functions
 from rangesfm.refine.radio import antennas
 from rangesfm.refine.vision_information import Observations, Poses, VisionInformation, vision_information
-from rangesfm.scale.problem import ScaleProblem
+from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 
 MAX_NUM_PHOTOS = 2000

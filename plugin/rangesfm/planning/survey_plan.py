@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from rangesfm.diagnostics.catalogue import STANDING
+from rangesfm.diagnostics.hypothesis_tests import Factorization, MistakeTest, row_of
+from rangesfm.diagnostics.linearized import linearized, ranges_on_map
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import component_words
-from rangesfm.trust.catalogue import STANDING
-from rangesfm.trust.linearized import linearized, ranges_on_map
-from rangesfm.trust.testing import Factorization, MistakeTest, row_of
 
 _MAX_NUM_SHOWN = 5
 # Columns of a mistake's test that do not depend on the measured ranges.

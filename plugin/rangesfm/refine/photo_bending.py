@@ -23,7 +23,7 @@ from rangesfm.ranging.errors.bending import (
     component_of,
     without_similarity,
 )
-from rangesfm.ranging.errors.cells import Cells
+from rangesfm.ranging.errors.range_bins import Cells
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 

@@ -29,9 +29,9 @@ from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, Solution, solve, solve_until_still
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
-from rangesfm.refine.problem import RefinementProblem
+from rangesfm.refine.graph_presolve import SAME_ERRORS, Unbent, unbend, unbend_again
 from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
-from rangesfm.refine.unbend import SAME_ERRORS, Unbent, unbend, unbend_again
+from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
 # Solutions of the full problem, with the weights of ranges and pixels estimated anew in between.

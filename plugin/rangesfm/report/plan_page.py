@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
+from rangesfm.diagnostics.hypothesis_tests import MistakeTest
 from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan
@@ -19,7 +20,6 @@ from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, eq
 from rangesfm.report.report_page import Section, render, write_page
 from rangesfm.report.report_tables import Table
 from rangesfm.report.text import count, duration, fixed, percent, rough
-from rangesfm.trust.testing import MistakeTest
 
 # From the smallest to the largest stddev; each colour is as visible on a light page as on a dark one.
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")

@@ -18,7 +18,7 @@ from rangesfm.options import AssociationOptions
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
-from rangesfm.scale.estimate import CutoffTest, ScaleSensitivity, ScaleUncertainty
+from rangesfm.scale.scale_estimate import CutoffTest, ScaleSensitivity, ScaleUncertainty
 from rangesfm.scale.two_candidate import Branch
 
 

@@ -12,6 +12,9 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
+from rangesfm.diagnostics.diagnosis import TrustVerdict
+from rangesfm.diagnostics.finished_map import Place
+from rangesfm.diagnostics.linearized import RangesOnMap
 from rangesfm.distances.tape import Tape
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import Similarity, align_points
@@ -22,11 +25,8 @@ from rangesfm.ranging.clock.time_offset import TimeOffset
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.at_map import MapWithRanges
-from rangesfm.scale.diagnostics import ScaleDiagnostics, scale_diagnostics
-from rangesfm.scale.estimate import ScaleEstimate
-from rangesfm.trust.finished_map import Place
-from rangesfm.trust.linearized import RangesOnMap
-from rangesfm.trust.verdict import TrustVerdict
+from rangesfm.scale.scale_diagnostics import ScaleDiagnostics, scale_diagnostics
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
 """Statuses of ranges that are used in the final model, with full or reduced weight."""

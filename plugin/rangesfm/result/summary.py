@@ -17,7 +17,7 @@ from rangesfm.distances.tape import CONTROL, DistanceRow
 from rangesfm.files.records import NumberOrNull, Record, Text
 from rangesfm.result import entries
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.scale.estimate import ScaleSensitivity
+from rangesfm.scale.scale_estimate import ScaleSensitivity
 
 # Change of the scale, in percent per centimetre of an error, above which the summary mentions it.
 _NOTABLE_PERCENT = 0.5

@@ -12,17 +12,17 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.errors.bending import BendingOfCells, MapBending
-from rangesfm.ranging.errors.cells import Cells
 from rangesfm.ranging.errors.learned import LearnedErrors
+from rangesfm.ranging.errors.range_bins import Cells
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
-from rangesfm.scale.problem import ScaleProblem, first_camera_from
 from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
+from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
+from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from
+from rangesfm.scale.scale_verdict import judge
 from rangesfm.scale.solution import Solution, weighted
 from rangesfm.scale.uncertainty import KnownMap, bending_of_cells, known_refined_map, learned_errors
-from rangesfm.scale.verdict import judge
 
 # With twice as many cells the learnt errors change by less than a twentieth (hall and laps of
 # ``tests.studies.drifting_maps``), and each cell costs one solution of the photos' normal equations.

@@ -21,15 +21,15 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
-from rangesfm.scale.estimate import ScaleByKind, ScaleEstimate, ScaleSensitivity, ScaleUncertainty
-from rangesfm.scale.lengths import LengthScale, scale_by_lengths
-from rangesfm.scale.problem import ScaleProblem, first_camera_from, scale_problem
 from rangesfm.scale.range_equation import RangeProblem, solve
+from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
+from rangesfm.scale.scale_estimate import ScaleByKind, ScaleEstimate, ScaleSensitivity, ScaleUncertainty
+from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from, scale_problem
+from rangesfm.scale.scale_verdict import judge, judge_lengths, levelled_places
 from rangesfm.scale.sensitivity import cutoff_test, scale_sensitivity
 from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import known_map, learned_errors, parameter_covariance
-from rangesfm.scale.verdict import judge, judge_lengths, levelled_places
 
 
 @with_one_blas_thread

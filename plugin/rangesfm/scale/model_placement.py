@@ -15,8 +15,8 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import wider
 from rangesfm.scale.anchor_alignment import PlacedAnchor, align_by_anchors
-from rangesfm.scale.estimate import ScaleEstimate
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
+from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.solution import MIN_COST_GAP
 from rangesfm.scale.starts import spread_subset
 

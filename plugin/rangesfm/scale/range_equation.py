@@ -27,7 +27,7 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
-from rangesfm.scale.lengths import distance_jacobian, distance_residuals
+from rangesfm.scale.scale_by_lengths import distance_jacobian, distance_residuals
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.scale.estimate import CutoffTest, ScaleSensitivity
 from rangesfm.scale.range_equation import predicted_ranges, range_gradient, solve
+from rangesfm.scale.scale_estimate import CutoffTest, ScaleSensitivity
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.starts import spread_subset
 from rangesfm.scale.uncertainty import scale_influence

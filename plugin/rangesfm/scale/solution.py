@@ -13,7 +13,6 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
-from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     RangeFit,
     RangeProblem,
@@ -23,6 +22,7 @@ from rangesfm.scale.range_equation import (
     solve,
     tag_positions,
 )
+from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.starts import (
     complete_unknown_anchors,
     each_once,

@@ -10,12 +10,10 @@ from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.bending import BendingOfCells, MapBending, by_poses
-from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells, noisiness
 from rangesfm.ranging.errors.components import CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
+from rangesfm.ranging.errors.range_bins import MAX_NUM_CELLS, Cells, cells, noisiness
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.estimate import ScaleUncertainty
-from rangesfm.scale.problem import ScaleProblem
 from rangesfm.scale.range_equation import (
     Columns,
     RangeFit,
@@ -29,6 +27,8 @@ from rangesfm.scale.range_equation import (
     range_gradient,
     range_jacobian,
 )
+from rangesfm.scale.scale_estimate import ScaleUncertainty
+from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 
 # Assumed walking speed where ranges have no times.

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.diagnostics.diagnosis import TrustVerdict
+from rangesfm.diagnostics.hypothesis import Correction
 from rangesfm.errors import GeometryError
 from rangesfm.join.join_models import PathOfModel
 from rangesfm.progress import Journal
@@ -14,8 +16,6 @@ from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.hypothesis import Correction
-from rangesfm.trust.verdict import TrustVerdict
 from rangesfm.workflows.make_metric_map import metric_map, ranges_on_path
 
 

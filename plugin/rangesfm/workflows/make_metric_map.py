@@ -12,6 +12,11 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
+from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
+from rangesfm.diagnostics.diagnosis import TrustVerdict, sentence, trust_in
+from rangesfm.diagnostics.finished_map import Doubt, doubts_of_map, doubts_of_pieces, place_of_map, why_broken
+from rangesfm.diagnostics.length_tests import trust_in_lengths
+from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError, SolverError
@@ -30,15 +35,10 @@ from rangesfm.refine.radio import predicted_ranges
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult, Rivals
 from rangesfm.scale.at_map import MapWithRanges, estimate_at
-from rangesfm.scale.estimate import NORMAL_95, ScaleEstimate
-from rangesfm.scale.verdict import refuse_unknown
+from rangesfm.scale.scale_estimate import NORMAL_95, ScaleEstimate
+from rangesfm.scale.scale_verdict import refuse_unknown
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.bent_path import bends_m, bent_to_ranges, estimate_by_bent
-from rangesfm.trust.finished_map import Doubt, doubts_of_map, doubts_of_pieces, place_of_map, why_broken
-from rangesfm.trust.lengths import trust_in_lengths
-from rangesfm.trust.linearized import RangesOnMap, ranges_on_map
-from rangesfm.trust.verdict import TrustVerdict, sentence, trust_in
 from rangesfm.vision.image_times import ImageTimes
 
 # Two likely time offsets whose scales differ by more than this fraction leave the scale undetermined, ...

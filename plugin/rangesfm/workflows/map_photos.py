@@ -15,6 +15,7 @@ import pycolmap
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.transform import rescale, take_over
+from rangesfm.diagnostics.preflight import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.export import check_formats
@@ -29,7 +30,6 @@ from rangesfm.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.sources.source import is_source
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
-from rangesfm.trust.before import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.mapping_loop import GlobalAdjustment

@@ -23,7 +23,7 @@ from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.model_path import path_of_model
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
-from rangesfm.scale.verdict import CALIBRATE
+from rangesfm.scale.scale_verdict import CALIBRATE
 
 # Assumed rate of photos without times.
 _PHOTO_RATE_HZ = 2.0

@@ -27,7 +27,7 @@ from rangesfm.result.result_folder import (
     write_models_and_tables,
 )
 from rangesfm.result.summary import ResultSummary
-from rangesfm.scale.lengths import BENDING
+from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.steps import DATABASE_NAME

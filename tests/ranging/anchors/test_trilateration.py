@@ -11,8 +11,8 @@ from tests.studies import anchor_initialization
 
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate, trilaterate_anchors
-from rangesfm.ranging.errors.cells import cells
 from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.ranging.errors.range_bins import cells
 from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.bending import WalkBending, averaged, bent_path, by_poses, without_similarity
-from rangesfm.ranging.errors.cells import Cells, cells
+from rangesfm.ranging.errors.range_bins import Cells, cells
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 

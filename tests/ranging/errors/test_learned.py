@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.ranging.errors.cells import MAX_NUM_CELLS, Cells, cells
 from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors, learn_errors
+from rangesfm.ranging.errors.range_bins import MAX_NUM_CELLS, Cells, cells
 
 Array = npt.NDArray[np.float64]
 

@@ -16,9 +16,9 @@ from scipy.optimize import least_squares
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import path_shape
-from rangesfm.ranging.errors.cells import cells, noisiness
 from rangesfm.ranging.errors.learned import learn_errors
 from rangesfm.ranging.errors.noise import inlier_noise, robust_stddevs
+from rangesfm.ranging.errors.range_bins import cells, noisiness
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 

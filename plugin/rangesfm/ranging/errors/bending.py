@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.errors.cells import Cells
 from rangesfm.ranging.errors.components import BENDS, Component
+from rangesfm.ranging.errors.range_bins import Cells
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.errors.cells import Cells
+from rangesfm.ranging.errors.range_bins import Cells
 
 _SHORT_M = 1.0
 _TIME_S = 3.0

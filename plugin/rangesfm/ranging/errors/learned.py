@@ -11,8 +11,8 @@ from scipy.optimize import minimize
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.bending import BendingOfCells
-from rangesfm.ranging.errors.cells import Cells
 from rangesfm.ranging.errors.components import BENDS, COMPONENTS, LEARNT_CURVE, Component
+from rangesfm.ranging.errors.range_bins import Cells
 
 # Noise of single ranges up to which a radio is one of the population. Of one with more all else may be off by more, and
 # faster than in proportion: an old one with five times the noise reads 7 % long, where the others are right to a

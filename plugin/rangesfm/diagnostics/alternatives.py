@@ -1,0 +1,193 @@
+"""Mistakes that have no size: swapped labels, mixed-up axes, another unit. Each is tried as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.diagnostics.hypothesis import Correction, corrected
+from rangesfm.diagnostics.linearized import RangesOnMap
+from rangesfm.geometry.similarity import Similarity, align_points
+from rangesfm.ranging.anchors.point_fit import multilaterate
+from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
+from rangesfm.scale.starts import spread_rows
+
+_NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
+_FOOT_M = 0.3048
+_UNITS_M = {
+    "the anchors' coordinates are in feet": _FOOT_M,
+    "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / _FOOT_M,
+    "the ranges are of both ways, there and back": 2.0,
+}
+_SCALE_FACTORS = np.geomspace(1 / 4, 4, 7).tolist()
+_AXES_OF_ANCHORS = {
+    "x and y are swapped": np.eye(3)[[1, 0, 2]],
+    "y and z are swapped": np.eye(3)[[0, 2, 1]],
+    "x has the wrong sign": np.diag([-1.0, 1, 1]),
+    "heights have the wrong sign (they are depths)": np.diag([1.0, 1, -1]),
+}
+_AXES_OF_LEVER_ARM = {
+    "has the wrong sign (from the tag to the camera, not from the camera to the tag)": -np.eye(3),
+    "is given along x forward, y left, z up, not x right, y down, z forward": np.array(
+        [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    ),
+    "is given along x right, y up, z back, not x right, y down, z forward": np.diag([1.0, -1, -1]),
+    "is given along x right, y forward, z up, not x right, y down, z forward": np.array(
+        [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]
+    ),
+    "is given along x forward, y right, z down, not x right, y down, z forward": np.array(
+        [[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A mistake without a size, with its correction; the texts are as in a Hypothesis."""
+
+    name: str
+    subject: str
+    words: str
+    remedy: str
+    correction: Correction
+
+
+def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """Yield all alternatives that a map can have."""
+    given_m, heard = on_map.problem.anchor_mean_m, np.unique(on_map.problem.anchor_index)
+    given = {on_map.anchor_ids[k]: given_m[k] for k in heard if np.isfinite(given_m[k]).all()}
+    yield from _of_labels([name for name in on_map.order_given if name in given], given)
+    yield from _of_coordinates(given)
+    if on_map.velocity is not None:  # as where the photos' order was taken from names that count down
+        times = on_map.time_s
+        yield Alternative(
+            "photos reversed",
+            "",
+            "the photos' times run backwards: the last photo has the time of the first",
+            "check the photos' times, or the order that they were given in",
+            Correction(time_shift_s=times.min() + times.max() - 2 * times),
+        )
+    arms = _lever_arms_m(on_map)
+    for words, axes in _AXES_OF_LEVER_ARM.items():
+        moves = {tag: axes @ arm - arm for tag, arm in arms.items()}
+        if max(np.linalg.norm(move) for move in moves.values()) > 1e-3:
+            remedy = "give the tag's place in the camera, x to the right, y down, z forward (--tag_in_cam)"
+            yield Alternative("lever arm's axes", "", f"the lever arm {words}", remedy, Correction(tag_moves_m=moves))
+
+
+def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Alternative]:
+    """Yield swapped pairs of anchors' labels (or of lines in their file), and coordinates shifted by one line."""
+    remedy = "compare the labels on the devices with the anchors' file"
+    for one, other in combinations(given, 2):
+        words = f"anchors {one} and {other} bear each other's label"
+        swapped = Correction({one: given[other], other: given[one]})
+        yield Alternative("labels swapped", f"{one}, {other}", words, remedy, swapped)
+    at = [given[name] for name in names]
+    for by, whose in ((1, "before"), (-1, "after")) if len(names) > 2 else ():
+        words = f"each anchor has the coordinates of the one in the line {whose} it in the anchors' file"
+        shifted = Correction(dict(zip(names, at[by:] + at[:by], strict=True)))
+        yield Alternative("lines shifted", "", words, remedy, shifted)
+
+
+def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Alternative]:
+    """Yield other axes of the anchors' coordinates, coordinates in feet, and ranges of the way there and back."""
+    remedy = "compare the anchors' file with a sketch of the site"
+    for axes_words, axes in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
+        words = f"in the anchors' coordinates {axes_words}"
+        turned = Correction({name: axes @ at for name, at in given.items()})
+        yield Alternative("anchors' axes", "", words, remedy, turned)
+    if len(given) < 2:
+        return
+    middle = np.mean(list(given.values()), axis=0)
+    remedy = "check the unit of ranges and anchors' file against a taped distance between two of them"
+    for words, metres in _UNITS_M.items():
+        grown = Correction({name: middle + metres * (at - middle) for name, at in given.items()})
+        yield Alternative("anchors' unit", "", words, remedy, grown)
+
+
+class Refits:
+    """Solutions of corrected problems, each started from where the map itself sees the anchors.
+
+    They use at most ``_NUM_PER_ANCHOR`` ranges of each anchor.
+    """
+
+    def __init__(self, on_map: RangesOnMap, scatter_m: float):
+        self._on_map = on_map
+        self._scatter_m = scatter_m
+        self._rows = spread_rows(on_map.problem, _NUM_PER_ANCHOR)
+        self._seen = _anchors_by_map(self._thinned(on_map))
+
+    def _thinned(self, on_map: RangesOnMap) -> RangeProblem:
+        thin = on_map.problem.subset(self._rows)
+        return replace(thin, stddev_m=np.full(len(thin.range_m), self._scatter_m))
+
+    def start(self, correction: Correction) -> tuple[float, RangesOnMap]:
+        """Return the cost of the thinned ranges before any fit, and the corrected map with its best starting state."""
+        right = corrected(self._on_map, correction)
+        thin, seen = self._thinned(right), self._seen
+        if np.any(correction.time_shift_s):
+            seen = _anchors_by_map(thin)
+        starts = [(_cost(thin, state), state) for state in self._starts(thin, *seen)]
+        cost, state = min(starts, key=lambda each: each[0])
+        return cost, replace(right, state=state)
+
+    def of(self, start: RangesOnMap) -> tuple[float, RangesOnMap]:
+        """Return the cost of the best fit of the thinned ranges, and the map at that fit."""
+        fit = solve(
+            self._thinned(start), start.state, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS
+        )
+        return fit.cost, replace(start, state=fit.state)
+
+    def _starts(self, problem: RangeProblem, placed: Similarity, seen_m: Array) -> Iterator[RangeState]:
+        """Yield starting states: the map as it is, and moved to where it sees the anchors (``seen_m``, (m, 3))."""
+        known = np.asarray(np.isfinite(problem.anchor_mean_m).all(axis=1))
+        anchors_m = np.where(known[:, None], problem.anchor_mean_m, self._on_map.state.anchors_m)
+        yield replace(self._on_map.state, anchors_m=anchors_m)
+        is_seen = np.asarray(np.isfinite(seen_m).all(axis=1))
+        if not problem.frame_is_free and not known.any():
+            yield RangeState(placed, np.where(is_seen[:, None], seen_m, anchors_m), self._on_map.state.bias_m)
+        usable = known & is_seen
+        if problem.frame_is_free and usable.sum() >= 3:
+            motion = align_points(seen_m[usable], anchors_m[usable])
+            yield RangeState(motion @ placed, anchors_m, self._on_map.state.bias_m)
+
+
+def _cost(problem: RangeProblem, state: RangeState) -> float:
+    off = (predicted_ranges(problem, state) - problem.range_m) / problem.stddev_m
+    return float(CAUCHY.rho(off**2)[0].sum())
+
+
+def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
+    """Estimate how the map lies and where it sees the anchors (m, 3) if nothing is known of them beforehand."""
+    unknown = replace(
+        problem,
+        anchor_mean_m=np.full_like(problem.anchor_mean_m, np.nan),
+        anchor_stddev_m=np.where(np.isin(np.arange(problem.num_anchors), problem.anchor_index), np.inf, 0.0),
+        frame_is_free=False,
+        gravity=None,
+    )
+    starts = [_multilaterated(unknown, factor) for factor in _SCALE_FACTORS]
+    start = min(starts, key=lambda state: _cost(unknown, state))
+    state = solve(unknown, start, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS).state
+    return state.metric_from_model, state.anchors_m
+
+
+def _multilaterated(problem: RangeProblem, scale: float) -> RangeState:
+    """Locate the anchors from the tag's positions, in a map enlarged by a given scale."""
+    tags = scale * problem.centers + problem.tag_from_center
+    anchors_m = np.full((problem.num_anchors, 3), np.nan)
+    for k in np.unique(problem.anchor_index):
+        rows = problem.anchor_index == k
+        anchors_m[k], _ = multilaterate(tags[rows], problem.range_m[rows] - problem.bias_mean_m[k])
+    return RangeState(Similarity(scale, np.eye(3), np.zeros(3)), anchors_m, problem.bias_mean_m)
+
+
+def _lever_arms_m(on_map: RangesOnMap) -> Mapping[str, Array]:
+    """Return the lever arms as given, in the camera's frame, by tag id; the median over each tag's ranges."""
+    arms = np.einsum("nji,nj->ni", on_map.model_from_cam, on_map.problem.tag_from_center)
+    return {on_map.tag_ids[k]: np.median(arms[on_map.tag_index == k], axis=0) for k in np.unique(on_map.tag_index)}

@@ -1,0 +1,148 @@
+"""Correction of a drifting path of poses by its ranges, so that tests see it where it probably was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from rangesfm.arrays import Array
+from rangesfm.diagnostics.hypothesis_tests import Factorization
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, slopes_by_poses
+from rangesfm.geometry.similarity import rmse
+from rangesfm.options import ScaleOptions
+from rangesfm.ranging.errors.bending import WalkBending
+from rangesfm.ranging.errors.components import BENDS
+from rangesfm.ranging.range_observations import status_by_weight
+from rangesfm.scale.range_equation import state_after
+from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.scale.scale_problem import ScaleProblem
+from rangesfm.scale.scale_verdict import judge
+from rangesfm.scale.uncertainty import KnownMap, LinearMap, best_estimate
+
+_MAX_NUM_ROUNDS = 8
+# Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
+_STILL = 0.1
+
+
+def bent_to_ranges(on_map: RangesOnMap) -> RangesOnMap:
+    """Return the map where ranges and the random-walk model of drift together put it, by Gauss-Newton steps.
+
+    A map that does not drift as a random walk is returned unchanged. The steps make the linear tests valid even for a
+    path that has drifted far.
+    """
+    for _ in range(_MAX_NUM_ROUNDS if isinstance(on_map.bending, WalkBending) else 0):
+        problem = learnt_at(on_map)
+        before, on_map = on_map, _bent_once(problem)
+        moved_m = on_map.from_anchor_m - before.from_anchor_m
+        if float(np.sqrt(np.mean(moved_m**2))) < _STILL * problem.scatter_m:
+            break
+    return on_map
+
+
+def bends_m(on_map: RangesOnMap) -> Array:
+    """Return (k,) how far the ranges moved each pose from the given path, metres; (0,) for a map that is no walk."""
+    walk, scale = on_map.bending, on_map.state.metric_from_model.scale
+    if not isinstance(walk, WalkBending) or walk.steps is None:
+        return np.zeros(0)
+    return np.asarray(scale * np.linalg.norm(walk.path.centers - walk.given.centers, axis=1))
+
+
+def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: ScaleOptions) -> ScaleEstimate:
+    """Return the estimate with the similarity that brings the path nearest to where the ranges bend it.
+
+    The estimate is returned unchanged if the bending is smaller than the scatter of the ranges, as a rigid path then
+    fits as well.
+
+    Args:
+        estimate: of the path as one piece. on_map: the path bent to the ranges.
+
+    Raises:
+        GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
+    """
+    posed, solution, bent_by_m = estimate.problem, estimate.solution, bends_m(on_map)
+    if posed is None or solution is None or not len(bent_by_m):
+        return estimate
+    problem, drift_m = learnt_at(on_map), rmse(bent_by_m[:, None])
+    if drift_m < problem.scatter_m:
+        return estimate
+    known = _known(problem, posed, estimate.uncertainty.formal)
+    uncertainty, covariance = known.uncertainty, known.covariance
+    fit = replace(solution.fit, state=on_map.state, weights=problem.cells.weight)
+    judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, (), options)
+    columns = problem.columns
+    of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
+    positions = zip(estimate.anchors, on_map.state.anchors_m, strict=True)
+    drift = f"the path drifts by {drift_m:.2g} m (root mean square) from where the ranges have it"
+    status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
+    status[on_map.rows] = status_by_weight(problem.cells.weight)
+    stddev_m[on_map.rows] = problem.scatter_m
+    return replace(
+        estimate,
+        metric_from_sfm=on_map.state.metric_from_model @ posed.first_camera_from_sfm,
+        uncertainty=uncertainty,
+        verdict=judged.verdict,
+        reasons=(*judged.reasons, drift, *estimate.remarks),
+        advice=judged.advice,
+        placement=None if columns.frame < 0 else covariance[np.ix_(of_map, of_map)],
+        observations=replace(estimate.observations, status=status),
+        errors=replace(estimate.errors, stddev_m=stddev_m),
+        anchors=tuple(replace(anchor, position_m=at) for anchor, at in positions),
+    )
+
+
+def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
+    """Return the uncertainty of a path at the estimate with the best weights, compared with simple weights."""
+    errors, given, index = problem.errors, posed.ranges, problem.cells.anchor_index
+    simple = errors.without(*(set(errors.names) - {"white", *BENDS})).covariance_m2
+    simple += given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
+    _, of_cells, of_priors = best_estimate(simple, problem.design, problem.prior_design)
+    variances = np.einsum("pi,ij,pj->p", of_cells, errors.covariance_m2, of_cells) + np.sum(of_priors**2, axis=1)
+    off_m, prior_off = -problem.residual_m, -problem.prior_residual
+    linear = LinearMap(off_m, problem.design, prior_off, problem.prior_design, problem.columns)
+    return linear.known(errors, formal, variances, of_cells @ off_m + of_priors @ prior_off)
+
+
+def learnt_at(on_map: RangesOnMap) -> Linearized:
+    """Return the linearised map, with the errors learnt under the assumption that no mistake was made."""
+    problem = linearized(on_map)
+    nothing = np.zeros((len(problem.residual_m), 0)), np.zeros((problem.num_priors, 0))
+    return problem.with_learnt_errors(*nothing)
+
+
+def _bent_once(problem: Linearized) -> RangesOnMap:
+    on_map, walk = problem.on_map, problem.on_map.bending
+    assert isinstance(walk, WalkBending)
+    is_free = on_map.problem.frame_is_free
+    factors = walk.factors(problem.cells, slopes_by_poses(on_map), frame_is_free=is_free)
+    step = Factorization(problem).step()
+    left_m = problem.residual_m + problem.design @ step
+    pulls = cho_solve(cho_factor(problem.errors.covariance_m2), left_m)
+    bent = walk.bent_back(factors, pulls, problem.errors.stddev_of_component, frame_is_free=is_free)
+    state = state_after((problem.columns,), on_map.state, step)
+    return _on_path(replace(on_map, state=state), walk, bent)
+
+
+def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> RangesOnMap:
+    """Return the ranges moved along from one path to another."""
+    at, problem = on_map.on_path, on_map.problem
+    moved = after.path.centers - before.path.centers
+    turned = after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)
+    turn = turned[np.where(at.weight < 0.5, at.before, at.after)]
+    share = at.weight[:, None]
+
+    def turned_by(vectors: Array) -> Array:
+        return np.asarray(np.einsum("nij,nj->ni", turn, vectors))
+
+    return replace(
+        on_map,
+        problem=replace(
+            problem,
+            centers=problem.centers + (1 - share) * moved[at.before] + share * moved[at.after],
+            tag_from_center=turned_by(problem.tag_from_center),
+        ),
+        model_from_cam=turn @ on_map.model_from_cam,
+        velocity=None if on_map.velocity is None else turned_by(on_map.velocity),
+        bending=after,
+    )

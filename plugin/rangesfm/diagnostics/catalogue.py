@@ -1,0 +1,324 @@
+"""The catalogue of mistakes that last for the whole survey. Every hypothesis added here is tested and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.diagnostics.hypothesis import (
+    Correction,
+    Effect,
+    Hypothesis,
+    duration_s,
+    in_axes,
+    is_given,
+    longer,
+    longest_m,
+    of_anchor_place,
+    of_cells,
+    too_long,
+)
+from rangesfm.diagnostics.linearized import Linearized
+
+_SAME_HEIGHT_M = 1e-3
+# Growth of an anchor's ranges per metre of distance below which they hardly change with the distance.
+_STUCK = 0.3
+# Largest mistakes, in metres, that nobody notices: along a camera, and of an anchor on a sketch of the site.
+MISMEASURED_M, UNSEEN_MOVE_M = 0.2, 1.0
+# Largest clock drift, seconds per second. A quartz stays within 100 ppm over temperature and age, and there are two.
+_MOST_CLOCK_DRIFT = 2e-4
+# Largest errors proportional to the distance, for all ranges and for one anchor's, as shares. The first also limits the
+# scale of coordinates. Larger factors, as from feet or two-way ranges, are tried as alternatives.
+_MOST_SHARE, _MOST_SHARE_OF_ANCHOR = 0.5, 2.0
+# Largest distance between the lens and a tag on anything that is carried or driven.
+_LARGEST_RIG_M = 3.0
+# Largest change of a radio's delay as it warms up, far more than was ever seen.
+_MOST_WARMING_M = 5.0
+# Largest excess of a range past the person with the camera: the way round the body, and a weak signal found late.
+_MOST_BODY_M = 2.0
+_MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
+
+
+def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield for each given anchor: it is not where its coordinates say."""
+    return (_anchor_place(problem, k) for k in problem.heard if is_given(problem, k))
+
+
+def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
+    name, at = problem.on_map.anchor_ids[k], problem.on_map.problem.anchor_mean_m[k]
+    # The anchor must be within its ranges of the path, wherever its coordinates put it.
+    most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.cells.anchor_index == k]))
+
+    def unknown(_: Array) -> Correction:
+        return Correction({name: None})
+
+    def coordinate(axis: int) -> Hypothesis:
+        letter, direction = "xyz"[axis], np.eye(3)[axis]
+        return Hypothesis(
+            "anchor coordinate",
+            of_anchor_place(problem, k, direction[:, None]),
+            subject=f"{name} {letter}",
+            words=lambda size: (
+                f"anchor {name}'s {letter} is given as {at[axis]:.3f} where about "
+                f"{at[axis] + size[0]:.2f} fits ({size[0]:+.2f} m)"
+            ),
+            remedy=f"check its {letter}, or {_MEASURE_AGAIN}",
+            correction=lambda size: Correction({name: at + size[0] * direction}),
+            most=most_m,
+            adoption=unknown,
+        )
+
+    return Hypothesis(
+        "anchor place",
+        of_anchor_place(problem, k, np.eye(3)),
+        subject=name,
+        words=lambda size: (
+            f"anchor {name} is about {np.linalg.norm(size):.2f} m from where its coordinates say "
+            f"(by {in_axes(size)} in x, y, z)"
+        ),
+        remedy=_MEASURE_AGAIN,
+        correction=lambda size: Correction({name: at + size}),
+        most=most_m,
+        adoption=unknown,
+        unawares=UNSEEN_MOVE_M,
+        narrower=tuple(map(coordinate, range(3))),
+    )
+
+
+def anchor_biases(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield for each anchor and for all together: ranges have a constant error, larger than usual."""
+    for k in problem.heard if len(problem.heard) > 1 else []:
+        yield _bias(problem, [k], "anchor bias", problem.on_map.anchor_ids[k], f"anchor {problem.on_map.anchor_ids[k]}")
+    yield _bias(problem, problem.heard, "common bias", "", "every anchor")
+
+
+def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whose: str) -> Hypothesis:
+    return Hypothesis(
+        kind,
+        of_cells(problem, -np.isin(problem.cells.anchor_index, anchors).astype(np.float64)),
+        subject=subject,
+        words=lambda size: f"the ranges to {whose} {too_long(size)}",
+        remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
+        correction=longer(lambda: np.isin(problem.on_map.problem.anchor_index, anchors)),
+        most=max(longest_m(problem, k) for k in anchors),
+        is_linear=True,
+        is_in_interval=True,
+    )
+
+
+def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield for all ranges and for each anchor's: they grow by more or less than the distance does."""
+    distance_m = problem.on_map.problem.range_m
+    yield Hypothesis(
+        "range share",
+        of_cells(problem, -problem.gradient.distance_m),
+        words=lambda size: f"all ranges read about {100 * abs(size[0]):.1f} % too {'long' if size[0] > 0 else 'short'}",
+        remedy="check the unit, and the propagation speed that the radio assumes, against a taped distance",
+        correction=lambda size: Correction(longer_m=distance_m * size[0] / (1 + size[0])),
+        unit="1",
+        most=_MOST_SHARE,
+        is_linear=True,
+        is_in_interval=True,
+    )
+    for k in problem.heard if len(problem.heard) > 1 else []:
+        yield _share_of_anchor(problem, k)
+
+
+def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
+    name, distance_m = problem.on_map.anchor_ids[k], problem.gradient.distance_m
+    is_of, of_ranges = problem.cells.anchor_index == k, problem.on_map.problem.anchor_index == k
+    mean = distance_m[is_of].mean()
+
+    def words(size: Array) -> str:
+        if 1 + size[0] < _STUCK:
+            return f"the ranges to anchor {name} hardly change with the distance: they are always nearly the same"
+        return f"the ranges to anchor {name} grow by {1 + size[0]:.2f} m for each metre of distance"
+
+    def level(size: Array) -> Correction:
+        grown_m = np.linalg.norm(problem.on_map.from_anchor_m, axis=1) - mean
+        return Correction(longer_m=np.where(of_ranges, size[0] * grown_m, 0.0))
+
+    return Hypothesis(
+        "anchor share",
+        of_cells(problem, np.where(is_of, -distance_m + mean, 0.0)),
+        subject=name,
+        words=words,
+        remedy="look at its ranges in the log, and leave it out (use_anchors)",
+        correction=level,
+        most=_MOST_SHARE_OF_ANCHOR,
+        unit="1",
+        adoption=lambda _: Correction(left_out=of_ranges),
+        is_linear=True,
+        is_in_interval=True,
+    )
+
+
+def anchors_in_another_scale(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: the anchors' coordinates are in a unit that is not quite the metre."""
+    given_m, ids = problem.on_map.problem.anchor_mean_m, problem.on_map.anchor_ids
+    known = np.flatnonzero(np.isfinite(given_m).all(axis=1)).tolist()
+    if len(known) < 2 or not any(is_given(problem, k) for k in known):
+        return
+    middle = given_m[known].mean(axis=0)
+    yield Hypothesis(
+        "anchors' scale",
+        Effect.of_sum(
+            [of_anchor_place(problem, k, (given_m[k] - middle)[:, None]) for k in known if is_given(problem, k)]
+        ),
+        words=lambda size: (
+            f"the anchors' coordinates are about {100 * abs(size[0]):.1f} % too {'small' if size[0] > 0 else 'large'}"
+        ),
+        remedy="check the unit of the anchors' coordinates against a taped distance between two of them",
+        correction=lambda size: Correction(
+            {ids[k]: middle + (1 + size[0]) * (given_m[k] - middle) for k in known},
+        ),
+        most=_MOST_SHARE,
+        unit="1",
+        is_in_interval=True,
+    )
+
+
+def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: the anchors were all given the same height, which is not true."""
+    given_m, ids = problem.on_map.problem.anchor_mean_m, problem.on_map.anchor_ids
+    known = [k for k in problem.heard if np.isfinite(given_m[k]).all()]
+    if len(known) < 3 or np.ptp(given_m[known, 2]) > _SAME_HEIGHT_M or not all(is_given(problem, k) for k in known):
+        return
+    up = np.array([0.0, 0.0, 1.0])
+    yield Hypothesis(
+        "anchor heights",
+        Effect.of_all([of_anchor_place(problem, k, up[:, None]) for k in known]),
+        words=lambda size: (
+            f"all anchors are given the same height, {given_m[known[0], 2]:g} m, but the ranges fit heights that "
+            f"differ by {np.ptp(size):.1f} m"
+        ),
+        remedy="measure the heights of the antennas",
+        correction=lambda size: Correction(
+            {ids[k]: given_m[k] + height_m * up for k, height_m in zip(known, size, strict=True)}
+        ),
+        most=longest_m(problem) * np.sqrt(len(known)),
+    )
+
+
+def to_other_side_m(lever_arm_m: float) -> float:
+    """Return the distance from a tag to the other side of its camera, plus an error of measurement, in metres."""
+    return MISMEASURED_M + 2 * lever_arm_m
+
+
+def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield for each tag: it is elsewhere on the camera."""
+    return (_lever_arm(problem, k) for k in np.unique(problem.cells.tag_index).tolist())
+
+
+def lever_arm_m(problem: Linearized, tag: int | None = None) -> float:
+    """Return the given length, metres, of a tag's lever arm, or of the longest one."""
+    on_map = problem.on_map
+    arms_m = np.linalg.norm(on_map.problem.tag_from_center, axis=1)
+    tags = np.unique(on_map.tag_index) if tag is None else [tag]
+    return max(float(np.median(arms_m[on_map.tag_index == each])) for each in tags)
+
+
+def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
+    on_map = problem.on_map
+    name = on_map.tag_ids[k] if len(on_map.tag_ids) > 1 else ""
+    length_m = lever_arm_m(problem, k)
+
+    def words(size: Array) -> str:
+        of_tag, far = f" of tag {name}" if name else "", f"about {np.linalg.norm(size):.2f} m"
+        what = f"no lever arm{of_tag} is given, and the tag sits {far} from the lens"
+        if length_m > 0:
+            what = f"the lever arm{of_tag} is off by {far}"
+        return f"{what} ({in_axes(size)} along the camera's x, y, z)"
+
+    return Hypothesis(
+        "lever arm",
+        of_cells(problem, np.where((problem.cells.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)),
+        subject=name,
+        words=words,
+        remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
+        correction=lambda size: Correction(tag_moves_m={on_map.tag_ids[k]: size}),
+        most=_LARGEST_RIG_M + length_m,
+        unawares=to_other_side_m(length_m),
+    )
+
+
+def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: the radio's delay changes steadily, by more than radios drift."""
+    of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
+    lasts, unit = float(np.ptp(of_ranges)), "s" if problem.by_time is not None else "m of the path"
+
+    def words(size: Array) -> str:
+        how = "longer" if size[0] > 0 else "shorter"
+        return f"the ranges get {how} and {how}, by about {abs(size[0]):.2f} m within {lasts:.0f} {unit}"
+
+    yield Hypothesis(
+        "radio drift",
+        of_cells(problem, -since / lasts),
+        words=words,
+        remedy="let the radio warm up before the survey, or calibrate it at the end too",
+        correction=lambda size: Correction(longer_m=size[0] / lasts * of_ranges),
+        most=_MOST_WARMING_M,
+        is_linear=True,
+    )
+
+
+def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: a person who carries the camera blocks the signals of anchors behind."""
+    on_map = problem.on_map
+    is_behind = np.sum(on_map.from_anchor_m * on_map.world_from_cam[:, :, 2], axis=1) > 0
+    yield Hypothesis(
+        "behind the camera",
+        of_cells(problem, -problem.cells.mean(is_behind.astype(np.float64))),
+        words=lambda size: f"the ranges to anchors behind the camera {too_long(size)}",
+        remedy="carry the tag above the head, or see what stands behind it",
+        correction=longer(lambda: is_behind),
+        most=_MOST_BODY_M,
+        is_linear=True,
+        unawares=MISMEASURED_M,
+    )
+
+
+def clocks(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: the offset or the rate between the clocks of camera and radio differs from what is assumed."""
+    if problem.by_time is None:
+        return
+    of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
+    remedy = "let the offset be searched for (ranges_time_offset auto), or film a sharp turn at both ends"
+    yield Hypothesis(
+        "clock offset",
+        of_cells(problem, -problem.by_time),
+        words=lambda size: (
+            f"the clocks are off by about {abs(size[0]):.2f} s more than assumed ({size[0]:+.2f} s on the offset)"
+        ),
+        remedy=remedy,
+        correction=lambda size: Correction(time_shift_s=float(size[0])),
+        most=duration_s(problem),
+        unit="s",
+    )
+    yield Hypothesis(
+        "clock drift",
+        of_cells(problem, -problem.by_time * since),
+        words=lambda size: (
+            f"the radio's clock runs {1e6 * abs(size[0]):.0f} ppm too {'slow' if size[0] > 0 else 'fast'}"
+        ),
+        remedy=remedy,
+        correction=lambda size: Correction(time_shift_s=size[0] * of_ranges),
+        unit="s/s",
+        most=_MOST_CLOCK_DRIFT,
+    )
+
+
+STANDING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
+    anchor_places,
+    anchor_biases,
+    range_shares,
+    anchors_in_another_scale,
+    heights_never_measured,
+    lever_arms,
+    radios_warming,
+    people_in_between,
+    clocks,
+)
+"""Mistakes that last for the whole survey."""

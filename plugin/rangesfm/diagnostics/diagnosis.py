@@ -1,0 +1,183 @@
+"""Results of a map's tests for people: the table, faults that are no mistake of one size, and the likeliest cause."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rangesfm.arrays import Indices
+from rangesfm.diagnostics.hypothesis_tests import MistakeTest, Test, row_of
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
+from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
+from rangesfm.processes.threads import with_one_blas_thread
+from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
+
+# Largest standard deviations, metres, of noise and of lasting errors. Real radios show 0.03 to 0.15 m beside outliers,
+# old ones 0.2 m; more has another cause.
+_MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
+# Addition to both limits per metre of distance: a radio over 70 m is noisier than in a room.
+_NOISE_BY_DISTANCE = 0.005
+_LASTING = ("time", "place", "view")
+_LEAST_USED, _MOST_OUTLYING = 0.4, 0.35
+# Share of an anchor's outliers that must fit one other anchor to be taken for its ranges, and the fewest outliers.
+_MOST_OF_OTHER, _MIN_NUM_OUTLYING = 0.5, 10
+_FEW_OBSTRUCTED = "place the anchors where nothing stands between them and the path"
+
+_MIXED_UP = "anchor mixed up"
+# Faults that show in single ranges, compared with those right before and after.
+_OF_SINGLE_RANGES = ("range noise", "anchor's outliers", _MIXED_UP)
+
+
+@dataclass(frozen=True)
+class TrustVerdict:
+    """The tests of a map and the mistakes that they found.
+
+    Attributes:
+        tests: rows of the table; what was found comes first.
+        reasons: sentences, the likeliest cause first; without any, at most a mistake that could stay hidden.
+        causes: the likeliest cause, and those that cannot be told from it.
+        rows: (n,) rows of the log to which the corrections refer.
+    """
+
+    tests: tuple[MistakeTest, ...]
+    reasons: tuple[str, ...]
+    causes: tuple[Cause, ...] = ()
+    rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def with_more(self, more: TrustVerdict) -> TrustVerdict:
+        """Return the verdict with tests of something other than ranges added."""
+        tests = (*more.tests, *self.tests)
+        return replace(self, tests=tests, reasons=(*self.reasons, *more.reasons))
+
+
+@with_one_blas_thread
+def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
+    """Test for all mistakes that ranges on a map can show."""
+    found = find_mistakes(on_map, seed=seed)
+    shown = list(_evidence(found.problem))
+    before = _before_causes(found, shown)
+    after = [row for row in shown if row not in before]
+    named = {(cause.name, cause.subject) for cause in found.causes}
+    others = (row_of(test) for test in found.tests if test.hypothesis.key not in named)
+    rows = (*before, *map(_row_of_cause, found.causes), *others, *after)
+    reasons = [f"{row.words}: {row.remedy}" for row in (*before, *(row for row in after if row.rejected))]
+    if found.causes:
+        reasons.insert(len(before), sentence(found.causes))
+    return TrustVerdict(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows)
+
+
+def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:
+    """Return faults of single ranges that the likeliest cause does not explain, but that may explain the cause.
+
+    Blocked ranges, for instance, may look like a step. A fault counts if it is of the cause's own anchor, or if it is
+    of all ranges and they scatter by more than the cause changes them.
+    """
+    about_ranges = [row for row in shown if row.rejected and row.name in _OF_SINGLE_RANGES]
+    if not about_ranges or not found.causes:
+        return []
+    cause, on_map = found.causes[0], found.problem.on_map
+    undone = cause.undone(on_map)
+    changed_m = float(np.sqrt(np.mean((undone.residual_m - replace(on_map, state=cause.state).residual_m) ** 2)))
+    left = {(row.name, row.subject) for row in _evidence(linearized(undone)) if row.rejected}
+    return [
+        row
+        for row in about_ranges
+        if (row.name == _MIXED_UP or (row.name, row.subject) in left)
+        and (f"{cause.subject} ".startswith(f"{row.subject} ") if row.subject else row.statistic > changed_m)
+    ]
+
+
+def sentence(causes: Sequence[Cause]) -> str:
+    """Return the likeliest cause with its remedy as a sentence; causes that cannot be told apart are all named."""
+    sure = f"{np.sqrt(_statistic(causes[0])):.0f} stddevs"
+    if len(causes) == 1:
+        return f"probably {causes[0].words} ({sure}): {causes[0].remedy}"
+    either = ", or ".join(cause.words for cause in causes)
+    remedies = dict.fromkeys(cause.remedy for cause in causes)
+    return f"either {either} ({sure}; the ranges do not tell which): {'; or '.join(remedies)}"
+
+
+def _what_could_hide(found: Findings) -> Iterator[str]:
+    """Yield the worst mistake that could stay hidden, if it changes the scale by more than a good scale may be off."""
+    hidden = [t for t in found.tests if not t.hypothesis.is_in_interval and np.isfinite(t.effect_on_log_scale)]
+    worst = max(hidden, key=_hidden_effect, default=None)
+    if worst is not None and _hidden_effect(worst) > DOUBTFUL_ABOVE:
+        size = min(worst.smallest_detectable, worst.hypothesis.most_unnoticed)
+        what = f"{' '.join(worst.hypothesis.key).strip()}, {size:.2g} {worst.hypothesis.unit}"
+        change = f"change the scale by {100 * _hidden_effect(worst):.1f} %"
+        yield f"a mistake could stay hidden here ({what}) and {change}: {worst.hypothesis.remedy}"
+
+
+def _hidden_effect(test: Test) -> float:
+    """Return the change of the scale's logarithm by the largest mistake that neither test nor surveyor would notice."""
+    return test.effect_on_log_scale * min(1.0, test.hypothesis.most_unnoticed / test.smallest_detectable)
+
+
+def _row_of_cause(cause: Cause) -> MistakeTest:
+    """Return the row of a cause, with the statistic by which it was found."""
+    if cause.test is None:
+        return MistakeTest(cause.name, cause.subject, cause.gain, cause.penalty, cause.words, cause.remedy)
+    return row_of(replace(cause.test, statistic=_statistic(cause)))
+
+
+def _statistic(cause: Cause) -> float:
+    """Return how much likelier a cause makes the ranges, by its test or by the errors that are left with it."""
+    return cause.gain if cause.test is None else max(cause.test.statistic, cause.gain)
+
+
+def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
+    """Yield faults that are no mistake of one size: noise and lasting errors of all ranges, faults of each anchor."""
+    far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
+    for kind, what, stddev_m, most_m in (
+        ("range noise", "scatter by", problem.scatter_m, _MOST_NOISE_M + far),
+        ("lasting errors", "have errors that last for seconds, of", _lasting_m(problem), _MOST_LASTING_M + far),
+    ):
+        words = f"the ranges {what} {stddev_m:.2f} m; radios in the open reach {most_m:.2f} m at most"
+        yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")
+    on_map, cells = problem.on_map, problem.cells
+    index = on_map.problem.anchor_index
+    for k in np.unique(index).tolist():
+        is_of, name = index == k, on_map.anchor_ids[k]
+        unused = float(np.mean(on_map.weights[is_of] < 0.1))
+        num = int(np.count_nonzero(is_of))
+        words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
+        remedy = "look whether it is the anchor that it is taken for, and where it stands"
+        yield _seen("anchor hardly used", name, unused, 1 - _LEAST_USED, words, remedy)
+        rows = np.flatnonzero(is_of & (cells.weight < 0.5))
+        if len(rows) >= _MIN_NUM_OUTLYING and len(on_map.anchor_ids) > 1:
+            yield _mixed_up(problem, k, rows)
+        outlying = len(rows) / num
+        words = f"{100 * outlying:.0f} % of the ranges to anchor {name} are far from those right before and after"
+        yield _seen("anchor's outliers", name, outlying, _MOST_OUTLYING, words, _FEW_OBSTRUCTED)
+
+
+def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTest:
+    """Return the test whether an anchor's outliers are ranges of another anchor."""
+    on_map = problem.on_map
+    anchors_m, index = on_map.state.anchors_m, on_map.problem.anchor_index[outlying]
+    tags_m = on_map.from_anchor_m[outlying] + anchors_m[index]
+    off_m = np.linalg.norm(tags_m[:, None] - anchors_m, axis=2) - on_map.problem.range_m[outlying, None]
+    fitting = np.mean(np.abs(off_m) < near_m(problem.scatter_m), axis=0)
+    fitting[anchor] = 0.0
+    name, other = on_map.anchor_ids[anchor], on_map.anchor_ids[int(np.argmax(fitting))]
+    words = (
+        f"{100 * fitting.max():.0f} % of the ranges to anchor {name} that are far from those right before and after "
+        f"are as long as those to {other}"
+    )
+    remedy = f"see whether two devices bear the label {name}, and leave it out (use_anchors)"
+    return _seen(_MIXED_UP, name, float(fitting.max()), _MOST_OF_OTHER, words, remedy)
+
+
+def _lasting_m(problem: Linearized) -> float:
+    """Return the root mean square of the lasting errors over the cells, metres."""
+    lasting = np.isin(problem.errors.names, _LASTING)
+    variances = np.trace(problem.errors.covariances_m2[lasting].sum(axis=0))
+    return float(np.sqrt(variances / len(problem.cells)))
+
+
+def _seen(
+    name: str, subject: str, found: float, most: float, words: str, remedy: str, *, unit: str = "1"
+) -> MistakeTest:
+    return MistakeTest(name, subject, found, most, words, remedy, unit, size=found, smallest_detectable=most)

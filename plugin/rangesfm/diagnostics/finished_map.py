@@ -1,0 +1,286 @@
+"""Faults of a finished map that its scale's interval does not show, and the uncertainty of its place.
+
+A refined map is first compared with the scaled map that the refinement started from, because the refinement may have
+broken it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from rangesfm.arrays import Array
+from rangesfm.colmap.pieces import LoosePiece
+from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
+from rangesfm.geometry.similarity import path_shape, similarity_motions
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
+from rangesfm.refine.with_ranges import RefineSummary
+from rangesfm.scale.scale_estimate import NORMAL_95, ScaleEstimate
+from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
+
+# Largest deviation of an anchor's coordinate, in prior standard deviations: chance exceeds it once in two thousand.
+_MAX_STDDEVS = 3.5
+# Largest noise of ranges, metres. UWB radios in the open have 0.02 to 0.3 m.
+_MAX_NOISE_M = 0.4
+# An anchor is reported if less than this share of its ranges was used, and it has at least this many ranges.
+_MIN_USED, _MIN_RANGES = 0.5, 10
+_CHECK_ANCHOR = "measure the anchors again, and see that each stands in the open and has its own label"
+# Allowance for comparing medians: ``_max_growth`` bounds sums of squares, while medians ignore a few large errors.
+_OF_MEDIANS = 1.5
+# An error is large if it exceeds this many typical errors before the refinement. An increase of the share of points
+# with large errors by more than the second number is not due to a few points.
+_LARGE, _MANY_MORE = 10.0, 0.05
+# Largest growth of the median distance of the points from the middle of the path.
+_MAX_POINTS_GROWTH = 2.0
+# Largest growth of the median residual of the ranges, or of their standard deviation; a refinement should reduce it.
+_MAX_RESIDUAL_GROWTH = 2.0
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A fault of a map, and what to do about it."""
+
+    reason: str
+    advice: str
+
+
+@dataclass(frozen=True)
+class Place:
+    """The map's place in the site's frame, with its uncertainty.
+
+    Attributes:
+        verdict: "good" or "doubtful".
+        reasons: why, in words.
+        stddev_m: (3,) standard deviations of the map's middle in x, y, z.
+        heading_stddev_deg: standard deviation of the map's rotation about z.
+        worst_keyframe_stddev_m: of the keyframe with the least certain position: root of its summed variances.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    stddev_m: tuple[float, float, float]
+    heading_stddev_deg: float
+    worst_keyframe_stddev_m: float
+
+
+def doubts_of_map(
+    estimate: ScaleEstimate,
+    summary: RefineSummary | None,
+    points: PointErrors,
+    *,
+    noise_is_given: bool,
+) -> tuple[Doubt, ...]:
+    """Return the faults of a finished map, each with its numbers; empty if there are none.
+
+    Args:
+        estimate: of the scale.
+        summary: of the refinement; None for a map that is only scaled.
+        points: of the final model.
+        noise_is_given: whether the user gave the scatter of the ranges.
+    """
+    stage = estimate if summary is None else summary
+    noise_m = np.full(len(stage.observations.log), np.nan) if noise_is_given else stage.errors.stddev_m
+    return (
+        *_of_fit(summary, points),
+        *_of_say(stage.observations),
+        *_of_positions(stage.anchors),
+        *_of_noise(stage.observations, noise_m),
+    )
+
+
+def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Doubt, ...]:
+    """Return a doubt for each part of a model that the photos hardly tie to the rest."""
+    advice = (
+        "match more pairs of photos across that gap ([mapper] matching, [mapper.pairing]) and reconstruct again, or "
+        "survey the parts apart and join them by their ranges (rangesfm join)"
+    )
+    return tuple(
+        Doubt(
+            f"the photos do not hold the map together: {len(piece.image_names)} of its {num_images} photos "
+            f"({piece.image_names[0]} to {piece.image_names[-1]}) share only {piece.num_shared} points with the "
+            "others, so that the two parts may differ in scale and place",
+            advice,
+        )
+        for piece in pieces
+    )
+
+
+def _surveyed(anchors: Sequence[AnchorEstimate]) -> Iterator[tuple[str, Array, float]]:
+    """Yield surveyed anchors that may move: id, displacement from the surveyed position (3,), standard deviation."""
+    for anchor in anchors:
+        prior_m, stddev_m = anchor.prior_position_m, anchor.prior_position_stddev_m
+        if prior_m is not None and 0 < stddev_m < np.inf:
+            yield anchor.anchor_id, anchor.position_m - prior_m, stddev_m
+
+
+def _of_fit(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doubt]:
+    """Yield doubts about points that do not fit the photos, and about the convergence of the refinement."""
+    if not points.fit:
+        yield Doubt(points.apart("the map"), MISMATCHED)
+    if summary is not None and not summary.converged:
+        remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
+        yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
+    for misfit in () if summary is None else summary.misfits:
+        yield Doubt(f"after the refinement {misfit}", "check clocks, lever arm and anchors")
+
+
+def _of_say(observations: RangeObservations) -> Iterator[Doubt]:
+    """Yield doubts about anchors most of whose ranges were left out."""
+    log, took_part = observations.log, observations.has_place
+    for k, anchor_id in enumerate(log.anchor_ids):
+        of_anchor = took_part & (log.anchor_index == k)
+        num, num_used = of_anchor.sum(), (of_anchor & (observations.status < RangeStatus.OUTLIER)).sum()
+        if num >= _MIN_RANGES and num_used < _MIN_USED * num:
+            yield Doubt(f"anchor {anchor_id}: {num_used} of {num} ranges used", _CHECK_ANCHOR)
+
+
+def _of_positions(anchors: Sequence[AnchorEstimate]) -> Iterator[Doubt]:
+    for anchor_id, moved_m, stddev_m in _surveyed(anchors):
+        worst = int(np.argmax(np.abs(moved_m)))
+        if abs(moved_m[worst]) > _MAX_STDDEVS * stddev_m:
+            reason = (
+                f"anchor {anchor_id} fits best {abs(moved_m[worst]):.2f} m from its surveyed position (along "
+                f"{'xyz'[worst]}), {abs(moved_m[worst]) / stddev_m:.2g} of its stddevs"
+            )
+            yield Doubt(reason, _CHECK_ANCHOR)
+
+
+def _of_noise(observations: RangeObservations, noise_m: Array) -> Iterator[Doubt]:
+    log = observations.log
+    used = (observations.status < RangeStatus.OUTLIER) & np.isfinite(noise_m)
+    of_anchors = {
+        anchor_id: float(np.median(noise_m[rows]))
+        for k, anchor_id in enumerate(log.anchor_ids)
+        if (rows := used & (log.anchor_index == k)).sum() >= _MIN_RANGES
+    }
+    noisy = {anchor_id: stddev_m for anchor_id, stddev_m in of_anchors.items() if stddev_m > _MAX_NOISE_M}
+    if not noisy:
+        return
+    whose = "the ranges" if len(noisy) == len(of_anchors) else f"the ranges to {', '.join(noisy)}"
+    reason = f"{whose} scatter by {max(noisy.values()):.2f} m; UWB radios scatter by 0.02 to 0.3 m"
+    remedy = "check the unit of the ranges and the radio's calibration (rangesfm ranges calibrate)"
+    yield Doubt(reason, f"{remedy}; if this radio is so coarse, say so (range_stddev_m)")
+
+
+def place_of_map(
+    estimate: ScaleEstimate,
+    summary: RefineSummary | None,
+    centers_m: Array,
+    doubts: Sequence[Doubt],
+    bent_by_m: Array,
+) -> Place | None:
+    """Return the map's place in the site's frame with its uncertainty; None if the frame is the first camera's.
+
+    Args:
+        summary: of the refinement; None for a map that is only scaled.
+        centers_m: (n, 3) keyframe centres in the final map, the first in time first.
+        doubts: about the map; with any of them its place is doubtful too.
+        bent_by_m: (n,) how far the ranges would bend each keyframe of a map that is only scaled; (0,) if unknown.
+    """
+    if estimate.placement is None:
+        return None
+    found = None if summary is None else summary.covariance
+    of_one_piece = by_similarity(estimate.placement, centers_m)
+    of_map, of_keyframes = of_one_piece if found is None else (found.similarity, found.centers)
+    stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
+    heading_deg = float(np.rad2deg(stddevs[3]))
+    bent_m2 = np.square(bent_by_m) if found is None and len(bent_by_m) else 0.0
+    worst_m = float(np.sqrt((np.trace(of_keyframes, axis1=1, axis2=2) + bent_m2).max()))
+    surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
+    size_m = float(np.linalg.norm(np.ptp(np.vstack([centers_m, *surveyed]), axis=0)))
+    summary_of_place = (
+        f"the map's place is known to {np.linalg.norm(stddevs[4:]):.2g} m, its heading to {heading_deg:.2g} deg, each "
+        f"keyframe to {worst_m:.2g} m or better (1 stddev)"
+    )
+    # The scale's own limit, applied to the site's size and to a radian: then no length and no place is less certain.
+    is_wide = NORMAL_95 * worst_m > DOUBTFUL_ABOVE * size_m or NORMAL_95 * stddevs[3] > DOUBTFUL_ABOVE
+    reasons = (*((summary_of_place,) if is_wide or not doubts else ()), *(doubt.reason for doubt in doubts))
+    x_m, y_m, z_m = stddevs[4:].tolist()
+    return Place("doubtful" if is_wide or doubts else "good", reasons, (x_m, y_m, z_m), heading_deg, worst_m)
+
+
+def by_similarity(placement: Array, centers_m: Array) -> tuple[Array, Array]:
+    """Return the covariance (7, 7) about the middle of the centres and (n, 3, 3) of each, for a rigid map."""
+    from_first = similarity_motions(centers_m - centers_m[0])
+    to_middle = np.eye(7)
+    to_middle[4:] = from_first.mean(axis=0)
+    return to_middle @ placement @ to_middle.T, from_first @ placement @ np.swapaxes(from_first, 1, 2)
+
+
+def why_broken(
+    scaled: pycolmap.Reconstruction,
+    refined: pycolmap.Reconstruction,
+    trajectory: Trajectory,
+    estimate: ScaleEstimate,
+    summary: RefineSummary,
+    range_loss_scale: float,
+) -> tuple[str, ...]:
+    """Return the signs that a refinement broke the map; empty if there are none.
+
+    Args:
+        scaled, refined: the map before and after, in the same metric world.
+        trajectory: of the keyframes, in any world.
+        range_loss_scale: as in the refinement's options.
+    """
+    before, after = point_errors(scaled), point_errors(refined)
+    old, new = (trajectory.as_in(model).centers for model in (scaled, refined))
+    return (
+        *_out_of_line(before, after, summary, _max_growth(scaled, summary, range_loss_scale)),
+        *_elsewhere(before.points - old.mean(axis=0), after.points - new.mean(axis=0)),
+        *_apart_from_ranges(estimate, summary, old),
+    )
+
+
+def _max_growth(scaled: pycolmap.Reconstruction, summary: RefineSummary, range_loss_scale: float) -> float:
+    """Return the factor by which the typical reprojection error may grow.
+
+    The solver only reduces the cost, and the loss of a range is bounded by half the square of its scale c. So n ranges
+    can outweigh at most n c^2 in squared pixel standard deviations, spread over the 2 N coordinates of N observations.
+    """
+    num_ranges = int(np.count_nonzero(summary.observations.status <= RangeStatus.OUTLIER))
+    num_coordinates = 2 * max(scaled.compute_num_observations(), 1)
+    return _OF_MEDIANS * float(np.sqrt(1 + num_ranges * range_loss_scale**2 / num_coordinates))
+
+
+def _out_of_line(before: PointErrors, after: PointErrors, summary: RefineSummary, max_growth: float) -> Iterator[str]:
+    if not after.fit:
+        yield after.apart("the refined map")
+        return
+    typical_px = max(before.median_px, summary.pixel_stddev if before.fit else 0.0)
+    if after.median_px > max_growth * typical_px:
+        yield (
+            f"the reprojection error grew from {before.median_px:.2f} to {after.median_px:.2f} px (median); the ranges "
+            f"account for {max_growth:.1f} times at most"
+        )
+    shares = [float(np.mean(of.error_px > _LARGE * max_growth * typical_px)) for of in (before, after)]
+    if shares[1] > shares[0] + _MANY_MORE:
+        yield (
+            f"{100 * shares[1]:.0f} % of the points are far from where the photos show them, {100 * shares[0]:.0f} % "
+            "before"
+        )
+
+
+def _elsewhere(old_points: Array, new_points: Array) -> Iterator[str]:
+    """Yield a reason if points moved away; both sets are relative to the path's middle, metres."""
+    # Points near the horizon may move far, but not half of all points.
+    old_m, new_m = (np.median(np.linalg.norm(of, axis=1)) if len(of) else 0.0 for of in (old_points, new_points))
+    if len(old_points) and new_m > _MAX_POINTS_GROWTH * old_m:
+        yield f"the points were thrown away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
+
+
+def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:
+    """Yield reasons if the ranges no longer fit, or a surveyed anchor moved by more than the extent of the path."""
+    if estimate.solution is not None:
+        old_m = float(np.median(np.abs(estimate.solution.fit.residuals_m)))
+        new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
+        if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
+            yield f"the difference of ranges and map grew from {old_m:.2g} to {new_m:.2g} m (median)"
+    size_m = float(np.linalg.norm(path_shape(path_m).stddevs))
+    for anchor_id, moved_m, stddev_m in _surveyed(summary.anchors):
+        if (far_m := float(np.linalg.norm(moved_m))) > max(size_m, 10 * stddev_m):
+            yield f"anchor {anchor_id} went {far_m:.3g} m from where it was surveyed"

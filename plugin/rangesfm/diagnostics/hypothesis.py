@@ -1,0 +1,214 @@
+"""Hypothesis: one possible mistake, its effect on the residuals, its texts and its correction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap
+
+# Step, in the unit of a hypothesis, of the difference quotient for its effect.
+_SMALL = 1e-4
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Changes of the input that undo a mistake.
+
+    Attributes:
+        anchors_m: corrected positions, (3,) by id; None: the anchor counts as unknown.
+        tag_moves_m: (3,) additions to lever arms in the camera's frame, by tag id.
+        time_shift_s: addition to the times of the ranges, one for all or (n,).
+        left_out: (n,) mask of ranges that are not used.
+        longer_m: (n,) amounts by which the ranges are too long.
+    """
+
+    anchors_m: Mapping[str, Array | None] = field(default_factory=dict)
+    tag_moves_m: Mapping[str, Array] = field(default_factory=dict)
+    time_shift_s: float | Array = 0.0
+    left_out: Mask | None = None
+    longer_m: Array | None = None
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Derivatives of the residuals by the k numbers of a mistake.
+
+    Attributes:
+        columns: (c, k) for the residuals of the cells, metres per unit.
+        priors: (r, k) for the residuals of the priors, in standard deviations per unit.
+    """
+
+    columns: Array
+    priors: Array
+
+    @classmethod
+    def of_all(cls, parts: Sequence[Effect]) -> Effect:
+        """Join effects that have numbers of their own."""
+        return cls(np.hstack([part.columns for part in parts]), np.hstack([part.priors for part in parts]))
+
+    @classmethod
+    def of_sum(cls, parts: Sequence[Effect]) -> Effect:
+        """Add effects that share the same numbers."""
+        return cls(np.sum([part.columns for part in parts], axis=0), np.sum([part.priors for part in parts], axis=0))
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A mistake described by k numbers.
+
+    Attributes:
+        name: of its kind. subject: which one of the kind, such as an anchor's id; may be empty.
+        effect: on the residuals.
+        words: returns for an estimate (k,) what is probably the case.
+        remedy: what to measure or to change.
+        correction: returns for an estimate the changes that undo the mistake.
+        most: largest possible size, as the length of the vector of numbers. A larger estimate is not this mistake.
+        unit: of the numbers.
+        adoption: returns the changes to make if the mistake is adopted; None: those of ``correction``.
+        unawares: a mistake larger than this is noticed without a test, so it need not be feared.
+        finer: yields the same mistake at times between those that are searched; None if it has no time.
+        narrower: hypotheses with fewer numbers, which explain as much if the mistake was of their kind.
+        is_linear: whether one step finds its size, however large it is.
+        is_in_interval: whether the scale's interval already includes its usual size, or it changes the unit of length.
+    """
+
+    name: str
+    effect: Effect
+    words: Callable[[Array], str]
+    remedy: str
+    correction: Callable[[Array], Correction]
+    most: float
+    subject: str = ""
+    unit: str = "m"
+    adoption: Callable[[Array], Correction] | None = None
+    unawares: float = np.inf
+    finer: Callable[[], Iterator[Hypothesis]] | None = None
+    narrower: tuple[Hypothesis, ...] = ()
+    is_linear: bool = False
+    is_in_interval: bool = False
+
+    def at_size(self, problem: Linearized, sizes: Array) -> Hypothesis:
+        """Return the hypothesis with its effect linearised about an estimate, as large mistakes are not linear."""
+        longer_m = self.correction(sizes).longer_m
+        if longer_m is None:
+            return self
+        steps = [self.correction(sizes + _SMALL * unit).longer_m for unit in np.eye(len(sizes))]
+        slopes = [(step - longer_m) / _SMALL for step in steps if step is not None]
+        return replace(self, effect=of_cells(problem, -problem.cells.mean(np.stack(slopes, axis=1))))
+
+    def can_be(self, sizes: Array) -> bool:
+        """Return True if a mistake of this size (k,) is possible."""
+        return bool(np.linalg.norm(sizes) <= self.most)
+
+    @property
+    def most_unnoticed(self) -> float:
+        """Largest possible size that nobody notices without a test."""
+        return min(self.most, self.unawares)
+
+    @property
+    def num(self) -> int:
+        return int(self.effect.columns.shape[1])
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.name, self.subject
+
+
+def of_cells(problem: Linearized, columns: Array) -> Effect:
+    """Return an effect on the cells alone, without a part in the priors."""
+    columns = columns.reshape(len(problem.residual_m), -1)
+    return Effect(columns, np.zeros((problem.num_priors, columns.shape[1])))
+
+
+def is_given(problem: Linearized, anchor: int) -> bool:
+    """Return True if an anchor's position was given."""
+    given = problem.on_map.problem
+    return bool(np.isfinite(given.anchor_mean_m[anchor]).all() and np.isfinite(given.anchor_stddev_m[anchor]))
+
+
+def longest_m(problem: Linearized, anchor: int | None = None) -> float:
+    """Return the longest range to one anchor, or to any.
+
+    It bounds the errors of ranges and positions: no range is too long by more than itself.
+    """
+    given = problem.on_map.problem
+    is_of = slice(None) if anchor is None else given.anchor_index == anchor
+    return float(np.max(given.range_m[is_of]))
+
+
+def duration_s(problem: Linearized) -> float:
+    """Return the time between the first and the last range; clocks that differ by more have no moment in common."""
+    return float(np.ptp(problem.on_map.time_s))
+
+
+def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effect:
+    """Return the effect of an anchor that is off its given position along directions (3, k), towards its true place."""
+    stddev_m = problem.on_map.problem.anchor_stddev_m
+    if problem.columns.anchor[anchor] < 0:
+        is_of = (problem.cells.anchor_index == anchor)[:, None]
+        return of_cells(problem, np.where(is_of, problem.gradient.by_tag @ directions, 0.0))
+    has_rows = (problem.columns.anchor >= 0) & np.isfinite(stddev_m)
+    row = 3 * np.count_nonzero(has_rows[:anchor])
+    priors = np.zeros((problem.num_priors, directions.shape[1]))
+    priors[row : row + 3] = directions / stddev_m[anchor]
+    return Effect(np.zeros((len(problem.residual_m), directions.shape[1])), priors)
+
+
+def longer(rows: Callable[[], Mask]) -> Callable[[Array], Correction]:
+    """Return the function that corrects some ranges for a constant error, given its size."""
+    return lambda size: Correction(longer_m=np.where(rows(), size[0], 0.0))
+
+
+def too_long(size: Array) -> str:
+    return f"read about {abs(size[0]):.2f} m too {'long' if size[0] > 0 else 'short'}"
+
+
+def in_axes(shift: Array) -> str:
+    return f"{shift[0]:+.2f}, {shift[1]:+.2f}, {shift[2]:+.2f} m"
+
+
+def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
+    """Return the ranges with anchors, lever arms, times and lengths corrected; ``left_out`` is not applied."""
+    problem, mean_m = on_map.problem, on_map.problem.anchor_mean_m.copy()
+    anchors_m = on_map.state.anchors_m.copy()
+    for name, position in correction.anchors_m.items():
+        k = on_map.anchor_ids.index(name)
+        mean_m[k] = np.full(3, np.nan) if position is None else position
+        anchors_m[k] = anchors_m[k] if position is None else position
+    problem = replace(problem, anchor_mean_m=mean_m)
+    on_map = replace(on_map, problem=problem, state=replace(on_map.state, anchors_m=anchors_m))
+    if on_map.velocity is not None and np.any(correction.time_shift_s):
+        on_map = _taken_later(on_map, np.broadcast_to(correction.time_shift_s, len(on_map.time_s)), on_map.velocity)
+    problem = on_map.problem
+    if correction.longer_m is not None:
+        problem = replace(problem, range_m=problem.range_m - correction.longer_m)
+    if correction.tag_moves_m:
+        moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in on_map.tag_ids])
+        turned = np.einsum("nij,nj->ni", on_map.model_from_cam, moves[on_map.tag_index])
+        problem = replace(problem, tag_from_center=problem.tag_from_center + turned)
+    return replace(on_map, problem=problem)
+
+
+def _taken_later(on_map: RangesOnMap, shift_s: Array, velocity: Array) -> RangesOnMap:
+    """Return the ranges moved along the path to later times.
+
+    Each takes the place of the range nearest to its new time, extrapolated by the velocity (n, 3) there.
+    """
+    problem, taken_s = on_map.problem, on_map.time_s + shift_s
+    order = np.argsort(on_map.time_s, kind="stable")
+    rising_s = on_map.time_s[order]
+    after = np.clip(np.searchsorted(rising_s, taken_s), 1, len(order) - 1)
+    at = order[np.where(taken_s - rising_s[after - 1] < rising_s[after] - taken_s, after - 1, after)]
+    arms = np.einsum("nji,nj->ni", on_map.model_from_cam, problem.tag_from_center)
+    turned = on_map.model_from_cam[at]
+    centers = problem.centers[at] + velocity[at] * (taken_s - on_map.time_s[at])[:, None]
+    return replace(
+        on_map,
+        problem=replace(problem, centers=centers, tag_from_center=np.einsum("nij,nj->ni", turned, arms)),
+        model_from_cam=turned,
+        velocity=velocity[at],
+    )

@@ -1,0 +1,311 @@
+"""RangesOnMap, the ranges of a survey on its scaled map, and Linearized, the linear problem that all tests use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.geometry.similarity import similarity_motions
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.ranging.errors.bending import BendingOfCells, MapBending, by_poses
+from rangesfm.ranging.errors.components import PLACES
+from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
+from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
+from rangesfm.ranging.errors.range_bins import Cells, cells, noisiness
+from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.ranging.range_observations import OnPath, RangeObservations
+from rangesfm.scale.initialize import camera_velocities, model_from_cam
+from rangesfm.scale.range_equation import (
+    Columns,
+    RangeProblem,
+    RangeState,
+    columns_of,
+    prior_jacobian,
+    prior_residuals,
+    range_jacobian,
+    tag_positions,
+)
+from rangesfm.scale.scale_problem import ScaleProblem
+from rangesfm.scale.solution import Solution
+from rangesfm.scale.uncertainty import ruled_out, times_of_ranges
+
+# Fewer cells than for an interval, because the tests learn the errors many times.
+_MAX_NUM_CELLS = 160
+_NUM_NEIGHBOURS = 8
+# A range farther than this many standard deviations from the median of its neighbours is an outlier among them. For
+# this the noise counts as _LEAST_SCATTER_M or more: a radio may repeat itself to a centimetre and still err by ten from
+# one place to the next.
+_OUTLYING = 3.0
+_LEAST_SCATTER_M = 0.08
+_NO_WEIGHT = 1e-6
+# Standard deviation and correlation time of a slow wandering of the ranges, for each anchor and for all, as hands and
+# bodies move. It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where
+# steps may explain it. It is too slow to be confused with a step.
+_WANDERING_M, _WANDERING_S = 0.025, 60.0
+# Limit on learnt errors, in standard deviations of their spread over radios: more is a mistake and must not pass for
+# noise.
+_MOST_UNUSUAL = 3.0
+
+
+@dataclass(frozen=True)
+class RangesOnMap:
+    """n ranges that took part in an estimate, and its state.
+
+    Attributes:
+        problem: with standard deviations of 1, so that its residuals and Jacobians are in metres.
+        state: the estimate.
+        model_from_cam: (n, 3, 3) rotations into the model's world.
+        velocity: (n, 3) camera velocities, model units per second; None where ranges have no times.
+        time_s: (n,) on the radio's clock; where the log names photos, from the distance walked (see
+            ``uncertainty.times_of_ranges``).
+        tag_index: (n,). tag_ids, anchor_ids: by index. order_given: anchors in the order of their file.
+        rows: (n,) rows of the log.
+        weights: (n,) robust weights in the estimate.
+        placing_m: (n,) standard deviation of each coordinate of the antenna. gap: (n,) the keyframe gap of each range.
+        curve_stddev_m: (n,) of a learnt error curve that was subtracted from the ranges; None if none was.
+        on_path: where the ranges were taken. bending: of the map; None: the map is not bent.
+    """
+
+    problem: RangeProblem
+    state: RangeState
+    model_from_cam: Array
+    velocity: Array | None
+    time_s: Array
+    tag_index: Indices
+    tag_ids: tuple[str, ...]
+    anchor_ids: tuple[str, ...]
+    order_given: tuple[str, ...]
+    rows: Indices
+    weights: Array
+    placing_m: Array
+    gap: Indices
+    curve_stddev_m: Array | None
+    on_path: OnPath
+    bending: MapBending | None
+
+    @property
+    def world_from_cam(self) -> Array:
+        """(n, 3, 3) rotations of the cameras into the metric world."""
+        turned: Array = np.einsum("ij,njk->nik", self.state.metric_from_model.rotation, self.model_from_cam)
+        return turned
+
+    @property
+    def residual_m(self) -> Array:
+        """(n,) predicted minus measured range, metres, with the prior means of the biases."""
+        biases_m = self.problem.bias_mean_m[self.problem.anchor_index]
+        return np.asarray(np.linalg.norm(self.from_anchor_m, axis=1) + biases_m - self.problem.range_m)
+
+    @property
+    def from_anchor_m(self) -> Array:
+        """(n, 3) vectors from each range's anchor to its tag, in the metric world."""
+        tags_m = tag_positions(self.problem, self.state.metric_from_model)
+        return np.asarray(tags_m - self.state.anchors_m[self.problem.anchor_index])
+
+
+def ranges_on_map(
+    posed: ScaleProblem,
+    solution: Solution,
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    bending: MapBending | None,
+) -> RangesOnMap:
+    """Collect the ranges of a problem at its solution."""
+    log, rows = observations.log, posed.rows
+    return RangesOnMap(
+        problem=replace(posed.ranges, stddev_m=np.ones(len(rows)), share=None),
+        state=solution.fit.state,
+        model_from_cam=model_from_cam(observations, trajectory, posed),
+        velocity=camera_velocities(observations, trajectory, posed),
+        time_s=times_of_ranges(posed, solution, observations),
+        tag_index=log.tag_index[rows],
+        tag_ids=log.tag_ids,
+        anchor_ids=log.anchor_ids,
+        order_given=posed.order_given,
+        rows=rows,
+        weights=solution.fit.weights,
+        placing_m=posed.placing_stddev_m(solution.fit.state.metric_from_model.scale),
+        gap=observations.before[rows],
+        curve_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[rows],
+        on_path=observations.on_path(rows),
+        bending=bending,
+    )
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """The linear problem of c cells of ranges and r priors with p parameters; the anchors' biases are random errors.
+
+    Attributes:
+        residual_m: (c,) predicted minus measured, on the map as the photos alone would have it.
+        design: (c, p) Jacobian of the residuals.
+        prior_residual, prior_design: (r,) and (r, p), in standard deviations; first those of the anchors' positions.
+        columns: position of each parameter; the first is the logarithm of the scale.
+        place: (c, 3, p) derivative of the camera's position in each cell.
+        cells: how ranges are averaged. time_s: (c,) mean times.
+        gradient: of the c distances.
+        by_lever_arm: (c, 3) derivative of the residual by the lever arm in the camera's frame.
+        by_time: (c,) derivative by the clocks' offset; None without times.
+        on_map: the ranges. scatter_m: standard deviation of a range among its neighbours.
+        expected: errors to expect before anything is measured. errors: the errors assumed random.
+    """
+
+    residual_m: Array
+    design: Array
+    prior_residual: Array
+    prior_design: Array
+    columns: Columns
+    place: Array
+    cells: Cells
+    time_s: Array
+    gradient: RangeGradient
+    by_lever_arm: Array
+    by_time: Array | None
+    on_map: RangesOnMap
+    scatter_m: float
+    expected: ExpectedErrors
+    errors: LearnedErrors
+
+    @property
+    def num_priors(self) -> int:
+        return len(self.prior_residual)
+
+    @property
+    def heard(self) -> list[int]:
+        """Indices of the anchors that have ranges."""
+        anchors: list[int] = np.unique(self.cells.anchor_index).tolist()
+        return anchors
+
+    def with_learnt_errors(self, columns: Array, priors: Array) -> Linearized:
+        """Return the problem with the errors learnt while given mistakes explain what they can.
+
+        Args:
+            columns, priors: (c, k) and (r, k) effects of the mistakes.
+        """
+        # Residuals are taken where the priors' residuals are smallest, with the map as it is.
+        back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
+        learnt = self.expected.learnt(
+            off_m=self.design @ back - self.residual_m + self.expected.shift_m,
+            design=np.hstack([self.design, columns]),
+            prior_design=np.hstack([self.prior_design, priors]),
+            noise_m=self.scatter_m,
+            most_unusual=_MOST_UNUSUAL,
+        )
+        return replace(self, errors=learnt)
+
+    def with_usual_errors(self) -> Linearized:
+        """Return the problem with the errors usual for radios and maps with this scatter."""
+        return replace(self, errors=self.expected.usual({"white": self.scatter_m}))
+
+
+def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Linearized:
+    """Linearise at the map's own state, with the usual errors.
+
+    Args:
+        cells_of_ranges: for ranges without noise; None: cells are formed from the ranges that agree with their
+            neighbours, however far they are from the map.
+    """
+    found, scatter_m = _cells(on_map) if cells_of_ranges is None else (cells_of_ranges, 0.0)
+    towards = RangeGradient.of(on_map.from_anchor_m).by_tag
+    others_m2 = _wandering(found) | {PLACES: found.shared_by_places(towards, on_map.placing_m, on_map.gap)}
+    expected = ExpectedErrors.of(
+        found, on_map.curve_stddev_m, ruled_out(on_map.problem), others_m2, _bending(on_map, found)
+    )
+    return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
+
+
+def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
+    """Linearise the problem at another state or for corrected ranges, with the same cells and errors."""
+    return _linearized(on_map, problem.expected, problem.scatter_m, problem.errors)
+
+
+def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float, errors: LearnedErrors) -> Linearized:
+    # The anchors' biases are random errors here, not parameters.
+    problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
+    state, placed = on_map.state, on_map.state.metric_from_model
+    columns, gradient, mean = columns_of([problem])[0], RangeGradient.of(on_map.from_anchor_m), expected.cells.mean
+    by_time = None
+    if on_map.velocity is not None:
+        by_time = mean(gradient.by_log_scale(placed.scale * on_map.velocity @ placed.rotation.T))
+    place = np.zeros((len(expected.cells), 3, columns.num))
+    place[:, :, columns.scale] = mean(placed.scale * problem.centers @ placed.rotation.T)
+    if columns.frame >= 0:
+        arms_m = mean(tag_positions(problem, placed) - placed.translation)
+        place[:, :, columns.frame : columns.frame + 6] = similarity_motions(arms_m)[:, :, 1:]
+    return Linearized(
+        residual_m=mean(on_map.residual_m) + expected.shift_m,
+        design=mean(range_jacobian(problem, columns, state, state)),
+        prior_residual=prior_residuals(problem, columns, state),
+        prior_design=prior_jacobian(problem, columns, state, state),
+        columns=columns,
+        place=place,
+        cells=expected.cells,
+        time_s=mean(on_map.time_s),
+        gradient=RangeGradient(mean(gradient.distance_m), mean(gradient.by_tag)),
+        by_lever_arm=mean(gradient.by_tag_in_cam(on_map.world_from_cam)),
+        by_time=by_time,
+        on_map=on_map,
+        scatter_m=scatter_m,
+        expected=expected,
+        errors=errors,
+    )
+
+
+def _bending(on_map: RangesOnMap, cells_of_ranges: Cells) -> BendingOfCells | None:
+    if on_map.bending is None:
+        return None
+    return on_map.bending.of_cells(cells_of_ranges, slopes_by_poses(on_map), frame_is_free=on_map.problem.frame_is_free)
+
+
+def slopes_by_poses(on_map: RangesOnMap) -> csr_array:
+    """Return the (n, 6 k) derivatives of the distances by the path's k poses."""
+    gradient, placed = RangeGradient.of(on_map.from_anchor_m), on_map.state.metric_from_model
+    return by_poses(gradient, placed, on_map.model_from_cam, on_map.problem.tag_from_center, on_map.on_path)
+
+
+def _wandering(cells_of_ranges: Cells) -> dict[str, Array]:
+    index, time_s = cells_of_ranges.anchor_index, cells_of_ranges.time_s
+    together = np.exp(-np.abs(time_s[:, None] - time_s) / _WANDERING_S)
+    return {"wandering": _WANDERING_M**2 * (1.0 + (index[:, None] == index)) * together}
+
+
+def _cells(on_map: RangesOnMap) -> tuple[Cells, float]:
+    index = on_map.problem.anchor_index
+    order = np.lexsort((on_map.time_s, on_map.tag_index, index))
+    off_m, scatter_m = _off_neighbours(on_map.residual_m[order], index[order])
+    is_near = np.empty(len(order), dtype=bool)
+    is_near[order] = np.abs(off_m) <= near_m(scatter_m)
+    of_ranges = cells(
+        index,
+        on_map.tag_index,
+        on_map.time_s,
+        on_map.from_anchor_m,
+        np.swapaxes(on_map.world_from_cam, 1, 2),
+        np.where(is_near, 1.0, _NO_WEIGHT),
+        noisiness(index[order], off_m, on_map.problem.num_anchors),
+        _MAX_NUM_CELLS,
+    )
+    return of_ranges, scatter_m
+
+
+def near_m(scatter_m: float) -> float:
+    """Return how far from its neighbours a range with this scatter may be, in metres."""
+    return _OUTLYING * max(scatter_m, _LEAST_SCATTER_M)
+
+
+def _off_neighbours(values: Array, anchor_index: Indices) -> tuple[Array, float]:
+    """Return (n,) differences from the lower median of a few consecutive values, and the stddev of a value.
+
+    Args:
+        values: in order of time within each anchor. anchor_index: (n,), equal values together.
+    """
+    begins: Mask = np.diff(anchor_index, prepend=-1) != 0
+    since = np.arange(len(values)) - np.maximum.accumulate(np.where(begins, np.arange(len(values)), 0))
+    labels = np.cumsum(begins | (since % _NUM_NEIGHBOURS == 0)) - 1
+    counts = np.bincount(labels)
+    by_value = np.lexsort((values, labels))
+    middles = values[by_value][np.cumsum(counts) - counts + (counts - 1) // 2]
+    steps = np.diff(values)[~begins[1:]]
+    return values - middles[labels], max(robust_stddev(steps) / np.sqrt(2), MIN_STDDEV_M)

@@ -1,0 +1,297 @@
+"""Search for the mistakes that were made: learn the noise, test every hypothesis and name the likeliest cause."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives
+from rangesfm.diagnostics.catalogue import STANDING
+from rangesfm.diagnostics.hypothesis import Correction, Effect, Hypothesis, corrected, of_cells
+from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized
+from rangesfm.diagnostics.timed_hypotheses import SCANNING
+from rangesfm.scale.range_equation import RangeState, state_after
+
+# Numbers of explanations that are tried, each with the noise that it leaves: in all, of one kind, and when no test
+# exceeds its threshold.
+_NUM_TRIED, _NUM_OF_KIND, _NUM_NEARLY = 6, 2, 3
+# Number of alternatives that are fitted. The right one starts near its minimum, where the map itself sees the anchors.
+_NUM_FITTED = 12
+# Smallest difference of scores (twice a log-likelihood, less a penalty) that tells two explanations apart.
+_AS_LIKELY = 6.0
+_SAME = 0.95
+_MAX_NUM_RIVALS = 2
+_NUM_SETTLING, _SETTLED = 6, 0.05
+# Consecutive growing steps that count as divergence. One may be too short at first, with a large mistake.
+_NUM_LONGER = 2
+# Largest number of steps for a nonlinear hypothesis.
+_NUM_STEPS = 10
+
+
+@dataclass(frozen=True)
+class Cause(Alternative):
+    """An explanation that is more likely than chance; its words include the size that was found.
+
+    Attributes:
+        gain: increase of twice the log-likelihood of the ranges, with the errors that are left with it.
+        penalty: for the numbers or alternatives to choose from.
+        state: the likeliest state of the map with it.
+        test: None for an alternative.
+    """
+
+    gain: float
+    penalty: float
+    state: RangeState
+    test: Test | None
+
+    @property
+    def score(self) -> float:
+        return self.gain - self.penalty
+
+    def undone(self, on_map: RangesOnMap) -> RangesOnMap:
+        """Return the ranges as they would be without the mistake."""
+        correction = self.correction if self.test is None else self.test.hypothesis.correction(self.test.sizes)
+        return corrected(replace(on_map, state=self.state), correction)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """The results for one map.
+
+    Attributes:
+        problem: with the errors that are left with the likeliest cause.
+        tests: for each kind and subject the one that fits best, the likeliest first.
+        causes: the likeliest, and those that cannot be told from it; empty if nothing was found.
+    """
+
+    problem: Linearized
+    tests: tuple[Test, ...]
+    causes: tuple[Cause, ...]
+
+
+def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
+    """Test all hypotheses with the noise that is left when all lasting mistakes explain what they can.
+
+    A mistake with a time, such as a step, may have been learnt as noise instead. So if no test exceeds its threshold,
+    the likeliest hypotheses are tried again, each with the noise that it leaves, and kept if they make the ranges
+    likelier by enough.
+    """
+    problem = linearized(on_map)
+    standing = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
+    hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
+    problem = _learnt(problem, standing)
+    tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
+    possible = [test for test in tests if test.is_possible]
+    rejected = [test for test in possible if test.is_rejected]
+    causes = _causes(problem, rejected or possible[:_NUM_NEARLY], is_sure=bool(rejected))
+    if causes and causes[0].test is not None:
+        problem = _learnt(problem, [*standing, causes[0].test.hypothesis])
+        tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
+    return Findings(problem, tuple(tests), tuple(causes))
+
+
+def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized:
+    """Return the problem with the errors learnt while some mistakes explain what they can."""
+    effects = Effect.of_all([of_cells(problem, problem.design[:, :0]), *(h.effect for h in explaining)])
+    return problem.with_learnt_errors(effects.columns, effects.priors)
+
+
+def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) -> list[Cause]:
+    """Return the likeliest explanation and those as good; empty if none is better than chance."""
+    before = Factorization(_learnt(_settled(problem), [])).deviance()
+    num = len(problem.residual_m)
+    causes = []
+    factorized = Factorization(problem)
+    for test in _varied(nominated):
+        again, deviance, state = _settled_test(problem, _at_best_time(factorized, test.hypothesis))
+        gain = before - deviance
+        is_found = again.is_possible and bool(np.isfinite(deviance))
+        # The first step of a nonlinear hypothesis says little about a large mistake, so it needs more than the penalty.
+        # An explanation fails if the errors alone explain as much once no other mistake takes part of it.
+        penalty = _penalty(again, num)
+        enough = penalty if is_sure and test.hypothesis.is_linear else test.threshold
+        if is_found and gain > enough:
+            causes.append(_cause(replace(again, threshold=test.threshold), state, gain, penalty))
+    if not causes and not is_sure:
+        return []
+    causes += _alternatives(problem, before)
+    causes.sort(key=lambda cause: -cause.score)
+    likeliest = [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)]
+    return [_narrowed(problem, cause, before) for cause in likeliest[: 1 + _MAX_NUM_RIVALS]]
+
+
+def _at_best_time(factorized: Factorization, hypothesis: Hypothesis) -> Hypothesis:
+    """Return a hypothesis at the time that fits best; ranges between its true time and a tried one fit neither way."""
+    if hypothesis.finer is None:
+        return hypothesis
+    tests = factorized.estimates([hypothesis, *hypothesis.finer()])
+    return max(tests, key=lambda test: test.statistic).hypothesis
+
+
+def _varied(tests: Sequence[Test]) -> list[Test]:
+    """Return the first tests, at most a few of each kind."""
+    kinds = [test.hypothesis.name for test in tests]
+    return [test for k, test in enumerate(tests) if kinds[:k].count(kinds[k]) < _NUM_OF_KIND][:_NUM_TRIED]
+
+
+def _is_rival(best: Cause, other: Cause) -> bool:
+    if best.score - other.score < _AS_LIKELY:
+        return True
+    return best.test is not None and other.test is not None and overlap(best.test, other.test) > _SAME
+
+
+def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, float, RangeState]:
+    """Return the test of a hypothesis, its deviance and its state, with the errors that it leaves.
+
+    The deviance is infinite if the steps diverge: then no size fits.
+    """
+    found = (_linear_settled if hypothesis.is_linear else _settled_in_steps)(problem, hypothesis)
+    factorized = Factorization(_learnt(found.at, [found.hypothesis]))
+    [test] = factorized.estimates([found.hypothesis])
+    # The next step's gain is only counted if the steps have converged.
+    sizes = found.sizes + test.sizes if found.is_settled else found.sizes
+    deviance = np.inf if found.diverges else factorized.deviance(test if found.is_settled else None)
+    return replace(test, hypothesis=hypothesis, sizes=sizes), deviance, found.at.on_map.state
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """The end of the steps to the likeliest size of a mistake.
+
+    Attributes:
+        at: the problem with the ranges corrected by ``sizes``, at the state that is then likeliest.
+        hypothesis: linearised there. sizes: (k,) by which the ranges are corrected.
+        is_settled: whether the next step is short.
+        diverges: whether steps grow, or lead to impossible sizes.
+    """
+
+    at: Linearized
+    hypothesis: Hypothesis
+    sizes: Array
+    is_settled: bool
+    diverges: bool = False
+
+
+class _Steps:
+    """Detection of steps that do not shrink."""
+
+    def __init__(self) -> None:
+        self._last, self._num_longer = np.inf, 0
+
+    def grow(self, step: float) -> bool:
+        """Add a step of this length, and return True if the last ``_NUM_LONGER`` steps each were longer than before."""
+        self._num_longer = self._num_longer + 1 if step > self._last or not np.isfinite(step) else 0
+        self._last = step
+        return self._num_longer >= _NUM_LONGER
+
+
+def _linear_settled(problem: Linearized, hypothesis: Hypothesis) -> _Settled:
+    """Find the likeliest state with a linear mistake, whose size is left free."""
+    at, before, nothing, steps = problem, np.zeros(hypothesis.num), np.zeros(hypothesis.num), _Steps()
+    for _ in range(_NUM_SETTLING):
+        factorized = Factorization(at)
+        [test] = factorized.estimates([hypothesis])
+        change = float(np.linalg.norm(test.sizes - before))
+        if change < _SETTLED * np.linalg.norm(test.sizes):
+            break
+        if steps.grow(change) or not test.is_possible:
+            return _Settled(at, hypothesis, nothing, is_settled=True, diverges=True)
+        at, before = at_state(at, _stepped(at, factorized, hypothesis, test.sizes)), test.sizes
+    return _Settled(at, hypothesis, nothing, is_settled=True)
+
+
+def _settled_in_steps(problem: Linearized, original: Hypothesis) -> _Settled:
+    """Find the likeliest size of a mistake by repeated correction; the steps may diverge if the data hardly fix it."""
+    at, hypothesis, sizes, steps = problem, original, np.zeros(original.num), _Steps()
+    for _ in range(_NUM_STEPS):
+        factorized = Factorization(at)
+        [test] = factorized.estimates([hypothesis])
+        step, size = (float(np.linalg.norm(each)) for each in (test.sizes, sizes + test.sizes))
+        if steps.grow(step) or not original.can_be(sizes + test.sizes):
+            return _Settled(at, hypothesis, sizes, is_settled=False, diverges=True)
+        if step < _SETTLED * size:
+            return _Settled(at, hypothesis, sizes, is_settled=True)
+        sizes = sizes + test.sizes
+        moved = replace(problem.on_map, state=_stepped(at, factorized, hypothesis, test.sizes).state)
+        at = at_state(at, corrected(moved, original.correction(sizes)))
+        found = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.narrower))
+        hypothesis = next((each for each in found if each.key == original.key), None) or original.at_size(at, sizes)
+    return _Settled(at, hypothesis, sizes, is_settled=False)
+
+
+def _stepped(at: Linearized, factorized: Factorization, hypothesis: Hypothesis, sizes: Array) -> RangesOnMap:
+    """Return the ranges on the map that is likeliest with a mistake of some size."""
+    step = factorized.step((hypothesis.effect, sizes))
+    return replace(at.on_map, state=state_after((at.columns,), at.on_map.state, step))
+
+
+def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
+    """Return a cause with fewer numbers if one explains as much; otherwise the cause itself."""
+    if cause.test is None or not cause.test.hypothesis.narrower:
+        return cause
+    tried = [_settled_test(problem, h) for h in cause.test.hypothesis.narrower]
+    tried = [each for each in tried if each[0].is_possible]
+    if not tried:
+        return cause
+    best, deviance, state = min(tried, key=lambda each: each[1])
+    test = replace(best, threshold=cause.test.threshold)
+    narrow = _cause(test, state, before - deviance, _penalty(best, len(problem.residual_m)))
+    return narrow if narrow.score > cause.score else cause
+
+
+def _cause(test: Test, state: RangeState, gain: float, penalty: float) -> Cause:
+    h = test.hypothesis
+    adoption = (h.adoption or h.correction)(test.sizes)
+    return Cause(h.name, h.subject, h.words(test.sizes), h.remedy, adoption, gain, penalty, state, test)
+
+
+def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
+    """Yield the alternatives that make the ranges likelier than chance would."""
+    on_map = problem.on_map
+    tried = list(alternatives(on_map))
+    if not tried:
+        return
+    refits = Refits(on_map, problem.scatter_m)
+    as_given, _ = refits.of(refits.start(Correction())[1])
+    starts = sorted(((*refits.start(each.correction), each) for each in tried), key=lambda start: start[0])
+    fits = sorted(((*refits.of(start), each) for _, start, each in starts[:_NUM_FITTED]), key=lambda fit: fit[0])
+    for _, refitted, each in [fit for fit in fits if fit[0] < as_given][:_NUM_TRIED]:
+        moved = _settled(at_state(problem, refitted))
+        gain = before - Factorization(_learnt(moved, [])).deviance()
+        penalty = 2 * float(np.log(len(tried)))
+        if gain > penalty + _AS_LIKELY:
+            yield Cause(**vars(each), gain=gain, penalty=penalty, state=moved.on_map.state, test=None)
+
+
+def _settled(problem: Linearized) -> Linearized:
+    """Move to the likeliest state if a linear step improves it; from far away it does not."""
+    here = Factorization(problem.with_usual_errors())
+    state = state_after((problem.columns,), problem.on_map.state, here.step())
+    there = at_state(problem, replace(problem.on_map, state=state))
+    return min(problem, there, key=lambda each: Factorization(each.with_usual_errors()).deviance())
+
+
+def _best_of_each(tests: Sequence[Test], problem: Linearized) -> list[Test]:
+    """Return for each kind and subject the test that fits best, the likeliest first."""
+    of_key: dict[tuple[str, str], list[Test]] = {}
+    for test in tests:
+        of_key.setdefault(test.hypothesis.key, []).append(test)
+    # The smallest detectable size is the median over all times, because a mistake does not happen at the best time.
+    best = {
+        key: replace(
+            max(group, key=lambda test: (test.is_possible, test.statistic)),
+            smallest_detectable=float(np.median([test.smallest_detectable for test in group])),
+        )
+        for key, group in of_key.items()
+    }
+    num = len(problem.residual_m)
+    return sorted(best.values(), key=lambda test: _penalty(test, num) - test.statistic)
+
+
+def _penalty(test: Test, num: int) -> float:
+    """Return the cost of the numbers that a hypothesis may choose (Schwarz, 1978)."""
+    return test.num * float(np.log(num))

@@ -1,0 +1,284 @@
+"""Mistakes that begin or end at an unknown time: each is searched for over the whole survey."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.diagnostics.catalogue import MISMEASURED_M, UNSEEN_MOVE_M, lever_arm_m, to_other_side_m
+from rangesfm.diagnostics.hypothesis import (
+    Correction,
+    Hypothesis,
+    duration_s,
+    in_axes,
+    longer,
+    longest_m,
+    of_cells,
+    too_long,
+)
+from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.scale.range_equation import tag_positions
+
+# Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.
+_NUM_TIMES = 32
+_NUM_FINER = 17
+# Share of the survey that must be before and after a change; otherwise it is as good as a lasting mistake.
+_LEAST_SHARE = 1 / 12
+# Shares of the survey that a stretch may last.
+_STRETCHES = (1 / 4, 1 / 8, 1 / 16)
+# Fewest cells before and after a change.
+_MIN_NUM_CELLS = 3
+# Kinds of moves at some time: text for whose, when and by how much; remedy; largest unnoticed size, metres.
+_MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
+    "anchor moved": (
+        lambda whose, when, size: (
+            f"anchor {whose} was moved by about {np.linalg.norm(size):.2f} m {when} ({in_axes(size)} in x, y, z)"
+        ),
+        "fix anchors so that nobody bumps into them, and use its ranges from before only",
+        UNSEEN_MOVE_M,
+    ),
+    "map break": (
+        lambda _, when, size: (
+            f"the map breaks: {when} it lies about {np.linalg.norm(size):.2f} m from where it should "
+            f"({in_axes(-size)} in x, y, z)"
+        ),
+        "look at the photos there for a false match or too little overlap, and map the parts apart",
+        UNSEEN_MOVE_M,
+    ),
+    "tag slipped": (
+        lambda _, when, size: (
+            f"the tag slipped: {when} it sits about {np.linalg.norm(size):.2f} m elsewhere on the "
+            f"camera ({in_axes(size)} along the camera's x, y, z)"
+        ),
+        "fix the tag to the camera, and run the two parts as surveys of their own",
+        MISMEASURED_M,
+    ),
+}
+
+
+def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield for each anchor: it was moved at some time."""
+    for k in problem.heard:
+        # The anchor must be within reach before and after.
+        most_m = 2 * longest_m(problem, k)
+        yield from _elsewhere(problem, k, "anchor moved", most_m, lambda: -np.eye(3), -problem.gradient.by_tag)
+
+
+def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: after some time the map is elsewhere, as after a wrong match."""
+    # Two parts of a map cannot be farther apart than the map is large.
+    tags_m = tag_positions(problem.on_map.problem, problem.on_map.state.metric_from_model)
+    extent_m = float(np.linalg.norm(np.ptp(tags_m, axis=0)))
+    return _elsewhere(problem, None, "map break", extent_m, lambda: np.eye(3), problem.gradient.by_tag)
+
+
+def tags_slipped(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: after some time the tag is elsewhere on the camera."""
+    # The tag is still on the camera.
+    most_m = to_other_side_m(lever_arm_m(problem))
+    return _elsewhere(problem, None, "tag slipped", most_m, lambda: problem.on_map.world_from_cam, problem.by_lever_arm)
+
+
+def _elsewhere(
+    problem: Linearized,
+    anchor: int | None,
+    name: str,
+    most_m: float,
+    axes: Callable[[], Array],
+    by_shift: Array,
+    around: float | None = None,
+) -> Iterator[Hypothesis]:
+    """Yield moves at unknown times, relative to one anchor or to all.
+
+    Args:
+        name: kind of the move, a key of ``_MOVES``. most_m: largest possible move.
+        axes: axes of the move, (3, 3), or (n, 3, 3) for each range.
+        by_shift: (c, 3) derivatives of the predicted ranges along these axes.
+        around: as in ``_changes``.
+    """
+    words, remedy, unawares = _MOVES[name]
+    whose = _name(problem, anchor)
+
+    def back(later: Callable[[], Mask], size: Array) -> Correction:
+        from_anchor_m = problem.on_map.from_anchor_m
+        grown_m = np.linalg.norm(from_anchor_m + axes() @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
+        return Correction(longer_m=np.where(later(), grown_m, 0.0))
+
+    for time, later, after in _changes(problem, anchor, 3 * _MIN_NUM_CELLS, around):
+        yield Hypothesis(
+            name,
+            of_cells(problem, -after[:, None] * by_shift),
+            subject=whose,
+            words=partial(words, whose, _when(problem, time)),
+            remedy=remedy,
+            correction=partial(back, later),
+            most=most_m,
+            adoption=partial(_left_out, later),
+            unawares=unawares,
+            finer=partial(_elsewhere, problem, anchor, name, most_m, axes, by_shift, around=time),
+        )
+
+
+def steps(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: after some time the ranges of one anchor, or of all, read longer or shorter."""
+    for k in _each_and_all(problem):
+        yield from _steps(problem, k)
+
+
+def _steps(problem: Linearized, anchor: int | None, around: float | None = None) -> Iterator[Hypothesis]:
+    name = _name(problem, anchor)
+
+    def words(when: str, size: Array) -> str:
+        to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
+        return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
+
+    for time, later, after in _changes(problem, anchor, _MIN_NUM_CELLS, around):
+        yield Hypothesis(
+            "anchor step" if name else "step",
+            of_cells(problem, -after),
+            subject=name,
+            words=partial(words, _when(problem, time)),
+            remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
+            correction=longer(later),
+            most=longest_m(problem, anchor),
+            is_linear=True,
+            finer=partial(_steps, problem, anchor, around=time),
+        )
+
+
+def stretches(problem: Linearized) -> Iterator[Hypothesis]:
+    """Yield: for some time the ranges of one anchor, or of all, read longer or shorter."""
+    windows = list(_windows(problem))
+
+    def words(name: str, when: str, size: Array) -> str:
+        return f"{when} the ranges{f' to anchor {name}' if name else ''} {too_long(size)}"
+
+    for k in _each_and_all(problem):
+        name = _name(problem, k)
+        for start, end, share in windows:
+            inside = np.where(_is_of(problem.cells.anchor_index, k), share, 0.0)
+            if inside.sum() < _MIN_NUM_CELLS:
+                continue
+            within = partial(_later, problem, k, start, end)
+            yield Hypothesis(
+                "anchor stretch" if name else "stretch",
+                of_cells(problem, -inside),
+                subject=name,
+                words=partial(words, name, _when(problem, start, end)),
+                remedy="look for what stood in the line of sight, and leave that stretch out",
+                correction=longer(within),
+                most=longest_m(problem, k),
+                adoption=partial(_left_out, within),
+                is_linear=True,
+            )
+
+
+def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hypothesis]:
+    """Yield: the clocks' offset jumped at some time."""
+    if problem.by_time is None:
+        return
+
+    def words(when: str, size: Array) -> str:
+        return f"the clocks' offset jumped by about {size[0]:+.2f} s {when}"
+
+    def correction(later: Callable[[], Mask], size: Array) -> Correction:
+        return Correction(time_shift_s=np.where(later(), size[0], 0.0))
+
+    for time, later, after in _changes(problem, None, _MIN_NUM_CELLS, around):
+        yield Hypothesis(
+            "clock jump",
+            of_cells(problem, -after * problem.by_time),
+            words=partial(words, _when(problem, time)),
+            remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
+            correction=partial(correction, later),
+            most=duration_s(problem),
+            unit="s",
+            is_linear=True,
+            finer=partial(clock_jumps, problem, around=time),
+        )
+
+
+def _name(problem: Linearized, anchor: int | None) -> str:
+    return "" if anchor is None else problem.on_map.anchor_ids[anchor]
+
+
+def _each_and_all(problem: Linearized) -> list[int | None]:
+    """Return the anchors, if there are several, and None for all together."""
+    return [*(problem.heard if len(problem.heard) > 1 else []), None]
+
+
+def _later(problem: Linearized, anchor: int | None, start: float, end: float = np.inf) -> Mask:
+    """Return an (n,) mask of the ranges to one anchor, or to all, between two times."""
+    on_map = problem.on_map
+    return _is_of(on_map.problem.anchor_index, anchor) & (on_map.time_s > start) & (on_map.time_s <= end)
+
+
+def _left_out(rows: Callable[[], Mask], _: Array) -> Correction:
+    return Correction(left_out=rows())
+
+
+def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
+    """Return a mask of the ranges of one anchor, or of all if None."""
+    return np.ones(len(anchor_index), dtype=bool) if anchor is None else np.asarray(anchor_index == anchor)
+
+
+def _changes(
+    problem: Linearized, anchor: int | None, least: int, around: float | None = None
+) -> Iterator[tuple[float, Callable[[], Mask], Array]]:
+    """Yield times away from the ends of the survey, with what follows them.
+
+    Each comes with a function that returns the later ranges of one anchor, or of all, and with (c,) shares of the cells
+    that are later.
+
+    Args:
+        least: fewest cells before and after. around: try only times near this one, more closely spaced.
+    """
+    ends = _LEAST_SHARE, 1 - _LEAST_SHARE
+    of_ranges = _is_of(problem.on_map.problem.anchor_index, anchor)
+    times = np.unique(np.quantile(problem.on_map.time_s[of_ranges], np.linspace(*ends, _NUM_TIMES)))
+    if around is not None:
+        at = int(np.searchsorted(times, around))
+        times = np.linspace(times[max(at - 1, 0)], times[min(at + 1, len(times) - 1)], _NUM_FINER)
+    is_of = _is_of(problem.cells.anchor_index, anchor)
+    for time, share in zip(times.tolist(), _shares_after(problem, times), strict=True):
+        after = np.where(is_of, share, 0.0)
+        if min(after.sum(), is_of.sum() - after.sum()) >= least:
+            yield time, partial(_later, problem, anchor, time), after
+
+
+def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
+    """Yield begin, end and the (c,) shares of the cells in between, for stretches of several lengths."""
+    starts = [(start, share) for share in _STRETCHES for start in np.arange(0.0, 1.0 - share + 1e-9, share / 2)]
+    ends = np.quantile(problem.on_map.time_s, [(start, min(start + share, 1.0)) for start, share in starts])
+    times, rows = np.unique(ends, return_inverse=True)
+    after = _shares_after(problem, times)
+    for (start, end), (first, last) in zip(ends.tolist(), rows.reshape(ends.shape), strict=True):
+        yield start, end, after[first] - after[last]
+
+
+def _shares_after(problem: Linearized, times: Array) -> Array:
+    """Return (t, c) the share of each cell's weight that is later than each of (t,) increasing times."""
+    cells, num = problem.cells, len(times) + 1
+    of_span = cells.of_range * num + np.searchsorted(times, problem.on_map.time_s)
+    worth = np.bincount(of_span, cells.weight, len(cells) * num).reshape(len(cells), num)
+    later: Array = np.cumsum(worth[:, :0:-1], axis=1)[:, ::-1].T / cells.worth
+    return later
+
+
+def _when(problem: Linearized, start: float, end: float | None = None) -> str:
+    begin = problem.on_map.time_s.min()
+    what = "m along the path" if problem.by_time is None else "s after the first range"
+    return f"from {start - begin:.0f}{'' if end is None else f' to {end - begin:.0f}'} {what}"
+
+
+SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
+    anchors_moved,
+    map_breaks,
+    tags_slipped,
+    steps,
+    stretches,
+    clock_jumps,
+)

@@ -1,0 +1,264 @@
+"""Unbends a drifted map before the full problem is solved, and finds what the ranges are worth on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.colmap.transform import transform
+from rangesfm.geometry.similarity import Similarity, align_points, are_apart, rmse
+from rangesfm.geometry.trajectory import pose_of
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
+from rangesfm.ranging.errors.robust_loss import wider
+from rangesfm.refine.keyframe_graph import GraphSolution, GraphState, KeyframeGraph, local_scales, solve_graph
+from rangesfm.refine.radio import moved_anchors
+from rangesfm.refine.refinement_problem import RefinementProblem
+from rangesfm.refine.vision_information import (
+    Observations,
+    Poses,
+    VisionInformation,
+    model_poses,
+    project,
+    ray_residuals,
+    robust_root_weights,
+    vision_information,
+)
+
+_MAX_NUM_ROUNDS = 12
+# Relative; the noise itself is not known better from some hundred ranges.
+SAME_ERRORS = 0.05
+# Of the ranges' stddev. A turn of the whole world by centimetres takes the full problem, of which all points have to
+# follow it, tens of iterations; here it takes one step.
+_TOLERANCE = 0.001
+# Likewise. The same goes for a part of the map that turns about a weak link.
+_MIN_BEND = 0.05
+# Likewise, as a tolerance: from here on the residuals show the same errors.
+_ROUGH_TOLERANCE = 0.05
+_NUM_TRIANGULATIONS = 5
+
+
+@dataclass(frozen=True)
+class Unbent:
+    """What was found.
+
+    Attributes:
+        errors: of the ranges. num_absorbed: degrees of freedom that the map takes from them.
+        anchors: where they are now.
+        bend_m: root mean square distance of keyframes from where one similarity would have put them.
+        num_steps: of the keyframe graph's solver.
+    """
+
+    errors: RangeErrors
+    num_absorbed: float
+    anchors: tuple[AnchorEstimate, ...]
+    bend_m: float
+    num_steps: int
+
+
+def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Unbent:
+    """Solve the keyframe graph and move the model after it, in place.
+
+    The errors are estimated anew with every solution. While drift is large, so are residuals and with them the
+    stddevs: the robust loss, which counts in stddevs, tightens as the map straightens and takes no drift for an
+    outlier. From there a bounded loss, which is that of the scale and of the full problem, sets aside what is one.
+
+    Args:
+        rays: all that the photos see. errors: of the ranges that take part.
+    """
+    if not len(problem.ranges.rows):  # a few lengths bend no map
+        return Unbent(errors, 0.0, problem.radio.anchors, 0.0, 0)
+    graph = _graph(problem, rays, errors, problem.radio.anchors)
+    fit, errors = _solve_with_own_errors(graph)
+    _move(problem, rays, graph.vision, fit.state.poses, errors)
+    return Unbent(
+        errors=errors,
+        num_absorbed=fit.num_absorbed,
+        anchors=moved_anchors(problem.radio.anchors, fit.state.anchors_m, fit.state.biases_m),
+        bend_m=_bend(graph.vision.origin.centers, fit.state.poses.centers),
+        num_steps=fit.num_steps,
+    )
+
+
+def unbend_again(
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
+) -> tuple[AnchorEstimate, ...]:
+    """Likewise, with errors that are known by now, and from where the model and these anchors are; the moved anchors.
+
+    Where the errors change, the whole map turns by a little: nothing here, and tens of refused steps in the full
+    problem, whose points follow a turn along straight lines.
+    """
+    graph = _graph(problem, rays, errors, anchors)
+    state = solve_graph(graph, graph.start(), tolerance_m=_tolerance_m(errors)).state
+    _move(problem, rays, graph.vision, state.poses, errors)
+    return moved_anchors(anchors, state.anchors_m, state.biases_m)
+
+
+def _graph(
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
+) -> KeyframeGraph:
+    """Of the model as it is."""
+    ranges = problem.ranges
+    takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))[rays.point]
+    seen = rays.subset(np.flatnonzero(takes_part))
+    return KeyframeGraph(
+        vision=vision_information(seen, model_poses(problem.metric, problem.frame_ids)),
+        antennas=ranges.antennas.subset(ranges.rows),
+        range_m=ranges.observations.log.range_m[ranges.rows],
+        errors=errors,
+        anchors=anchors,
+        held_frame=0 if problem.first_pose_is_fixed else None,
+        gravity=problem.gravity,
+    )
+
+
+def _move(
+    problem: RefinementProblem, rays: Observations, vision: VisionInformation, after: Poses, errors: RangeErrors
+) -> None:
+    """As a whole, to which the photos are indifferent, or, where it bends, keyframe by keyframe."""
+    metric, before = problem.metric, vision.origin
+    whole = _as_a_whole(before, after, 0 if problem.first_pose_is_fixed else None)
+    if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(errors.stddev_m)):
+        carry_model(metric, problem.frame_ids, rays, before, after, local_scales(vision, after))
+        return
+    first = pose_of(metric.frame(problem.first_frame_id)).params
+    held = first.copy()
+    transform(metric, whole)
+    if problem.first_pose_is_fixed:
+        first[:] = held  # which rounding may have changed
+
+
+def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similarity:
+    """Most of the way that the keyframes went: turned as they are in the mean; one that is held stays."""
+    if held_frame is None:
+        turn = Rotation.from_matrix(after.world_from_rig @ np.swapaxes(before.world_from_rig, 1, 2)).mean().as_matrix()
+        start, end = before.centers.mean(axis=0), after.centers.mean(axis=0)
+    else:
+        turn, start, end = np.eye(3), before.centers[held_frame], after.centers[held_frame]
+    turned = (before.centers - start) @ turn.T
+    likeness = float(np.sum(turned * (after.centers - end)))
+    # Of a point, or turned inside out, there is none.
+    scale = likeness / float(np.sum(turned**2)) if likeness > 0 and are_apart(before.centers) else 1.0
+    return Similarity(scale, turn, end - scale * turn @ start)
+
+
+def _solve_with_own_errors(graph: KeyframeGraph) -> tuple[GraphSolution, RangeErrors]:
+    """A map and the errors that its residuals show: roughly, with the wide loss, then the bounded; at last precisely.
+
+    Where so many ranges are wrong that the wide loss follows them, the map as it came is likelier, and the bounded one
+    starts from there, with the errors as they came.
+    """
+    errors, start = graph.errors, graph.start()
+    wide, shown = _alternate(graph, replace(errors, loss=wider(errors.loss)), start)
+    seen, reached = (
+        errors.noise_of_estimated(graph.residuals_m(state)).log_likelihood for state in (start, wide.state)
+    )
+    if reached >= seen:
+        state, residuals_m = wide.state, graph.residuals_m(wide.state)
+        errors = replace(shown, loss=errors.loss).seen_by_bending_map(residuals_m, wide.num_absorbed)
+    else:
+        state, errors = start, replace(errors, log_likelihood=seen)
+    bounded, errors = _alternate(graph, errors, state)
+    settled = solve_graph(replace(graph, errors=errors), bounded.state, tolerance_m=_tolerance_m(errors))
+    return replace(settled, num_steps=wide.num_steps + bounded.num_steps + settled.num_steps), errors
+
+
+def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> tuple[GraphSolution, RangeErrors]:
+    """Between the map and the errors that its residuals show, with the steps of all rounds."""
+    num_steps = 0
+
+    def fit(errors: RangeErrors, before: GraphSolution | None) -> GraphSolution:
+        nonlocal num_steps
+        state = start if before is None else before.state
+        solution = solve_graph(replace(graph, errors=errors), state, tolerance_m=_tolerance_m(errors, _ROUGH_TOLERANCE))
+        num_steps += solution.num_steps
+        return solution
+
+    solution, _, seen = fit_with_own_errors(
+        fit,
+        lambda errors, found: errors.seen_by_bending_map(graph.residuals_m(found.state), found.num_absorbed),
+        errors,
+        max_num_rounds=_MAX_NUM_ROUNDS,
+        is_last=lambda used, shown, _: used.change(shown) < SAME_ERRORS,
+    )
+    return replace(solution, num_steps=num_steps), seen
+
+
+def _tolerance_m(errors: RangeErrors, share: float = _TOLERANCE) -> float:
+    return share * float(errors.stddev_m.min())
+
+
+def _bend(before: Array, after: Array) -> float:
+    """RMS distance that no similarity explains; of a path too short for one, nothing does not."""
+    return rmse(align_points(before, after).apply(before) - after) if len(before) > 2 else 0.0
+
+
+def carry_model(
+    metric: pycolmap.Reconstruction,
+    frame_ids: Indices,
+    observations: Observations,
+    before: Poses,
+    after: Poses,
+    local_scale: Array,
+) -> None:
+    """Move frames and points of a model, in place: a solver that works on its arrays sees it.
+
+    Args:
+        frame_ids: (n,) of the poses. observations: of the model's points in them.
+        before, after: poses of the frames as the model has them, and as it shall.
+        local_scale: (n,) by how much the map grows around each frame.
+    """
+    points = _triangulated(observations, after, _carried(observations, before, after, local_scale))
+    quaternions = Rotation.from_matrix(np.swapaxes(after.world_from_rig, 1, 2)).as_quat()
+    translations = -np.einsum("nji,nj->ni", after.world_from_rig, after.centers)
+    moved = np.any(after.centers != before.centers, axis=1) | np.any(
+        after.world_from_rig != before.world_from_rig, axis=(1, 2)
+    )
+    for k in np.flatnonzero(moved):
+        pose_of(metric.frame(int(frame_ids[k]))).params[:] = [*quaternions[k], *translations[k]]
+    for point_id, point in zip(observations.point_ids, points, strict=True):
+        metric.point3D(int(point_id)).xyz[:] = point
+
+
+def _carried(observations: Observations, before: Poses, after: Poses, local_scale: Array) -> Array:
+    """(p, 3) points, each moved rigidly and in scale with the first keyframe that sees it."""
+    points = observations.points.copy()
+    seen, first = np.unique(observations.point, return_index=True)
+    frame = observations.frame[first]
+    in_rig = np.einsum("nji,nj->ni", before.world_from_rig[frame], points[seen] - before.centers[frame])
+    in_rig *= local_scale[frame][:, None]
+    points[seen] = after.centers[frame] + np.einsum("nij,nj->ni", after.world_from_rig[frame], in_rig)
+    return points
+
+
+def _triangulated(observations: Observations, poses: Poses, start: Array) -> Array:
+    """(p, 3) points that fit the rays best, by damped Gauss-Newton steps that are taken where they help."""
+    n, num_points = len(observations.frame), len(start)
+    adder = sparse.csr_array((np.ones(n), (observations.point, np.arange(n))), shape=(num_points, n))
+    points, cost = start, _costs(observations, poses, start, adder)
+    for _ in range(_NUM_TRIANGULATIONS):
+        _, in_cam, derivative = project(observations, poses, points)
+        residuals = np.nan_to_num(ray_residuals(observations, in_cam), posinf=0.0)
+        root = robust_root_weights(residuals)
+        to_rig = np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
+        to_point = root[:, None, None] * to_rig @ np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
+        normal = (adder @ np.einsum("nai,naj->nij", to_point, to_point).reshape(n, 9)).reshape(-1, 3, 3)
+        gradient = adder @ np.einsum("nai,na->ni", to_point, root[:, None] * residuals)
+        ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-200
+        trial = points - np.linalg.solve(normal + ridge * np.eye(3), gradient[:, :, None])[:, :, 0]
+        trial_cost = _costs(observations, poses, trial, adder)
+        better = trial_cost < cost
+        points = np.where(better[:, None], trial, points)
+        cost = np.where(better, trial_cost, cost)
+    return points
+
+
+def _costs(observations: Observations, poses: Poses, points: Array, adder: sparse.csr_array) -> Array:
+    """(p,) robust cost of each point; infinite for one behind a camera that sees it."""
+    residuals = ray_residuals(observations, project(observations, poses, points)[1])
+    return np.asarray(adder @ np.log1p(np.sum(residuals**2, axis=1)))

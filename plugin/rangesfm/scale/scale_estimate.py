@@ -1,0 +1,176 @@
+"""ScaleEstimate: the result of the scale stage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.range_errors import RangeErrors
+from rangesfm.ranging.range_observations import RangeObservations
+from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_problem import ScaleProblem
+from rangesfm.scale.solution import Solution
+from rangesfm.scale.two_candidate import TwoCandidate
+
+NORMAL_95 = 1.96
+
+
+@dataclass(frozen=True)
+class ScaleUncertainty:
+    """Relative standard deviations of the scale, by their causes.
+
+    Attributes:
+        formal: from the Jacobian, as if all ranges erred independently (Cramer-Rao bound).
+        components: standard deviation due to each component of the ranges' errors, by its name.
+        lean: offset of the interval's middle from the estimate, in the logarithm of the scale.
+    """
+
+    formal: float
+    components: dict[str, float]
+    lean: float = 0.0
+
+    @property
+    def empirical(self) -> float:
+        """Realistic standard deviation: all components together, and never less than the formal one."""
+        return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
+
+    def beside(self, name: str, stddev: float) -> ScaleUncertainty:
+        """Return a copy with more of one component, added in quadrature."""
+        return replace(
+            self, components={**self.components, name: float(np.hypot(self.components.get(name, 0), stddev))}
+        )
+
+    @property
+    def interval_95(self) -> tuple[float, float]:
+        """Bounds, with 95 % probability, of the logarithm of the true scale divided by the estimate."""
+        return self.lean - self.half_width_95, self.lean + self.half_width_95
+
+    @property
+    def half_width_95(self) -> float:
+        """Half the width of the 95 % interval, in the logarithm of the scale."""
+        return NORMAL_95 * self.empirical
+
+
+@dataclass(frozen=True)
+class ScaleByKind:
+    """The scale from ranges alone, or from measured lengths alone, in metres per SfM unit.
+
+    Attributes:
+        stddev: with all error components; inf where the scale is not determined.
+    """
+
+    value: float
+    stddev: float
+
+
+@dataclass(frozen=True)
+class CutoffTest:
+    """The scale from ranges of at least some length, with short ranges weighted like the others.
+
+    Attributes:
+        min_range_m: shorter ranges are left out.
+        scale: metres per SfM unit.
+        stddev: metres per SfM unit, widened for the correlation of the errors; errors of the range model are not in it.
+    """
+
+    min_range_m: float
+    scale: float
+    stddev: float
+
+
+@dataclass(frozen=True)
+class ScaleSensitivity:
+    """Change of the scale, in percent, per error of the range model; estimated biases absorb their part of it.
+
+    Attributes:
+        common_bias_per_cm: if all ranges were a centimetre longer.
+        short_range_per_cm: if the shorter half of the ranges were a centimetre longer.
+        anchor_bias_per_cm: by anchor id, if the ranges to that anchor were a centimetre longer.
+        range_slope_per_percent: if all ranges were one percent longer.
+        lever_arm_per_cm: if the tag sat a centimetre further along x, y, z of the camera.
+    """
+
+    common_bias_per_cm: float
+    short_range_per_cm: float
+    anchor_bias_per_cm: dict[str, float]
+    range_slope_per_percent: float
+    lever_arm_per_cm: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ScaleEstimate:
+    """The scale, its frame and its uncertainty.
+
+    Attributes:
+        metric_from_sfm: similarity from the world of the unscaled model to the metric world.
+        frame: the metric world: "site" or "first_camera".
+        method: "robust", "two-candidate" or "lengths".
+        uncertainty: relative standard deviations of the scale.
+        verdict: "good" or "doubtful" (a refused scale is a GeometryError).
+        reasons: why, in words.
+        advice: what to do about it, in words; for a finished survey also what would improve the next one most.
+        cutoff_test: how the scale changes as short ranges are left out.
+        sensitivity: change of the scale per error of the range model.
+        per_anchor: scale from each anchor alone, by id; anchors that do not determine one are missing.
+        two_candidate: the paper's table; None where too few ranges have candidates.
+        anchors: estimates in the order of the log.
+        observations: all ranges, with their status by final weight.
+        errors: of all n ranges of the log, as weighted; their inflation widens the formal standard deviation.
+        noise_stddev_m: standard deviation of an ordinary range.
+        problem, solution: what the estimate was computed from; None where there were no ranges.
+        placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
+            first camera, from all error components; None in the first camera's frame.
+        lengths: what the measured lengths alone say; None without lengths between points of the map.
+        remarks: those of the reasons that a refinement does not change.
+        refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
+        by_kind: scale by "ranges" and by "lengths", as far as available, where measured lengths were used.
+    """
+
+    metric_from_sfm: Similarity
+    frame: str
+    method: str
+    uncertainty: ScaleUncertainty
+    verdict: str
+    reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+    cutoff_test: tuple[CutoffTest, ...]
+    sensitivity: ScaleSensitivity
+    per_anchor: dict[str, float]
+    two_candidate: TwoCandidate | None
+    anchors: tuple[AnchorEstimate, ...]
+    observations: RangeObservations
+    errors: RangeErrors
+    noise_stddev_m: float
+    problem: ScaleProblem | None = None
+    solution: Solution | None = None
+    placement: Array | None = None
+    lengths: LengthScale | None = None
+    by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    refined_value: float | None = None
+
+    @property
+    def value(self) -> float:
+        """Scale of the delivered map, in metres per SfM unit."""
+        return self.metric_from_sfm.scale if self.refined_value is None else self.refined_value
+
+    @property
+    def stddev_formal(self) -> float:
+        """Standard deviation in metres per SfM unit, as if all ranges erred independently."""
+        return self.value * self.uncertainty.formal
+
+    @property
+    def stddev_empirical(self) -> float:
+        """Standard deviation in metres per SfM unit, with all error components."""
+        return self.value * self.uncertainty.empirical
+
+    @property
+    def interval_95(self) -> tuple[float, float]:
+        """Bounds of the scale with 95 % probability, in metres per SfM unit."""
+        low, high = self.uncertainty.interval_95
+        return self.value * float(np.exp(low)), self.value * float(np.exp(high))

@@ -1,0 +1,198 @@
+"""The verdict on a scale, good, doubtful or refused, with reasons and advice in a surveyor's words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
+from rangesfm.options import ScaleOptions
+from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
+from rangesfm.scale.range_equation import RangeFit
+from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_estimate import NORMAL_95, CutoffTest, ScaleUncertainty
+from rangesfm.scale.scale_problem import ScaleProblem
+from rangesfm.scale.sensitivity import scale_drift
+from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
+
+# A scale is doubtful if half of its relative 95 % interval is wider than this.
+DOUBTFUL_ABOVE = 0.04
+# Relative change of the scale with the minimum range below which it is not mentioned.
+_MIN_DRIFT = 0.01
+_MANY_OUTLIERS = 0.3
+_FEW_RANGES = 50
+# Relative standard deviation of the scale from which nothing is known about it.
+_NOTHING_KNOWN = 1.0
+# Scatter of the scales from single anchors above which they disagree. Antennas and short paths alone cause less.
+_MAX_ANCHOR_SPREAD = 0.05
+CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on a scale.
+
+    Attributes:
+        verdict: "good" or "doubtful".
+        reasons: in words.
+        advice: what to do about the faults, in words; what would improve the survey most is part of its plan.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+
+
+class _Doubt(NamedTuple):
+    reason: str
+    advice: str = ""
+
+
+def judge(
+    problem: ScaleProblem,
+    solution: Solution,
+    uncertainty: ScaleUncertainty,
+    per_anchor: dict[str, float],
+    anchors: Sequence[AnchorEstimate],
+    cutoff_tests: tuple[CutoffTest, ...],
+    options: ScaleOptions,
+) -> Verdict:
+    """Return the verdict by the 95 % interval, and by faults that make the interval itself doubtful.
+
+    Raises:
+        GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
+    """
+    half_width = uncertainty.half_width_95
+    doubts = [*_doubts_of_survey(problem, solution, half_width), *_doubts_of_ranges(solution.fit, per_anchor)]
+    remarks = _remarks(solution, anchors)
+    if (drift := scale_drift(cutoff_tests)) is not None:
+        change = drift.scale / cutoff_tests[0].scale - 1
+        if abs(change) >= _MIN_DRIFT:
+            reason = (
+                f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would "
+                f"change by {100 * change:+.1f} %"
+            )
+            doubt = _Doubt(reason, f"{CALIBRATE}, or put the anchors farther from the path")
+            (doubts if abs(change) > half_width else remarks).append(doubt)
+    return _verdict(doubts, remarks, half_width, options)
+
+
+def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
+    """Return the verdict on a scale that was found from measured lengths alone."""
+    another = "measure another length, far from the first and in another direction"
+    doubts = []
+    if len(lengths.rows) == 1:
+        reason = "the scale depends on one length that nothing checks: a mistake in it changes the whole map"
+        doubts.append(_Doubt(reason, another))
+    if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+        doubts.append(_Doubt("the lengths are short for their standard deviations", "measure more and longer lengths"))
+    return _verdict(doubts, [], uncertainty.half_width_95, options)
+
+
+def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[str], options: ScaleOptions) -> None:
+    """Raise GeometryError if a scale is less certain than allowed, with the first reason and the first advice.
+
+    Args:
+        half_width: half of the 95 % interval of the scale, relative.
+    """
+    if half_width > NORMAL_95 * options.max_relative_stddev:
+        planned = "plan it first, which says what would narrow it (rangesfm plan)"
+        raise GeometryError(
+            f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), more than the "
+            f"{100 * options.max_relative_stddev:g} % allowed (max_relative_stddev)"
+            f"{''.join(f': {reason}' for reason in reasons[:1])}; next time: {next(iter(advice), planned)}"
+        )
+
+
+def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, options: ScaleOptions) -> Verdict:
+    why, advised = [doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts if doubt.advice]
+    refuse_unknown(half_width, why, advised, options)
+    summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
+    if half_width > DOUBTFUL_ABOVE:
+        doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %"))
+    said = [*doubts, *remarks]
+    advice = tuple(dict.fromkeys(each.advice for each in said if each.advice))
+    reasons = tuple(each.reason for each in said)
+    if not doubts:
+        return Verdict("good", (summary, *reasons), advice)
+    return Verdict("doubtful", reasons, advice)
+
+
+def _doubts_of_survey(posed: ScaleProblem, solution: Solution, half_width: float) -> Iterator[_Doubt]:
+    """Return the faults of the path and of the anchors."""
+    problem = solution.problem
+    kind, heard = path_kind(problem.centers), np.unique(problem.anchor_index)
+    is_round = kind in ("circular", "spherical") and not np.isfinite(problem.anchor_stddev_m[heard]).any()
+    # On these paths the scale is uncertain because of their shape: a longer walk of the same shape would not help.
+    if half_width > DOUBTFUL_ABOVE and is_round:
+        yield _Doubt(*WHY_SCALE_IS_OPEN[kind])
+    elif half_width > NORMAL_95 * _NOTHING_KNOWN:
+        yield _Doubt("the ranges do not show that the camera moved", "walk a loop of several metres")
+    for note in posed.notes:
+        yield _Doubt(note, "survey three anchors or more that are not on one line")
+    if ids := posed.left_out:
+        which = f"anchor {ids[0]} has" if len(ids) == 1 else f"anchors {', '.join(ids)} have"
+        reason = f"{which} too few ranges on the path to be placed: left out"
+        yield _Doubt(reason, "range more often, or survey them all")
+    stddevs = path_shape(problem.centers).stddevs
+    if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
+        if np.isinf(problem.anchor_stddev_m).any():
+            yield _Doubt("the path is nearly straight: an unknown anchor may stand anywhere on a circle around it")
+        elif problem.frame_is_free:
+            yield _Doubt("the path is nearly straight: the map's roll about it is uncertain")
+
+
+def _doubts_of_ranges(fit: RangeFit, per_anchor: dict[str, float]) -> Iterator[_Doubt]:
+    if len(fit.weights) < _FEW_RANGES:
+        reason = f"only {len(fit.weights)} ranges lie on the path"
+        yield _Doubt(reason, "range more often, and all along the path")
+    outliers = float(np.mean(fit.weights < 0.1))
+    if outliers > _MANY_OUTLIERS:
+        reason = f"{100 * outliers:.0f} % of the ranges do not fit the map: blocked, reflected, or of another anchor"
+        yield _Doubt(reason, "place the anchors where nothing stands between them and the path")
+    if len(per_anchor) > 1:
+        spread = float(np.std(np.log(np.array(list(per_anchor.values()))), ddof=1))
+        if spread > _MAX_ANCHOR_SPREAD:
+            reason = f"the anchors disagree: the scales found with each of them alone scatter by {100 * spread:.1f} %"
+            yield _Doubt(reason, "check the anchors' positions and antenna delays, and place them in the open")
+
+
+def _remarks(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Doubt]:
+    """Return what is not determined but does not affect the scale."""
+    stddevs = path_shape(solution.problem.centers).stddevs
+    if stddevs[2] >= NEARLY_FLAT * stddevs[0] or all(a.mirror_position_m is None for a in anchors):
+        return []
+    reason = (
+        "the path is nearly flat: it is open on which side of it the unknown anchors stand; the scale is not affected"
+    )
+    return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
+
+
+def levelled_places(gravity: Gravity, surveyed: Sequence[Anchor], found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
+    """Describe in words where gravity puts the first camera if the site's anchors do not fix the map's heading.
+
+    Args:
+        surveyed: anchors in the site frame. found: anchors in the first camera's frame.
+    """
+    height_of = {anchor.anchor_id: anchor.position_m[2] for anchor in surveyed if anchor.position_m is not None}
+    texts = []
+    for anchor in found:
+        if anchor.anchor_id not in height_of or not np.isfinite(anchor.position_m).all():
+            continue
+        wheres = []
+        for place in (anchor.position_m, anchor.mirror_position_m):
+            if place is not None:
+                rise = float(place @ gravity.up_in_first_camera)
+                away = float(np.linalg.norm(place - rise * gravity.up_in_first_camera))
+                wheres.append(f"at site height {height_of[anchor.anchor_id] - rise:.2f} m, {away:.2f} m horizontally")
+        # An anchor on the path's plane is its own mirror image.
+        where = " or ".join(dict.fromkeys(wheres))
+        texts.append(
+            f"the first camera was {where} from anchor {anchor.anchor_id}; in which direction is not determined"
+        )
+    return tuple(texts)

@@ -1,0 +1,184 @@
+"""Making of a survey from folders: the choice of one input of each kind, or a question where it is not clear."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rangesfm.errors import InputError
+from rangesfm.ranging.readers import read_ranges
+from rangesfm.sources.source import is_source, open_source
+from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
+from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, Found, look_into
+from rangesfm.vision.image_times import list_images
+from rangesfm.vision.photo_files import usable_photos
+
+# A file or folder with such a name (without suffix, in lower case) is chosen among several candidates for a key.
+_USUAL_NAMES = {
+    PHOTOS: ("images", "photos", "dcim", "rgb", "frames"),
+    LOG: ("uwb", "ranges"),
+    "images.times": ("images", "times", "image_times", "timestamps"),
+    "anchors.path": ("anchors",),
+    "report.reference": ("reference", "groundtruth", "ground_truth", "truth"),
+    "camera": ("camera", "cameras"),
+}
+_LEVER_ARMS = ("tag.tag_in_cam_m", "tag.lever_arms_m")
+
+
+@dataclass(frozen=True)
+class Understood:
+    """Values of a survey file, as found in folders and given by the user.
+
+    Attributes:
+        values: by dotted key; paths are absolute.
+        notes: lines that say what was left out, and why.
+    """
+
+    values: dict[str, Any]
+    notes: tuple[str, ...]
+
+    def survey(self) -> Survey:
+        """Return the survey for a run.
+
+        Raises:
+            InputError: a given value is not valid.
+        """
+        return survey_from_tables({}, Path.cwd(), self.values)
+
+
+def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understood:
+    """Look into folders and choose the inputs of a run.
+
+    Args:
+        folders: to look into.
+        given: values by dotted key from the user; inputs of these keys are not looked for.
+
+    Raises:
+        InputError: there are no inputs, or there are several of a kind and it is not clear which one to take. The
+            advice of the error asks for it.
+    """
+    folders = [Path(os.path.abspath(folder)) for folder in folders]
+    found = look_into(folders)
+    roles = {item.dotted: item.role for item in KEYS}
+    values = {key: value if roles[key] is None else Path(os.path.abspath(str(value))) for key, value in given.items()}
+    notes, questions = list(found.notes), []
+    for item in KEYS:
+        key, paths = item.dotted, found.paths.get(item.dotted, [])
+        if key in values or not paths or (key == "scale.markers" and "scale.distances" not in values):
+            continue
+        paths = _tops(paths, folders) if key == PHOTOS else paths
+        chosen = _chosen(key, paths)
+        if chosen is None:
+            names = ", ".join(_shown(path, folders) for path in paths)
+            questions.append(f"{names}: any of them may be [{item.table}] {item.name}; say which by --{item.flag} PATH")
+            continue
+        values[key] = chosen
+        if chosen in paths and len(paths) > 1:
+            others = ", ".join(_shown(path, folders) for path in paths if path != chosen)
+            notes.append(f"{chosen.name} is used; left out: {others}")
+    if questions:
+        raise InputError("more than one survey could be meant", folders[0], advice=questions)
+    if found.models and PHOTOS not in values:
+        values.setdefault(MODEL, found.models[0])
+    notes += [
+        f"{path} is a COLMAP model: rangesfm refine SURVEY --input_path {path} starts from it"
+        for path in found.models
+        if path != values.get(MODEL)
+    ]
+    if not {PHOTOS, LOG, "scale.distances"} & values.keys():
+        raise InputError("found no photos, no radio log and no lengths in it", folders[0], advice=notes)
+    _add_camera(values, found, notes)
+    return Understood(values, tuple(notes))
+
+
+def _chosen(key: str, paths: Sequence[Path]) -> Path | None:
+    """Choose one path for a key.
+
+    It is the only one, the only one with a usual name, or (for a log) a pattern for files of one anchor each. None
+    where it is not clear.
+    """
+    usual = [path for path in paths if path.stem.lower() in _USUAL_NAMES.get(key, ())]
+    for candidates in (paths, usual):
+        if len(candidates) == 1:
+            return candidates[0]
+    return _pattern(paths) if key == LOG else None
+
+
+def _tops(paths: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
+    """Replace folders of photos by the highest folder above them with a usual name, such as photos for photos/left.
+
+    Only folders inside ``folders`` are considered. Videos and bags are kept.
+    """
+    tops = []
+    for path in paths:
+        if is_source(path):
+            tops.append(path)
+            continue
+        inside = [above for above in (path, *path.parents) if any(above.is_relative_to(folder) for folder in folders)]
+        tops.append(next((above for above in reversed(inside) if above.name.lower() in _USUAL_NAMES[PHOTOS]), path))
+    return list(dict.fromkeys(tops))
+
+
+def _pattern(paths: Sequence[Path]) -> Path | None:
+    """Return a pattern that matches exactly these files, if each is a log of another anchor; otherwise None."""
+    names, folder = [path.name for path in paths], paths[0].parent
+    common = os.path.commonprefix
+    prefix = common(names)
+    suffix = common([name[len(prefix) :][::-1] for name in names])[::-1]
+    pattern = Path(folder, f"{prefix}*{suffix}")
+    if glob.has_magic(f"{folder}{prefix}{suffix}") or {*map(Path, glob.glob(str(pattern)))} != {*paths}:
+        return None
+    try:
+        anchors = [read_ranges(path).anchor_ids for path in paths]
+    except InputError:
+        return None
+    return pattern if all(len(ids) == 1 for ids in anchors) and len({*anchors}) == len(paths) else None
+
+
+def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
+    """Add camera and lever arm to ``values`` where exactly one calibration fits the size of the photos."""
+    files = [*found.calibrations]
+    path = _chosen("camera", files)
+    if path is None:
+        if files:
+            several = ", ".join(file.name for file in files)
+            notes.append(f"{several}: it is not clear which of these is the camera, so none is used; keep only one")
+        return
+    cameras = found.calibrations[path]
+    arms = [camera.tag_in_cam_m for camera in cameras if camera.tag_in_cam_m is not None]
+    if len(arms) == 1 and not values.keys() & {*_LEVER_ARMS}:
+        values["tag.tag_in_cam_m"] = arms[0]
+        notes.append(f"the lever arm is that of {path.name}")
+    if {"camera.model", "camera.params", MODEL} & values.keys():  # a COLMAP model has its own cameras
+        return
+    size_px = _size_px(values)
+    fitting = [camera for camera in cameras if None in (camera.size_px, size_px) or camera.size_px == size_px]
+    if len(fitting) == 1:
+        values |= {"camera.model": fitting[0].model, "camera.params": fitting[0].params}
+        notes.append(f"the camera is that of {path.name}")
+    else:
+        sizes = ", ".join(" x ".join(map(str, camera.size_px)) for camera in cameras if camera.size_px)
+        notes.append(f"{path.name}: {len(fitting)} of its cameras ({sizes} pixels) fit the photos, so none is used")
+
+
+def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Return the most common width and height of the photos; None without photos."""
+    if PHOTOS not in values:
+        return None
+    if is_source(values[PHOTOS]):
+        with suppress(InputError):  # rangesfm check reports this error
+            return open_source(values[PHOTOS], values.get("images.topic")).size_px
+        return None
+    photos = usable_photos(values[PHOTOS], list_images(values[PHOTOS]))
+    return Counter(photos.sizes).most_common(1)[0][0]
+
+
+def _shown(path: Path, folders: Sequence[Path]) -> str:
+    inside = [os.path.relpath(path, folder) for folder in folders if path.is_relative_to(folder)]
+    return inside[0] if inside else str(path)

@@ -1,0 +1,101 @@
+"""Tests of hypotheses: their statistic, their power, and the rate of false alarms of all together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from tests.studies.erring_surveys import SITES, run, surveyed
+
+from rangesfm.diagnostics import hypothesis_tests
+from rangesfm.diagnostics.catalogue import STANDING
+from rangesfm.diagnostics.hypothesis import Hypothesis
+from rangesfm.diagnostics.hypothesis_tests import FALSE_ALARMS, Factorization, noncentrality, row_of
+from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.diagnostics.mistakes import find_mistakes
+from rangesfm.diagnostics.timed_hypotheses import SCANNING
+
+
+@pytest.fixture(scope="module")
+def problem() -> Linearized:
+    """The linearized problem of a clean survey, with the noise that was learnt."""
+    on_map = run(surveyed(SITES[2], 3), 3).on_map
+    assert on_map is not None
+    return find_mistakes(on_map).problem
+
+
+def hypotheses(problem: Linearized) -> list[Hypothesis]:
+    return [each for of_kind in (*STANDING, *SCANNING) for each in of_kind(problem)]
+
+
+def without_noise(problem: Linearized) -> Linearized:
+    return replace(
+        problem,
+        residual_m=np.zeros_like(problem.residual_m),
+        prior_residual=np.zeros_like(problem.prior_residual),
+    )
+
+
+def test_a_mistake_without_noise_is_estimated_exactly(problem: Linearized) -> None:
+    silent = without_noise(problem)
+    for each in hypotheses(problem):
+        size = np.arange(1.0, each.num + 1)
+        made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
+        [test] = Factorization(made).test([each], 0)
+        if np.isfinite(test.smallest_detectable):
+            np.testing.assert_allclose(test.sizes, size, rtol=1e-5)
+
+
+def test_the_smallest_detectable_mistake_raises_the_statistic_as_it_must(problem: Linearized) -> None:
+    silent = without_noise(problem)
+    for each in hypotheses(problem):
+        [test] = Factorization(silent).test([each], 0)
+        if each.num == 1 and np.isfinite(test.smallest_detectable):
+            size = np.array([test.smallest_detectable])
+            made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
+            [found] = Factorization(made).test([each], 0)
+            assert found.statistic == pytest.approx(noncentrality(1), rel=1e-4)
+            moved = Factorization(made).step()[0]
+            assert abs(moved) == pytest.approx(found.effect_on_log_scale, rel=1e-3, abs=1e-9)
+
+
+def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(problem: Linearized) -> None:
+    silent = without_noise(problem)
+    for each in hypotheses(problem):
+        direction = -np.arange(1.0, each.num + 1) / np.linalg.norm(np.arange(1.0, each.num + 1))
+        for share in (0.5, 1.5):
+            size = share * each.most * direction
+            made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
+            [test] = Factorization(made).test([each], 0)
+            if np.isfinite(test.smallest_detectable):
+                told = row_of(test).size
+                signed = -share * each.most if each.num == 1 else share * each.most
+                # Impossible sizes are not reported.
+                assert told == (pytest.approx(signed, rel=1e-4) if share < 1 else None)
+
+
+def test_baardas_number() -> None:
+    assert np.sqrt(noncentrality(1)) == pytest.approx(4.13, abs=0.005)
+    assert stats.ncx2.sf(stats.chi2.isf(0.001, 3), 3, noncentrality(3)) == pytest.approx(0.8, abs=1e-6)
+
+
+def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
+    problem: Linearized, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, num = np.random.default_rng(1), 150
+    factor, tried = np.linalg.cholesky(problem.errors.covariance_m2), hypotheses(problem)
+    thresholds = np.array([test.threshold for test in Factorization(problem).test(tried, 0)])
+    # The thresholds do not depend on the measurements, and they are most of the work.
+    monkeypatch.setattr(hypothesis_tests, "_thresholds", lambda *_: thresholds)
+    alarms = 0
+    for _ in range(num):
+        drawn = replace(
+            problem,
+            residual_m=factor @ rng.standard_normal(len(factor)),
+            prior_residual=rng.standard_normal(problem.num_priors),
+        )
+        tests = Factorization(drawn).test(tried, 0)
+        alarms += any(test.statistic > most for test, most in zip(tests, thresholds, strict=True))
+    assert stats.binom.sf(alarms - 1, num, FALSE_ALARMS) > 0.001

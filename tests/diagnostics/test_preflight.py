@@ -1,0 +1,155 @@
+"""Mistakes that the files alone show are reported before the long work; a survey in order causes no report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.known import known
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import loop_path
+
+from rangesfm.diagnostics.preflight import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
+from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
+from rangesfm.survey.settings import Survey
+
+if TYPE_CHECKING:
+    from tests.conftest import WalkedSurvey
+
+NO_LEVER_ARM = "the tag's place on the camera is not given"
+
+
+@pytest.fixture
+def survey(walked_survey: WalkedSurvey) -> Survey:
+    folder = walked_survey.folder
+    return Survey().changed({"ranges.path": folder / "uwb.csv", "anchors.path": folder / "anchors.csv"})
+
+
+@pytest.fixture
+def complete(survey: Survey) -> Survey:
+    return survey.changed({"tag.tag_in_cam_m": (0.0, 0.0, 0.0)})
+
+
+def with_heights(inputs: RangingInputs, heights_m: Sequence[float]) -> RangingInputs:
+    placed = [
+        replace(anchor, position_m=np.array([*anchor.position_m[:2], height_m]))
+        for anchor, height_m in zip(inputs.anchors, heights_m)
+        if anchor.position_m is not None
+    ]
+    return replace(inputs, anchors=tuple(placed))
+
+
+def test_of_a_survey_in_order_nothing_is_said(complete: Survey) -> None:
+    assert not list(notes_before_work(complete, read_ranging_inputs(complete)))
+
+
+def test_a_lever_arm_that_nobody_gave_is_told_and_one_of_zero_is_not(survey: Survey, complete: Survey) -> None:
+    inputs = read_ranging_inputs(survey)
+    (note,) = notes_before_work(survey, inputs)
+    assert note.startswith(NO_LEVER_ARM)
+    by_tag = survey.changed({"tag.lever_arms_m": {"tag": (0.0, 0.0, 0.0)}})
+    assert not list(notes_before_work(by_tag, inputs))
+
+
+@pytest.mark.parametrize("height_m", [0.0, 1.5])
+def test_heights_that_are_all_the_same_are_told(complete: Survey, height_m: float) -> None:
+    level = with_heights(read_ranging_inputs(complete), [height_m] * 4)
+    (note,) = notes_before_work(complete, level)
+    assert note.startswith(f"all 4 anchors have one height, {height_m:g} m")
+    assert not list(notes_before_work(complete, replace(level, anchor_frame="first_camera")))
+    assert not list(notes_before_work(complete, with_heights(level, [1.5, 1.5, 1.5, 1.51])))
+
+
+def test_two_anchors_in_one_place_are_told(complete: Survey) -> None:
+    inputs = read_ranging_inputs(complete)
+    first, second, *others = inputs.anchors
+    notes = list(
+        notes_before_work(
+            complete, replace(inputs, anchors=(first, replace(second, position_m=first.position_m), *others))
+        )
+    )
+    assert notes[0].startswith("anchors A1 and A2 have the same position")
+
+
+def test_an_anchor_that_repeats_one_value_is_told_and_a_tag_that_stands_still_is_not(complete: Survey) -> None:
+    inputs = read_ranging_inputs(complete)
+    log = inputs.log
+    stuck = replace(log, range_m=np.where(log.anchor_index == 1, 7.25, log.range_m))
+    assert any(
+        "anchor A2 reads one and the same value in 100 %" in note
+        for note in notes_before_work(complete, replace(inputs, log=stuck))
+    )
+    still = replace(log, range_m=np.array([4.0, 5.0, 6.0, 7.0])[log.anchor_index])
+    assert not any("same value" in note for note in notes_before_work(complete, replace(inputs, log=still)))
+
+
+def test_ranges_beyond_any_radio_are_told(complete: Survey) -> None:
+    inputs = read_ranging_inputs(complete)
+    in_mm = replace(inputs, log=replace(inputs.log, range_m=1e3 * inputs.log.range_m))
+    assert any(note.startswith("nearly all ranges are longer than") for note in notes_before_work(complete, in_mm))
+
+
+def test_positions_that_are_not_used_are_not_looked_at(complete: Survey) -> None:
+    level = with_heights(read_ranging_inputs(complete), [0.0] * 4)
+    assert not list(notes_before_work(complete, replace(level, anchor_frame="unknown")))
+
+
+WALK_S = np.linspace(0.0, 120.0, 400)
+
+
+@pytest.mark.parametrize("offset_s", [0.0, -50.0, 1.7e9])
+def test_clocks_that_differ_are_no_matter(offset_s: float) -> None:
+    assert not list(notes_on_times(WALK_S + offset_s, WALK_S + 3.0))
+
+
+def test_times_an_hour_apart_by_clocks_that_know_the_date_are_told() -> None:
+    (note,) = notes_on_times(WALK_S + 1.7e9, WALK_S + 1.7e9 + 3600)
+    assert "0.97 h apart: another time zone, or another walk" in note
+
+
+def test_ranges_that_last_a_fraction_of_the_walk_are_told() -> None:
+    (note,) = notes_on_times(1e-3 * WALK_S, WALK_S)
+    assert note.startswith("the ranges last 0.12 s, the photos 120 s")
+
+
+def test_keyframes_too_far_apart_for_the_ranges_between_them_are_told_and_one_pause_is_not() -> None:
+    assert not list(notes_on_gaps(np.append(np.arange(10.0), 11.5), 2.0))
+    assert not list(notes_on_gaps(np.array([3.0]), 2.0))
+    assert not list(notes_on_gaps(np.concatenate([np.arange(10.0), 3600 + np.arange(10.0)]), 2.0))
+    (note,) = notes_on_gaps(np.array([0.0, 1.0, 3.1, 5.2, 7.3]), 2.0)
+    assert "for 86 % of the time keyframes are more than 2 s apart (in the median 2.1 s)" in note
+
+
+@pytest.fixture
+def model() -> pycolmap.Reconstruction:
+    path, times = loop_path(30.0, seed=3), np.arange(1.0, 29.0)
+    made = synthetic_model(
+        times, path.centers(times), path.world_from_cam(times), num_observations=40, pixel_stddev=1.0
+    )
+    return made.reconstruction
+
+
+def test_of_a_model_as_colmap_leaves_it_or_without_points_nothing_is_said(model: pycolmap.Reconstruction) -> None:
+    assert not list(notes_on_model(model))
+    for point_id in list(model.points3D):
+        model.delete_point3D(point_id)
+    assert not list(notes_on_model(model))
+
+
+def test_a_model_whose_points_are_not_of_its_photos_is_told(model: pycolmap.Reconstruction) -> None:
+    for point in model.points3D.values():
+        point.xyz = point.xyz * [1.0, 1.0, -1.0]
+    (note,) = notes_on_model(model)
+    assert note.startswith("the model's points lie")
+
+
+def test_a_photo_whose_pose_is_wrong_is_named(model: pycolmap.Reconstruction) -> None:
+    frame = model.frame(7)
+    pose = known(frame.rig_from_world)
+    frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([5.0, 3.0, 0.0]))
+    (note,) = notes_on_model(model)
+    assert note.startswith(f"photo {model.image(7).name}: in the model most of its points are farther than 4.8 px")

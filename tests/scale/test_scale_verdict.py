@@ -1,0 +1,128 @@
+"""The verdict names what makes a scale doubtful, and what to do about it next time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from rangesfm.demo.simulated_radio import Radio
+from rangesfm.errors import GeometryError
+from rangesfm.options import ScaleOptions
+from rangesfm.ranging.range_observations import RangeStatus
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import CutoffTest
+from rangesfm.scale.sensitivity import scale_drift
+
+if TYPE_CHECKING:
+    from tests.scale.conftest import MakeSurvey
+
+NOISE = Radio(range_stddev_m=0.05)
+ONE_ANCHOR_M = {"A": (6.0, 0.0, 2.5)}
+FAR_ANCHORS_M = {"A": (30.0, 5.0, 8.0), "B": (-28.0, 6.0, 1.0), "C": (2.0, 31.0, 4.0), "D": (3.0, -29.0, 0.2)}
+NEAR_ANCHORS_M = {"A": (3.0, 0.0, 2.5), "B": (-3.0, 1.0, 0.4), "C": (0.5, 3.0, 3.0), "D": (1.0, -3.0, 0.2)}
+
+
+def on_a_line() -> np.ndarray:
+    return np.stack([np.linspace(0.0, 10.0, 40), np.zeros(40), np.full(40, 1.6)], axis=1)
+
+
+def test_far_anchors_and_little_noise_are_good(make_survey: MakeSurvey) -> None:
+    centers = 4.0 * make_survey().centers_m
+    estimate = make_survey(centers_m=centers, anchors_m=FAR_ANCHORS_M, radio=NOISE, num_epochs=3).scale("site", "ABCD")
+    assert estimate.verdict == "good"
+    assert estimate.advice == ()
+    low, high = estimate.interval_95
+    assert low < estimate.value < high
+
+
+def test_a_radio_without_error_curve_near_its_anchors_is_doubtful(make_survey: MakeSurvey) -> None:
+    centers = 0.2 * make_survey().centers_m
+    survey = make_survey(centers_m=centers, anchors_m=NEAR_ANCHORS_M, radio=Radio(range_stddev_m=0.02), num_epochs=5)
+    estimate = survey.scale("unknown")
+    assert estimate.verdict == "doubtful"
+
+
+def test_a_straight_path_is_said_to_be_straight(make_survey: MakeSurvey) -> None:
+    estimate = make_survey(centers_m=on_a_line(), radio=NOISE, num_epochs=3).scale("unknown")
+    assert any("straight" in reason for reason in estimate.reasons)
+
+
+def test_a_flat_path_with_unknown_anchors_is_to_be_raised_and_lowered(make_survey: MakeSurvey) -> None:
+    centers = make_survey().centers_m.copy()
+    centers[:, 2] = 1.6
+    estimate = make_survey(centers_m=centers, anchors_m=ONE_ANCHOR_M, radio=NOISE, num_epochs=3).scale("unknown")
+    assert any("raise and lower the camera" in advice for advice in estimate.advice)
+
+
+def test_few_ranges_and_many_outliers_have_their_advice(make_survey: MakeSurvey) -> None:
+    few = make_survey(anchors_m=ONE_ANCHOR_M, radio=NOISE).scale("first_camera", "A")
+    assert any("range more often" in advice for advice in few.advice)
+    obstructed = Radio(range_stddev_m=0.05, obstructed_share=0.45, obstructed_mean_m=5.0)
+    many = make_survey(radio=obstructed, num_epochs=4).scale("first_camera", "ABCDE")
+    assert any("nothing stands between" in advice for advice in many.advice)
+    status = many.observations.status
+    outliers = np.mean(status[status <= RangeStatus.OUTLIER] == RangeStatus.OUTLIER)
+    assert any(reason.startswith(f"{100 * outliers:.0f} % of the ranges do not fit") for reason in many.reasons)
+
+
+def test_two_surveyed_anchors_ask_for_a_third(make_survey: MakeSurvey) -> None:
+    survey = make_survey(anchors_m={name: FAR_ANCHORS_M[name] for name in "AB"}, radio=NOISE, num_epochs=3)
+    estimate = survey.scale("site", "AB")
+    assert any("survey three anchors or more" in advice for advice in estimate.advice)
+
+
+def test_a_straight_path_leaves_the_roll_of_a_map_in_the_site_uncertain(make_survey: MakeSurvey) -> None:
+    centers = on_a_line() + 0.05 * np.sin(np.linspace(0.0, 9.0, 40))[:, None] * [0.0, 1.0, 0.7]
+    survey = make_survey(centers_m=centers, radio=NOISE, num_epochs=3)
+    estimate = survey.scale("site", "ABCDE")
+    assert any("roll about it" in reason for reason in estimate.reasons)
+
+
+def test_an_anchor_that_is_hardly_heard_is_named(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE, num_epochs=3)
+    log = survey.simulated.log
+    rows = np.flatnonzero((log.anchor_index != 4) | (np.cumsum(log.anchor_index == 4) <= 3))
+    estimate = survey.scale("first_camera", "ABCD", log.subset(rows))
+    assert "anchor E has too few ranges on the path to be placed: left out" in estimate.reasons
+    assert "range more often, or survey them all" in estimate.advice
+
+
+def test_anchors_in_wrong_places_disagree(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=NOISE, num_epochs=3)
+    anchors = [
+        replace(anchor, position_m=np.asarray(anchor.position_m) + shift)
+        for anchor, shift in zip(survey.anchors("first_camera", "ABCDE"), np.linspace(-1.0, 1.0, 5), strict=True)
+    ]
+    options = ScaleOptions(max_relative_stddev=0.5)
+    estimate = initialize_scale(
+        survey.observations(), survey.trajectory, anchors, anchor_frame="first_camera", options=options
+    )
+    assert any("the anchors disagree" in reason for reason in estimate.reasons)
+    assert any("check the anchors' positions" in advice for advice in estimate.advice)
+
+
+def test_a_refusal_says_what_to_do(make_survey: MakeSurvey) -> None:
+    survey = make_survey(anchors_m=ONE_ANCHOR_M, radio=Radio(range_stddev_m=0.1))
+    with pytest.raises(GeometryError, match=r"more than the 0.1 % allowed \(max_relative_stddev\): .*next time: "):
+        survey.scale("unknown", options=ScaleOptions(max_relative_stddev=0.001))
+
+
+def test_a_radio_that_reads_short_at_short_range_is_noticed(make_survey: MakeSurvey) -> None:
+    centers = 0.4 * make_survey(num_keyframes=100).centers_m
+    survey = make_survey(centers_m=centers, anchors_m=NEAR_ANCHORS_M, radio=Radio(range_stddev_m=0.03), num_epochs=10)
+    true = survey.simulated.distance_m
+    noise = survey.simulated.log.range_m - true
+    for error, noticed in ((0 * true, False), (-0.4 * np.exp(-true / 1.0), True)):
+        estimate = survey.scale("unknown", (), survey.log_with(true + noise + error))
+        assert (scale_drift(estimate.cutoff_test) is not None) == noticed
+        assert any("short ranges disagree with long ones" in reason for reason in estimate.reasons) == noticed
+
+
+def test_a_change_is_judged_by_the_variance_that_leaving_out_adds() -> None:
+    tests = (CutoffTest(0.0, 1.00, 0.003), CutoffTest(1.0, 1.011, 0.005), CutoffTest(2.0, 1.0, 0.02))
+    assert scale_drift(tests) == tests[1]
+    assert scale_drift((tests[0], CutoffTest(1.0, 1.009, 0.005))) is None
+    assert scale_drift(tests[:1]) is None
