@@ -3,8 +3,8 @@
 The page is written by: python examples/keys.py > examples/keys.md
 """
 
-from rangesfm.planning.plan_file import TABLES as PLAN_TABLES
-from rangesfm.survey.settings import KEYS, TABLES
+from rangesfm.planning.plan_file import PLAN_TABLES as PLAN_TABLES
+from rangesfm.survey.settings import KEYS, SURVEY_TABLES
 
 HEAD = """# Keys of a survey file
 
@@ -20,7 +20,7 @@ def cell(text: str) -> str:
 
 def main() -> None:
     print(HEAD)
-    for table, model in TABLES.items():
+    for table, model in SURVEY_TABLES.items():
         print(f"## [{table}]\n\n{model.__doc__}\n\n| key | flag | value | meaning |\n|---|---|---|---|")
         for key in KEYS:
             if key.table == table:

@@ -28,7 +28,7 @@ from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 from tests.simulated.path import loop_path
 
 from rangesfm.cli.arguments import Commands, normalize, parse
-from rangesfm.planning.plan_file import TABLES as PLAN_TABLES
+from rangesfm.planning.plan_file import PLAN_TABLES as PLAN_TABLES
 from rangesfm.survey.settings import KEYS, read_survey
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from rangesfm.errors import OptionError
-from rangesfm.option_model import Options, Told
+from rangesfm.option_model import KeyMeta, Options
 
 # A key this similar to one of ours (difflib's ratio, 0 to 1) is a typing error; any other key is meant for pycolmap.
 _LIKE_OURS = 0.85
@@ -19,21 +19,21 @@ _LIKE_OURS = 0.85
 class MapperOptions(Options, table="mapper"):
     """Mapping of the photos to an unscaled model by COLMAP. Other keys are passed to pycolmap as in pipeline."""
 
-    method: Annotated[Literal["incremental", "global", "hierarchical"], Told(flag="mapper_method")] = "incremental"
+    method: Annotated[Literal["incremental", "global", "hierarchical"], KeyMeta(flag="mapper_method")] = "incremental"
     """COLMAP's mapper. incremental: photo by photo; global: all photos at once; hierarchical: photo by photo in
     clusters, which are then merged."""
     matching: Literal["sequential", "exhaustive", "spatial", "vocabtree", "auto"] = "auto"
     """Pairs of photos that are matched. sequential: neighbours in time; exhaustive: all pairs; spatial: neighbours by
     EXIF position; vocabtree: photos that look alike; auto: exhaustive up to 60 keyframes, sequential above."""
-    vocab_tree_path: Annotated[Path | None, Told(metavar="TREE", role="file")] = None
+    vocab_tree_path: Annotated[Path | None, KeyMeta(metavar="TREE", role="file")] = None
     """File with COLMAP's vocabulary tree, which finds photos that look alike. vocabtree matching needs it, and so does
     loop_detection with sequential matching; it is never downloaded."""
-    pairs: Annotated[Path | None, Told(role="file")] = None
+    pairs: Annotated[Path | None, KeyMeta(role="file")] = None
     """Text file with the names of two photos on each line, separated by a tab. Only these pairs are matched."""
-    mask_path: Annotated[Path | None, Told(role="photos")] = None
+    mask_path: Annotated[Path | None, KeyMeta(role="photos")] = None
     """Folder of masks. The mask of photo a/b.jpg is a/b.jpg.png, of the same size, black where features are not
     wanted."""
-    database_path: Annotated[Path | None, Told(metavar="DB", role="file")] = None
+    database_path: Annotated[Path | None, KeyMeta(metavar="DB", role="file")] = None
     """COLMAP database, also one written by hloc. It is copied. Its features and matches are used, and its cameras too
     unless [camera] gives a model or params; what it lacks is computed. Photos that are not in it are left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -51,7 +51,8 @@ class MapperOptions(Options, table="mapper"):
     """Use the ranges in each global bundle adjustment during mapping, once they determine the scale. This takes much
     longer, and the refinement at the end usually finds the same map without it."""
     num_threads: Annotated[
-        Literal[-1] | Annotated[int, Field(ge=1, le=4096)], Told(expected="1 or more up to 4096, or -1 for all cores")
+        Literal[-1] | Annotated[int, Field(ge=1, le=4096)],
+        KeyMeta(expected="1 or more up to 4096, or -1 for all cores"),
     ] = -1
     """Number of threads; -1: one for each core. It does not change the result. Matching on the processor runs this many
     processes with one thread each, because pycolmap 4.2 loses matches with several threads; matcher.num_threads sets

@@ -69,7 +69,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class Told:
+class KeyMeta:
     """Annotation of a key: what its name and its type do not say.
 
     Attributes:
@@ -94,12 +94,12 @@ class Key:
     Attributes:
         table: name of its table, without brackets.
         name: of the key in that table.
-        flag: as in ``Told``, never None.
-        metavar: as in ``Told``.
+        flag: as in ``KeyMeta``, never None.
+        metavar: as in ``KeyMeta``.
         type: of the value, without the None that means "not given".
-        expected: as in ``Told``, never None.
+        expected: as in ``KeyMeta``, never None.
         meaning: the docstring on one line without its full stop, followed by the default.
-        role: as in ``Told``.
+        role: as in ``KeyMeta``.
     """
 
     table: str
@@ -160,15 +160,15 @@ class Options(BaseModel):
         bare, hints = get_type_hints(cls), get_type_hints(cls, include_extras=True)
         keys = {}
         for name, field in cls.model_fields.items():
-            told = next((item for item in field.metadata if isinstance(item, Told)), Told())
-            if not told.is_key:
+            meta = next((item for item in field.metadata if isinstance(item, KeyMeta)), KeyMeta())
+            if not meta.is_key:
                 continue
             unit = next((unit for end, unit in _UNITS.items() if name.endswith(f"_{end}")), None)
-            expected = told.expected or _described(hints[name], unit)
+            expected = meta.expected or _described(hints[name], unit)
             meaning = " ".join((field.description or "").split()).removesuffix(".")
             meaning += _default(field.get_default(call_default_factory=True))
             type_ = _without_none(bare[name])
-            keys[name] = Key(cls.table, name, told.flag or name, told.metavar, type_, expected, meaning, told.role)
+            keys[name] = Key(cls.table, name, meta.flag or name, meta.metavar, type_, expected, meaning, meta.role)
         return keys
 
     @classmethod

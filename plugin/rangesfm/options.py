@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from rangesfm.errors import OptionError
 from rangesfm.mapper_options import MapperOptions as MapperOptions
-from rangesfm.option_model import Bounds, Options, Told
+from rangesfm.option_model import Bounds, KeyMeta, Options
 
 DEFAULT_FORMATS = ("tum", "ply")
 # Relative stddev of a calibrated focal length: focus, temperature and another calibration board change it by this much.
@@ -98,38 +98,38 @@ class KeyframeOptions(Options, table="images"):
 class ImageOptions(KeyframeOptions):
     """The photos."""
 
-    path: Annotated[Path | None, Told(flag="images", metavar="PATH", role="photos")] = None
+    path: Annotated[Path | None, KeyMeta(flag="images", metavar="PATH", role="photos")] = None
     """Folder of the photos (subfolders included), a video, or a ROS bag with images. The flag also takes the CSV with
     the photos' times."""
-    model: Annotated[Path | None, Told(flag="input_path", metavar="MODEL", role="model")] = None
+    model: Annotated[Path | None, KeyMeta(flag="input_path", metavar="MODEL", role="model")] = None
     """Folder of a COLMAP model, such as sparse/0, to start from; no photos are needed then."""
-    times: Annotated[Path | None, Told(flag="image_times", role="file")] = None
+    times: Annotated[Path | None, KeyMeta(flag="image_times", role="file")] = None
     """CSV image_name,timestamp_s with the times of the photos (default: EXIF, else file names)."""
-    rig_config: Annotated[Path | None, Told(flag="rig_config_path", metavar="JSON", role="file")] = None
+    rig_config: Annotated[Path | None, KeyMeta(flag="rig_config_path", metavar="JSON", role="file")] = None
     """COLMAP's rig_config.json, lengths in metres. Photos of a rig whose names are the same after their image_prefix
     were taken at the same time, that of the reference camera's photo. A given cam_from_rig is kept while mapping, and
     the length of its translation is a measured distance, tested against the ranges; cameras without one are placed by
     a first model made without the rig."""
     baseline_stddev_m: _Positive = 0.001
     """Standard deviation of the known distance of each camera of a rig from the reference camera."""
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e3), Told(flag="image_rate_hz")] = 2.0
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e3), KeyMeta(flag="image_rate_hz")] = 2.0
     """Photos per second taken from a video or a bag: the sharpest image of each interval."""
-    topic: Annotated[str | None, Told(flag="image_topic")] = None
+    topic: Annotated[str | None, KeyMeta(flag="image_topic")] = None
     """Topic of the images, for a bag with several image topics."""
 
 
 class CameraOptions(Options, table="camera"):
     """The cameras of the photos."""
 
-    images: Annotated[str | None, Told(flag="camera_images", metavar="PATTERN")] = None
+    images: Annotated[str | None, KeyMeta(flag="camera_images", metavar="PATTERN")] = None
     """Photos that this table is about, where there are several [[camera]] tables: a folder, or a pattern of names such
     as left*.jpg. One table may leave it out, for all other photos."""
-    mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], Told(flag="camera_mode")] = "auto"
+    mode: Annotated[Literal["auto", "single", "per_folder", "per_image"], KeyMeta(flag="camera_mode")] = "auto"
     """Photos of one size that share a camera. auto: those with the same make, model, serial number and focal length in
     EXIF, or all without EXIF; single: all; per_folder: those of one folder; per_image: none."""
-    model: Annotated[str | None, Told(flag="camera_model")] = None
+    model: Annotated[str | None, KeyMeta(flag="camera_model")] = None
     """COLMAP camera model, such as OPENCV (default: COLMAP chooses one)."""
-    params: Annotated[_Numbers | None, Told(flag="camera_params")] = None
+    params: Annotated[_Numbers | None, KeyMeta(flag="camera_params")] = None
     """Parameters of the camera model in COLMAP's order, for photos of the most common size; they are rescaled for
     photos of another size and the same shape."""
     focal_length_stddev_px: Uncertainty | None = None
@@ -140,7 +140,7 @@ class CameraOptions(Options, table="camera"):
     """Adjust the camera parameters in mapping and refinement (default: mapping does, given ones only once the map is
     complete; the refinement adjusts given ones within their stddev and keeps all others)."""
 
-    others: Annotated[tuple[CameraOptions, ...], Told(is_key=False)] = ()
+    others: Annotated[tuple[CameraOptions, ...], KeyMeta(is_key=False)] = ()
     """Further [[camera]] tables, each with its pattern. This table is for photos that match none of them."""
 
     @property
@@ -184,11 +184,11 @@ class CameraOptions(Options, table="camera"):
 class LogOptions(Options, table="ranges"):
     """The radio's log and how it is read."""
 
-    path: Annotated[Path | None, Told(flag="ranges", metavar="LOG", role="log")] = None
+    path: Annotated[Path | None, KeyMeta(flag="ranges", metavar="LOG", role="log")] = None
     """The radio's log: a file, a folder of files, or a pattern such as uwb_*.csv."""
-    format: Annotated[str | None, Told(flag="ranges_format")] = None
+    format: Annotated[str | None, KeyMeta(flag="ranges_format")] = None
     """Format of the log (default: recognised by content)."""
-    columns: Annotated[dict[str, str], Told(metavar="QUANTITY=NAME,..")] = Field(default_factory=dict)
+    columns: Annotated[dict[str, str], KeyMeta(metavar="QUANTITY=NAME,..")] = Field(default_factory=dict)
     """Names of the log's columns (numbers, where they have no names) for timestamp (or image_name), anchor_id, range,
     tag_id, range_stddev, los; range:A1 for a column that holds the ranges of anchor A1. A log without ranges needs the
     time stamps of two-way ranging: tx1, rx1, tx2, rx2 and possibly tx3, rx3."""
@@ -198,7 +198,7 @@ class LogOptions(Options, table="ranges"):
     range_unit: Literal["m", "cm", "mm", "ft"] | None = None
     """Unit of the log's ranges (default: by format, column name or values)."""
     separator: Annotated[
-        Annotated[str, Field(min_length=1, max_length=1)] | None, Told(metavar="CHARACTER", expected="one character")
+        Annotated[str, Field(min_length=1, max_length=1)] | None, KeyMeta(metavar="CHARACTER", expected="one character")
     ] = None
     """Character between the cells of a row (default: recognised)."""
     ranging_interval_s: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
@@ -209,16 +209,16 @@ class LogOptions(Options, table="ranges"):
     """Number of bits of the counter behind the time stamps; 32 bits count up to 67 ms."""
     propagation_speed: Annotated[
         Literal["air", "vacuum"] | Annotated[float, Field(ge=1e8, le=3e8)],
-        Told(expected="air, vacuum or a speed of light in m/s"),
+        KeyMeta(expected="air, vacuum or a speed of light in m/s"),
     ] = "air"
     """Speed of the radio signal, for ranges computed from time stamps."""
     t_off_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Time that the delays of both devices together add to a round trip, for ranges computed from time stamps."""
-    error_curve: Annotated[Path | None, Told(role="file")] = None
+    error_curve: Annotated[Path | None, KeyMeta(role="file")] = None
     """File with the radio's error by distance, written by rangesfm ranges calibrate."""
     time_offset: Annotated[
         Literal["auto"] | _Time,
-        Told(flag="ranges_time_offset", metavar="auto|SECONDS", expected='"auto" or seconds, at most 1e+10 of them'),
+        KeyMeta(flag="ranges_time_offset", metavar="auto|SECONDS", expected='"auto" or seconds, at most 1e+10 of them'),
     ] = "auto"
     """Time offset between the clocks: image time = range time + offset. auto: it is searched for."""
 
@@ -247,7 +247,7 @@ class CheckOptions(Options, table="ranges"):
     check_anchors: _Texts = ()
     """Ids of anchors with surveyed positions; all their ranges are held out."""
     check_times_s: Annotated[
-        _Times, AfterValidator(_span), Told(metavar="A,B", expected="two times in seconds, the later one last")
+        _Times, AfterValidator(_span), KeyMeta(metavar="A,B", expected="two times in seconds, the later one last")
     ] = ()
     """First and last time, on the radio's clock; the ranges between them are held out."""
 
@@ -271,24 +271,24 @@ class RangesOptions(RangeModelOptions, CheckOptions, AssociationOptions, LogOpti
 class AnchorOptions(Options, table="anchors"):
     """The anchors."""
 
-    path: Annotated[Path | None, Told(flag="anchors", role="file")] = None
+    path: Annotated[Path | None, KeyMeta(flag="anchors", role="file")] = None
     """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m]; empty coordinates mean an unknown
     position (default: the anchors in the log, all unknown)."""
-    frame: Annotated[Literal["site", "first_camera", "unknown"] | None, Told(flag="anchor_frame")] = None
+    frame: Annotated[Literal["site", "first_camera", "unknown"] | None, KeyMeta(flag="anchor_frame")] = None
     """Frame of the anchors' coordinates (default: site if the file has any position, else unknown)."""
-    crs: Annotated[str | None, Told(flag="anchor_crs")] = None
+    crs: Annotated[str | None, KeyMeta(flag="anchor_crs")] = None
     """Coordinate reference system of the anchors' positions, such as EPSG:2056 (default: a local frame in metres)."""
-    use: Annotated[_Texts, Told(flag="use_anchors")] = ()
+    use: Annotated[_Texts, KeyMeta(flag="use_anchors")] = ()
     """Ids of the anchors whose ranges are used (default: all)."""
 
 
 class TagOptions(Options, table="tag"):
     """The radio tag on the camera, or several tags."""
 
-    tag_in_cam_m: Annotated[_LeverArm, Told(flag="tag_in_cam", metavar="[ID:]X,Y,Z")] = (0.0, 0.0, 0.0)
+    tag_in_cam_m: Annotated[_LeverArm, KeyMeta(flag="tag_in_cam", metavar="[ID:]X,Y,Z")] = (0.0, 0.0, 0.0)
     """Lever arm: position of the tag's antenna in the camera frame (right, down, forward), metres; with a rig, in the
     frame of its reference camera. With several tags, give the flag once for each, with the tag's ID."""
-    lever_arms_m: Annotated[dict[str, _LeverArm], Told(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
+    lever_arms_m: Annotated[dict[str, _LeverArm], KeyMeta(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
         default_factory=dict
     )
     """Lever arms by tag id, for a camera with several tags."""
@@ -306,13 +306,13 @@ class TagOptions(Options, table="tag"):
 class ScaleOptions(Options, table="scale"):
     """The estimate of the scale, and distances taped on the site."""
 
-    method: Annotated[Literal["robust", "two-candidate"], Told(flag="scale_method")] = "robust"
+    method: Annotated[Literal["robust", "two-candidate"], KeyMeta(flag="scale_method")] = "robust"
     """Method of the scale estimate. robust: a robust fit of all ranges; two-candidate: that of the 2018 paper."""
     max_relative_stddev: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.1
     """Largest accepted relative standard deviation of the scale; a scale that is less certain is refused."""
     up_in_first_camera: Annotated[
         Annotated[_Three, AfterValidator(_direction)] | None,
-        Told(expected="a list of 3 numbers up to 1e+09: a direction, not 0,0,0"),
+        KeyMeta(expected="a list of 3 numbers up to 1e+09: a direction, not 0,0,0"),
     ] = None
     """Upward direction in the camera frame of the first keyframe, of any length; 0,-1,0 if the camera was level. With
     it, two anchors with site coordinates are enough, and a mirror image that puts the map upside down is ruled out."""
@@ -321,9 +321,9 @@ class ScaleOptions(Options, table="scale"):
     adopt: bool = False
     """Run again with the likeliest mistake corrected, where the tests find one: an anchor taken as unknown, the lever
     arm that fits, labels swapped, some of the ranges left out. The result says what was changed."""
-    distances: Annotated[Path | None, Told(role="file")] = None
+    distances: Annotated[Path | None, KeyMeta(role="file")] = None
     """CSV from,to,distance_m[,stddev_m,kind] with taped distances."""
-    markers: Annotated[Path | None, Told(role="file")] = None
+    markers: Annotated[Path | None, KeyMeta(role="file")] = None
     """CSV marker,image_name,x_px,y_px with the places in photos of the marks between which distances were taped."""
 
     @model_validator(mode="after")
@@ -337,13 +337,13 @@ class ScaleOptions(Options, table="scale"):
 class MarkerOptions(Options, table="markers"):
     """Printed tags of known size in the photos."""
 
-    dictionary: Annotated[TagDictionary | None, Told(flag="marker_dictionary")] = None
+    dictionary: Annotated[TagDictionary | None, KeyMeta(flag="marker_dictionary")] = None
     """Dictionary of the printed tags, by OpenCV's name. The corners of tag 7 are the markers tag7.0 (upper left of the
     upright tag) to tag7.3, clockwise (default: no tags are looked for)."""
-    side_m: Annotated[_Positive | None, Told(flag="marker_side_m")] = None
+    side_m: Annotated[_Positive | None, KeyMeta(flag="marker_side_m")] = None
     """Side of the tags, from black corner to black corner. Each tag found gives four known lengths (default: none; the
     corners only serve as ends of taped distances)."""
-    side_stddev_m: Annotated[_Positive, Told(flag="marker_side_stddev_m")] = 0.0005
+    side_stddev_m: Annotated[_Positive, KeyMeta(flag="marker_side_stddev_m")] = 0.0005
     """Standard deviation of the side; the error is the same for all tags."""
 
     @model_validator(mode="after")
@@ -356,7 +356,7 @@ class MarkerOptions(Options, table="markers"):
 class RefineOptions(Options, table="refine"):
     """Bundle adjustment with the ranges."""
 
-    enabled: Annotated[bool, Told(flag="refine")] = True
+    enabled: Annotated[bool, KeyMeta(flag="refine")] = True
     """Refine the map after it is scaled."""
     max_num_iterations: Annotated[int, Field(ge=0, le=1_000_000)] = 200
     """Largest number of iterations of the solver."""
@@ -382,20 +382,20 @@ class ExportOptions(Options, table="export"):
 
     formats: _Texts = DEFAULT_FORMATS
     """Names of export formats; the message about an unknown name lists them all."""
-    frame: Annotated[Literal["result", "level", "enu"], Told(flag="export_frame")] = "result"
+    frame: Annotated[Literal["result", "level", "enu"], KeyMeta(flag="export_frame")] = "result"
     """Frame of the exported files. result: that of the result (site or first camera); level: z up, y along the first
     camera's view, same origin; enu: x east, y north, z up, which needs a georeferenced map."""
     up: str = "auto"
     """Upward direction, for the frames level and enu. cameras: mean upward direction of the photos; path: perpendicular
     to the plane of the path; X,Y,Z: a direction in the result's frame; auto: z in a site frame, else as cameras."""
-    crs: Annotated[str | None, Told(flag="export_crs")] = None
+    crs: Annotated[str | None, KeyMeta(flag="export_crs")] = None
     """Coordinate reference system of LAZ and GeoPackage files, such as EPSG:2056 (default: that of the anchors, else
     longitude and latitude)."""
     origin_anchor: str | None = None
     """Id of an anchor whose geographic position is known."""
     origin_lat_lon_height: Annotated[
         _Place | None,
-        Told(
+        KeyMeta(
             metavar="LAT,LON,H",
             expected="3 numbers: latitude up to 90 and longitude up to 360 degrees, height up to 1e+05 metres",
         ),
@@ -408,16 +408,16 @@ class ExportOptions(Options, table="export"):
 class ReportOptions(Options, table="report"):
     """The report, and true positions to compare the result with."""
 
-    reference: Annotated[Path | None, Told(metavar="FILE", role="file")] = None
+    reference: Annotated[Path | None, KeyMeta(metavar="FILE", role="file")] = None
     """File with true positions of the camera, for comparison: CSV or TUM."""
-    enabled: Annotated[bool, Told(flag="report")] = True
+    enabled: Annotated[bool, KeyMeta(flag="report")] = True
     """Write report.html."""
 
 
 class OutputOptions(Options, table="output"):
     """The folder of the results, and the seed."""
 
-    path: Annotated[Path, Told(flag="output_path", role="output")] = Path("out")
+    path: Annotated[Path, KeyMeta(flag="output_path", role="output")] = Path("out")
     """Folder of the results."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
     """Seed of everything random: same input and seed, same result."""

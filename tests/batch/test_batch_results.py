@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rangesfm.batch.batch_state import Course, Status
+from rangesfm.batch.batch_state import BatchState, Status
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.run_batch import write_results
 from rangesfm.errors import Failure
@@ -20,17 +20,17 @@ BAD_NAME = '</td><script>alert(1)</script>&".toml'
 
 
 @pytest.fixture
-def course(tmp_path: Path) -> Course:
+def batch_state(tmp_path: Path) -> BatchState:
     jobs = [Job(f"surveys/{i}.toml", Survey(output=OutputOptions(path=tmp_path / f"out #{i}"))) for i in range(3)]
-    course = Course([*jobs, Job(BAD_NAME, None, Failure(f"{BAD_NAME}: no such file", 2))])
+    batch_state = BatchState([*jobs, Job(BAD_NAME, None, Failure(f"{BAD_NAME}: no such file", 2))])
     for i, verdict in enumerate(["good", "doubtful"]):
-        course.tell(i, {"began_on": "here"})
+        batch_state.tell(i, {"began_on": "here"})
         found = (verdict, 0.5, 0.002, "site", 14, 725, 481, 0.0795, 0.51, 0.0821, 2)
-        figures = dict(zip(list(course.rows[i].cells())[-len(found) :], found))
-        course.end(i, Status.DONE, "" if verdict == "good" else "short path", 0, **figures)
+        figures = dict(zip(list(batch_state.rows[i].cells())[-len(found) :], found))
+        batch_state.end(i, Status.DONE, "" if verdict == "good" else "short path", 0, **figures)
     (tmp_path / "out #0").mkdir()
     (tmp_path / "out #0" / "report.html").touch()
-    return course
+    return batch_state
 
 
 class Page(HTMLParser):
@@ -51,8 +51,8 @@ class Page(HTMLParser):
         self.texts.append(data)
 
 
-def test_csv_and_json_have_a_row_for_each_survey(course: Course, tmp_path: Path) -> None:
-    write_results(course, tmp_path)
+def test_csv_and_json_have_a_row_for_each_survey(batch_state: BatchState, tmp_path: Path) -> None:
+    write_results(batch_state, tmp_path)
     with (tmp_path / "batch.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     summary = json.loads((tmp_path / "batch.json").read_text())
@@ -68,8 +68,8 @@ def test_csv_and_json_have_a_row_for_each_survey(course: Course, tmp_path: Path)
     }
 
 
-def test_the_page_escapes_names_and_links_to_reports_that_are_there(course: Course, tmp_path: Path) -> None:
-    write_results(course, tmp_path)
+def test_the_page_escapes_names_and_links_to_reports_that_are_there(batch_state: BatchState, tmp_path: Path) -> None:
+    write_results(batch_state, tmp_path)
     page = Page((tmp_path / "batch.html").read_text())
     assert "script" not in page.tags
     assert BAD_NAME in page.texts
@@ -77,9 +77,9 @@ def test_the_page_escapes_names_and_links_to_reports_that_are_there(course: Cour
     assert any("Short path" in text or "short path" in text for text in page.texts)
 
 
-def test_the_page_loads_itself_anew_until_the_batch_is_over(course: Course, tmp_path: Path) -> None:
-    write_results(course, tmp_path)
+def test_the_page_loads_itself_anew_until_the_batch_is_over(batch_state: BatchState, tmp_path: Path) -> None:
+    write_results(batch_state, tmp_path)
     assert Page((tmp_path / "batch.html").read_text()).has_refresh
-    course.end_all(Status.INTERRUPTED, "interrupted")
-    write_results(course, tmp_path)
+    batch_state.end_all(Status.INTERRUPTED, "interrupted")
+    write_results(batch_state, tmp_path)
     assert not Page((tmp_path / "batch.html").read_text()).has_refresh

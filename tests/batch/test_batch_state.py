@@ -6,7 +6,7 @@ import pytest
 from tests.cli.screen import Clock
 from tests.result_document import result_document
 
-from rangesfm.batch.batch_state import Course, Status, SurveyRow, exit_status_of, figures_of, format_rows
+from rangesfm.batch.batch_state import BatchState, Status, SurveyRow, exit_status_of, figures_of, format_rows
 from rangesfm.batch.jobs import Job
 from rangesfm.errors import Failure
 from rangesfm.result.summary import ResultSummary
@@ -19,52 +19,56 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def course(clock: Clock) -> Course:
-    return Course([Job(name, Survey()) for name in "abcd"], clock=clock)
+def batch_state(clock: Clock) -> BatchState:
+    return BatchState([Job(name, Survey()) for name in "abcd"], clock=clock)
 
 
-def test_an_attempt_begins_anew_where_a_worker_was_killed(course: Course, clock: Clock) -> None:
-    course.tell(0, {"began_on": "one"})
-    course.tell(0, {"stage": "mapping"})
-    course.tell(0, {"num_done": 3, "num_total": 9})
-    assert (course.states[0].stage, course.states[0].num_done, course.states[0].num_total) == ("mapping", 3, 9)
+def test_an_attempt_begins_anew_where_a_worker_was_killed(batch_state: BatchState, clock: Clock) -> None:
+    batch_state.tell(0, {"began_on": "one"})
+    batch_state.tell(0, {"stage": "mapping"})
+    batch_state.tell(0, {"num_done": 3, "num_total": 9})
+    assert (batch_state.states[0].stage, batch_state.states[0].num_done, batch_state.states[0].num_total) == (
+        "mapping",
+        3,
+        9,
+    )
     clock.now_s += 50
-    course.tell(0, {"began_on": "two"})
-    assert (course.states[0].stage, course.states[0].num_done) == ("", None)
+    batch_state.tell(0, {"began_on": "two"})
+    assert (batch_state.states[0].stage, batch_state.states[0].num_done) == ("", None)
     clock.now_s += 8
-    course.end(0, Status.DONE, "", 0, verdict="good")
-    row = course.rows[0]
+    batch_state.end(0, Status.DONE, "", 0, verdict="good")
+    row = batch_state.rows[0]
     assert (row.status, row.num_attempts, row.host, row.seconds) == (Status.DONE, 2, "two", 8)
-    course.tell(0, {"began_on": "late"})  # from a worker that was thought to be lost
-    assert course.rows[0] == row
+    batch_state.tell(0, {"began_on": "late"})  # from a worker that was thought to be lost
+    assert batch_state.rows[0] == row
 
 
-def test_time_left_is_that_of_those_that_are_done(course: Course, clock: Clock) -> None:
-    course.num_at_once = 2
+def test_time_left_is_that_of_those_that_are_done(batch_state: BatchState, clock: Clock) -> None:
+    batch_state.num_at_once = 2
     for index in (0, 1):
-        course.tell(index, {"began_on": "here"})
+        batch_state.tell(index, {"began_on": "here"})
     clock.now_s += 30
-    assert course.seconds_left() is None
-    course.end(0, Status.DONE, "", 0)
-    course.tell(2, {"began_on": "here"})
+    assert batch_state.seconds_left() is None
+    batch_state.end(0, Status.DONE, "", 0)
+    batch_state.tell(2, {"began_on": "here"})
     # d waits, b should have ended by now, c has just begun
-    assert course.seconds_left() == pytest.approx((30 + 0 + 30) / 2)
+    assert batch_state.seconds_left() == pytest.approx((30 + 0 + 30) / 2)
     clock.now_s += 20
-    assert course.seconds_left() == pytest.approx((30 + 0 + 10) / 2)
+    assert batch_state.seconds_left() == pytest.approx((30 + 0 + 10) / 2)
 
 
-def test_whatever_is_not_over_when_it_is_interrupted_says_so(course: Course) -> None:
-    course.tell(0, {"began_on": "here"})
-    course.end(1, Status.DONE, "", 0)
-    course.end_all(Status.INTERRUPTED, "interrupted")
-    assert course.is_over
-    assert [row.status.value for row in course.rows] == ["interrupted", "done", "interrupted", "interrupted"]
+def test_whatever_is_not_over_when_it_is_interrupted_says_so(batch_state: BatchState) -> None:
+    batch_state.tell(0, {"began_on": "here"})
+    batch_state.end(1, Status.DONE, "", 0)
+    batch_state.end_all(Status.INTERRUPTED, "interrupted")
+    assert batch_state.is_over
+    assert [row.status.value for row in batch_state.rows] == ["interrupted", "done", "interrupted", "interrupted"]
 
 
 def test_a_file_that_could_not_be_read_is_over_from_the_start() -> None:
-    course = Course([Job("x.toml", None, Failure("x.toml: no such file", 2))])
-    assert course.is_over
-    assert exit_status_of(course.rows) == 2
+    batch_state = BatchState([Job("x.toml", None, Failure("x.toml: no such file", 2))])
+    assert batch_state.is_over
+    assert exit_status_of(batch_state.rows) == 2
 
 
 @pytest.mark.parametrize(

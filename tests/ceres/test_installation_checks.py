@@ -9,11 +9,11 @@ import pytest
 from tests.installed import with_gpus, with_installed
 
 from rangesfm.ceres import installation_checks
-from rangesfm.ceres.installation_checks import Check, diagnose, versions
+from rangesfm.ceres.installation_checks import InstallationCheck, diagnose, versions
 from rangesfm.errors import SolverError
 
 
-def check_named(name: str) -> Check:
+def check_named(name: str) -> InstallationCheck:
     (check,) = (check for check in diagnose() if check.name == name)
     return check
 

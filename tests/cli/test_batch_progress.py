@@ -7,7 +7,7 @@ import io
 import pytest
 from tests.cli.screen import Clock, Terminal
 
-from rangesfm.batch.batch_state import Course, Status
+from rangesfm.batch.batch_state import BatchState, Status
 from rangesfm.batch.jobs import Job
 from rangesfm.cli.batch import BatchTerminal
 from rangesfm.survey.settings import Survey
@@ -19,32 +19,32 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def course(clock: Clock) -> Course:
-    return Course([Job(name, Survey()) for name in ("a.toml", "b.toml")], clock=clock)
+def batch_state(clock: Clock) -> BatchState:
+    return BatchState([Job(name, Survey()) for name in ("a.toml", "b.toml")], clock=clock)
 
 
-def go_on(course: Course, shown: BatchTerminal, clock: Clock) -> None:
+def go_on(batch_state: BatchState, shown: BatchTerminal, clock: Clock) -> None:
     """Advance a batch in which one survey is done and the other is refused, and show each step."""
-    shown.show(course)
+    shown.show(batch_state)
     for index in (0, 1):
-        course.tell(index, {"began_on": "here"})
-    shown.show(course)
-    course.tell(0, {"stage": "mapping"})
-    course.tell(0, {"num_done": 5, "num_total": 20})
+        batch_state.tell(index, {"began_on": "here"})
+    shown.show(batch_state)
+    batch_state.tell(0, {"stage": "mapping"})
+    batch_state.tell(0, {"num_done": 5, "num_total": 20})
     clock.now_s += 10.0
-    shown.show(course)
-    course.tell(1, {"began_on": "there"})
-    shown.show(course)
-    course.end(0, Status.DONE, "", 0, verdict="good")
+    shown.show(batch_state)
+    batch_state.tell(1, {"began_on": "there"})
+    shown.show(batch_state)
+    batch_state.end(0, Status.DONE, "", 0, verdict="good")
     clock.now_s += 4.0
-    shown.show(course)
-    course.end(1, Status.FAILED, "the scale is not known", 3)
-    shown.show(course)
+    shown.show(batch_state)
+    batch_state.end(1, Status.FAILED, "the scale is not known", 3)
+    shown.show(batch_state)
 
 
-def test_plain_lines_tell_each_stage_once(course: Course, clock: Clock) -> None:
+def test_plain_lines_tell_each_stage_once(batch_state: BatchState, clock: Clock) -> None:
     stream = io.StringIO()
-    go_on(course, BatchTerminal(stream, clock=clock), clock)
+    go_on(batch_state, BatchTerminal(stream, clock=clock), clock)
     assert stream.getvalue().splitlines() == [
         "a.toml: begins",
         "b.toml: begins",
@@ -57,24 +57,24 @@ def test_plain_lines_tell_each_stage_once(course: Course, clock: Clock) -> None:
     ]
 
 
-def test_a_terminal_keeps_what_has_ended(course: Course, clock: Clock) -> None:
+def test_a_terminal_keeps_what_has_ended(batch_state: BatchState, clock: Clock) -> None:
     stream = Terminal()
-    go_on(course, BatchTerminal(stream, clock=clock), clock)
+    go_on(batch_state, BatchTerminal(stream, clock=clock), clock)
     assert stream.lines() == ["a.toml: good after 10.0 s", "b.toml: failed after 4.0 s: the scale is not known"]
 
 
-def test_a_terminal_shows_what_is_going_on(course: Course, clock: Clock) -> None:
+def test_a_terminal_shows_what_is_going_on(batch_state: BatchState, clock: Clock) -> None:
     stream = Terminal()
     shown = BatchTerminal(stream, clock=clock)
     for index in (0, 1):
-        course.tell(index, {"began_on": "here"})
-    course.tell(0, {"stage": "mapping"})
-    course.tell(0, {"num_done": 5, "num_total": 20})
+        batch_state.tell(index, {"began_on": "here"})
+    batch_state.tell(0, {"stage": "mapping"})
+    batch_state.tell(0, {"num_done": 5, "num_total": 20})
     clock.now_s += 10.0
-    shown.show(course)
+    shown.show(batch_state)
     shown.message("a worker is gone")
     clock.now_s += 1.0
-    shown.show(course)
+    shown.show(batch_state)
     assert stream.lines() == [
         "a worker is gone",
         "  a.toml: mapping 5/20, 25 %, 11.0 s",
@@ -83,7 +83,7 @@ def test_a_terminal_shows_what_is_going_on(course: Course, clock: Clock) -> None
     ]
 
 
-def test_quiet_is_quiet(course: Course, clock: Clock) -> None:
+def test_quiet_is_quiet(batch_state: BatchState, clock: Clock) -> None:
     stream = Terminal()
-    go_on(course, BatchTerminal(stream, quiet=True, clock=clock), clock)
+    go_on(batch_state, BatchTerminal(stream, quiet=True, clock=clock), clock)
     assert stream.getvalue() == ""

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from rangesfm.ceres.installation_checks import Check
+from rangesfm.ceres.installation_checks import InstallationCheck
 from rangesfm.cli import main
 from rangesfm.survey.settings import Survey
 
@@ -97,8 +97,8 @@ def test_doctor_fails_where_a_part_does_not_fit(
     ok: bool, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checks = [
-        Check("numpy", "2.0", "any", True),
-        Check("pyceres", "1.0", "2.6", ok, "" if ok else "pip install pyceres==2.6"),
+        InstallationCheck("numpy", "2.0", "any", True),
+        InstallationCheck("pyceres", "1.0", "2.6", ok, "" if ok else "pip install pyceres==2.6"),
     ]
     monkeypatch.setattr("rangesfm.ceres.installation_checks.diagnose", lambda: checks)
     assert main(["doctor"]) == status

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import Table, header_names, read_table, read_text, write_table
+from rangesfm.files.text_tables import TextTable, header_names, read_table, read_text, write_table
 
 
 def write(folder: Path, content: str | bytes) -> Path:
@@ -209,9 +209,9 @@ class TestFastWay:
     NUMBERS = (st.floats() | st.integers() | st.decimals(-1e7, 1e7, places=6)).map(str)
     CELLS = NUMBERS | st.text("019.-+eE_ nainfx\u0661\u00e9\t\x0b\x85\0", max_size=5)
 
-    def said(self, table: Callable[[], Table]) -> list[object]:
+    def said(self, table: Callable[[], TextTable]) -> list[object]:
         """Return everything that can be read of columns a (numbers) and b (text), or the errors."""
-        asked: list[Callable[[Table], object]] = [
+        asked: list[Callable[[TextTable], object]] = [
             lambda table: table.numbers("a").tobytes(),
             lambda table: table.numbers("a", empty=7.0).tobytes(),
             lambda table: table.text("a"),

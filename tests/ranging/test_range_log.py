@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rangesfm.ranging.range_log import RangeKind, RangeLog
-from rangesfm.ranging.readers.reader import Sides, tell_roles
+from rangesfm.ranging.readers.reader import EndpointRoles, tell_roles
 
 
 def log_of(*pairs: tuple[str, str]) -> RangeLog:
@@ -87,44 +87,46 @@ class TestPeerRanges:
 class TestRoles:
     def test_sides_decide_where_nothing_else_is_known(self) -> None:
         log = log_of(("t", "A"), ("u", "A"))
-        assert tell_roles(log, Sides.TOLD) is log
+        assert tell_roles(log, EndpointRoles.TAG_AND_ANCHOR) is log
 
     def test_known_anchors_tell_ranges_between_two_of_a_kind(self) -> None:
         log = log_of(("t", "A"), ("u", "A"), ("A", "B"), ("t", "u"), ("B", "t"))
-        for sides in (Sides.TOLD, Sides.ASKED):
-            told = tell_roles(log, sides, known_anchor_ids={"A", "B"})
+        for roles in (EndpointRoles.TAG_AND_ANCHOR, EndpointRoles.ASKER_AND_ASKED):
+            told = tell_roles(log, roles, known_anchor_ids={"A", "B"})
             assert told.kind.tolist() == [0, 0, RangeKind.ANCHOR_ANCHOR, RangeKind.TAG_TAG, 0]
             assert told.tag_ids == ("t", "u")
 
     def test_known_tags_do_as_well_where_sides_mean_nothing(self) -> None:
         log = log_of(("A", "t"), ("t", "B"), ("t", "u"), ("A", "B"))
-        log = tell_roles(log, Sides.ASKED, known_tag_ids={"t", "u"})
+        log = tell_roles(log, EndpointRoles.ASKER_AND_ASKED, known_tag_ids={"t", "u"})
         assert log.kind.tolist() == [0, 0, RangeKind.TAG_TAG, RangeKind.ANCHOR_ANCHOR]
         assert (log.tag_ids, log.anchor_ids) == (("t", "u"), ("A", "B"))
 
     def test_node_on_both_sides_is_what_it_is_mostly(self) -> None:
-        log = tell_roles(log_of(("t", "A"), ("t", "A"), ("t", "B"), ("A", "B")), Sides.TOLD)
+        log = tell_roles(log_of(("t", "A"), ("t", "A"), ("t", "B"), ("A", "B")), EndpointRoles.TAG_AND_ANCHOR)
         assert log.kind.tolist() == [0, 0, 0, RangeKind.ANCHOR_ANCHOR]
-        log = tell_roles(log_of(("t", "A"), ("u", "A"), ("u", "B"), ("t", "u")), Sides.TOLD)
+        log = tell_roles(log_of(("t", "A"), ("u", "A"), ("u", "B"), ("t", "u")), EndpointRoles.TAG_AND_ANCHOR)
         assert log.kind.tolist() == [0, 0, 0, RangeKind.TAG_TAG]
 
     def test_node_that_only_known_anchors_range_with_is_a_tag(self) -> None:
-        log = tell_roles(log_of(("A", "t"), ("B", "t")), Sides.TOLD, known_anchor_ids={"A", "B"})
+        log = tell_roles(log_of(("A", "t"), ("B", "t")), EndpointRoles.TAG_AND_ANCHOR, known_anchor_ids={"A", "B"})
         assert (log.tag_ids, log.anchor_ids) == (("t",), ("A", "B"))
 
     def test_stranger_on_the_side_of_the_anchors_stays_one(self) -> None:
-        log = tell_roles(log_of(("t", "A"), ("t", "X"), ("A", "t")), Sides.TOLD, known_anchor_ids={"A"})
+        log = tell_roles(
+            log_of(("t", "A"), ("t", "X"), ("A", "t")), EndpointRoles.TAG_AND_ANCHOR, known_anchor_ids={"A"}
+        )
         assert log.anchor_ids == ("A", "X")
 
     def test_single_node_that_several_ask_is_the_tag_if_the_sides_say_nothing(self) -> None:
         log = log_of(("A", "t"), ("B", "t"))
-        assert tell_roles(log, Sides.ASKED).tag_ids == ("t",)
-        assert tell_roles(log, Sides.TOLD).tag_ids == ("A", "B")
+        assert tell_roles(log, EndpointRoles.ASKER_AND_ASKED).tag_ids == ("t",)
+        assert tell_roles(log, EndpointRoles.TAG_AND_ANCHOR).tag_ids == ("A", "B")
 
-    @pytest.mark.parametrize("sides", Sides)
-    def test_id_that_ranges_with_itself_shows_that_tags_are_numbered_by_themselves(self, sides: Sides) -> None:
+    @pytest.mark.parametrize("roles", EndpointRoles)
+    def test_id_that_ranges_with_itself_shows_that_tags_are_numbered_by_themselves(self, roles: EndpointRoles) -> None:
         log = log_of(("0", "0"), ("0", "1"), ("1", "0"))
-        assert tell_roles(log, sides, known_anchor_ids={"0", "1"}) is log
+        assert tell_roles(log, roles, known_anchor_ids={"0", "1"}) is log
         part = log.subset(np.array([1, 2]))
         assert (part.tag_ids, part.anchor_ids) == (("0", "1"), ("0", "1"))
         assert (part.tag_index.tolist(), part.anchor_index.tolist()) == ([0, 1], [1, 0])
@@ -132,11 +134,13 @@ class TestRoles:
 
     def test_id_known_as_both_is_that_of_two_nodes(self) -> None:
         log = log_of(("1", "2"), ("1", "3"))
-        assert tell_roles(log, Sides.TOLD, known_anchor_ids={"1", "2", "3"}, known_tag_ids={"1"}) is log
+        assert (
+            tell_roles(log, EndpointRoles.TAG_AND_ANCHOR, known_anchor_ids={"1", "2", "3"}, known_tag_ids={"1"}) is log
+        )
 
     def test_nodes_that_are_numbered_by_side_are_never_confused(self) -> None:
         log = log_of(("0", "1"), ("1", "2"))
-        assert tell_roles(log, Sides.APART, known_anchor_ids={"0", "1", "2"}) is log
+        assert tell_roles(log, EndpointRoles.NUMBERED_APART, known_anchor_ids={"0", "1", "2"}) is log
 
 
 def test_a_clock_that_begins_anew_is_told_from_rows_in_no_order() -> None:

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from tests.result_document import result_document
 
-from rangesfm.report.checks import Check, quality_checks
+from rangesfm.report.checks import QualityCheck, quality_checks
 from rangesfm.result.summary import ResultSummary
 
 
-def check_of(name: str, **changes: Any) -> Check:
+def check_of(name: str, **changes: Any) -> QualityCheck:
     summary = ResultSummary.model_validate(result_document(**changes))
     (check,) = (check for check in quality_checks(summary) if check.name == name)
     return check
@@ -23,12 +23,12 @@ def light_of(name: str, **changes: Any) -> str:
 
 @pytest.mark.parametrize(("value", "light"), [(0.0, "green"), (1.0, "green"), (1.1, "amber"), (2.1, "red")])
 def test_smaller_is_better_up_to_and_with_each_limit(value: float, light: str) -> None:
-    assert Check("n", "m", value, "px", green_limit=1.0, amber_limit=2.0, decimals=1).light == light
+    assert QualityCheck("n", "m", value, "px", green_limit=1.0, amber_limit=2.0, decimals=1).light == light
 
 
 @pytest.mark.parametrize(("value", "light"), [(90.0, "green"), (70.0, "green"), (50.0, "amber"), (39.0, "red")])
 def test_larger_is_better_where_it_says_so(value: float, light: str) -> None:
-    check = Check("n", "m", value, "%", green_limit=70.0, amber_limit=40.0, decimals=1, larger_is_better=True)
+    check = QualityCheck("n", "m", value, "%", green_limit=70.0, amber_limit=40.0, decimals=1, larger_is_better=True)
     assert check.light == light
 
 
@@ -65,12 +65,12 @@ def test_nothing_measured_means_no_light() -> None:
 
 
 def test_the_gauge_shows_the_limits_to_scale_and_the_value_on_it() -> None:
-    smaller = Check("n", "m", 1.5, "px", green_limit=1.0, amber_limit=2.0, decimals=1)
+    smaller = QualityCheck("n", "m", 1.5, "px", green_limit=1.0, amber_limit=2.0, decimals=1)
     assert [color for color, _ in smaller.zones] == ["green", "amber", "red"]
     assert [width for _, width in smaller.zones] == pytest.approx([100 / 3] * 3)
     assert smaller.needle_percent == pytest.approx(50.0)
     assert smaller.text == "1.5\u00a0px"
     assert smaller.limits == "green ≤ 1\u00a0px · amber ≤ 2\u00a0px"
-    larger = Check("n", "m", 120.0, "%", green_limit=70.0, amber_limit=40.0, decimals=1, larger_is_better=True)
+    larger = QualityCheck("n", "m", 120.0, "%", green_limit=70.0, amber_limit=40.0, decimals=1, larger_is_better=True)
     assert larger.zones == [("red", 40.0), ("amber", 30.0), ("green", 30.0)]
     assert larger.needle_percent == 100.0

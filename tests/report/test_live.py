@@ -8,9 +8,9 @@ import pytest
 from tests.cli.screen import Clock
 
 from rangesfm.progress import SilentProgress
-from rangesfm.report.live import RELOAD_S, LivePage, live_page
+from rangesfm.report.live import LIVE_RELOAD_S, LivePage, live_page
 
-RELOAD = f'http-equiv="refresh" content="{RELOAD_S}"'
+RELOAD = f'http-equiv="refresh" content="{LIVE_RELOAD_S}"'
 
 
 class Listener(SilentProgress):

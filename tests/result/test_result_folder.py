@@ -19,7 +19,7 @@ from rangesfm.result.result_folder import (
     read_result_folder,
     refuse_to_overwrite,
 )
-from rangesfm.result.result_tables import TABLES, RangesAsUsed
+from rangesfm.result.result_tables import RESULT_TABLES, RangesAsUsed
 from rangesfm.survey.settings import Survey, survey_from_tables
 
 PAGE = (Path(__file__).parents[2] / "examples" / "results.md").read_text(encoding="utf-8")
@@ -124,7 +124,7 @@ def test_anchors_and_lever_arms_are_arrays(tmp_path: Path) -> None:
 
 def test_what_a_run_did_not_leave_is_none(tmp_path: Path) -> None:
     result = read_result_folder(write_document(tmp_path))
-    assert [result.read(table) for table in TABLES] == [None] * len(TABLES)
+    assert [result.read(table) for table in RESULT_TABLES] == [None] * len(RESULT_TABLES)
     assert (result.read_reference(), result.read_metric_model()) == (None, None)
     assert (result.timestamps_s, result.images_path) == (None, None)
 

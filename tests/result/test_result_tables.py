@@ -11,7 +11,7 @@ from tests.outputs import names_in
 
 from rangesfm.errors import InputError
 from rangesfm.result.result_tables import (
-    TABLES,
+    RESULT_TABLES,
     CenterCovariances,
     PhotoTimes,
     ScaleConsensus,
@@ -34,7 +34,7 @@ def example(kind: type[TableFile], num_rows: int) -> TableFile:
 
 
 @pytest.mark.parametrize("num_rows", [0, 3])
-@pytest.mark.parametrize("kind", TABLES, ids=lambda kind: kind.NAME)
+@pytest.mark.parametrize("kind", RESULT_TABLES, ids=lambda kind: kind.NAME)
 def test_table_is_read_as_it_was_written(kind: type[TableFile], num_rows: int, tmp_path: Path) -> None:
     written = example(kind, num_rows)
     written.write(tmp_path)

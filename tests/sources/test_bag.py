@@ -17,7 +17,7 @@ from tests.sources.damage import DAMAGES, Damage
 from tests.sources.recorded import Message, camera_info, compressed, raw, write_bag
 
 from rangesfm.errors import InputError
-from rangesfm.sources.source import Source, open_source
+from rangesfm.sources.source import PhotoSource, open_source
 
 Pixels = npt.NDArray[np.uint8]
 IMAGE, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
@@ -45,12 +45,12 @@ def yuv422() -> Pixels:
     return np.stack([colours, luma], axis=-1)
 
 
-def open_bag(folder: Path, messages: list[Message], *, topic: str | None = None, **how: Any) -> Source:
+def open_bag(folder: Path, messages: list[Message], *, topic: str | None = None, **how: Any) -> PhotoSource:
     path = folder / ("a.bag" if how.get("version") == 1 else "a")
     return open_source(write_bag(path, messages, **how), topic)
 
 
-def written(source: Source, folder: Path) -> Pixels:
+def written(source: PhotoSource, folder: Path) -> Pixels:
     next(source.frames()).write(folder / "photo.png")
     with Image.open(folder / "photo.png") as photo:
         return np.asarray(photo.convert("RGB"))

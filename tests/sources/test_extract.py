@@ -14,7 +14,7 @@ from rangesfm.errors import InputError
 from rangesfm.progress import SilentProgress
 from rangesfm.sources import extract
 from rangesfm.sources.extract import TakenPhotos, sharpest, take_photos
-from rangesfm.sources.source import Frame, Source
+from rangesfm.sources.source import Frame, PhotoSource
 from rangesfm.vision.image_times import read_image_times_csv
 
 CONTRASTS = {"blurred": 10, "sharp": 200}
@@ -35,8 +35,10 @@ class Film:
         self.path, self.frames, self.num_watched = path, frames, 0
         path.write_text("a film")
 
-    def open(self, path: Path, topic: str | None) -> Source:
-        return Source("a film", (8, 8), 2.0, 8, "its own", self.watch, ("PINHOLE", (9.0, 9.0, 4.0, 4.0)), ("in black",))
+    def open(self, path: Path, topic: str | None) -> PhotoSource:
+        return PhotoSource(
+            "a film", (8, 8), 2.0, 8, "its own", self.watch, ("PINHOLE", (9.0, 9.0, 4.0, 4.0)), ("in black",)
+        )
 
     def watch(self) -> Iterator[Frame]:
         self.num_watched += 1

@@ -9,7 +9,7 @@ import pytest
 
 from rangesfm.errors import InputError
 from rangesfm.options import CameraOptions
-from rangesfm.survey_discovery.calibration_files import Calibration, read_calibrations
+from rangesfm.survey_discovery.calibration_files import CameraCalibration, read_calibrations
 from rangesfm.vision.camera import check_camera
 
 KALIBR = """\
@@ -43,7 +43,7 @@ distortion_coefficients:
 """
 
 
-def read(path: Path, text: str) -> tuple[Calibration, ...]:
+def read(path: Path, text: str) -> tuple[CameraCalibration, ...]:
     path.write_text(text)
     cameras = read_calibrations(path)
     for camera in cameras:
@@ -53,24 +53,24 @@ def read(path: Path, text: str) -> tuple[Calibration, ...]:
 
 def test_kalibrs_cameras_are_moved_by_half_a_pixel(tmp_path: Path) -> None:
     assert read(tmp_path / "camchain.yaml", KALIBR) == (
-        Calibration("OPENCV", (458.6, 457.3, 367.2, 248.9, -0.28, 0.07, 0.0002, 0.00002), (752, 480)),
-        Calibration("OPENCV_FISHEYE", (457.6, 456.1, 380.0, 255.7, -0.01, 0.02, 0.003, 0.004), (640, 480)),
+        CameraCalibration("OPENCV", (458.6, 457.3, 367.2, 248.9, -0.28, 0.07, 0.0002, 0.00002), (752, 480)),
+        CameraCalibration("OPENCV_FISHEYE", (457.6, 456.1, 380.0, 255.7, -0.01, 0.02, 0.003, 0.004), (640, 480)),
     )
 
 
 def test_a_ros_camera_with_a_third_coefficient_is_full_opencv(tmp_path: Path) -> None:
     pinhole, four = (430.2, 430.5, 307.2, 227.7), (-0.34, 0.11, 0.0003, -0.0001)
     (plain,) = read(tmp_path / "plain.yaml", ROS.format(third=0.0))
-    assert plain == Calibration("OPENCV", (*pinhole, *four), (640, 480))
+    assert plain == CameraCalibration("OPENCV", (*pinhole, *four), (640, 480))
     (full,) = read(tmp_path / "full.yml", ROS.format(third=0.05))
-    assert full == Calibration("FULL_OPENCV", (*pinhole, *four, 0.05, 0.0, 0.0, 0.0), (640, 480))
+    assert full == CameraCalibration("FULL_OPENCV", (*pinhole, *four, 0.05, 0.0, 0.0, 0.0), (640, 480))
 
 
 def test_colmaps_cameras_are_taken_as_they_are(tmp_path: Path) -> None:
     text = "# Camera list\n1 PINHOLE 640 480 500 501 320 240\n2 SIMPLE_RADIAL 480 640 500 240 320 0.01\n"
     assert read(tmp_path / "cameras.txt", text) == (
-        Calibration("PINHOLE", (500, 501, 320, 240), (640, 480)),
-        Calibration("SIMPLE_RADIAL", (500, 240, 320, 0.01), (480, 640)),
+        CameraCalibration("PINHOLE", (500, 501, 320, 240), (640, 480)),
+        CameraCalibration("SIMPLE_RADIAL", (500, 240, 320, 0.01), (480, 640)),
     )
 
 
@@ -83,7 +83,7 @@ def test_a_camera_as_json_may_have_the_lever_arm(tmp_path: Path) -> None:
         "tag_in_cam_m": [0, 1, 2],
     }
     assert read(tmp_path / "any.json", json.dumps(camera)) == (
-        Calibration("PINHOLE", (50, 50, 32, 24), (64, 48), (0, 1, 2)),
+        CameraCalibration("PINHOLE", (50, 50, 32, 24), (64, 48), (0, 1, 2)),
     )
 
 

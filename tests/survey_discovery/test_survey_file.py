@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rangesfm.errors import InputError
-from rangesfm.survey.settings import TABLES, read_survey, survey_from_tables
+from rangesfm.survey.settings import SURVEY_TABLES, read_survey, survey_from_tables
 from rangesfm.survey_discovery.survey_file import survey_text
 
 
@@ -48,7 +48,7 @@ def test_what_is_not_known_stands_there_as_a_comment(tmp_path: Path) -> None:
 
 def test_each_key_is_explained_by_its_own_meaning(tmp_path: Path) -> None:
     text = survey_text({"ranges.check_share": 0.1}, tmp_path)
-    meaning = TABLES["ranges"].keys()["check_share"].meaning
+    meaning = SURVEY_TABLES["ranges"].keys()["check_share"].meaning
     assert meaning in " ".join(text.replace("\n# ", " ").split())
 
 

@@ -13,8 +13,8 @@ from tests.known import known
 
 import rangesfm
 from rangesfm.errors import InputError
-from rangesfm.result.folder import read_result_folder
 from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME
+from rangesfm.result.result_folder import read_result_folder
 
 FIRST, LAST = "frame_00001.jpg", "frame_00025.jpg"
 

@@ -8,13 +8,13 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from rangesfm.batch.batch_state import Course, Status, SurveyRow
+from rangesfm.batch.batch_state import BatchState, Status, SurveyRow
 from rangesfm.report import report_page
-from rangesfm.report.report_tables import Table
+from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain
 from rangesfm.result.result_folder import REPORT_NAME
 
-RELOAD_S = 5
+BATCH_RELOAD_S = 5
 _HEADER = (
     "survey",
     "",
@@ -34,32 +34,32 @@ _NOTE = (
 )
 
 
-def render(course: Course, folder: Path) -> str:
+def render(batch_state: BatchState, folder: Path) -> str:
     """Return the page as HTML; while the batch runs the page reloads itself.
 
     Args:
         folder: folder of the page, to which its links are relative.
     """
-    heading = f"{len(course.rows)} surveys"
+    heading = f"{len(batch_state.rows)} surveys"
     return report_page.render(
         "batch.html",
         title=f"{heading} – rangesfm batch",
         heading=heading,
-        reload=None if course.is_over else RELOAD_S,
-        tiles=_tiles(course),
-        table=Table("Results", _HEADER, [_row(row, folder) for row in course.rows], _NOTE),
-        reasons=[(_light(row), row) for row in course.rows if row.reason],
+        reload=None if batch_state.is_over else BATCH_RELOAD_S,
+        tiles=_tiles(batch_state),
+        table=ReportTable("Results", _HEADER, [_row(row, folder) for row in batch_state.rows], _NOTE),
+        reasons=[(_light(row), row) for row in batch_state.rows if row.reason],
     )
 
 
-def _tiles(course: Course) -> list[tuple[str, str, str]]:
-    seconds = sum(row.seconds or 0.0 for row in course.rows)
-    num_left = len(course.rows) - course.num(Status.DONE) - course.num(Status.FAILED)
+def _tiles(batch_state: BatchState) -> list[tuple[str, str, str]]:
+    seconds = sum(row.seconds or 0.0 for row in batch_state.rows)
+    num_left = len(batch_state.rows) - batch_state.num(Status.DONE) - batch_state.num(Status.FAILED)
     return [
-        ("Done", count(course.num(Status.DONE)), f"of {count(len(course.rows))}"),
-        ("Failed", count(course.num(Status.FAILED)), "reasons below"),
+        ("Done", count(batch_state.num(Status.DONE)), f"of {count(len(batch_state.rows))}"),
+        ("Failed", count(batch_state.num(Status.FAILED)), "reasons below"),
         ("Not done", count(num_left), "waiting, running or interrupted"),
-        ("Time taken", duration(course.seconds), f"sum of all surveys {duration(seconds)}"),
+        ("Time taken", duration(batch_state.seconds), f"sum of all surveys {duration(seconds)}"),
     ]
 
 

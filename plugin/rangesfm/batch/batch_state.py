@@ -129,7 +129,7 @@ class SurveyState:
         row: its row as far as it is known.
         stage: the stage that it is in.
         num_done, num_total: finished and all items of the stage, where the stage counts them.
-        began_s: start of the last attempt on the course's clock, seconds.
+        began_s: start of the last attempt on the clock of the batch, seconds.
     """
 
     row: SurveyRow
@@ -142,14 +142,14 @@ class SurveyState:
 class BatchListener(Protocol):
     """Receiver of the progress of a batch."""
 
-    def show(self, course: Course) -> None:
+    def show(self, batch_state: BatchState) -> None:
         """Show the state; called on every change, and several times a second."""
 
     def message(self, text: str) -> None:
         """Show a line that the user should read."""
 
 
-class Course:
+class BatchState:
     """State of all surveys of a batch, updated by the workers' messages.
 
     Attributes:

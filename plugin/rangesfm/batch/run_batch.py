@@ -15,7 +15,7 @@ from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch import workers
 from rangesfm.batch.batch_page import render
-from rangesfm.batch.batch_state import BatchListener, Course, Status, SurveyRow
+from rangesfm.batch.batch_state import BatchListener, BatchState, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
 from rangesfm.ceres.installation_checks import versions
 from rangesfm.errors import FAILED, Failure
@@ -29,22 +29,22 @@ _MAX_STOP_S = 30.0  # longer than a worker waits for an interrupted survey
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
 
 
-def write_results(course: Course, folder: Path) -> None:
+def write_results(batch_state: BatchState, folder: Path) -> None:
     """Write ``batch.csv``, ``batch.json`` and ``batch.html``; while the batch runs the page reloads itself."""
-    rows = course.rows
+    rows = batch_state.rows
     cells = [["" if value is None else str(value) for value in row.cells().values()] for row in rows]
     write_table(folder / TABLE_NAME, list(SurveyRow("").cells()), cells)
     summary = {
-        **{f"num_{status.value}": course.num(status) for status in Status},
-        "seconds": course.seconds,
+        **{f"num_{status.value}": batch_state.num(status) for status in Status},
+        "seconds": batch_state.seconds,
         "versions": versions(),
         "surveys": [row.cells() for row in rows],
     }
     write_json(summary, folder / JSON_NAME)
-    write_text(render(course, folder), folder / PAGE_NAME)
+    write_text(render(batch_state, folder), folder / PAGE_NAME)
 
 
-def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, listener: BatchListener) -> Course:
+def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, listener: BatchListener) -> BatchState:
     """Run all surveys; rewrite ``batch.csv``, ``batch.json`` and ``batch.html`` whenever one has ended.
 
     Args:
@@ -56,14 +56,14 @@ def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, lis
             are cores.
         KeyboardInterrupt: once the workers have stopped; the table then says how far each survey came.
     """
-    course = Course(jobs)
+    batch_state = BatchState(jobs)
     with sole_writer(output_path):
-        if not course.is_over:
+        if not batch_state.is_over:
             with _workers(options, jobs, listener) as (client, share):
-                _Crew(client, course, output_path, listener, share).run(jobs, options.restart)
-        write_results(course, output_path)
-        listener.show(course)
-    return course
+                _Crew(client, batch_state, output_path, listener, share).run(jobs, options.restart)
+        write_results(batch_state, output_path)
+        listener.show(batch_state)
+    return batch_state
 
 
 @contextmanager
@@ -86,9 +86,11 @@ def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener
 class _Crew:
     """The workers of a batch: gives them its surveys and takes in their messages."""
 
-    def __init__(self, client: Client, course: Course, output_path: Path, listener: BatchListener, share: Share):
+    def __init__(
+        self, client: Client, batch_state: BatchState, output_path: Path, listener: BatchListener, share: Share
+    ):
         self._client = client
-        self._course = course
+        self._state = batch_state
         self._output_path = output_path
         self._listener = listener
         self._share = share
@@ -99,19 +101,19 @@ class _Crew:
     def run(self, jobs: Sequence[Job], restart: bool) -> None:
         """Run the surveys until all are over."""
         try:
-            write_results(self._course, self._output_path)
+            write_results(self._state, self._output_path)
             self._client.subscribe_topic(self._batch, self._inbox.put)
             for index, job in enumerate(jobs):
                 if job.survey is not None:
                     self._submit(workers.SurveyTask(self._batch, index, job.survey, self._share, restart))
-            while not self._course.is_over:
+            while not self._state.is_over:
                 self._look()
         except BaseException:
             self._listener.message("stopping the workers")
             self._stop()
-            self._course.end_all(Status.INTERRUPTED, "interrupted")
-            write_results(self._course, self._output_path)
-            self._listener.show(self._course)
+            self._state.end_all(Status.INTERRUPTED, "interrupted")
+            write_results(self._state, self._output_path)
+            self._listener.show(self._state)
             raise
 
     def _submit(self, task: workers.SurveyTask) -> None:
@@ -124,27 +126,27 @@ class _Crew:
         """Process the messages that have arrived, after a short wait for the first."""
         items = _all_of(self._inbox)
         if self._client.status != "running":
-            self._course.end_all(Status.FAILED, "the connection to the scheduler was lost", FAILED)
+            self._state.end_all(Status.FAILED, "the connection to the scheduler was lost", FAILED)
             return
         if items:
-            self._course.num_at_once = max(1, sum(self._client.nthreads().values()))
+            self._state.num_at_once = max(1, sum(self._client.nthreads().values()))
         ended = [item for item in items if not isinstance(item, tuple)]
         for item in items:
             if isinstance(item, tuple):  # a message: its time and its content
-                self._course.tell(item[1]["index"], item[1])
+                self._state.tell(item[1]["index"], item[1])
             else:
                 self._take_end(item)
         if ended:
-            write_results(self._course, self._output_path)
-        self._listener.show(self._course)
+            write_results(self._state, self._output_path)
+        self._listener.show(self._state)
 
     def _take_end(self, future: Future) -> None:
         task = self._task_of[future]
         ending = _ending(future)
         if isinstance(ending, Failure):
-            self._course.end(task.index, Status.FAILED, ending.message, ending.exit_status)
+            self._state.end(task.index, Status.FAILED, ending.message, ending.exit_status)
         else:
-            self._course.end(task.index, Status.DONE, ending["reason"], 0, **ending["figures"])
+            self._state.end(task.index, Status.DONE, ending["reason"], 0, **ending["figures"])
 
     def _stop(self) -> None:
         """Have the workers interrupt their surveys, and wait for them, so that nothing is left half-written."""

@@ -30,7 +30,7 @@ _KNOWN_COST = 2.0
 
 
 @dataclass(frozen=True)
-class Check:
+class InstallationCheck:
     """One thing looked at.
 
     Attributes:
@@ -48,7 +48,7 @@ class Check:
     remedy: str = ""
 
 
-def diagnose() -> list[Check]:
+def diagnose() -> list[InstallationCheck]:
     """Look at everything a run depends on. Nothing is raised or printed: what fails is in the list."""
     checks = [_check_python(), _check_package("rangesfm"), *map(_check_package, needed_packages())]
     checks.append(_check_compiled_part())
@@ -75,13 +75,13 @@ def _found(package: str) -> str:
     return " and ".join(said) or "not installed"
 
 
-def _check_python() -> Check:
+def _check_python() -> InstallationCheck:
     ok = any(is_version(platform.python_version(), python) for python in PYTHONS)
     expected = f"{PYTHONS[0]} to {PYTHONS[-1]}"
-    return Check("Python", platform.python_version(), expected, ok, "" if ok else f"use Python {expected}")
+    return InstallationCheck("Python", platform.python_version(), expected, ok, "" if ok else f"use Python {expected}")
 
 
-def _check_package(package: str) -> Check:
+def _check_package(package: str) -> InstallationCheck:
     """Whether a package is there, once, and in the version needed."""
     needed, builds = NEEDED_VERSIONS.get(package), installed_builds(package)
     expected, remedy = needed or "any", ""
@@ -90,33 +90,33 @@ def _check_package(package: str) -> Check:
     elif len(builds) > 1:  # the files of one lie over those of the other
         expected = f"one of {' and '.join(builds)}, as both are the module {package}"
         remedy = f"run: python -m pip uninstall -y {' '.join(builds)}, then {install_command()}"
-    return Check(package, _found(package), expected, not remedy, remedy)
+    return InstallationCheck(package, _found(package), expected, not remedy, remedy)
 
 
-def _check_compiled_part() -> Check:
+def _check_compiled_part() -> InstallationCheck:
     try:
         check_compatibility()
         remedy = ""
     except SolverError as error:
         remedy = str(error)
     expected = "shares its types with pycolmap and pyceres"
-    return Check("compiled part", compiled_part_version(), expected, not remedy, remedy)
+    return InstallationCheck("compiled part", compiled_part_version(), expected, not remedy, remedy)
 
 
-def _check_ceres() -> Check:
+def _check_ceres() -> InstallationCheck:
     # The compiled part has passed with them: what does not fit is in its own check.
     found = ", ".join(f"{version} in {where}" for where, version in _ceres_versions().items())
-    return Check("Ceres", found, f"{CERES} in both", ok=True)
+    return InstallationCheck("Ceres", found, f"{CERES} in both", ok=True)
 
 
-def _check_threads() -> Check:
+def _check_threads() -> InstallationCheck:
     num_cores = os.cpu_count() or 1
     # A container or a batch queue may allow fewer than there are.
     num_usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else num_cores
-    return Check("threads", f"{num_usable} of {num_cores} cores", "1 or more", ok=True)
+    return InstallationCheck("threads", f"{num_usable} of {num_cores} cores", "1 or more", ok=True)
 
 
-def _check_cuda() -> Check:
+def _check_cuda() -> InstallationCheck:
     num = num_gpus()
     if num is None:
         others = " or ".join(OTHER_BUILDS["pycolmap"])
@@ -125,7 +125,7 @@ def _check_cuda() -> Check:
         found = "pycolmap has it, and there is no GPU: the processor is used"
     else:
         found = f"pycolmap has it, and there {'is 1 GPU' if num == 1 else f'are {num} GPUs'} for features and matching"
-    return Check("CUDA", found, "not needed", ok=True)
+    return InstallationCheck("CUDA", found, "not needed", ok=True)
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress, duration
 
 if TYPE_CHECKING:
-    from rangesfm.batch.batch_state import Course, SurveyState
+    from rangesfm.batch.batch_state import BatchState, SurveyState
 
 
 # Keys without a flag here: each survey has its own photos and output, and the workers share the threads.
@@ -86,14 +86,14 @@ def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
     jobs = read_jobs(args.surveys, overrides_from_arguments(args), output_path)
     options = BatchOptions(args.scheduler, args.num_workers, args.num_threads, args.memory_limit, args.restart)
     terminal = BatchTerminal(sys.stderr or io.StringIO(), quiet=args.quiet)
-    course = run_batch(jobs, options, output_path, terminal)
+    batch_state = run_batch(jobs, options, output_path, terminal)
     lines = [
-        *format_rows(course.rows).splitlines(),
+        *format_rows(batch_state.rows).splitlines(),
         "",
         f"table: {output_path / TABLE_NAME}",
         f"page: {output_path / PAGE_NAME}",
     ]
-    return Outcome(lines, exit_status_of(course.rows))
+    return Outcome(lines, exit_status_of(batch_state.rows))
 
 
 def _at_least_1(text: str) -> int:
@@ -120,38 +120,38 @@ class BatchTerminal:
         self._told: dict[int, str] = {}
         self._num_over = 0
 
-    def show(self, course: Course) -> None:
+    def show(self, batch_state: BatchState) -> None:
         """Print what is new, and on a terminal draw the running surveys again."""
-        new = self._news(course)
+        new = self._news(batch_state)
         now = self._clock()
-        if new or course.is_over:
+        if new or batch_state.is_over:
             self._screen.say(new)
-        if not course.is_over and (new or self._last_drawn is None or now - self._last_drawn >= _INTERVAL_S):
+        if not batch_state.is_over and (new or self._last_drawn is None or now - self._last_drawn >= _INTERVAL_S):
             self._last_drawn = now
-            self._screen.draw(_going_on(course))
+            self._screen.draw(_going_on(batch_state))
 
     def message(self, text: str) -> None:
         self._screen.say([text])
 
-    def _news(self, course: Course) -> list[str]:
+    def _news(self, batch_state: BatchState) -> list[str]:
         """Return new lines about surveys: each survey that has ended, and off a terminal also each stage."""
         lines = []
-        for index, state in enumerate(course.states):
+        for index, state in enumerate(batch_state.states):
             line = _ended(state) if state.row.status.is_final else "" if self._screen.is_terminal else _stage(state)
             if line and self._told.get(index) != line:
                 self._told[index] = line
                 lines.append(line)
-        num_over = sum(row.status.is_final for row in course.rows)
+        num_over = sum(row.status.is_final for row in batch_state.rows)
         if num_over > self._num_over and not self._screen.is_terminal:
-            lines.append(_summary(course))
+            lines.append(_summary(batch_state))
         self._num_over = num_over
         return lines
 
 
-def _going_on(course: Course) -> list[str]:
-    running = [state for state in course.states if state.began_s is not None]
-    lines = [f"  {_stage(state)}{_counted(state)}, {duration(course.seconds_running(state))}" for state in running]
-    return [*lines[:_MAX_NUM_LINES], _summary(course)]
+def _going_on(batch_state: BatchState) -> list[str]:
+    running = [state for state in batch_state.states if state.began_s is not None]
+    lines = [f"  {_stage(state)}{_counted(state)}, {duration(batch_state.seconds_running(state))}" for state in running]
+    return [*lines[:_MAX_NUM_LINES], _summary(batch_state)]
 
 
 def _stage(state: SurveyState) -> str:
@@ -173,10 +173,10 @@ def _ended(state: SurveyState) -> str:
     return f"{row.survey}: {what}{seconds}{reason}"
 
 
-def _summary(course: Course) -> str:
-    num_over = sum(row.status.is_final for row in course.rows)
-    num_failed = sum(bool(row.exit_status) for row in course.rows)
+def _summary(batch_state: BatchState) -> str:
+    num_over = sum(row.status.is_final for row in batch_state.rows)
+    num_failed = sum(bool(row.exit_status) for row in batch_state.rows)
     failed = f", {num_failed} of them failed" if num_failed else ""
-    left = course.seconds_left()
-    time_left = "" if left is None or course.is_over else f", {duration(left)} left"
-    return f"{num_over} of {len(course.rows)} surveys over{failed}, {duration(course.seconds)}{time_left}"
+    left = batch_state.seconds_left()
+    time_left = "" if left is None or batch_state.is_over else f", {duration(left)} left"
+    return f"{num_over} of {len(batch_state.rows)} surveys over{failed}, {duration(batch_state.seconds)}{time_left}"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rangesfm.option_model import Bounds
     from rangesfm.ranging.anchors.anchor import Anchor
     from rangesfm.ranging.anchors.trilateration import AnchorPlacement
-    from rangesfm.ranging.errors.radio_calibration import Calibration
+    from rangesfm.ranging.errors.radio_calibration import RadioCalibration
     from rangesfm.ranging.range_log import RangeLog
     from rangesfm.ranging.range_summary import LinkSummary, RangeSummary
 
@@ -337,7 +337,7 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
     return Outcome(lines)
 
 
-def _calibrated(calibration: Calibration, num_in_log: int) -> list[str]:
+def _calibrated(calibration: RadioCalibration, num_in_log: int) -> list[str]:
     from rangesfm.files.text_tables import align_rows
 
     curve, share = calibration.curve, f"{100 * calibration.outlier_share:.1f} % do not fit"

@@ -53,9 +53,9 @@ def add_flags(parser: Parser, *keys: str, without: tuple[str, ...] = (), by_own_
 
 
 def _add_flags(parser: Parser, *, keys: tuple[str, ...], without: tuple[str, ...], by_own_names: bool) -> None:
-    from rangesfm.survey.settings import TABLES, chosen_keys
+    from rangesfm.survey.settings import SURVEY_TABLES, chosen_keys
 
-    for table, model in TABLES.items():
+    for table, model in SURVEY_TABLES.items():
         # Both keys for lever arms share one flag.
         left_out = (*without, "tag.lever_arms_m")
         if chosen := [item for item in chosen_keys(keys) if item.table == table and item.dotted not in left_out]:

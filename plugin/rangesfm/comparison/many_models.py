@@ -21,7 +21,7 @@ from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import Similarity, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.report.report_tables import Table
+from rangesfm.report.report_tables import ReportTable
 from rangesfm.result.entries import rms
 from rangesfm.result.model_path import path_of_model
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
@@ -117,20 +117,20 @@ class ModelsComparison:
     taped: tuple[TapedRow, ...] = ()
 
     @property
-    def tables(self) -> tuple[Table, ...]:
+    def tables(self) -> tuple[ReportTable, ...]:
         """Return the tables of the comparison. A table without data has no rows."""
         cells, names = [_cells(row) for row in self.rows], [model.name for model in self.models]
         of_row = [f"{name} after Sim(3)" for name in names] if self.taped and self.taped[0].lengths_m else []
         distances = [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in self.distances]
         return (
-            Table(
+            ReportTable(
                 "Each model against the first",
                 [name for name, _ in cells[0]],
                 [[text for _, text in row] for row in cells],
                 _NOTE,
             ),
-            Table("Distances between photos, in each model's unit", ["distance", *names], distances),
-            Table(
+            ReportTable("Distances between photos, in each model's unit", ["distance", *names], distances),
+            ReportTable(
                 "Taped distances",
                 ["taped distance", "tape m", *names, *of_row],
                 [_taped_cells(row) for row in self.taped],

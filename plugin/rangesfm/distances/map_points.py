@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.distances.ends import images_by_name, triangulate_marker
+from rangesfm.distances.locate_lengths import images_by_name, triangulate_marker
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import InputError
 from rangesfm.geometry.map_errors import Part, PointErrors

@@ -13,7 +13,7 @@ from pydantic import AliasChoices, Field
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
-from rangesfm.files.text_tables import Table, read_table, repeated
+from rangesfm.files.text_tables import TextTable, read_table, repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 
 CONTROL, CHECK = "control", "check"
@@ -120,7 +120,7 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
     return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
 
 
-def _distances(table: Table) -> tuple[TapedDistance, ...]:
+def _distances(table: TextTable) -> tuple[TapedDistance, ...]:
     if not len(table):
         raise InputError("holds no distance, expected one per line", table.path)
     starts, ends = table.text("from"), table.text("to")

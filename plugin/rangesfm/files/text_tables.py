@@ -71,7 +71,7 @@ class Categories:
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """The requested columns of a file, n rows.
 
     Attributes:
@@ -86,17 +86,17 @@ class Table:
     columns: tuple[str, ...]
     line: npt.NDArray[np.int64]
     cells: Mapping[str, list[str] | npt.NDArray[np.float64]]
-    reread: Callable[[], Table] | None = None
+    reread: Callable[[], TextTable] | None = None
 
     def __len__(self) -> int:
         return len(self.line)
 
-    def where(self, chosen: Sequence[bool]) -> Table:
+    def where(self, chosen: Sequence[bool]) -> TextTable:
         """Return the table with the rows that are true in ``chosen``; all cells must be text."""
         if all(chosen):
             return self
         cells = {name: [*compress(texts, chosen)] for name, texts in self.cells.items()}
-        return Table(self.path, self.columns, self.line[np.array(chosen)], cells)
+        return TextTable(self.path, self.columns, self.line[np.array(chosen)], cells)
 
     def __contains__(self, column: str) -> bool:
         return column in self.cells
@@ -187,7 +187,7 @@ def read_table(
     text: Sequence[str] = (),
     aliases: Mapping[str, str] | None = None,
     separator: str | None = ",",
-) -> Table:
+) -> TextTable:
     """Read the named columns of a file; other columns are ignored.
 
     Args:
@@ -226,7 +226,7 @@ def read_table(
     if rows is None or len(rows) != body.count("\n") + (not body.endswith("\n")):
         return reread()
     cells = {name: rows[f"f{k}"].tolist() if name in text else rows[f"f{k}"].copy() for name, k in wanted.items()}
-    return Table(path, tuple(names), header_line + 1 + np.arange(len(rows)), cells, reread)
+    return TextTable(path, tuple(names), header_line + 1 + np.arange(len(rows)), cells, reread)
 
 
 def _plain_rows(path: Path, num_skipped: int, types: list[str], separator: str) -> npt.NDArray[np.void] | None:
@@ -242,7 +242,7 @@ def _plain_rows(path: Path, num_skipped: int, types: list[str], separator: str) 
 
 def _table_of_texts(
     path: Path, names: list[str], wanted: Mapping[str, int], header_line: int, body: str, separator: str
-) -> Table:
+) -> TextTable:
     """Read all rows as text, with quoted cells, comments and blank lines."""
     lines: list[int] = []
     cells: dict[str, list[str]] = {name: [] for name in wanted}
@@ -256,7 +256,7 @@ def _table_of_texts(
         lines.append(line)
         for name, index in wanted.items():
             cells[name].append(found[index])
-    return Table(path, tuple(names), np.array(lines, dtype=np.int64), cells)
+    return TextTable(path, tuple(names), np.array(lines, dtype=np.int64), cells)
 
 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.text_tables import (
-    Table,
+    TextTable,
     has_columns,
     header_names,
     read_head,
@@ -191,7 +191,7 @@ def _are_numbers(cells: list[str]) -> bool:
         return False
 
 
-def _read_tum(path: Path) -> Table:
+def _read_tum(path: Path) -> TextTable:
     columns = ("timestamp_s", *POSITION_COLUMNS, *QUATERNION_COLUMNS)
     rows = [(line, text.split()) for line, text in enumerate(read_text(path).split("\n"), start=1)]
     rows = [(line, cells) for line, cells in rows if cells and not cells[0].startswith("#")]
@@ -202,10 +202,10 @@ def _read_tum(path: Path) -> Table:
             expected = f"{len(columns)} (timestamp tx ty tz qx qy qz qw, separated by blanks)"
             raise InputError(f"{len(cells)} numbers, expected {expected}", path, line)
     lines = np.array([line for line, _ in rows], dtype=np.int64)
-    return Table(path, columns, lines, {name: [cells[i] for _, cells in rows] for i, name in enumerate(columns)})
+    return TextTable(path, columns, lines, {name: [cells[i] for _, cells in rows] for i, name in enumerate(columns)})
 
 
-def _from_table(table: Table, key: str) -> Reference:
+def _from_table(table: TextTable, key: str) -> Reference:
     if len(table) == 0:
         raise InputError("no pose in the file, only its header row", table.path)
     positions = np.column_stack([table.numbers(column, bounds=COORDINATE_M) for column in POSITION_COLUMNS])
@@ -220,7 +220,7 @@ def _from_table(table: Table, key: str) -> Reference:
     return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns)
 
 
-def _rotations(table: Table) -> Array | None:
+def _rotations(table: TextTable) -> Array | None:
     missing = [column for column in QUATERNION_COLUMNS if column not in table]
     if len(missing) == len(QUATERNION_COLUMNS):
         return None

@@ -12,7 +12,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
 from rangesfm.files.atomic import path_of
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.option_model import Options, Told
+from rangesfm.option_model import KeyMeta, Options
 from rangesfm.options import LENGTH_M, RangeModelOptions, TagOptions, Uncertainty
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
@@ -42,17 +42,17 @@ def _corners(corners: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[tupl
 
 
 _Heights = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False), AfterValidator(ascending)]
-_HEIGHTS = Told(expected="a list of 2 numbers, the larger one last")
+_HEIGHTS = KeyMeta(expected="a list of 2 numbers, the larger one last")
 _Corners = Annotated[tuple[_Spot, ...], Field(strict=False), AfterValidator(_going_somewhere)]
 
 
 class PlannedAnchorOptions(Options, table="anchors"):
     """Planned anchors: their places in the site, in metres, z up."""
 
-    path: Annotated[Path | None, Told(role="file")] = None
+    path: Annotated[Path | None, KeyMeta(role="file")] = None
     """CSV file anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], each with a position."""
-    places: Annotated[dict[str, _Place], Told(expected="a table in which each value is a list of 3 numbers")] = Field(
-        default_factory=dict
+    places: Annotated[dict[str, _Place], KeyMeta(expected="a table in which each value is a list of 3 numbers")] = (
+        Field(default_factory=dict)
     )
     """Positions x, y, z by anchor id, instead of path."""
     frame: Literal["site", "first_camera", "unknown"] = "site"
@@ -63,12 +63,12 @@ class PlannedAnchorOptions(Options, table="anchors"):
     """Number of anchors to place where they help most, in the region or on the walls, instead of places and path."""
     region_m: Annotated[
         Annotated[tuple[_Place, _Place], Field(strict=False), AfterValidator(_corners)] | None,
-        Told(expected="two places, the second one in no coordinate smaller"),
+        KeyMeta(expected="two places, the second one in no coordinate smaller"),
     ] = None
     """Two opposite corners x, y, z of the box in which anchors may be placed."""
     walls_m: Annotated[
         Annotated[tuple[_Corners, ...], Field(strict=False)] | None,
-        Told(expected="a list of walls, each a list of 2 corners x, y or more"),
+        KeyMeta(expected="a list of walls, each a list of 2 corners x, y or more"),
     ] = None
     """Walls on which anchors may be placed instead, at heights_m: each a list of corners x, y as seen from above."""
     heights_m: Annotated[_Heights | None, _HEIGHTS] = None
@@ -79,12 +79,12 @@ class PlannedPathOptions(Options, table="path"):
     """Planned path of the camera: waypoints, a loop, a trajectory, or a model."""
 
     waypoints: Annotated[
-        Annotated[tuple[_Place, ...], Field(strict=False)] | None, Told(expected="a list of lists of 3 numbers")
+        Annotated[tuple[_Place, ...], Field(strict=False)] | None, KeyMeta(expected="a list of lists of 3 numbers")
     ] = None
     """Points x, y, z in the site that the camera passes; it looks ahead."""
     loop_inside_m: Annotated[
         Annotated[tuple[_Spot, ...], Field(strict=False, min_length=3)] | None,
-        Told(expected="a list of 3 corners x, y or more"),
+        KeyMeta(expected="a list of 3 corners x, y or more"),
     ] = None
     """Corners of a floor instead; a loop two thirds as wide is walked in it, up and down between heights_m."""
     heights_m: Annotated[_Heights, _HEIGHTS] = (1.2, 2.0)
@@ -93,9 +93,9 @@ class PlannedPathOptions(Options, table="path"):
     """Speed along the waypoints or the loop."""
     num_rounds: Annotated[int, Field(ge=1, le=1000)] = 1
     """Number of times that they are walked; each further round starts by going back to the first waypoint."""
-    file: Annotated[Path | None, Told(role="file")] = None
+    file: Annotated[Path | None, KeyMeta(role="file")] = None
     """A recorded trajectory instead, TUM or CSV, with rotations."""
-    model: Annotated[Path | None, Told(role="model")] = None
+    model: Annotated[Path | None, KeyMeta(role="model")] = None
     """A metric COLMAP model in the site's frame instead, its photos in the order of their names."""
     photo_rate_hz: Annotated[float, Field(ge=0.5, le=100)] = 2.0
     """Keyframes per second."""
@@ -116,7 +116,7 @@ class PlannedRadioOptions(RangeModelOptions, table="radio"):
     """Standard deviations of components of the range errors, named as in result.json (default: those of like)."""
 
 
-TABLES: dict[str, type[Options]] = {
+PLAN_TABLES: dict[str, type[Options]] = {
     "anchors": PlannedAnchorOptions,
     "path": PlannedPathOptions,
     "radio": PlannedRadioOptions,
@@ -135,10 +135,10 @@ def read_plan(path: str | Path) -> PlannedSurvey:
     tables, source = parse_toml(Path(path))
     folder = Path(path).absolute().parent
     with source.naming_lines():
-        refuse_unknown_tables(tables, TABLES)
+        refuse_unknown_tables(tables, PLAN_TABLES)
         options: dict[str, Any] = {
             name: model(**_absolute(tables.get(name, {}), model, folder))
-            for name, model in TABLES.items()
+            for name, model in PLAN_TABLES.items()
             if name != "photos" or name in tables
         }
         return _planned(**options)

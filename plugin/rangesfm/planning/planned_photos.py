@@ -18,7 +18,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.option_model import Options, Told
+from rangesfm.option_model import KeyMeta, Options
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.learned import LearnedErrors
@@ -61,7 +61,7 @@ class PlannedPhotos(Options, table="photos"):
     """Horizontal field of view."""
     seen_m: Annotated[
         Annotated[tuple[_Distance, _Distance], Field(strict=False), AfterValidator(ascending)],
-        Told(expected="a list of 2 distances, the larger one last"),
+        KeyMeta(expected="a list of 2 distances, the larger one last"),
     ] = (1.5, 8.0)
     """Distances of the nearest and the farthest points that the camera sees, in metres."""
     num_points: Annotated[int, Field(ge=8, le=100_000)] = 200

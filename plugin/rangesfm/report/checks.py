@@ -15,7 +15,7 @@ from rangesfm.result.summary import ResultSummary
 
 
 @dataclass(frozen=True)
-class Check:
+class QualityCheck:
     """One traffic light.
 
     Attributes:
@@ -83,7 +83,7 @@ class Check:
         return 100.0 if self.larger_is_better else 1.5 * self.amber_limit
 
 
-def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
+def quality_checks(summary: ResultSummary) -> tuple[QualityCheck, ...]:
     """Return the checks of a result, the most important one first."""
     scale, ranges, offset = summary.scale, summary.ranges, summary.time_offset
     uncertainty = _relative_percent(scale.larger_stddev, scale.value)
@@ -117,16 +117,18 @@ def quality_checks(summary: ResultSummary) -> tuple[Check, ...]:
     no_matter = does_not if offset.offset_matters is False else None
     checked_m, clocks_s = summary.check_ranges.rms_m, offset.stddev_s
     checks_of_ranges = (
-        Check("Anchor agreement", of_anchors, _anchor_spread_percent(scale), "%", 2.0, 5.0, 2),
-        Check("Check ranges", of_check_ranges, checked_m, "m", 0.20, 0.40, 3, key="check_ranges.rms_m"),
-        Check("Range residuals", of_ranges, ranges.rms_m, "m", 0.15, 0.30, 3, key="ranges.rms_m"),
-        Check("Ranges used", of_share, share_used, "%", 70.0, 40.0, 1, larger_is_better=True),
-        Check("Clock offset", of_clocks, clocks_s, "s", 0.02, 0.1, 4, key="time_offset.stddev_s", no_matter=no_matter),
+        QualityCheck("Anchor agreement", of_anchors, _anchor_spread_percent(scale), "%", 2.0, 5.0, 2),
+        QualityCheck("Check ranges", of_check_ranges, checked_m, "m", 0.20, 0.40, 3, key="check_ranges.rms_m"),
+        QualityCheck("Range residuals", of_ranges, ranges.rms_m, "m", 0.15, 0.30, 3, key="ranges.rms_m"),
+        QualityCheck("Ranges used", of_share, share_used, "%", 70.0, 40.0, 1, larger_is_better=True),
+        QualityCheck(
+            "Clock offset", of_clocks, clocks_s, "s", 0.02, 0.1, 4, key="time_offset.stddev_s", no_matter=no_matter
+        ),
     )
     return (
-        Check("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
+        QualityCheck("Scale uncertainty", of_scale, uncertainty, "%", 1.0, 5.0, 2),
         *(checks_of_ranges if summary.has_ranges else ()),
-        Check("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2, key="refine.reprojection_rms_px"),
+        QualityCheck("Reprojection", of_points, reprojection_px, "px", 1.0, 2.0, 2, key="refine.reprojection_rms_px"),
     )
 
 

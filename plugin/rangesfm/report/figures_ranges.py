@@ -7,7 +7,7 @@ import colorsys
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.ranging.errors.radio_calibration import Calibration
+from rangesfm.ranging.errors.radio_calibration import RadioCalibration
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
@@ -171,7 +171,7 @@ def plot_ranges(log: RangeLog) -> Figure:
     return figure_of("ranges", "", "Ranges over time", (label, "m"), series, y_range=y_range, size=_SIZE_ALONE)
 
 
-def plot_error_curve(calibration: Calibration) -> Figure:
+def plot_error_curve(calibration: RadioCalibration) -> Figure:
     """Return the figure of a radio's error curve with two stddevs on either side, and the errors it was learnt from."""
     curve = calibration.curve
     shown = 5 * calibration.noise_stddev_m

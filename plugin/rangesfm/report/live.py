@@ -13,7 +13,7 @@ from rangesfm.report.report_page import render, write_page
 from rangesfm.report.text import duration
 
 PAGE_NAME = "live.html"
-RELOAD_S = 2
+LIVE_RELOAD_S = 2
 _MIN_INTERVAL_S = 1.0
 
 
@@ -30,7 +30,7 @@ class LivePage:
         self._done: list[tuple[str, float]] = []
         self._counts: tuple[int, int | None] | None = None
         self._messages: list[str] = []
-        self._write("The run has begun.", reload=f"{RELOAD_S}")
+        self._write("The run has begun.", reload=f"{LIVE_RELOAD_S}")
 
     def stage(self, name: str) -> None:
         self._listener.stage(name)
@@ -66,7 +66,7 @@ class LivePage:
         self._stage = self._counts = None
 
     def _write_running(self) -> None:
-        self._write(f"Running for {duration(self._clock() - self._start)}.", reload=f"{RELOAD_S}")
+        self._write(f"Running for {duration(self._clock() - self._start)}.", reload=f"{LIVE_RELOAD_S}")
 
     def _write(self, headline: str, *, reload: str | None) -> None:
         self._last_written = self._clock()

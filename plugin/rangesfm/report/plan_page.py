@@ -18,7 +18,7 @@ from rangesfm.planning.survey_plan import SurveyPlan
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.report_page import Section, render, write_page
-from rangesfm.report.report_tables import Table
+from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, duration, fixed, percent, rough
 
 # From the smallest to the largest stddev; each colour is as visible on a light page as on a dark one.
@@ -151,7 +151,7 @@ def _stretches(line: Array, inside: Mask) -> Array:
     return np.where(kept[:, None], line, np.nan)
 
 
-def _advice(caption: str, ranked: Sequence[Advice]) -> Table:
+def _advice(caption: str, ranked: Sequence[Advice]) -> ReportTable:
     rows = [
         [f"{k}. {each.words}", percent(each.scale_stddev), rough(each.place_stddev_m, "m")]
         for k, each in enumerate(ranked, 1)
@@ -159,22 +159,22 @@ def _advice(caption: str, ranked: Sequence[Advice]) -> Table:
     columns = ["one change", "scale then ±", "that keyframe then ±"]
     if ranked and np.isnan(ranked[0].place_stddev_m):  # the first camera's frame has no place
         rows, columns = [row[:2] for row in rows], columns[:2]
-    return Table(caption, columns, rows, kind="settings")
+    return ReportTable(caption, columns, rows, kind="settings")
 
 
-def _components(plan: SurveyPlan) -> Table:
+def _components(plan: SurveyPlan) -> ReportTable:
     words = component_words(plan.components)
     largest = sorted(plan.components.items(), key=lambda item: -item[1])
     rows = [[words[name], percent(part)] for name, part in largest]
-    return Table("What makes the scale uncertain", ["", "of the scale"], rows, is_narrow=True)
+    return ReportTable("What makes the scale uncertain", ["", "of the scale"], rows, is_narrow=True)
 
 
-def _anchors(plan: SurveyPlan) -> Table:
+def _anchors(plan: SurveyPlan) -> ReportTable:
     rows = [[name, *(fixed(x, 2) for x in place)] for name, place in plan.anchors_m.items()]
-    return Table("Anchors", ["anchor", "x m", "y m", "z m"], rows, is_narrow=True)
+    return ReportTable("Anchors", ["anchor", "x m", "y m", "z m"], rows, is_narrow=True)
 
 
-def _mistakes(mistakes: Sequence[MistakeTest]) -> Table:
+def _mistakes(mistakes: Sequence[MistakeTest]) -> ReportTable:
     rows = [
         [
             f"{each.name} {each.subject}".strip(),
@@ -187,4 +187,4 @@ def _mistakes(mistakes: Sequence[MistakeTest]) -> Table:
     ]
     header = ["mistake", "found from", "", "would change the scale by", "places by"]
     note = "For each possible mistake: the smallest size that will be found, and how much that size changes at most."
-    return Table("Mistakes just too small to be found", header, rows, note)
+    return ReportTable("Mistakes just too small to be found", header, rows, note)

@@ -34,11 +34,11 @@ class Section(NamedTuple):
     id: str
     title: str
     figures: Sequence[Figure] = ()
-    tables: Sequence[report_tables.Table] = ()
+    tables: Sequence[report_tables.ReportTable] = ()
 
 
 # Sections of the report: title, and the functions that make its figures and tables.
-_SECTIONS: dict[str, tuple[Callable[[Content], Figure | report_tables.Table | None], ...]] = {
+_SECTIONS: dict[str, tuple[Callable[[Content], Figure | report_tables.ReportTable | None], ...]] = {
     "Path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale, report_tables.comparison),
     "Scale": (
         *(figures_scale.scale_per_anchor, figures_scale.consensus, figures_scale.clock_curve, figures_scale.candidates),
@@ -71,7 +71,9 @@ def sections_of(content: Content) -> list[Section]:
         made = [make(content) for make in makers]
         figures = [each for each in made if isinstance(each, Figure)]
         sections.append(
-            Section(title.lower(), title, figures, [each for each in made if isinstance(each, report_tables.Table)])
+            Section(
+                title.lower(), title, figures, [each for each in made if isinstance(each, report_tables.ReportTable)]
+            )
         )
     return sections
 

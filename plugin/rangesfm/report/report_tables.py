@@ -44,7 +44,7 @@ _REFINEMENT = {
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """A table of the page. The page leaves it out if it has no rows.
 
     Attributes:
@@ -64,14 +64,14 @@ class Table:
     is_narrow: bool = False
 
 
-def range_statuses(content: Content) -> Table:
+def range_statuses(content: Content) -> ReportTable:
     """Return the table of how many ranges of the log have each status."""
     statuses = Counter([] if content.ranges is None else content.ranges.status)
     rows = [[name, count(num), fixed(100.0 * num / statuses.total(), 1, "%")] for name, num in statuses.most_common()]
-    return Table("What became of the ranges", ["status", "ranges", "share"], rows)
+    return ReportTable("What became of the ranges", ["status", "ranges", "share"], rows)
 
 
-def ranges_per_anchor(content: Content) -> Table:
+def ranges_per_anchor(content: Content) -> ReportTable:
     """Return the table of each anchor's ranges: how many, and their residuals before and after the refinement."""
     ranges, rows = content.ranges, []
     for anchor_id in [] if ranges is None else in_natural_order(ranges.anchor_id):
@@ -85,10 +85,10 @@ def ranges_per_anchor(content: Content) -> Table:
             row += [fixed(rms(known), 3), fixed(median(known), 3)]
         rows.append(row)
     header = ["anchor", "ranges", "used", "scaled: RMS m", "median m", "refined: RMS m", "median m"]
-    return Table("Ranges of each anchor", header, rows)
+    return ReportTable("Ranges of each anchor", header, rows)
 
 
-def mistakes(content: Content) -> Table:
+def mistakes(content: Content) -> ReportTable:
     """Return the table of the tests of mistakes: which were made and found, and what the others may do.
 
     A bar that is half full is at the threshold of the test. Where several mistakes of one kind were not found, such as
@@ -115,7 +115,7 @@ def mistakes(content: Content) -> Table:
         unit = "fraction" if test.unit == "1" else test.unit
         verdict = "found" if test.rejected else unfound
         rows.append([mistake(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
-    return Table(
+    return ReportTable(
         "Mistakes that may have been made",
         ["mistake", "if it was made", "evidence", "", "unit", *numbers.values()],
         rows,
@@ -137,12 +137,12 @@ def _from_stddevs(tests: Sequence[MistakeEntry]) -> str:
     )
 
 
-def comparison(content: Content) -> Table:
+def comparison(content: Content) -> ReportTable:
     """Return the table of the comparison with the reference, which is the table of the 2018 paper."""
     columns = dict.fromkeys(("rmse_m", "rmse_se3_m", "rmse_sim3_m"), partial(fixed, decimals=4))
     columns["scale_error_percent"] = partial(signed, decimals=3)
     rows = [[row.name, *_cells(f"comparison.{i}", row, columns)] for i, row in enumerate(content.summary.comparison)]
-    return Table(
+    return ReportTable(
         "Keyframe centres against the reference",
         ["trajectory", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale error %"],
         rows,
@@ -151,13 +151,13 @@ def comparison(content: Content) -> Table:
     )
 
 
-def two_candidates(content: Content) -> Table:
+def two_candidates(content: Content) -> ReportTable:
     """Return the table of the paper's two branches of scale candidates, with mean and standard deviation."""
     given, rows = content.summary.scale.two_candidate, []
     for name in () if given is None else ("alpha0", "alpha1"):
         cells = _cells(f"scale.two_candidate.{name}", getattr(given, name), {"mean": plain, "std": plain})
         rows.append([name, *cells, "chosen" if given and given.chosen == name else ""])
-    return Table(
+    return ReportTable(
         "The paper's two candidates",
         ["branch", "mean", "stddev", ""],
         rows,
@@ -166,13 +166,13 @@ def two_candidates(content: Content) -> Table:
     )
 
 
-def anchors(content: Content) -> Table:
+def anchors(content: Content) -> ReportTable:
     """Return the table of the anchors: positions, their standard deviations, and range biases."""
     given = content.summary.anchors
     rows = [_anchor(anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given)]
     header = ["anchor", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
     note = "Δ: estimated minus surveyed position, for surveyed anchors. A stddev of 0: the position was held fixed."
-    return Table("Anchors in the map's frame", header, rows, note)
+    return ReportTable("Anchors in the map's frame", header, rows, note)
 
 
 def _anchor(anchor_id: str, anchor: AnchorEntry) -> list[str]:
@@ -189,7 +189,7 @@ def _anchor(anchor_id: str, anchor: AnchorEntry) -> list[str]:
     ]
 
 
-def distances(content: Content) -> Table:
+def distances(content: Content) -> ReportTable:
     """Return the table of taped distances: those that helped to fix the scale (control) and those that check it."""
     columns = dict.fromkeys(("measured_m", "stddev_m", "estimated_m"), partial(fixed, decimals=4))
     columns["residual_m"] = partial(signed, decimals=4)
@@ -198,10 +198,10 @@ def distances(content: Content) -> Table:
         for i, row in enumerate(content.summary.distances)
     ]
     header = ["distance", "kind", "by tape m", "stddev m", "in the map m", "difference m"]
-    return Table("Control and check distances", header, rows)
+    return ReportTable("Control and check distances", header, rows)
 
 
-def intrinsics(content: Content) -> Table:
+def intrinsics(content: Content) -> ReportTable:
     """Return the table of the cameras' intrinsics before the refinement and, if there was one, after it."""
     header = ["camera", "parameter", "scaled", "refined", "change"]
     num_columns = 3 if content.refined is None else 5
@@ -210,28 +210,28 @@ def intrinsics(content: Content) -> Table:
         for camera in content.cameras
         for name, before, after in camera.parameters
     ]
-    return Table("Cameras", header[:num_columns], rows)
+    return ReportTable("Cameras", header[:num_columns], rows)
 
 
-def inputs(content: Content) -> Table:
+def inputs(content: Content) -> ReportTable:
     """Return the table of the files from which the result was made."""
     rows = [
         [entry.path, *_cells(f"inputs.{i}", entry, {"bytes": count}), entry.sha256, entry.hashed]
         for i, entry in enumerate(content.summary.inputs)
     ]
-    return Table("Inputs", ["file", "bytes", "SHA-256", "of"], rows, kind="settings")
+    return ReportTable("Inputs", ["file", "bytes", "SHA-256", "of"], rows, kind="settings")
 
 
-def stages(content: Content) -> Table:
+def stages(content: Content) -> ReportTable:
     """Return the table of the time that each stage took."""
     known = {name: s for name, s in content.summary.seconds.items() if s is not None and name != "total"}
     longest = max(known.values(), default=0.0) or 1.0
     bar = Markup('<i class="bar" style="width:{:.1f}%"></i>')
     rows = [[name.replace("_", " "), duration(s), bar.format(100.0 * s / longest)] for name, s in known.items()]
-    return Table("Time", ["stage", "time", ""], rows, kind="stages", is_narrow=True)
+    return ReportTable("Time", ["stage", "time", ""], rows, kind="stages", is_narrow=True)
 
 
-def refinement(content: Content) -> Table:
+def refinement(content: Content) -> ReportTable:
     """Return the table of what the refinement did."""
     refine = content.summary.refine
     values = {} if refine is None else refine.to_json()
@@ -240,18 +240,18 @@ def refinement(content: Content) -> Table:
         for name, value in values.items()
         if value not in (None, "", {})
     ]
-    return Table("Refinement", [], rows, is_narrow=True)
+    return ReportTable("Refinement", [], rows, is_narrow=True)
 
 
-def error_budget(content: Content) -> Table:
+def error_budget(content: Content) -> ReportTable:
     """Return the table of the components of the scale's standard deviation, the largest first."""
     parts = content.summary.scale.relative_stddev.components
     words = component_words(parts)
     rows = [[words[name], f"{100 * stddev:.2f}"] for name, stddev in sorted(parts.items(), key=lambda part: -part[1])]
-    return Table("Components of the scale's stddev", ["errors", "stddev %"], rows, is_narrow=True)
+    return ReportTable("Components of the scale's stddev", ["errors", "stddev %"], rows, is_narrow=True)
 
 
-def sensitivity(content: Content) -> Table:
+def sensitivity(content: Content) -> ReportTable:
     """Return the table of how much the scale would change, in percent, if ranges or lever arm were longer."""
     given = content.summary.scale.sensitivity
     percents = {
@@ -263,30 +263,32 @@ def sensitivity(content: Content) -> Table:
     }
     rows = [[what, signed(percent, 3)] for what, percent in percents.items() if content.summary.has_ranges]
     title = "Change of the scale if a length were longer than assumed"
-    return Table(title, ["longer by", "scale %"], rows, is_narrow=True)
+    return ReportTable(title, ["longer by", "scale %"], rows, is_narrow=True)
 
 
-def scale_by_kind(content: Content) -> Table:
+def scale_by_kind(content: Content) -> ReportTable:
     """Return the table of the scale from ranges alone and from measured lengths alone."""
     columns = dict.fromkeys(("value", "stddev"), plain)
     rows = [
         [f"{kind} alone", *_cells(f"scale.by_kind.{kind}", entry, columns)]
         for kind, entry in content.summary.scale.by_kind.items()
     ]
-    return Table("The scale from each kind of measurement", ["from", "metres per unit", "stddev"], rows, is_narrow=True)
+    return ReportTable(
+        "The scale from each kind of measurement", ["from", "metres per unit", "stddev"], rows, is_narrow=True
+    )
 
 
-def versions(content: Content) -> Table:
+def versions(content: Content) -> ReportTable:
     """Return the table of the versions of the software."""
-    return Table("Versions", [], [*map(list, content.summary.versions.items())], is_narrow=True)
+    return ReportTable("Versions", [], [*map(list, content.summary.versions.items())], is_narrow=True)
 
 
-def settings(content: Content) -> Table:
+def settings(content: Content) -> ReportTable:
     """Return the table of the settings of the run, with the meaning of each key."""
     given = content.summary.settings.to_json()
     known = [item for item in KEYS if (given.get(item.table) or {}).get(item.name) not in (None, [], {})]
     rows = [[item.meaning, plain(given[item.table][item.name]), f"[{item.table}] {item.name}"] for item in known]
-    return Table("Settings", ["meaning", "value", "key of the survey file"], rows, kind="settings")
+    return ReportTable("Settings", ["meaning", "value", "key of the survey file"], rows, kind="settings")
 
 
 def _cells(key: str, entry: object, columns: _Columns) -> list[str]:

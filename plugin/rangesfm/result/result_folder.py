@@ -23,7 +23,7 @@ from rangesfm.options import ExportOptions
 from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME, read_map_errors, write_map_errors
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.places import input_beside, path_in
-from rangesfm.result.result_tables import TABLES, PhotoTimes, TableFile
+from rangesfm.result.result_tables import RESULT_TABLES, PhotoTimes, TableFile
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.steps import RECONSTRUCTION_NAMES
@@ -38,7 +38,7 @@ REFERENCE_NAME = "reference.csv"
 MODEL_NAMES = ("sparse_scaled", "sparse_metric")
 RESULT_FILES = (
     *(ResultSummary.NAME, REPORT_NAME, REFERENCE_NAME, JOINT_COVARIANCE_NAME),
-    *(table.NAME for table in TABLES),
+    *(table.NAME for table in RESULT_TABLES),
 )
 RESULT_NAMES = (*RESULT_FILES, *MODEL_NAMES)
 """Names of all files and folders of a result. The first one is written last: where it is there, the result is whole."""
@@ -134,7 +134,7 @@ def write_models_and_tables(
     write_model(found.scaled, folder / "sparse_scaled" / "0")
     if found.refined is not None:
         write_model(found.final, folder / "sparse_metric" / "0")
-    for kind in TABLES:
+    for kind in RESULT_TABLES:
         table = kind.of(found)
         if table is not None:
             table.write(folder)
@@ -207,7 +207,7 @@ class ResultFolder:
         return np.array(arms, dtype=np.float64).reshape(-1, 3)
 
     def read(self, table: type[_Table]) -> _Table | None:
-        """Read one of ``TABLES``; None if its file is not there."""
+        """Read one of ``RESULT_TABLES``; None if its file is not there."""
         return table.read(self.path)
 
     def read_map_errors(self) -> MapErrors | None:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.files.text_tables import Table, read_table, write_table
+from rangesfm.files.text_tables import TextTable, read_table, write_table
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
 
@@ -22,7 +22,7 @@ _TEXT = "s"
 USED_LABELS = [status.label for status in USED]
 
 
-class Column(NamedTuple):
+class ColumnFormat(NamedTuple):
     """Format of a column.
 
     Attributes:
@@ -35,13 +35,13 @@ class Column(NamedTuple):
     may_be_empty: bool = False
 
 
-Texts = Annotated[tuple[str, ...], Column(_TEXT)]
-TextsOrEmpty = Annotated[tuple[str, ...], Column(_TEXT, may_be_empty=True)]
-Numbers = Annotated[Array, Column("")]
-NumbersOrEmpty = Annotated[Array, Column("", may_be_empty=True)]
-Rounded = Annotated[Array, Column(".6g")]
-RoundedOrEmpty = Annotated[Array, Column(".6g", may_be_empty=True)]
-_Covariance = Annotated[Array, Column(".9g")]
+Texts = Annotated[tuple[str, ...], ColumnFormat(_TEXT)]
+TextsOrEmpty = Annotated[tuple[str, ...], ColumnFormat(_TEXT, may_be_empty=True)]
+Numbers = Annotated[Array, ColumnFormat("")]
+NumbersOrEmpty = Annotated[Array, ColumnFormat("", may_be_empty=True)]
+Rounded = Annotated[Array, ColumnFormat(".6g")]
+RoundedOrEmpty = Annotated[Array, ColumnFormat(".6g", may_be_empty=True)]
+_Covariance = Annotated[Array, ColumnFormat(".9g")]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class TableFile(ABC):
         """Return the table of what a run found; None where the run does not write this file."""
 
     @classmethod
-    def columns(cls) -> dict[str, Column]:
+    def columns(cls) -> dict[str, ColumnFormat]:
         """Return the columns by name, in their order."""
         hints = get_type_hints(cls, include_extras=True)
         return {field.name: hints[field.name].__metadata__[0] for field in fields(cls)}
@@ -88,7 +88,7 @@ def _cells(values: Any, format_spec: str) -> Iterable[str]:
     return (f"{value:{format_spec}}" if math.isfinite(value) else "" for value in values.tolist())
 
 
-def _values(table: Table, name: str, column: Column) -> Any:
+def _values(table: TextTable, name: str, column: ColumnFormat) -> Any:
     if column.format_spec == _TEXT:
         return tuple(table.text(name, empty="" if column.may_be_empty else None))
     return table.numbers(name, empty=np.nan if column.may_be_empty else None)
@@ -284,7 +284,7 @@ class ScaleConsensus(TableFile):
 
     NAME: ClassVar = "scale_consensus.csv"
     scale: Rounded
-    num_agreeing: Annotated[Array, Column(".0f")]
+    num_agreeing: Annotated[Array, ColumnFormat(".0f")]
 
     @classmethod
     def of(cls, found: MetricResult) -> ScaleConsensus | None:
@@ -308,4 +308,4 @@ class TimeOffsetCurve(TableFile):
 
 
 _OF_A_RUN = (RangesAsUsed, PhotoTimes, CenterCovariances, ScaleCandidates, ScaleConsensus, TimeOffsetCurve, TagCorners)
-TABLES: tuple[type[TableFile], ...] = _OF_A_RUN
+RESULT_TABLES: tuple[type[TableFile], ...] = _OF_A_RUN

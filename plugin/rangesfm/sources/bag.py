@@ -20,7 +20,7 @@ from scipy.ndimage import convolve
 from rangesfm.colmap.calibrated_cameras import colmap_camera
 from rangesfm.errors import InputError
 from rangesfm.files.bags import messages_of, open_bag, stamp_s, type_name
-from rangesfm.sources.source import MAX_SIDE_PX, Frame, Source
+from rangesfm.sources.source import MAX_SIDE_PX, Frame, PhotoSource
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -39,7 +39,7 @@ def has_images(path: Path) -> bool:
     return False
 
 
-def open_images(path: Path, topic: str | None) -> Source:
+def open_images(path: Path, topic: str | None) -> PhotoSource:
     """Open the images of a bag as a source of photos.
 
     Args:
@@ -64,7 +64,7 @@ def open_images(path: Path, topic: str | None) -> Source:
     clock = "the stamps of their headers" if is_stamped else "times of arrival, because their headers have no stamps"
     what = f"{num_by_topic[topic]} images of {topic}, {size_px[0]} x {size_px[1]} pixels"
     frames = partial(_frames, path, topic, is_stamped)
-    return Source(what, size_px, duration_s, num_by_topic[topic], clock, frames, camera, notes)
+    return PhotoSource(what, size_px, duration_s, num_by_topic[topic], clock, frames, camera, notes)
 
 
 def _num_by_topic(bag: AnyReader) -> dict[str, int]:

@@ -13,7 +13,7 @@ from rangesfm.files.contents import state_and_sha256
 from rangesfm.files.records import Record
 from rangesfm.files.text_tables import write_table
 from rangesfm.progress import Progress
-from rangesfm.sources.source import Frame, Source, open_source
+from rangesfm.sources.source import Frame, PhotoSource, open_source
 
 TIMES_NAME = "images.csv"
 RECORD_NAME = "photos.json"
@@ -118,7 +118,7 @@ def _with_intervals(frames: Iterable[Frame], rate_hz: float) -> Iterator[tuple[i
             yield math.floor((last_s - first_s) * rate_hz + _ROUNDING), frame
 
 
-def _write(source: Source, folder: Path, rate_hz: float, progress: Progress) -> tuple[dict[str, float], int]:
+def _write(source: PhotoSource, folder: Path, rate_hz: float, progress: Progress) -> tuple[dict[str, float], int]:
     """Write the photos and the table of their times; return times (seconds) by name, and the bytes of all photos."""
     times_s: dict[str, float] = {}
     num_expected, num_bytes = source.num_photos(rate_hz), 0

@@ -46,7 +46,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Source:
+class PhotoSource:
     """A video, or the images of a bag.
 
     Attributes:
@@ -84,7 +84,7 @@ def is_source(path: Path) -> bool:
     return is_video(path) or is_bag(path)
 
 
-def open_source(path: Path, topic: str | None) -> Source:
+def open_source(path: Path, topic: str | None) -> PhotoSource:
     """Open a video or a bag and read all that is known before its frames are decoded.
 
     Args:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from PIL import Image
 
 from rangesfm.errors import InputError
-from rangesfm.sources.source import Frame, Source
+from rangesfm.sources.source import Frame, PhotoSource
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -26,7 +26,7 @@ _CREATION_KEYS = ("com.apple.quicktime.creationdate", "creation_time")
 _CREATION_FORMS = ("%Y-%m-%dT%H:%M:%S%z", "%Y-%m-%dT%H:%M:%S.%f%z")
 
 
-def open_video(path: Path) -> Source:
+def open_video(path: Path) -> PhotoSource:
     """Open a video as a source of photos. The photos are turned as players turn the video.
 
     Raises:
@@ -51,7 +51,7 @@ def open_video(path: Path) -> Source:
             "and with some cameras it is local time, or the end of the video"
         )
     turned = "the photos are turned as players show the video; the lever arm refers to the turned photos"
-    return Source(
+    return PhotoSource(
         what=f"video, {size_px[0]} x {size_px[1]} pixels, {duration_s:.1f} s",
         size_px=size_px,
         duration_s=duration_s,

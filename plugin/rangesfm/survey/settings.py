@@ -42,7 +42,7 @@ _INSTEAD_OF = {"tag.tag_in_cam_m": "lever_arms_m", "tag.lever_arms_m": "tag_in_c
 
 
 @dataclass(frozen=True)
-class Source:
+class OptionsOrigin:
     """Origin of options, for messages. Any two are equal, so that surveys are compared without it.
 
     Attributes:
@@ -86,7 +86,7 @@ class Source:
         return None
 
 
-def parse_toml(path: Path) -> tuple[dict[str, Any], Source]:
+def parse_toml(path: Path) -> tuple[dict[str, Any], OptionsOrigin]:
     """Read a TOML file.
 
     Raises:
@@ -96,7 +96,7 @@ def parse_toml(path: Path) -> tuple[dict[str, Any], Source]:
 
     text = read_text(path)
     try:
-        return tomllib.loads(text), Source(path, text)
+        return tomllib.loads(text), OptionsOrigin(path, text)
     except RecursionError:
         raise InputError("not a TOML file (nested too deeply)", path) from None
     except ValueError as error:  # a TOMLDecodeError, or a number that Python refuses to read
@@ -141,7 +141,7 @@ class Survey(BaseModel):
     export: ExportOptions = ExportOptions()
     report: ReportOptions = ReportOptions()
     output: OutputOptions = OutputOptions()
-    source: Source = Field(default=Source(), exclude=True, repr=False)
+    source: OptionsOrigin = Field(default=OptionsOrigin(), exclude=True, repr=False)
 
     def changed(self, values: Mapping[str, Any]) -> Survey:
         """Return a copy with other values by dotted key, such as ``{"scale.method": "robust"}``.
@@ -233,14 +233,16 @@ class InputPath:
     path: Path
 
 
-TABLES: dict[str, type[Options]] = {
+SURVEY_TABLES: dict[str, type[Options]] = {
     name: field.annotation
     for name, field in Survey.model_fields.items()
     if isinstance(field.annotation, type) and issubclass(field.annotation, Options)
 }
 # Paths come first in each table; pydantic lists the keys of a base class before those of the table itself.
 KEYS = tuple(
-    item for model in TABLES.values() for item in sorted(model.keys().values(), key=lambda item: item.role is None)
+    item
+    for model in SURVEY_TABLES.values()
+    for item in sorted(model.keys().values(), key=lambda item: item.role is None)
 )
 _ROLE_OF_PATH: dict[str, PathRole] = {item.dotted: item.role for item in KEYS if item.role is not None}
 
@@ -274,15 +276,15 @@ def survey_from_tables(
     tables: Mapping[str, Any],
     base_folder: str | Path,
     overrides: Mapping[str, object] | None = None,
-    source: Source | None = None,
+    source: OptionsOrigin | None = None,
 ) -> Survey:
     """Make a survey from tables in memory, otherwise as ``read_survey``; ``source`` names the file for messages."""
     folder, overrides = Path(base_folder).absolute(), overrides or {}
-    source = replace(source or Source(), overridden=tuple(overrides))
+    source = replace(source or OptionsOrigin(), overridden=tuple(overrides))
     with source.naming_lines():
         tables, other_cameras = _with_one_camera(tables)
-        refuse_unknown_tables(tables, TABLES)
-        given: dict[str, dict[Any, Any]] = {name: dict(tables.get(name, {})) for name in TABLES}
+        refuse_unknown_tables(tables, SURVEY_TABLES)
+        given: dict[str, dict[Any, Any]] = {name: dict(tables.get(name, {})) for name in SURVEY_TABLES}
         given["output"].setdefault("path", "out")
         for dotted_key in _ROLE_OF_PATH:
             table, _, name = dotted_key.partition(".")
@@ -293,7 +295,7 @@ def survey_from_tables(
             given[table].pop(_INSTEAD_OF.get(dotted_key), None)
             given[table][name] = _absolute(value, Path.cwd()) if dotted_key in _ROLE_OF_PATH else value
         given["camera"] |= {"others": other_cameras} if other_cameras else {}
-        options: dict[str, Any] = {name: model(**given[name]) for name, model in TABLES.items()}
+        options: dict[str, Any] = {name: model(**given[name]) for name, model in SURVEY_TABLES.items()}
         survey = Survey(**options, source=source)
         _require_files(survey)
     return survey

@@ -20,7 +20,7 @@ _COLMAP_LINE = re.compile(r"\d+ ([A-Z][A-Z0-9_]+) (\d+) (\d+)((?: [-+.\deE]+)+)"
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CameraCalibration:
     """One calibrated camera in COLMAP's conventions.
 
     Attributes:
@@ -36,7 +36,7 @@ class Calibration:
     tag_in_cam_m: tuple[float, float, float] | None = None
 
 
-def read_calibrations(path: Path) -> tuple[Calibration, ...]:
+def read_calibrations(path: Path) -> tuple[CameraCalibration, ...]:
     """Read the cameras of a file; none if the file is not a calibration.
 
     Raises:
@@ -49,15 +49,15 @@ def read_calibrations(path: Path) -> tuple[Calibration, ...]:
         raise InputError(f"the calibration of a camera is not complete ({what})", path) from None
 
 
-def _read_colmap(path: Path) -> Iterator[Calibration]:
+def _read_colmap(path: Path) -> Iterator[CameraCalibration]:
     lines = [" ".join(line.split()) for line in read_head(path).split("\n")]
     found = [_COLMAP_LINE.fullmatch(line) for line in lines if line and not line.startswith("#")]
     for match in found if all(found) else ():
         assert match is not None
-        yield Calibration(match[1], tuple(map(float, match[4].split())), (int(match[2]), int(match[3])))
+        yield CameraCalibration(match[1], tuple(map(float, match[4].split())), (int(match[2]), int(match[3])))
 
 
-def _read_json(path: Path) -> Iterator[Calibration]:
+def _read_json(path: Path) -> Iterator[CameraCalibration]:
     try:
         camera = json.loads(read_head(path))
     except (ValueError, RecursionError):
@@ -66,10 +66,10 @@ def _read_json(path: Path) -> Iterator[Calibration]:
         size_px = (int(camera["width"]), int(camera["height"])) if "width" in camera else None
         arm = camera.get("tag_in_cam_m")
         tag_in_cam_m = None if arm is None else (float(arm[0]), float(arm[1]), float(arm[2]))
-        yield Calibration(camera["camera_model"], tuple(map(float, camera["params"])), size_px, tag_in_cam_m)
+        yield CameraCalibration(camera["camera_model"], tuple(map(float, camera["params"])), size_px, tag_in_cam_m)
 
 
-def _read_yaml(path: Path) -> Iterator[Calibration]:
+def _read_yaml(path: Path) -> Iterator[CameraCalibration]:
     try:
         content = YAML(typ="safe", pure=True).load(read_head(path))
     except (YAMLError, ValueError, RecursionError):
@@ -86,16 +86,16 @@ def _read_yaml(path: Path) -> Iterator[Calibration]:
             yield _of_kalibr(path, camera)
 
 
-def _of_kalibr(path: Path, camera: Mapping[str, Any]) -> Calibration:
+def _of_kalibr(path: Path, camera: Mapping[str, Any]) -> CameraCalibration:
     if camera["camera_model"] != "pinhole":
         raise InputError(f"camera_model is '{camera['camera_model']}', expected pinhole: COLMAP has no other", path)
     model = camera.get("distortion_model", "none")
     return _of_opencv(path, model, camera["intrinsics"], camera.get("distortion_coeffs", ()), camera["resolution"])
 
 
-def _of_opencv(path: Path, distortion: str, pinhole: Any, coefficients: Any, size: Any) -> Calibration:
+def _of_opencv(path: Path, distortion: str, pinhole: Any, coefficients: Any, size: Any) -> CameraCalibration:
     model, params = colmap_camera(distortion, pinhole, coefficients, path)
-    return Calibration(model, params, (int(size[0]), int(size[1])))
+    return CameraCalibration(model, params, (int(size[0]), int(size[1])))
 
 
 _READERS = {".txt": _read_colmap, ".json": _read_json, ".yaml": _read_yaml, ".yml": _read_yaml}

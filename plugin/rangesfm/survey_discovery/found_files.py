@@ -19,7 +19,7 @@ from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.sources.bag import has_images
 from rangesfm.sources.source import is_video
-from rangesfm.survey_discovery.calibration_files import Calibration, read_calibrations
+from rangesfm.survey_discovery.calibration_files import CameraCalibration, read_calibrations
 from rangesfm.vision.image_times import IMAGE_EXTENSIONS, is_image_times_file
 from rangesfm.vision.photo_files import MIN_NUM_PHOTOS
 
@@ -54,7 +54,7 @@ class Found:
     """
 
     paths: dict[str, list[Path]]
-    calibrations: dict[Path, tuple[Calibration, ...]]
+    calibrations: dict[Path, tuple[CameraCalibration, ...]]
     models: tuple[Path, ...]
     notes: tuple[str, ...]
 
@@ -66,7 +66,7 @@ def look_into(folders: Sequence[Path]) -> Found:
         InputError: a path is not a folder.
     """
     paths: dict[str, list[Path]] = defaultdict(list)
-    calibrations: dict[Path, tuple[Calibration, ...]] = {}
+    calibrations: dict[Path, tuple[CameraCalibration, ...]] = {}
     models: list[Path] = []
     notes: list[str] = []
     unsure: list[str] = []

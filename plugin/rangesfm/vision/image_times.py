@@ -17,7 +17,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
 from rangesfm.files.folders import walk
-from rangesfm.files.text_tables import Table, has_columns, read_table
+from rangesfm.files.text_tables import TextTable, has_columns, read_table
 from rangesfm.options import TIME_S
 from rangesfm.vision.photo_files import exif_tags
 
@@ -230,7 +230,7 @@ def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: s
 
 
 def _refuse_repetitions(
-    table: Table, image_names: Sequence[str], times: Sequence[float], frame_of: Mapping[str, str]
+    table: TextTable, image_names: Sequence[str], times: Sequence[float], frame_of: Mapping[str, str]
 ) -> None:
     row_of_name: dict[str, int] = {}
     row_of_time: dict[float, int] = {}

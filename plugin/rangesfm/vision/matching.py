@@ -25,7 +25,7 @@ from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.device import refuse_missing_gpu, uses_gpu
 from rangesfm.vision.features import refuse_learned
 from rangesfm.vision.own_process import MODULE, MatchingShare
-from rangesfm.vision.pairs import NamedPairs, Pairing, pairing_options, pairs_to_match
+from rangesfm.vision.pairs import NamedPairs, PairingOptions, pairing_options, pairs_to_match
 from rangesfm.vision.photo_files import Photos
 
 _MIN_NUM_PAIRS = 100  # with fewer pairs, a second process is not worth its start
@@ -51,7 +51,7 @@ class MatchingOptions:
         num_processes: processes that match at the same time.
     """
 
-    pairing: Pairing | NamedPairs
+    pairing: PairingOptions | NamedPairs
     matcher: pycolmap.FeatureMatchingOptions
     verification: pycolmap.TwoViewGeometryOptions
     verifier: pycolmap.GeometricVerifierOptions

@@ -17,7 +17,7 @@ from rangesfm.vision.photo_files import Photos
 
 _MAX_NUM_EXHAUSTIVE = 60  # photos, which make 1770 pairs; with more photos the number of pairs grows too large
 
-Pairing = (
+PairingOptions = (
     pycolmap.ExhaustivePairingOptions
     | pycolmap.SequentialPairingOptions
     | pycolmap.SpatialPairingOptions
@@ -26,7 +26,7 @@ Pairing = (
 NamedPairs = tuple[tuple[str, str], ...]
 
 
-def pairing_options(mapper: MapperOptions, num_photos: int) -> Pairing | NamedPairs:
+def pairing_options(mapper: MapperOptions, num_photos: int) -> PairingOptions | NamedPairs:
     """Return COLMAP's options for pairing, whose type is the way of pairing, or the pairs of a list by name.
 
     Raises:
@@ -37,7 +37,7 @@ def pairing_options(mapper: MapperOptions, num_photos: int) -> Pairing | NamedPa
     way = mapper.matching
     if way == "auto":
         way = "exhaustive" if num_photos <= _MAX_NUM_EXHAUSTIVE else "sequential"
-    ways: dict[str, Pairing] = {
+    ways: dict[str, PairingOptions] = {
         "exhaustive": pycolmap.ExhaustivePairingOptions(),
         "sequential": pycolmap.SequentialPairingOptions(),
         "spatial": pycolmap.SpatialPairingOptions(),
@@ -71,7 +71,7 @@ def read_pairs(path: Path) -> NamedPairs:
     return tuple(pairs)
 
 
-def pairs_to_match(database_path: Path, photos: Photos, pairing: Pairing | NamedPairs) -> list[tuple[int, int]]:
+def pairs_to_match(database_path: Path, photos: Photos, pairing: PairingOptions | NamedPairs) -> list[tuple[int, int]]:
     """Return the ids of all pairs to be matched, sorted, smaller id first.
 
     Pairing by similarity needs the features in the database, and pairing by position the photos' positions.
@@ -81,7 +81,7 @@ def pairs_to_match(database_path: Path, photos: Photos, pairing: Pairing | Named
     """
     if isinstance(pairing, tuple):
         return _pairs_of_names(photos.names, pairing)
-    generators: dict[type[Pairing], Callable[..., Any]] = {
+    generators: dict[type[PairingOptions], Callable[..., Any]] = {
         pycolmap.ExhaustivePairingOptions: pycolmap.ExhaustivePairGenerator,
         pycolmap.SequentialPairingOptions: pycolmap.SequentialPairGenerator,
         pycolmap.SpatialPairingOptions: pycolmap.SpatialPairGenerator,

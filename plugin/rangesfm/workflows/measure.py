@@ -13,13 +13,13 @@ from rangesfm.arrays import Array
 from rangesfm.distances.map_points import MapPoint, MapPoints
 from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
 from rangesfm.errors import InputError
-from rangesfm.files.tables import align_rows, read_table, write_table
+from rangesfm.files.text_tables import align_rows, read_table, write_table
 from rangesfm.geometry.gravity import UP_IN_SITE, gravity_of
 from rangesfm.geometry.map_errors import MapErrors
-from rangesfm.result.folder import ResultFolder, read_result_folder
 from rangesfm.result.places import input_beside
-from rangesfm.result.tables import TagCorners
-from rangesfm.scale.estimate import NORMAL_95
+from rangesfm.result.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.result_tables import TagCorners
+from rangesfm.scale.scale_estimate import NORMAL_95
 
 PAIR_COLUMNS = ("from", "to")
 Interval = tuple[float, float]

@@ -8,7 +8,7 @@ import pytest
 
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.radio_calibration import Calibration, calibrate_ranges
+from rangesfm.ranging.errors.radio_calibration import RadioCalibration, calibrate_ranges
 from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
@@ -94,7 +94,7 @@ def test_what_cannot_be_learnt_is_refused() -> None:
 
 def test_the_curve_takes_out_what_it_was_learnt_from() -> None:
     log, tags = simulated(short_at_short_range, seed=3)
-    calibration: Calibration = calibrate_ranges(log, tags, ANCHORS)
+    calibration: RadioCalibration = calibrate_ranges(log, tags, ANCHORS)
     distance, _ = calibration.curve.true_distance(log.range_m)
     short = calibration.distance_m < 2.0
     before = log.range_m - calibration.distance_m

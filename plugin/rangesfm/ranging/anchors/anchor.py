@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import Table, read_table, repeated, write_user_table
+from rangesfm.files.text_tables import TextTable, read_table, repeated, write_user_table
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 
 _COORDINATES = ("x_m", "y_m", "z_m")
@@ -120,7 +120,7 @@ def default_anchor_frame(anchors: Sequence[Anchor]) -> str:
     return "site" if any(anchor.position_m is not None for anchor in anchors) else "unknown"
 
 
-def _positions(table: Table) -> Array:
+def _positions(table: TextTable) -> Array:
     """Return the positions (n, 3) in metres, with NaN for a row in which all three cells are empty."""
     positions = np.column_stack([table.numbers(name, empty=np.nan, bounds=COORDINATE_M) for name in _COORDINATES])
     unknown = np.isnan(positions)

@@ -55,7 +55,7 @@ class Bursts(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Pairing:
+class BurstPairing:
     """Assignment of bursts to photos, and how well the ranges then fit the path.
 
     Attributes:
@@ -77,7 +77,7 @@ class Pairing:
         """Return whether there are enough medians, and the path explains them better than no motion at all."""
         return self.num_spare >= _MIN_NUM_SPARE and self.chance < _MAX_CHANCE
 
-    def log_odds(self, rival: Pairing) -> float:
+    def log_odds(self, rival: BurstPairing) -> float:
         """Return the logarithm of the likelihood ratio to a rival; infinite if the rival has too few medians."""
         if rival.num_spare < _MIN_NUM_SPARE:
             return np.inf
@@ -104,7 +104,7 @@ def find_bursts(ranges: TimedRanges, photo_times_s: Array) -> Bursts | None:
     return Bursts(ranges.times_s[starts], ranges.times_s[ends - 1], ends - starts, medians, anchor, tag)
 
 
-def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) -> list[Pairing]:
+def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) -> list[BurstPairing]:
     """Return all assignments of bursts to photos that pair most of them, the best first.
 
     Args:
@@ -122,7 +122,7 @@ def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) ->
     return sorted(pairings, key=lambda pairing: (pairing.num_spare < _MIN_NUM_SPARE, pairing.variance))
 
 
-def offsets_that_keep(pairing: Pairing, bursts: Bursts, trajectory: Trajectory) -> tuple[float, float]:
+def offsets_that_keep(pairing: BurstPairing, bursts: Bursts, trajectory: Trajectory) -> tuple[float, float]:
     """Return the smallest and the largest offset at which every burst is nearest to its photo.
 
     If there is no such offset, the first is larger than the second.
@@ -138,7 +138,7 @@ def offsets_that_keep(pairing: Pairing, bursts: Bursts, trajectory: Trajectory) 
     )
 
 
-def curve_of(pairings: list[Pairing], bursts: Bursts, trajectory: Trajectory) -> CostCurve:
+def curve_of(pairings: list[BurstPairing], bursts: Bursts, trajectory: Trajectory) -> CostCurve:
     """Return the cost curve of all pairings; the cost is constant while the bursts stay nearest to their photos."""
     points: list[tuple[float, float]] = []
     for pairing in pairings:
@@ -162,7 +162,7 @@ def _offsets(burst_times: Array, photo_times: Array, reach_s: float) -> list[flo
     return offsets
 
 
-def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: Indices, photo: Indices) -> Pairing:
+def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: Indices, photo: Indices) -> BurstPairing:
     assert trajectory.timestamps_s is not None
     pair, link = np.nonzero(np.isfinite(bursts.range_m[burst]))
     anchor = bursts.anchor[link]
@@ -181,4 +181,4 @@ def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: In
     variation = float(np.sum((range_m - means[anchor]) ** 2)) / num_varying
     offset_s = float(np.median(trajectory.timestamps_s[photo] - bursts.middle_s[burst]))
     chance = float(special.fdtrc(num_varying, num_spare, variation / variance))
-    return Pairing(offset_s, burst, photo, variance, num_spare, chance)
+    return BurstPairing(offset_s, burst, photo, variance, num_spare, chance)

@@ -36,7 +36,7 @@ _MIN_ANCHORS_TO_LEAVE_OUT = 3
 
 
 @dataclass(frozen=True)
-class Calibration:
+class RadioCalibration:
     """What was learnt about a radio.
 
     Attributes:
@@ -75,7 +75,7 @@ class _Problem:
 
 
 @with_one_blas_thread
-def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> Calibration:
+def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> RadioCalibration:
     """Learn the mean error of a radio as a smooth function of distance.
 
     A piecewise linear curve in the logarithm of distance with a penalty on its bends, common to all
@@ -106,7 +106,7 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
     curve = ErrorCurve(knots, fitted.values[: len(knots)], stddev, noise)
     biases = dict(zip(log.anchor_ids, fitted.values[len(knots) :].tolist(), strict=True))
     outliers = float(np.mean(fitted.weights < 0.1))
-    return Calibration(curve, len(used), scatter.noise_m, outliers, biases, distance, error)
+    return RadioCalibration(curve, len(used), scatter.noise_m, outliers, biases, distance, error)
 
 
 def _errors(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> tuple[Array, Array]:

@@ -72,7 +72,7 @@ def read_ranges(
         _check_numbers(one)
     source = paths[0] if len(paths) == 1 else paths[0].parent
     log = logs[0] if len(logs) == 1 else _join_logs(logs, source)
-    log = tell_roles(log, chosen[0][1].sides, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
+    log = tell_roles(log, chosen[0][1].roles, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
     step_m = None if np.all(np.isnan(log.range_stddev_m)) else find_quantization_m(log.range_m)
     least_m = 0.0 if step_m is None else quantization_stddev_m(step_m)
     return replace(log, range_stddev_m=np.maximum(log.range_stddev_m, least_m))

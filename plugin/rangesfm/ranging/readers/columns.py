@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array
-from rangesfm.files.text_tables import Categories, Table, read_table
+from rangesfm.files.text_tables import Categories, TextTable, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout
@@ -39,7 +39,7 @@ _TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
 
 
 @dataclass(frozen=True)
-class Columns:
+class RangeColumns:
     """Columns of a table that hold the quantities of a log.
 
     Attributes:
@@ -63,7 +63,7 @@ class Columns:
     notes: tuple[str, ...] = ()
 
 
-def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str) -> RangeLog:
+def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format: str) -> RangeLog:
     """Read a log from the named columns of a table.
 
     Args:
@@ -125,7 +125,7 @@ def read_columns(path: Path, columns: Columns, options: ReadOptions, format: str
     )
 
 
-def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
+def _anchors(table: TextTable, name: Mapping[str, str], columns: RangeColumns) -> Categories:
     """Return the anchor of each range, row by row: the same in each row, or from a column."""
     if not columns.wide:
         if "anchor_id" not in name:
@@ -141,7 +141,7 @@ def _anchors(table: Table, name: Mapping[str, str], columns: Columns) -> Categor
     return Categories(names.names, index.ravel())
 
 
-def _tags(table: Table, name: Mapping[str, str], columns: Columns) -> Categories:
+def _tags(table: TextTable, name: Mapping[str, str], columns: RangeColumns) -> Categories:
     """Return the tag of each range, row by row; each antenna of a tag counts as a tag of its own."""
     if "tag_id" not in name:
         tag_ids = [tag_id or DEFAULT_TAG_ID for _, tag_id in columns.wide.values()]
@@ -169,7 +169,7 @@ def _repeated(ids: list[str], num_rows: int) -> Categories:
     return Categories(each.names if num_rows else (), np.tile(each.index, num_rows))
 
 
-def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Categories:
+def _ids(table: TextTable, column: str, columns: RangeColumns, empty: str | None) -> Categories:
     ids = table.categories(column, empty=empty)
     if columns.is_strict or not all(
         re.fullmatch(r"\d{1,18}(?:\.\d*(?:[eE][+-]?0{0,3}\d{1,2})?)?", name) for name in ids.names
@@ -180,7 +180,7 @@ def _ids(table: Table, column: str, columns: Columns, empty: str | None) -> Cate
     return Categories(merged.names, merged.index[ids.index])
 
 
-def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: ReadOptions) -> Array:
+def _ranges(table: TextTable, name: Mapping[str, str], columns: RangeColumns, options: ReadOptions) -> Array:
     """Return the ranges (n,) in the unit of the file, row by row; one that is not positive means no measurement."""
     if "range" not in name and not columns.wide:
         return _ranges_by_stamps(table, name, StampOptions.of(options))
@@ -190,7 +190,7 @@ def _ranges(table: Table, name: Mapping[str, str], columns: Columns, options: Re
     return np.column_stack([table.numbers(k, empty=empty, missing=MISSING, expected=expected) for k in names]).ravel()
 
 
-def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptions) -> Array:
+def _ranges_by_stamps(table: TextTable, name: Mapping[str, str], options: StampOptions) -> Array:
     """Compute ranges (n,) from two-way ranging, double-sided if there is a third message; 0 where a stamp is empty."""
     stamps = {
         stamp: table.numbers(name[stamp], empty=np.nan, expected="a time stamp or nothing")
@@ -205,7 +205,7 @@ def _ranges_by_stamps(table: Table, name: Mapping[str, str], options: StampOptio
 
 
 def _timestamps(
-    table: Table, name: Mapping[str, str], units: Mapping[str, str], options: ReadOptions, notes: list[str]
+    table: TextTable, name: Mapping[str, str], units: Mapping[str, str], options: ReadOptions, notes: list[str]
 ) -> Array:
     column, said = name["timestamp"], options.timestamp_unit
     ask = partial(options.which_unit, table.path, "timestamp")
@@ -218,7 +218,7 @@ def _timestamps(
     return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
 
 
-def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes: list[str], ask: Ask) -> Array:
+def _civil_times(table: TextTable, name: Mapping[str, str], unit: str | None, notes: list[str], ask: Ask) -> Array:
     texts = table.text(name["timestamp"])
     if "date" in name:
         texts = [f"{date} {time}" for date, time in zip(table.text(name["date"]), texts)]
@@ -241,7 +241,7 @@ def _civil_times(table: Table, name: Mapping[str, str], unit: str | None, notes:
     return seconds
 
 
-def _line_of_sight(table: Table, name: Mapping[str, str]) -> npt.NDArray[np.int8]:
+def _line_of_sight(table: TextTable, name: Mapping[str, str]) -> npt.NDArray[np.int8]:
     column = name.get("los") or name.get("nlos")
     if column is None:
         return np.full(len(table), -1, np.int8)

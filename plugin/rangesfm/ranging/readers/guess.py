@@ -15,8 +15,8 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.readers import vocabulary as terms
-from rangesfm.ranging.readers.layout import Column, Layout
-from rangesfm.ranging.readers.reader import Sides
+from rangesfm.ranging.readers.layout import ColumnSample, Layout
+from rangesfm.ranging.readers.reader import EndpointRoles
 
 _MAX_NUM_IDS = 64
 _SAME_SPOT_M = 1.5  # largest distance between tags on one rig, and so largest difference of their ranges to an anchor
@@ -29,7 +29,7 @@ class Guess:
     Attributes:
         columns: by quantity, the name of its column in the file.
         wide: columns of ranges, each with its anchor and tag.
-        sides: what the log says about the two ends of a range.
+        roles: what the log says about the two ends of a range.
         notes: lines for the user about what was found.
         doubts: why the guess is not sure; empty if it is.
         missing: quantities for which no column was found.
@@ -38,7 +38,7 @@ class Guess:
 
     columns: dict[str, str] = field(default_factory=dict)
     wide: dict[str, tuple[str, str]] = field(default_factory=dict)
-    sides: Sides = Sides.TOLD
+    roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR
     notes: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
@@ -62,7 +62,7 @@ def guess_columns(layout: Layout) -> Guess:
     return guess
 
 
-def _find_time(free: list[Column], guess: Guess) -> list[Column]:
+def _find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     ranked = sorted((rank, k) for k, column in enumerate(free) if (rank := _time_rank(column)) is not None)
     if not ranked:
         ends = (".jpg", ".jpeg", ".png")
@@ -82,7 +82,7 @@ def _find_time(free: list[Column], guess: Guess) -> list[Column]:
     return [column for column in free if column not in (time, *others, *dates, *fractions)]
 
 
-def _time_rank(column: Column) -> tuple[float, int] | None:
+def _time_rank(column: ColumnSample) -> tuple[float, int] | None:
     """Return a rank of a column as the time, smaller for a better one, or None if it is not one."""
     words = [word for word in column.words if word not in terms.PLAIN]
     if column.kind not in ("numbers", "times") or terms.NO_TIME & {*words} or terms.NANOSECONDS & {*words}:
@@ -97,7 +97,7 @@ def _time_rank(column: Column) -> tuple[float, int] | None:
     return is_arrival + 0.5 * (not terms.TIME & {*words}), len({*words} - terms.TIME - terms.TIME_IN_SHORT)
 
 
-def _find_pairs(free: list[Column], guess: Guess) -> list[Column]:
+def _find_pairs(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     """Find several pairs of columns with an anchor and its range, of the same number or next to each other."""
     nodes = {_numbers(column): column for column in free if _names_anchor(column)}
     values = [column for column in free if _is_range(column)]
@@ -110,29 +110,29 @@ def _find_pairs(free: list[Column], guess: Guess) -> list[Column]:
     return [column for column in free if all(column not in pair for pair in pairs)]
 
 
-def _take_pairs(pairs: Sequence[tuple[Column, Column]], guess: Guess) -> None:
+def _take_pairs(pairs: Sequence[tuple[ColumnSample, ColumnSample]], guess: Guess) -> None:
     guess.wide = {value.name: (f"@{node.name}", "") for node, value in pairs}
     guess.notes.append(f"an anchor and its range in {len(pairs)} pairs of columns, such as {pairs[0][0].name}")
 
 
-def _names_anchor(column: Column) -> bool:
+def _names_anchor(column: ColumnSample) -> bool:
     words = {*_without_numbers(column)}
     return bool(words) and words <= terms.ANCHOR | terms.ASKED | terms.ID and (column.kind == "text" or column.is_whole)
 
 
-def _names(columns: Iterable[Column]) -> str:
+def _names(columns: Iterable[ColumnSample]) -> str:
     return ", ".join(column.name for column in columns)
 
 
-def _numbers(column: Column) -> tuple[str, ...]:
+def _numbers(column: ColumnSample) -> tuple[str, ...]:
     return tuple(word for word in column.words if word.isdigit())
 
 
-def _without_numbers(column: Column) -> tuple[str, ...]:
+def _without_numbers(column: ColumnSample) -> tuple[str, ...]:
     return tuple(word for word in column.words if not word.isdigit() and word not in terms.PLAIN)
 
 
-def _find_range(free: list[Column], guess: Guess) -> list[Column]:
+def _find_range(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     if guess.wide:
         return free
     numbers = [column for column in free if column.kind == "numbers" and not terms.NO_RANGE & {*column.words}]
@@ -158,7 +158,7 @@ def _find_range(free: list[Column], guess: Guess) -> list[Column]:
     return [column for column in free if column not in named and column.name not in in_groups]
 
 
-def _is_range(column: Column) -> bool:
+def _is_range(column: ColumnSample) -> bool:
     """Return whether a column holds ranges by its name; ``d`` and ``r`` count only alone or with a unit."""
     words = {*_without_numbers(column)}
     if column.kind != "numbers" or terms.NO_RANGE & words:
@@ -166,9 +166,9 @@ def _is_range(column: Column) -> bool:
     return bool(words & terms.RANGE) or (bool(words) and words <= terms.RANGE_IN_SHORT | terms.LENGTH_UNIT)
 
 
-def _groups(columns: Sequence[Column]) -> list[list[tuple[Column, list[int]]]]:
+def _groups(columns: Sequence[ColumnSample]) -> list[list[tuple[ColumnSample, list[int]]]]:
     """Return groups of columns whose names differ in ids only, with the indices of these words in each name."""
-    groups: dict[tuple[str, ...], list[tuple[Column, list[int]]]] = defaultdict(list)
+    groups: dict[tuple[str, ...], list[tuple[ColumnSample, list[int]]]] = defaultdict(list)
     for column in columns:
         ids = [
             k
@@ -188,13 +188,13 @@ def _is_letter(word: str, k: int, words: list[str]) -> bool:
     return len(word) == 1 and k == len(words) - 1 > 0 and bool(terms.RANGE & {*words}) and word not in terms.LENGTH_UNIT
 
 
-def _may_be_wide(member: tuple[Column, list[int]]) -> bool:
+def _may_be_wide(member: tuple[ColumnSample, list[int]]) -> bool:
     column, ids = member
     others = {word for k, word in enumerate(column.words) if k not in ids} - terms.PLAIN
     return others <= terms.IN_WIDE and bool(others & (terms.RANGE | terms.RANGE_IN_SHORT | terms.ANCHOR | {"a", "b"}))
 
 
-def _take_wide(group: list[tuple[Column, list[int]]], guess: Guess) -> None:
+def _take_wide(group: list[tuple[ColumnSample, list[int]]], guess: Guess) -> None:
     for column, ids in group:
         tags = [k for k in ids if k and column.words[k - 1] in terms.TAG | {"t"} and len(ids) > 1]
         anchors = [k for k in ids if k not in tags]
@@ -219,9 +219,9 @@ def _id_at(words: list[str], k: int, name: str) -> str:
     return name[at : at + len(text)] if at >= 0 else words[k]
 
 
-def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
+def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     """Find the columns of ids by name; if the names give no role, the last is the anchor's and the first the tag's."""
-    ids: dict[str, list[Column]] = defaultdict(list)
+    ids: dict[str, list[ColumnSample]] = defaultdict(list)
     # An id in the same nested record as the range is the anchor's, and an id outside of it is the tag's.
     within = guess.columns.get("range", "").rpartition(".")[0] + "."
     for column in free:
@@ -238,7 +238,11 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
     elif not anchor and nameless:
         anchor = [column for column in nameless if column.name.startswith(within)] or nameless[-1:]
         tag = tag or [column for column in nameless if column not in anchor][:1]
-    guess.sides = Sides.ASKED if anchor and anchor[0] not in ids["anchor"] and tag else Sides.TOLD
+    guess.roles = (
+        EndpointRoles.ASKER_AND_ASKED
+        if anchor and anchor[0] not in ids["anchor"] and tag
+        else EndpointRoles.TAG_AND_ANCHOR
+    )
     anchor, tag = _by_id_rather_than_index(anchor), _by_id_rather_than_index(tag)
     if guess.wide and max(len(anchor), len(nameless)) > 1:
         guess.doubts.append("the anchor of a column of ranges seems to be given in another column")
@@ -263,11 +267,11 @@ def _find_nodes(free: list[Column], guess: Guess) -> list[Column]:
     return [column for column in free if not any(column in columns for columns in ids.values())]
 
 
-def _by_id_rather_than_index(columns: list[Column]) -> list[Column]:
+def _by_id_rather_than_index(columns: list[ColumnSample]) -> list[ColumnSample]:
     return [column for column in columns if not {"idx", "index", "no", "num", "nr"} & {*column.words}] or columns
 
 
-def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
+def _find_by_values(free: list[ColumnSample], guess: Guess, has_names: bool) -> None:
     """Find by their values the columns that were not found by name.
 
     If the table has names, the names should have told, so that such a finding is not sure.
@@ -311,7 +315,7 @@ def _find_by_values(free: list[Column], guess: Guess, has_names: bool) -> None:
         guess.missing.append("range")
 
 
-def _pairs_by_values(free: Sequence[Column]) -> list[tuple[Column, Column]]:
+def _pairs_by_values(free: Sequence[ColumnSample]) -> list[tuple[ColumnSample, ColumnSample]]:
     """Return the longest series of equally spaced pairs of a column of ids and a column of decimals after it."""
     at = [k for k, (node, value) in enumerate(pairwise(free)) if _is_id(node) and _is_real(value)]
     run: list[int] = []
@@ -320,16 +324,16 @@ def _pairs_by_values(free: Sequence[Column]) -> list[tuple[Column, Column]]:
     return [(free[k], free[k + 1]) for k in run]
 
 
-def _is_real(column: Column) -> bool:
+def _is_real(column: ColumnSample) -> bool:
     return column.kind == "numbers" and not column.is_whole and _is_positive(column)
 
 
-def _is_nanoseconds(column: Column) -> bool:
+def _is_nanoseconds(column: ColumnSample) -> bool:
     """Return whether a column holds the nanoseconds within a second."""
     return column.is_whole and column.num_distinct > 9 and 1e8 < float(np.max(column.numbers)) < 1e9
 
 
-def _ids_by_values(ids: list[Column], guess: Guess) -> None:
+def _ids_by_values(ids: list[ColumnSample], guess: Guess) -> None:
     """Choose the column of anchors and that of tags among columns of ids, by the rule that there are more anchors."""
     *others, anchor = sorted(ids, key=lambda column: column.num_distinct)
     tag = others[-1] if others else None
@@ -338,29 +342,29 @@ def _ids_by_values(ids: list[Column], guess: Guess) -> None:
     guess.columns["anchor_id"] = anchor.name
     if tag is not None:
         guess.columns["tag_id"] = tag.name
-        guess.sides = Sides.ASKED
+        guess.roles = EndpointRoles.ASKER_AND_ASKED
         if tag.num_distinct > 1:
             guess.doubts.append(f"columns {tag.name} and {anchor.name} may be the tag and the anchor")
 
 
-def _is_rising(column: Column) -> bool:
+def _is_rising(column: ColumnSample) -> bool:
     if column.kind != "numbers" or len(column.numbers) < 2 or column.numbers[-1] <= column.numbers[0]:
         return False
     return bool(np.mean(np.diff(column.numbers) >= 0) > 0.95)
 
 
-def _is_positive(column: Column) -> bool:
+def _is_positive(column: ColumnSample) -> bool:
     return bool(np.mean(column.numbers > 0) > 0.5 and np.mean(column.numbers < 0) < 0.05)
 
 
-def _is_id(column: Column) -> bool:
+def _is_id(column: ColumnSample) -> bool:
     # A word without digits that is the same in each row, such as "range:" or "m", is not an id.
     is_word = column.num_distinct == 1 and not any(map(str.isdigit, column.cells[0]))
     few = column.num_distinct <= min(_MAX_NUM_IDS, max(2, len(column.cells) // 4))
     return few and not is_word and (column.kind == "text" or (column.is_whole and bool(np.all(column.numbers >= 0))))
 
 
-def _wide_by_values(columns: list[Column], guess: Guess) -> None:
+def _wide_by_values(columns: list[ColumnSample], guess: Guess) -> None:
     """Take similar columns for ranges, one per anchor, or one per tag and anchor; this is never sure."""
     num_tags = _num_tags(columns)
     num = len(columns) // num_tags
@@ -376,7 +380,7 @@ def _wide_by_values(columns: list[Column], guess: Guess) -> None:
     guess.doubts.append(f"columns {names[0]} to {names[-1]} may be ranges to {num} anchors{tags}")
 
 
-def _num_tags(columns: Sequence[Column]) -> int:
+def _num_tags(columns: Sequence[ColumnSample]) -> int:
     """Return the number of tags: the largest size of groups of neighbouring columns with nearly equal values.
 
     Ranges of tags on one rig to one anchor are nearly equal.
@@ -396,7 +400,7 @@ def _are_alike(ranges: Array) -> bool:
     return bool(np.max(spread) < min(_SAME_SPOT_M, apart / 3))
 
 
-def described(columns: Collection[Column]) -> Iterator[str]:
+def described(columns: Collection[ColumnSample]) -> Iterator[str]:
     """Yield a description of each column for the user; of many columns, only the first eight."""
     for k, column in enumerate(columns):
         if k == 8 and len(columns) > 9:

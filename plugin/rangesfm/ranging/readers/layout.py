@@ -19,7 +19,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import Table, read_head, read_text
+from rangesfm.files.text_tables import TextTable, read_head, read_text
 from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
@@ -41,7 +41,7 @@ _WITH_UNIT = re.compile(rf"({_NUMBER.pattern}) ?([A-Za-z]+)", re.ASCII)
 _DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}", re.ASCII)
 _UNITS = {*TIMES, *LENGTHS, "dbm"} - {"d", "h"}  # 1d may be an id
 
-Record = dict[str, str]
+NamedValues = dict[str, str]
 _BLOCK = "\n---\n"  # end of a message of rostopic echo
 _NAMED = re.compile(r"(?<![\w.:/])([A-Za-z]\w*)(?: ?= ?|: +)(\"[^\"]*\"|[^\s,;\[\]{}]+)", re.ASCII)
 _KEY = re.compile(r"([A-Za-z_]\w*):(?: +(.*))?", re.ASCII)
@@ -49,7 +49,7 @@ _MIN_SHARE_NAMED = 0.9  # smallest share of lines or blocks with named values in
 
 
 @dataclass(frozen=True)
-class Column:
+class ColumnSample:
     """A column with its name and its first cells.
 
     Attributes:
@@ -95,7 +95,7 @@ class Column:
     def num_distinct(self) -> int:
         return len(set(self.cells))
 
-    def cured(self) -> Column:
+    def cured(self) -> ColumnSample:
         """Return the column with numbers and dates in the usual form: decimal points, no units, 2026-01-31."""
         cure: Callable[[str], str]
         unit = ""
@@ -141,9 +141,9 @@ class Layout:
         are_records: whether the rows are records, in which values may be missing.
     """
 
-    columns: tuple[Column, ...]
+    columns: tuple[ColumnSample, ...]
     has_names: bool
-    read_cells: Callable[[], tuple[Table, list[str]]]
+    read_cells: Callable[[], tuple[TextTable, list[str]]]
     are_records: bool = False
 
     @property
@@ -151,7 +151,7 @@ class Layout:
         """Unit after the numbers of each column, by the column's name."""
         return {column.name: column.unit for column in self.columns}
 
-    def read(self) -> tuple[Table, list[str]]:
+    def read(self) -> tuple[TextTable, list[str]]:
         """Read all rows, with lines for the user about them.
 
         Raises:
@@ -166,14 +166,14 @@ class Layout:
 
 def layout_without_header(path: Path, header: Sequence[str], separator: str) -> Layout:
     """Return the layout of a file without a header row that is known to have these columns."""
-    columns = tuple(Column(name, ()) for name in header)
+    columns = tuple(ColumnSample(name, ()) for name in header)
     return Layout(columns, True, lambda: _read_rows(path, header, separator, 0, ()))
 
 
 def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     """Find the layout of a file; None if it has no table."""
     if table := _read_records(path):
-        first_rows = (Column(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
+        first_rows = (ColumnSample(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
         return Layout(tuple(column.cured() for column in first_rows), True, lambda: (table, []), True)
     lines = read_head(path).split("\n")
     numbered = [(number, line) for number, line in enumerate(lines[:-1] or lines, 1) if line.strip()]
@@ -201,7 +201,7 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     if not body:
         return None
     header = tuple(_unique(names or [str(k + 1) for k in range(num)], num))
-    columns = (Column(name, tuple(row[k] for row in body)) for k, name in enumerate(header))
+    columns = (ColumnSample(name, tuple(row[k] for row in body)) for k, name in enumerate(header))
     header_row = rows[first] if num_skipped >= content[first][0] else ()
     return Layout(
         tuple(column if separator == "," and "," in "".join(column.cells) else column.cured() for column in columns),
@@ -212,7 +212,7 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
 
 def _read_rows(
     path: Path, header: Sequence[str], separator: str, num_skipped: int, names: Sequence[str]
-) -> tuple[Table, list[str]]:
+) -> tuple[TextTable, list[str]]:
     """Read all rows, and leave out a few other lines (text, a truncated line, a repeated header) with a note."""
     numbered = enumerate(read_text(path).split("\n")[num_skipped:], num_skipped + 1)
     content = [(line, _cells(text, separator)) for line, text in numbered if text.strip() and not _is_comment(text)]
@@ -224,7 +224,7 @@ def _read_rows(
     lost = f"{len(odd)} lines that are not rows of the table are left out, the first is line {odd[0][0]}" if odd else ""
     columns = list(zip(*(row for _, row in rows))) or [()] * len(header)
     cells = {name: [*column] for name, column in zip(header, columns)}
-    return Table(path, tuple(header), np.array([line for line, _ in rows], np.int64), cells), [lost] if lost else []
+    return TextTable(path, tuple(header), np.array([line for line, _ in rows], np.int64), cells), [lost] if lost else []
 
 
 def _is_comment(line: str) -> bool:
@@ -254,11 +254,11 @@ def _cells(line: str, separator: str) -> list[str]:
 
 def _is_header(row: list[str], rows: list[list[str]]) -> bool:
     """Return whether a row has words where those below it have numbers or times."""
-    below = [Column("", tuple(cells)).cured() for cells in zip(*rows)]
+    below = [ColumnSample("", tuple(cells)).cured() for cells in zip(*rows)]
     return any(
-        column.kind in ("numbers", "times") and cell and Column("", (cell,)).cured().kind == "text"
+        column.kind in ("numbers", "times") and cell and ColumnSample("", (cell,)).cured().kind == "text"
         for cell, column in zip(row, below)
-    ) or (not rows and all(Column("", (cell,)).kind == "text" for cell in row))
+    ) or (not rows and all(ColumnSample("", (cell,)).kind == "text" for cell in row))
 
 
 def _unique(names: list[str], num: int) -> list[str]:
@@ -266,7 +266,7 @@ def _unique(names: list[str], num: int) -> list[str]:
     return [name if filled.index(name) == k else f"{name} ({k + 1})" for k, name in enumerate(filled)]
 
 
-def _read_records(path: Path) -> Table | None:
+def _read_records(path: Path) -> TextTable | None:
     """Read a file of records as a table, or return None if it is not one.
 
     A record that holds several ranges gives a row for each. A cell is empty if its record has no such value.
@@ -281,7 +281,7 @@ def _read_records(path: Path) -> Table | None:
         return None
     names = tuple(dict.fromkeys(name for _, record in numbered for name in record))
     cells = {name: [record.get(name, "") for _, record in numbered] for name in names}
-    return Table(path, names, np.array([line for line, _ in numbered], np.int64), cells) if names else None
+    return TextTable(path, names, np.array([line for line, _ in numbered], np.int64), cells) if names else None
 
 
 def _share_named(head: str) -> float:
@@ -299,7 +299,7 @@ def _units(text: str) -> Iterator[tuple[int, str]]:
         line += unit.count("\n") + end.count("\n")
 
 
-def _named_records(text: str) -> Iterator[tuple[int, Record]]:
+def _named_records(text: str) -> Iterator[tuple[int, NamedValues]]:
     """Yield the record of each line or block, with its line number.
 
     A time without a name comes first, as "time". A name that is repeated gets a number.
@@ -313,7 +313,7 @@ def _named_records(text: str) -> Iterator[tuple[int, Record]]:
         yield line, record
 
 
-def _blocks(text: str) -> Iterator[tuple[int, Record]]:
+def _blocks(text: str) -> Iterator[tuple[int, NamedValues]]:
     for line, unit in _units(text):
         lines = [(len(row) - len(row.lstrip()), row.strip()) for row in unit.split("\n") if row.strip("- \t")]
         yield from ((line, record) for record in _flat(_nested(lines)))
@@ -341,7 +341,7 @@ def _value(text: str) -> Any:
         return text
 
 
-def _json_records(text: str) -> Iterator[tuple[int, Record]]:
+def _json_records(text: str) -> Iterator[tuple[int, NamedValues]]:
     decoder, at, line, counted = json.JSONDecoder(), 0, 1, 0
     while (begin := text.find("{", at)) >= 0:
         line, counted = line + text.count("\n", counted, begin), begin
@@ -353,13 +353,13 @@ def _json_records(text: str) -> Iterator[tuple[int, Record]]:
         yield from ((line, record) for record in _flat(value))
 
 
-def _flat(value: Any) -> list[Record]:
+def _flat(value: Any) -> list[NamedValues]:
     """Return a record for each object in the value's lists, with the values outside of lists, or else one record."""
     common, each = _common_and_each(value, "")
     return [{**common, **record} for record in each] or [common]
 
 
-def _common_and_each(value: Any, name: str) -> tuple[Record, list[Record]]:
+def _common_and_each(value: Any, name: str) -> tuple[NamedValues, list[NamedValues]]:
     if isinstance(value, list) and value and all(isinstance(inner, (dict, list)) for inner in value):
         found = [_common_and_each(inner, name) for inner in value]
         return {}, [{**common, **record} for common, each in found for record in each or [{}]]

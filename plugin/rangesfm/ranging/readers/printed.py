@@ -19,7 +19,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.text_tables import read_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID
-from rangesfm.ranging.readers.reader import Reader, Reading, ReadOptions, Sides, reader_of_readings
+from rangesfm.ranging.readers.reader import EndpointRoles, Reader, Reading, ReadOptions, reader_of_readings
 from rangesfm.ranging.readers.times import HostClock
 
 _LOST = Reading(0.0, "", math.nan)
@@ -39,7 +39,7 @@ def _reader(
     each: str,
     whole: str,
     ranges: Callable[[re.Match[str], float, int], Iterable[Reading]] = _one_range,
-    sides: Sides = Sides.TOLD,
+    roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR,
 ) -> Reader:
     """Make the reader of lines with phrases that are given as ASCII patterns.
 
@@ -49,7 +49,7 @@ def _reader(
         whole: a complete phrase. Groups x, y and z, if present, are the position of the anchor in metres. A group time,
             if present, is the time of the range, and no time before the phrase is used.
         ranges: yields the ranges of a phrase, given its time in seconds and its line.
-        sides: what the log says about the two ends of a range.
+        roles: what the log says about the two ends of a range.
     """
     first, begun, phrase = (re.compile(pattern, re.ASCII | re.MULTILINE) for pattern in (begin, each, whole))
     has_time = "time" in phrase.groupindex
@@ -70,7 +70,7 @@ def _reader(
     def recognizes(head: str) -> bool:
         return first.search(head) is not None
 
-    return reader_of_readings(name, recognizes, readings, partial(_anchors_said, phrase), sides)
+    return reader_of_readings(name, recognizes, readings, partial(_anchors_said, phrase), roles)
 
 
 def _anchors_said(phrase: re.Pattern[str], path: Path) -> tuple[Anchor, ...]:
@@ -246,7 +246,7 @@ PRINTED = (
             r"(?P<rest>,ancid:(?:\((?P<anchor_id>-?\d{1,9}(?:,-?\d{1,9}){0,63})\))?)?"
         ),
         ranges=_mauwb_ranges,
-        sides=Sides.APART,
+        roles=EndpointRoles.NUMBERED_APART,
     ),
     _reader(  # Arduino sketches for the DW1000, such as those of Makerfabs: from: D325 Range: 29.40 m ..
         "arduino",

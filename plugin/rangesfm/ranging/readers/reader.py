@@ -53,12 +53,12 @@ class ReadOptions(LogOptions):
         return InputError(message, path, advice=[self.command(path, **{flag: unit}) for unit in units])
 
 
-class Sides(Enum):
+class EndpointRoles(Enum):
     """Meaning of the two ends of a range in a log format."""
 
-    ASKED = "who asked whom"
-    TOLD = "a side for tags and one for anchors, where a peer may stand on the other's side"
-    APART = "tags and anchors, each numbered by themselves"
+    ASKER_AND_ASKED = "who asked whom"
+    TAG_AND_ANCHOR = "a side for tags and one for anchors, where a peer may stand on the other's side"
+    NUMBERED_APART = "tags and anchors, each numbered by themselves"
 
 
 @dataclass(frozen=True)
@@ -70,14 +70,14 @@ class Reader:
         recognizes: returns whether the beginning of a file has this format.
         read: reads the whole file.
         read_anchors: returns the anchors whose positions the log contains.
-        sides: what the log says about the two ends of a range.
+        roles: what the log says about the two ends of a range.
     """
 
     name: str
     recognizes: Callable[[str], bool]
     read: Callable[[Path, ReadOptions], RangeLog]
     read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: ()
-    sides: Sides = Sides.TOLD
+    roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR
 
 
 class Reading(NamedTuple):
@@ -119,7 +119,7 @@ def reader_of_readings(
     recognizes: Callable[[str], bool],
     readings: Callable[[Path, ReadOptions], Iterable[Reading]],
     read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: (),
-    sides: Sides = Sides.TOLD,
+    roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR,
 ) -> Reader:
     """Make the reader of a format that is not a table, from a function that yields its ranges."""
 
@@ -144,12 +144,12 @@ def reader_of_readings(
             notes=notes,
         )
 
-    return Reader(name, recognizes, read, read_anchors, sides)
+    return Reader(name, recognizes, read, read_anchors, roles)
 
 
 def tell_roles(
     log: RangeLog,
-    sides: Sides,
+    roles: EndpointRoles,
     *,
     known_anchor_ids: Collection[str] = (),
     known_tag_ids: Collection[str] = (),
@@ -157,28 +157,28 @@ def tell_roles(
     """Return the log with every node as an anchor or a tag, and with ranges between two anchors or two tags.
 
     Known anchors and tags are decisive. A node that is always on one side has the role of that side, except a node that
-    only known anchors range with, which is a tag. A node on both sides is a tag if the anchors are known, and an anchor
+    only known anchors range with, which is a tag. A node on both roles is a tag if the anchors are known, and an anchor
     if the tags are known and the sides mean nothing. Otherwise it has its role in most ranges. If an id ranges with
     itself, or is known as both, tags and anchors are numbered separately, and the sides are the roles.
 
     Args:
         log: log as read, with all ranges between the tag and the anchor of their record.
-        sides: meaning of the two sides of a record.
+        roles: meaning of the two sides of a record.
         known_anchor_ids, known_tag_ids: ids of known anchors and tags.
     """
     known_anchors, known_tags = set(known_anchor_ids), set(known_tag_ids)
     tags, anchors = set(log.tag_ids), set(log.anchor_ids)
-    if sides is Sides.APART or known_anchors & known_tags:
+    if roles is EndpointRoles.NUMBERED_APART or known_anchors & known_tags:
         return log
     if not (tags & anchors or tags & known_anchors or anchors & known_tags):
         is_hub = len(anchors) == 1 and len(tags) > 1 and not (known_anchors or known_tags)
         # One node that many others range with is the tag, because there are more anchors than tags.
-        return log.with_anchors(tags) if sides is Sides.ASKED and is_hub else log
+        return log.with_anchors(tags) if roles is EndpointRoles.ASKER_AND_ASKED and is_hub else log
     asked = Counter(zip(log.tag_index.tolist(), log.anchor_index.tolist()))
     num_by_pair = {(log.tag_ids[tag], log.anchor_ids[anchor]): num for (tag, anchor), num in asked.items()}
     if any(tag == anchor for tag, anchor in num_by_pair):
         return log
-    if sides is Sides.ASKED and known_tags and not known_anchors:
+    if roles is EndpointRoles.ASKER_AND_ASKED and known_tags and not known_anchors:
         return log.with_anchors((tags | anchors) - known_tags)
     return log.with_anchors(
         {node for node in tags | anchors if _is_anchor(node, num_by_pair, known_anchors, known_tags)}

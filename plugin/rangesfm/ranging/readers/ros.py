@@ -9,7 +9,7 @@ from typing import Any
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import SQLITE_HEAD, messages_of, open_bag, stamp_s, type_name
-from rangesfm.ranging.readers.reader import Reading, ReadOptions, Sides, reader_of_readings
+from rangesfm.ranging.readers.reader import EndpointRoles, Reading, ReadOptions, reader_of_readings
 
 _BEGINS = ("#ROSBAG V", SQLITE_HEAD)
 _MCAP = "MCAP0"
@@ -81,5 +81,5 @@ def _character(value: int | str) -> str:
 
 
 READER = reader_of_readings(
-    "ros", lambda head: head.startswith(_BEGINS) or head[1:6] == _MCAP, _readings, sides=Sides.ASKED
+    "ros", lambda head: head.startswith(_BEGINS) or head[1:6] == _MCAP, _readings, roles=EndpointRoles.ASKER_AND_ASKED
 )

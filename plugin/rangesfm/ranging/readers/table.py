@@ -17,12 +17,12 @@ import numpy as np
 from rangesfm.errors import InputError, printable
 from rangesfm.files.text_tables import header_names, read_head, write_user_table
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
-from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, Columns, read_columns
+from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, RangeColumns, read_columns
 from rangesfm.ranging.readers.guess import Guess, described, guess_columns
 from rangesfm.ranging.readers.layout import Layout, find_layout, layout_without_header
-from rangesfm.ranging.readers.reader import Reader, ReadOptions, Sides
+from rangesfm.ranging.readers.reader import EndpointRoles, Reader, ReadOptions
 
-_BY_TIME = Columns(
+_BY_TIME = RangeColumns(
     required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
     optional={"tag_id": "tag_id", "range_stddev": "range_stddev_m", "los": "los"},
     is_strict=True,
@@ -76,9 +76,9 @@ def table_reader(path: Path, options: ReadOptions) -> Reader:
     if layout is None or guess is None or guess.missing or guess.doubts:
         raise _question(path, options, layout, guess)
     notes = tuple(_notes(path, layout, guess))
-    columns = Columns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
+    columns = RangeColumns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
     return replace(
-        TABLE, read=lambda path, options: read_columns(path, columns, options, TABLE.name), sides=guess.sides
+        TABLE, read=lambda path, options: read_columns(path, columns, options, TABLE.name), roles=guess.roles
     )
 
 
@@ -146,7 +146,9 @@ def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
             raise InputError(f"columns name neither range nor the time stamps {wanted}; found {found}", path)
         columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
         third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
-    return read_columns(path, Columns(columns, third_message, wide, _anchor_of_file(path), layout), options, format)
+    return read_columns(
+        path, RangeColumns(columns, third_message, wide, _anchor_of_file(path), layout), options, format
+    )
 
 
 def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
@@ -218,7 +220,7 @@ PRESETS = tuple(
         name,
         partial(_recognizes, name),
         partial(_read, format=name),
-        sides=Sides.ASKED if "from_id" in preset.values() else Sides.TOLD,
+        roles=EndpointRoles.ASKER_AND_ASKED if "from_id" in preset.values() else EndpointRoles.TAG_AND_ANCHOR,
     )
     for name, preset in _PRESETS.items()
 )
