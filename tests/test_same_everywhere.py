@@ -43,7 +43,7 @@ LARGEST_DIFFERENCE = 1e-9
 
 @dataclass(frozen=True)
 class Left:
-    """What a command left in its output folder."""
+    """Content that a command left in its output folder."""
 
     folder: Path
 

@@ -229,7 +229,7 @@ LIFETIMES = """
     import gc, itertools
     import numpy as np
     from rangesfm import ceres
-    from rangesfm.ceres import problem
+    from rangesfm.ceres import adjuster_problem
 
     def make():
         reconstruction = pycolmap.synthesize_dataset(
@@ -274,7 +274,7 @@ LIFETIMES = """
             elif "problem" in held:
                 assert np.all(np.isfinite(held["problem"].evaluate_residuals())), (order, name)
     gc.collect()
-    assert not problem._used_by_adjuster, "adjusters that nobody refers to are still there"
+    assert not adjuster_problem._used_by_adjuster, "adjusters that nobody refers to are still there"
 """
 
 

@@ -31,7 +31,7 @@ from rangesfm.files.atomic import new_file
 from rangesfm.option_model import Bounds
 
 MAX_NUMBER = 1e100
-"""In any file: squares of it are finite."""
+"""The largest number in any file; its squares are finite."""
 _HEAD_BYTES = 1 << 16
 _GZIP_MARK = b"\x1f\x8b"
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")

@@ -1,4 +1,4 @@
-"""How the parts of a map err together: what is needed for the precision of one point relative to another."""
+"""Joint errors of the parts of a map: what is needed for the precision of one point relative to another."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Part = tuple[Kind, int | str]
 
 @dataclass(frozen=True)
 class PartErrors:
-    """How k parts of one kind err, each in d numbers.
+    """Errors of k parts of one kind, each in d numbers.
 
     The numbers of a frame are a turn of its rig about the axes of the world (rotation vector, radians) and a shift of
     the rig's origin (metres). Those of a sensor are a turn (left rotation vector) and a shift of sensor_from_rig, those
@@ -45,7 +45,7 @@ class PartErrors:
 
 @dataclass(frozen=True)
 class PointErrors:
-    """How a point of a map errs.
+    """Errors of one point of a map.
 
     Attributes:
         by_part: (3, d) change of the point, in metres, by each part that it depends on.
@@ -58,7 +58,7 @@ class PointErrors:
 
 @dataclass(frozen=True)
 class MapErrors:
-    """How all parts of a map err together.
+    """Joint errors of all parts of a map.
 
     The covariance of all numbers of all parts is ``modes @ modes.T``, with the modes of all parts as rows, plus the
     rests on its diagonal.

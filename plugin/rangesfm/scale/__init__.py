@@ -1,1 +1,1 @@
-"""From ranges and an unscaled path to metres per SfM unit."""
+"""Estimate the scale: from ranges and an unscaled path to metres per SfM unit."""

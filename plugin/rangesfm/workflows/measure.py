@@ -128,7 +128,7 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class _Measuring:
-    """What measuring needs.
+    """Points of a map and their joint errors.
 
     Attributes:
         points: of the map.
