@@ -294,6 +294,24 @@ def test_anchors_that_cannot_hold_the_site_frame_still_give_the_scale_with_a_war
     assert result["scale"]["value"] == pytest.approx(own_survey.site_from_sfm.scale, rel=0.02)
 
 
+@pytest.mark.parametrize("output", ["loop", "loop/out"])
+@pytest.mark.parametrize("command", ["scale", "init"])
+def test_links_in_a_circle_are_refused_as_an_output(
+    command: str, output: str, own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    (own_survey.folder / "loop").symlink_to("loop")
+    flags = (".",) if command == "init" else own_survey.flags
+    assert f"/{output}: " in refusal(command, *flags, "--output_path", output)
+
+
+@pytest.mark.parametrize(("table", "key"), [("output", "path"), ("ranges", "path"), ("mapper", "pairs")])
+def test_a_path_that_no_file_can_have_is_refused_with_its_line(
+    table: str, key: str, own_survey: WalkedSurvey, refusal: Refusal
+) -> None:
+    (own_survey.folder / "survey.toml").write_text(f'[{table}]\n{key} = "a\\u0000b"\n')
+    assert refusal("check", "survey.toml") == f"survey.toml:2: [{table}] {key} is 'a?b', expected a path"
+
+
 def test_anchors_that_were_not_where_the_survey_puts_them_are_refused(
     own_survey: WalkedSurvey, refusal: Refusal
 ) -> None:

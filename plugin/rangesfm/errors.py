@@ -15,7 +15,10 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C, the one that shells use."""
 # Words of libraries that found no memory when they were loaded or when they started a thread.
 _WANT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "can't start new thread")
-_UNUSABLE_PATH = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
+_UNUSABLE_PATH = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.EEXIST),
+    *(errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),
+)
 
 
 def one_line(text: str) -> str:

@@ -267,15 +267,15 @@ class TestPublishing:
             self.write(tmp_path, "new")
         assert self.texts(tmp_path) == {"old", "mine"}
 
-    @pytest.mark.parametrize("target", ["../outside.csv", "/outside.csv"])
-    def test_a_record_that_names_places_outside_is_refused(self, target: str, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("target", ["../outside.csv", "/outside.csv", "a\0", "\ud800", ".", 7, None])
+    def test_a_record_that_names_places_outside_is_refused(self, target: object, tmp_path: Path) -> None:
         self.write(tmp_path / "out", "old")
         record = tmp_path / "out" / PRIVATE_NAME / "manifest.json"
         content = json.loads(record.read_text())
-        content["moves"] = [["", target]]
+        content["moves"] = [["parts/", "ours.csv"], ["", target]]
         record.write_text(json.dumps(content))
         (tmp_path / "outside.csv").write_text("mine")
-        with pytest.raises(InputError, match="expected a path inside the folder"):
+        with pytest.raises(InputError, match="is not a record of written files"):
             self.write(tmp_path / "out", "new")
         assert (tmp_path / "outside.csv").read_text() == "mine"
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rangesfm.errors import Failure, InputError, failure_of, one_line
+from rangesfm.files.folders import real_path
 from rangesfm.survey.settings import Survey, read_survey
 
 _USUAL_BYTES = 2 * 10**9  # a reconstruction of some hundred photos needs less memory than this
@@ -41,11 +42,11 @@ def read_jobs(paths: Sequence[str | Path], overrides: Mapping[str, object], outp
         InputError: two surveys write to the same folder, or one writes to the batch's own.
     """
     jobs = tuple(_read_job(path, overrides) for path in paths)
-    writes_to = {output_path.resolve(): "the table of the batch"}
+    writes_to = {real_path(output_path): "the table of the batch"}
     for job in jobs:
         if job.survey is None:
             continue
-        folder = job.survey.output.path.resolve()
+        folder = real_path(job.survey.output.path)
         if folder in writes_to:
             raise InputError(
                 f"writes to {folder}, as {writes_to[folder]} does: expected another [output] path", job.name

@@ -16,7 +16,8 @@ from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap, registered_images
-from rangesfm.files.atomic import new_folder, stays_inside, write_text
+from rangesfm.files.atomic import new_folder, write_text
+from rangesfm.files.folders import real_path, stays_inside
 from rangesfm.geometry.similarity import Similarity
 
 
@@ -44,7 +45,7 @@ def write_project(map_: MetricMap, path: Path, *, as_text: bool = False) -> Path
     write_model(map_.reconstruction, path, as_text=as_text)
     if map_.images_path is not None and map_.images_path.is_dir():
         database_path = map_.database_path or path / "database.db"
-        text = f"database_path={database_path.resolve()}\nimage_path={map_.images_path.resolve()}\n"
+        text = f"database_path={real_path(database_path)}\nimage_path={real_path(map_.images_path)}\n"
         if "#" not in text:  # a # would begin a comment in project.ini
             write_text(text, path / "project.ini")
     return path

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rangesfm.errors import InputError
+from rangesfm.files.folders import real_path
 from rangesfm.files.output_folder import absolute, is_private, make_output_folder, remove, sole_writer, writer_of
 
 __all__ = [
@@ -21,18 +22,11 @@ __all__ = [
     "require_apart",
     "scratch_folder",
     "sole_writer",
-    "stays_inside",
     "write_text",
 ]
 
 # Unicode categories: control characters, bytes that are not text, line separators and paragraph separators.
 _NOT_IN_NAMES = ("Cc", "Cs", "Zl", "Zp")
-
-
-def stays_inside(name: str) -> bool:
-    """Return whether a name from a file, taken relative to a folder, stays inside that folder."""
-    path = Path(name)
-    return not path.is_absolute() and ".." not in path.parts
 
 
 def path_of(text: str) -> Path:
@@ -55,9 +49,9 @@ def require_apart(inputs: Iterable[Path], output: Path) -> None:
     Raises:
         InputError: it is.
     """
-    target = output.resolve()
+    target = real_path(output)
     for path in inputs:
-        if path.resolve() in (target, *target.parents):
+        if real_path(path) in (target, *target.parents):
             raise InputError("the result would overwrite this input, expected another output path", path)
 
 

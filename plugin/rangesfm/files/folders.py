@@ -1,4 +1,4 @@
-"""Listing of all folders inside folders, following links, because photos of one survey may lie on several disks."""
+"""Paths without their links, and all folders inside folders: photos of one survey may lie on several disks."""
 
 from __future__ import annotations
 
@@ -6,8 +6,32 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from rangesfm.errors import InputError
+
 LEFT_BY_RUNS = frozenset({"result.json", "reconstruct.json", "photos.json"})
 """Names of files that mark a folder as the result of an earlier run."""
+
+
+def real_path(path: Path) -> Path:
+    """Return the absolute path after all links are followed, whether or not it exists; links in a circle remain.
+
+    Raises:
+        InputError: no file can have such a name.
+    """
+    try:
+        return Path(os.path.realpath(path))
+    except ValueError:
+        raise InputError("no file can have such a name", path) from None
+
+
+def stays_inside(name: str) -> bool:
+    """Return whether a name from a file, taken relative to a folder, is the name of a file inside that folder."""
+    path = Path(name)
+    try:
+        os.fsencode(name)
+    except UnicodeEncodeError:
+        return False
+    return bool(path.parts) and "\0" not in name and not path.is_absolute() and ".." not in path.parts
 
 
 def walk(*folders: Path) -> Iterator[tuple[Path, list[str], list[str]]]:

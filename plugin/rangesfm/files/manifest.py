@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rangesfm.errors import InputError
 from rangesfm.files.contents import CHUNK_BYTES
+from rangesfm.files.folders import stays_inside
 
 _NAME = "manifest.json"
 _VERSION = 1
@@ -116,13 +117,13 @@ class Manifest:
             if record["version"] != _VERSION:
                 raise ValueError(f"version {record['version']}")
             self.token = _word(record["token"])
-            self.moves = [(_text(source), _text(target)) for source, target in record["moves"]]
+            self.moves = [(_text(source) and _name(source), _name(target)) for source, target in record["moves"]]
             for name, entry in record["files"].items():
                 self._hashes[_text(name)] = [_text(sha256) for sha256 in entry["sha256"]]
                 if entry["state"] is not None:
                     size, modified, changed = map(int, entry["state"])
                     self._states[name] = size, modified, changed
-        except (OSError, ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
+        except (OSError, ValueError, TypeError, AttributeError, LookupError, OverflowError, RecursionError) as error:
             raise InputError(
                 "is not a record of written files by this version of rangesfm: move it away, or give another output"
                 " path",
@@ -179,6 +180,12 @@ def _text(value: object) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is no text")
     return value
+
+
+def _name(value: object) -> str:
+    if not stays_inside(_text(value)):
+        raise ValueError(f"{value!r} is no path inside the folder")
+    return str(value)
 
 
 def _word(value: object) -> str:

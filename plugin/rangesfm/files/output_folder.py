@@ -21,6 +21,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from rangesfm.errors import InputError
+from rangesfm.files.folders import real_path
 from rangesfm.files.manifest import Manifest
 
 if TYPE_CHECKING:
@@ -150,8 +151,7 @@ class OutputFolder:
     def _finish_moves(self) -> None:
         """Finish the moves that a killed process had begun; all that they need is still there."""
         moves = [
-            (self._inside(self.private, source) if source else None, self._inside(self.path, target))
-            for source, target in self._manifest.moves
+            (self.private / source if source else None, self.path / target) for source, target in self._manifest.moves
         ]
         if not moves:
             return
@@ -169,19 +169,14 @@ class OutputFolder:
         self._settle([target for _, target in moves])
         self._clear_parts()
 
-    def _inside(self, folder: Path, name: str) -> Path:
-        path = Path(name)
-        if path.is_absolute() or ".." in path.parts or not path.parts:
-            raise InputError(f"names '{name}', expected a path inside the folder", self.private / "manifest.json")
-        return folder / path
-
     def _relative(self, path: Path, folder: Path) -> str:
         return path.relative_to(folder).as_posix()
 
     def _clear_parts(self) -> None:
         """Remove unfinished files whose process has ended, except those that a begun move still needs."""
         folder = self.private / _PARTS_NAME
-        kept = {Path(source).parts[1] for source, _ in self._manifest.moves if source.startswith(f"{_PARTS_NAME}/")}
+        needed = [Path(source).parts for source, _ in self._manifest.moves]
+        kept = {parts[1] for parts in needed if parts[:1] == (_PARTS_NAME,) and len(parts) > 1}
         for path in sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else ():
             token, pid = (*path.name.split("-", 2), "")[:2]
             is_ours = token == self._manifest.token and pid.isdecimal() and path.name not in kept
@@ -203,7 +198,7 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
     Raises:
         InputError: another process (or thread) writes there, or the folder cannot be written to.
     """
-    key = folder.resolve()
+    key = real_path(folder)
     if key in _held.get():
         yield _held.get()[key]
         return
@@ -244,7 +239,7 @@ def writer_of(path: Path) -> Iterator[OutputFolder]:
 
 def absolute(path: Path) -> Path:
     """Return the absolute path with links in its parent folders resolved; a link at the path itself stays one."""
-    return path.parent.resolve() / path.name
+    return real_path(path.parent) / path.name
 
 
 def is_private(path: Path) -> bool:
@@ -267,9 +262,10 @@ def make_output_folder(path: Path) -> None:
     Raises:
         InputError: it cannot be made or written to, or is no place for an output folder.
     """
-    if path.resolve() == Path(path.resolve().anchor):
+    real = real_path(path)
+    if real == Path(real.anchor):
         raise InputError("is the root of the file system, expected a folder for the results", path)
-    if PRIVATE_NAME in path.resolve().parts and not is_private(path.resolve()):
+    if PRIVATE_NAME in real.parts and not is_private(real):
         raise InputError(f"lies in a folder {PRIVATE_NAME}, which is reserved for rangesfm's own files", path)
     try:
         path.mkdir(parents=True, exist_ok=True)

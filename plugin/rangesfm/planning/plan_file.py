@@ -10,7 +10,6 @@ from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
-from rangesfm.files.atomic import path_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import KeyMeta, Options
 from rangesfm.options import LENGTH_M, RangeModelOptions, TagOptions, Uncertainty
@@ -20,7 +19,7 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
 from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
-from rangesfm.survey.settings import parse_toml, refuse_unknown_tables
+from rangesfm.survey.settings import absolute_value, parse_toml, refuse_unknown_tables
 
 _Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 _Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
@@ -148,7 +147,7 @@ def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict
     """Return a table with absolute paths."""
     keys = model.keys()
     return {
-        name: folder / path_of(value) if name in keys and keys[name].role and isinstance(value, str) else value
+        name: absolute_value(value, folder) if name in keys and keys[name].role else value
         for name, value in table.items()
     }
 

@@ -13,6 +13,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.export.metric_map import points_of
+from rangesfm.files.folders import real_path
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.result.model_path import path_of_model
 from rangesfm.result.result_folder import ResultFolder
@@ -68,7 +69,7 @@ class Content:
             InputError: a file of the result is there but cannot be read.
         """
         self.result, self.summary = result, result.summary
-        self.title = _title((home or result.path).resolve())
+        self.title = _title(real_path(home or result.path))
         self.images_path = images_path or result.images_path
         self.ranges = result.read(RangesAsUsed)
         self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rangesfm.files.atomic import make_output_folder
+from rangesfm.files.folders import real_path
 from rangesfm.progress import Progress
 from rangesfm.report.report_page import render, write_page
 from rangesfm.report.text import duration
@@ -73,7 +74,7 @@ class LivePage:
         page = render(
             "live.html",
             title="rangesfm run",
-            heading=self.path.parent.resolve().name,
+            heading=real_path(self.path.parent).name,
             headline=headline,
             reload=reload,
             done=self._done,

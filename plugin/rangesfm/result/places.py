@@ -10,7 +10,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+from rangesfm.errors import InputError
 from rangesfm.files.atomic import path_of
+from rangesfm.files.folders import real_path
 from rangesfm.survey.settings import KEYS, Survey
 
 
@@ -54,7 +56,7 @@ def input_beside(folder: Path, recorded: str) -> Path | None:
     gives to others. For the same reason, the folder around the result does not count if it is the home folder or the
     root of the file system.
     """
-    path, around = path_in(folder, recorded), folder.resolve().parent
+    path, around = path_in(folder, recorded), real_path(folder).parent
     own = folder if around in (Path(around.anchor), _home()) else around
     return path if is_within(path, own) else None
 
@@ -62,15 +64,14 @@ def input_beside(folder: Path, recorded: str) -> Path | None:
 def is_within(path: Path, folder: Path) -> bool:
     """Return whether a path leads into a folder after all links are followed."""
     try:
-        end = path.resolve()
-        # Links in a circle raise an error before Python 3.13; from then on the resolved path is still a link.
-        return not end.is_symlink() and end.is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # ValueError: no file can have this name
+        end = real_path(path)
+    except InputError:
         return False
+    return not end.is_symlink() and end.is_relative_to(real_path(folder))  # links in a circle remain a link
 
 
 def _home() -> Path | None:
     try:
-        return Path.home().resolve()
+        return real_path(Path.home())
     except RuntimeError:  # this user has no home folder
         return None

@@ -16,6 +16,7 @@ from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, MetricMap, export_map, write_model
 from rangesfm.files.atomic import path_of, scratch_folder, sole_writer
+from rangesfm.files.folders import real_path
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.reference import Reference, read_reference
@@ -55,12 +56,12 @@ def refuse_to_overwrite(survey: Survey) -> None:
     Raises:
         InputError: they would; it names the input.
     """
-    folder = survey.output.path.resolve()
+    folder = real_path(survey.output.path)
     maps = survey.images.model is None
     places = {folder / name for name in result_names(survey)}
     places.update(folder / name for name in (*RECONSTRUCTION_NAMES, *PHOTOS_NAMES) if maps)
     for item in survey.input_paths():
-        path = item.path.resolve()
+        path = real_path(item.path)
         if not places.isdisjoint((path, *path.parents)):
             raise InputError("the results would overwrite this input, expected another output path", item.path)
         if path.is_dir() and path == folder:
@@ -99,8 +100,8 @@ def new_result(folder: Path, images_path: Path | None = None) -> Iterator[Path]:
             new = {output.path / path.name: path for path in staged.iterdir()}
             removed = [place for place in places if place not in new]
             photos = [output.path / name for name in PHOTOS_NAMES]
-            if images_path is not None and images_path.resolve() in photos:
-                removed += [path for path in photos if path != images_path.resolve() and output.is_own(path)]
+            if images_path is not None and real_path(images_path) in photos:
+                removed += [path for path in photos if path != real_path(images_path) and output.is_own(path)]
             output.publish(new, removed, last=output.path / ResultSummary.NAME)
 
 

@@ -289,11 +289,11 @@ def survey_from_tables(
         for dotted_key in _ROLE_OF_PATH:
             table, _, name = dotted_key.partition(".")
             if name in given[table]:
-                given[table][name] = _absolute(given[table][name], folder)
+                given[table][name] = absolute_value(given[table][name], folder)
         for dotted_key, value in overrides.items():
             table, _, name = dotted_key.partition(".")
             given[table].pop(_INSTEAD_OF.get(dotted_key), None)
-            given[table][name] = _absolute(value, Path.cwd()) if dotted_key in _ROLE_OF_PATH else value
+            given[table][name] = absolute_value(value, Path.cwd()) if dotted_key in _ROLE_OF_PATH else value
         given["camera"] |= {"others": other_cameras} if other_cameras else {}
         options: dict[str, Any] = {name: model(**given[name]) for name, model in SURVEY_TABLES.items()}
         survey = Survey(**options, source=source)
@@ -339,9 +339,11 @@ def refuse_unknown_tables(tables: Mapping[str, Any], known: Collection[str]) -> 
             raise OptionError(f"{name} is {shown(table)}, expected a table [{name}]", "", name)
 
 
-def _absolute(value: object, folder: Path) -> object:
+def absolute_value(value: object, folder: Path) -> object:
     """Return text or a path as an absolute path, and any other value unchanged."""
-    return folder / path_of(str(value)) if isinstance(value, (str, Path)) and str(value) else value
+    # What can be the name of no file stays as it is, and is refused as no path.
+    is_name = isinstance(value, (str, Path)) and str(value) and "\0" not in str(value)
+    return folder / path_of(str(value)) if is_name else value
 
 
 def _require_files(survey: Survey) -> None:

@@ -14,6 +14,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import require_apart, sole_writer
+from rangesfm.files.folders import real_path
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.join.join_models import PathOfModel
@@ -85,7 +86,7 @@ def read_finished_runs(folders: Sequence[Path]) -> list[FinishedRun]:
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """Return the part of each path that makes them distinct: the last part, if that is enough."""
-    paths = [folder.resolve() for folder in folders]
+    paths = [real_path(folder) for folder in folders]
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
         raise InputError("the same result folder is given twice", twice)
