@@ -1,4 +1,4 @@
-"""The full problem: COLMAP's bundle adjustment, with ranges; and when it is solved."""
+"""Bundle adjustment of all photos by COLMAP, to which ranges can be added, and the test for its convergence."""
 
 from __future__ import annotations
 
@@ -21,41 +21,41 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.refine.vision_information import model_poses
 
-# Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it creeps and is then taken for
-# converged; 1e8 does the same to the bends of a path of 2000 keyframes.
+# Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it changes slowly and seems converged.
+# 1e8 does the same to the bending of a path of 2000 keyframes.
 _INITIAL_TRUST_REGION_RADIUS = 1e10
-# Relative, of the cost: all that rounding leaves. When it is enough, the keyframes tell, not the cost.
+# Relative decrease of the cost: no more than rounding, because convergence is judged by the keyframes, not the cost.
 _FUNCTION_TOLERANCE = 1e-12
-# One thread adds up whatever number of residuals there is. More add up in the order in which they happen to end: the
-# same command would give other last digits each time, and of a million residuals they save hardly any time.
+# One thread is used for any number of residuals. Several threads would add them in the order in which they finish, so
+# that the same command gives other last digits each time; with a million residuals they save hardly any time.
 _MIN_NUM_RESIDUALS_FOR_THREADS = 2**31 - 1
-# No feature is located better; weighed against a smaller one, ranges lose all say in a model without noise.
+# No feature is located more precisely. With a smaller value, ranges would have no weight in a model without noise.
 _MIN_PIXEL_STDDEV = 0.05
 _MAX_NUM_TIE_POINTS = 500
-# Damping by a smaller one is felt.
+# A step with a trust region of at least this radius counts as free, that is not damped.
 _FREE_TRUST_REGION_RADIUS = 1e8
-# Of half the sum of squares in stddevs: where the optimum is no further below, nothing that the map says is further
-# than 0.05 of its stddev from what it says there.
+# Expected decrease of half the sum of squares (in standard deviations) below which the minimum is reached: then no
+# quantity of the map differs by more than 0.05 of its standard deviation from its value there.
 _MAX_GAIN_LEFT = 0.5 * 0.05**2
-# Likewise; of what a free step promised, and no step kept.
+# In the same unit: decrease that a free step promised and that no step achieved.
 _MAX_PROMISE_LEFT = 0.5
-# Relative, of the last step: with more than that, the cost still falls by orders of magnitude.
+# Largest relative decrease of the cost by the last step; with more, the cost is still falling by orders of magnitude.
 _MAX_LAST_GAIN = 1e-4
-# What the steps to come add up to, in the size of the last one: at least and at most.
+# Smallest and largest sum of the steps to come, in units of the last one.
 _NUM_STEPS_LEFT = (0.1, 10.0)
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What the solver did.
+    """Result of a run of the solver.
 
     Attributes:
-        num_iterations: successful and not. initial_cost, final_cost: half the sum of squares, in pixels.
-        seconds: of the solver.
-        converged: whether it stopped because nothing was left to gain.
-        is_still: whether the keyframes had come to rest by then, in steps as free as the first. is_stuck: whether such
-            steps still promise what matters, and none of them can be taken.
-        message: the solver's own words.
+        num_iterations: successful and unsuccessful ones. initial_cost, final_cost: half the sum of squares, in pixels.
+        seconds: time of the solver.
+        converged: whether it stopped by itself.
+        is_still: whether the keyframes came to rest in free steps.
+        is_stuck: whether free steps still promise a decrease that matters, but none of them succeeds.
+        message: of the solver.
     """
 
     num_iterations: int
@@ -70,14 +70,14 @@ class Solution:
 
 @dataclass(frozen=True)
 class BundleAdjustment:
-    """COLMAP's own problem over all photos of a model, to which ranges can be added once.
+    """COLMAP's problem of all photos of a model. Ranges can be added to it once.
 
     Attributes:
         metric: the model, adjusted in place.
-        adjuster: COLMAP's.
-        num_reprojections: residuals of features.
-        pixel_stddev: of one coordinate of a feature, estimated from the residuals before.
-        tie_points: blocks of 3-D points that few images see, for ``keep_from_elimination``.
+        adjuster: COLMAP's own.
+        num_reprojections: number of residuals of features, two per observation.
+        pixel_stddev: standard deviation of a feature's coordinate, pixels, from the residuals before the solution.
+        tie_points: parameter blocks of 3-D points with short tracks, for ``keep_from_elimination``.
     """
 
     metric: pycolmap.Reconstruction
@@ -88,7 +88,7 @@ class BundleAdjustment:
 
     @property
     def reprojection_rms_px(self) -> float:
-        """Root mean square length of the present reprojection errors."""
+        """Root mean square of the current lengths of reprojection errors, in pixels."""
         residuals = np.asarray(self.adjuster.problem.evaluate_residuals())[: self.num_reprojections]
         return float(np.sqrt(2 * np.mean(residuals**2)))
 
@@ -108,7 +108,7 @@ class BundleAdjustment:
         }
 
     def keep_from_elimination(self, block: Array) -> None:
-        """Have Ceres eliminate the map's points only; see ``keep_from_elimination`` of the costs."""
+        """Make Ceres eliminate only the map's points; see ``ceres.keep_from_elimination``."""
         tie_point = next(self.tie_points, None)
         if tie_point is not None:
             ceres.keep_from_elimination(self.adjuster, block, tie_point)
@@ -124,15 +124,15 @@ def bundle_adjustment(
     marker_ids: Collection[int] = (),
     left_out_ids: Collection[int] = (),
 ) -> BundleAdjustment:
-    """Set it up, with a gauge that leaves the scale to the ranges.
+    """Set up the bundle adjustment, with a gauge that leaves the scale free for the ranges.
 
     Args:
-        marker_ids: 3-D points that will have other residuals than their reprojections.
-        left_out_ids: 3-D points that take no part, and stay where they are.
+        marker_ids: 3-D points that must not serve as tie points, as other residuals are added to them.
+        left_out_ids: 3-D points that do not take part and keep their positions.
 
     Raises:
-        SolverError: nothing takes part.
-        InputError: an unknown key among the options passed through.
+        SolverError: no point takes part.
+        InputError: an option passed through to COLMAP is unknown.
     """
     adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_id, num_threads)
     for point_id in left_out_ids:
@@ -149,20 +149,20 @@ def bundle_adjustment(
 def _tie_points(
     metric: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster, marker_ids: Collection[int]
 ) -> Iterator[Array]:
-    """Points in turn, those of few images first: one that held many ties would itself have many neighbours."""
+    """Yield points in turn, those with short tracks first: a point with many ties would have many neighbours itself."""
     by_track_length = sorted(metric.points3D.items(), key=lambda item: (item[1].track.length(), item[0]))
     own = (point.xyz for point_id, point in by_track_length if point_id not in marker_ids)
     return itertools.cycle(itertools.islice(filter(adjuster.problem.has_parameter_block, own), _MAX_NUM_TIE_POINTS))
 
 
 def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
-    """Solve, in place, until keyframes stay where they are.
+    """Solve in place until the keyframes come to rest.
 
-    A cost of which a millionth part is left to gain may still move a map by metres, and points on the horizon may run
-    on forever without moving anything else.
+    The cost alone is no measure of this. A millionth of it may still move a map by metres, while points near the
+    horizon may move on forever without any other change.
 
     Args:
-        tolerance_m: how far any keyframe would still go.
+        tolerance_m: largest movement that a keyframe may still have to go.
 
     Raises:
         SolverError: the solver failed.
@@ -195,16 +195,17 @@ def _message(monitor: ConvergenceMonitor, tolerance_m: float, of_solver: str) ->
 def solve_until_still(
     problem: BundleAdjustment, before: Solution, tolerance_m: float, num_left: int
 ) -> tuple[list[Solution], bool]:
-    """Solve again from where the solver stopped, with its trust region opened, until keyframes stay where they are.
+    """Solve again from where the solver stopped, with a wide trust region, until the keyframes come to rest.
 
-    A solver whose steps have become small says that it has converged; whether it has, a free step tells. What often
-    keeps steps small is an unknown anchor far from where the ranges want it: it is put there first, the map held.
+    A solver whose steps have become small reports convergence; only a free step shows whether that is true. Steps are
+    often kept small by an unknown anchor far from where the ranges put it, so the radio's parameters are solved for
+    first, with the map held fixed.
 
     Args:
-        before: the solution so far. num_left: iterations after which to give up.
+        before: the solution so far. num_left: largest number of further iterations.
 
     Returns:
-        what was done, and whether the keyframes came to rest where nothing is left to gain.
+        the further solutions, and whether the keyframes came to rest at a minimum.
     """
     solutions: list[Solution] = []
     is_over = is_still = before.is_still
@@ -221,7 +222,7 @@ def solve_until_still(
 
 
 def _settle_radio(problem: BundleAdjustment) -> None:
-    """Solve for what is estimated beside the map alone."""
+    """Solve for the parameters that are not of the map, with the map held fixed."""
     metric, ceres_problem = problem.metric, problem.adjuster.problem
     blocks = [pose_of(metric.frame(frame_id)).params for frame_id in metric.reg_frame_ids()]
     blocks += [pose.params for rig in metric.rigs.values() for pose in rig.non_ref_sensors.values() if pose is not None]
@@ -250,7 +251,7 @@ def _bundle_adjuster(
     solver = ba.ceres.solver_options
     solver.initial_trust_region_radius = _INITIAL_TRUST_REGION_RADIUS
     solver.function_tolerance = _FUNCTION_TOLERANCE
-    # Steps are compared with all parameters, of which points on the horizon may be millions of metres.
+    # These tolerances compare steps with all parameters, and points near the horizon may be millions of metres away.
     solver.gradient_tolerance = solver.parameter_tolerance = 0.0
     solver.max_num_iterations = options.max_num_iterations
     solver.num_threads = num_threads
@@ -260,7 +261,7 @@ def _bundle_adjuster(
     if num > ba.ceres.max_num_images_direct_dense_cpu_solver:
         overlaps, limit = overlaps_in(metric), ba.ceres.max_num_images_direct_sparse_cpu_solver
         ba.ceres.max_num_images_direct_sparse_cpu_solver = limit = max_num_images_direct(overlaps, limit)
-        if num < limit and dense_is_faster(overlaps):  # COLMAP wants the one below the other
+        if num < limit and dense_is_faster(overlaps):  # COLMAP requires this order of the limits
             ba.ceres.max_num_images_direct_dense_cpu_solver = num
     apply_options(ba, options.bundle_adjustment, "refine.bundle_adjustment")
 
@@ -277,17 +278,17 @@ def _bundle_adjuster(
 
 
 def _pixel_stddev(adjuster: pycolmap.CeresBundleAdjuster, num_residuals: int) -> float:
-    """Stddev of a feature's coordinate from the residuals, which the parameters have already absorbed in part."""
+    """Estimate the standard deviation of a feature's coordinate; parameters have absorbed a part of the residuals."""
     residuals = np.asarray(adjuster.problem.evaluate_residuals())
     degrees_of_freedom = max(num_residuals - adjuster.problem.num_parameters(), 1)
     return max(robust_stddev(residuals) * float(np.sqrt(num_residuals / degrees_of_freedom)), _MIN_PIXEL_STDDEV)
 
 
 class ConvergenceMonitor:
-    """How far the keyframes go from step to step, and by how much the cost falls.
+    """Test for convergence by the movement of the keyframes and the decrease of the cost.
 
     Attributes:
-        is_still: whether neither will matter any more.
+        is_still: whether the keyframes have come to rest in free steps.
     """
 
     def __init__(self, metric: pycolmap.Reconstruction, residual_stddev: float, tolerance_m: float) -> None:
@@ -298,15 +299,15 @@ class ConvergenceMonitor:
 
     @property
     def is_stuck(self) -> bool:
-        """Whether a free step would gain what matters if residuals were linear, and smaller ones did not get there."""
+        """True if a free step promised, to first order, a decrease that matters, and later steps did not achieve it."""
         return self._promise > _MAX_PROMISE_LEFT
 
     def is_over(self, step: ceres.Step) -> bool:
-        """Whether to stop: nothing is left to gain, or nothing in steps that the solver dares not make larger.
+        """Return True if the solver should stop: the keyframes or the cost have come to rest.
 
-        Steps to come are taken to be each smaller than its last by as much as this one: Gauss-Newton's are so in the
-        end. A long path may bend by metres for next to no cost, and a map that little holds may sway by centimetres
-        for as little: keyframes are still, or the cost.
+        The steps to come are taken to shrink by the same factor as this one did, as Gauss-Newton steps finally do. Rest
+        of one of the two is enough: a long path may bend by metres at almost no cost, and a weak map may sway by
+        centimetres at as little.
         """
         if step.trust_region_radius >= _FREE_TRUST_REGION_RADIUS:
             self._promise = step.expected_gain / self._residual_stddev**2
@@ -325,16 +326,16 @@ class ConvergenceMonitor:
 
 
 def still_to_come(now: float, last: float) -> float:
-    """What a series adds up to from here on."""
+    """Return the sum of the remaining steps if they shrink geometrically by the ratio of the last two."""
     num = now / (last - now) if now < last else np.inf
     return now * float(np.clip(num, *_NUM_STEPS_LEFT))
 
 
 def farthest(before: Array, after: Array) -> float:
-    """Distance of the point that moved most."""
+    """Return the distance of the point that moved most."""
     return float(np.linalg.norm(after - before, axis=1).max())
 
 
 def keyframe_centers(metric: pycolmap.Reconstruction) -> Array:
-    """(n, 3) origins of the rig frames in the world."""
+    """Return the (n, 3) origins of the rig frames in the world."""
     return model_poses(metric, metric.reg_frame_ids()).centers

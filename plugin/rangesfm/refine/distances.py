@@ -1,4 +1,4 @@
-"""Measured distances as residuals of the full problem: by tape, and between anchors by radio."""
+"""Measured distances as residuals of the full problem: taped ones, and ranges between anchors."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from rangesfm.refine.bundle_adjustment import BundleAdjustment
 
 @dataclass(frozen=True)
 class MeasuredDistances:
-    """Distances that the map keeps to.
+    """Distances that are fitted together with the map.
 
     Attributes:
         tape: the control distances.
-        marker_ids: by name, the markers among their ends as 3-D points of the model.
-        by_radio: between anchors; their stddevs without what all of them share.
+        marker_ids: 3-D points of the model, by the names of the markers among the ends.
+        by_radio: distances between anchors; their standard deviations do not include the common bias.
     """
 
     by_radio: LocatedDistances
@@ -34,10 +34,10 @@ class MeasuredDistances:
 
 
 def add_marker_points(model: pycolmap.Reconstruction, tape: Tape) -> dict[str, int]:
-    """Make each marker a 3-D point of the model, its marks features; returns their ids by name.
+    """Add each marker to the model as a 3-D point, with its marks as features; return the points' ids by name.
 
     Raises:
-        InputError: as ``locate_distances`` does.
+        InputError: as in ``locate_distances``.
     """
     places, images = triangulate_markers(tape, model), images_by_name(model)
     ids = {}
@@ -55,7 +55,7 @@ def add_marker_points(model: pycolmap.Reconstruction, tape: Tape) -> dict[str, i
 
 
 def remove_marker_points(model: pycolmap.Reconstruction, marker_ids: Mapping[str, int]) -> None:
-    """Leave the model without the points and features that ``add_marker_points`` gave it."""
+    """Remove the points and features that ``add_marker_points`` added to the model."""
     marked = [
         element.image_id for point_id in marker_ids.values() for element in model.point3D(point_id).track.elements
     ]
@@ -72,14 +72,14 @@ def add_distances(
     anchor_blocks: Sequence[Array],
     errors: RangeErrors,
 ) -> list[Array]:
-    """Add them in units of pixels.
+    """Add the distances to the bundle adjustment, as residuals in pixels.
 
     Args:
-        anchors, anchor_blocks: in the order of the log; distances to one without a place are left out.
-        errors: of ranges, of which those between anchors have the loss and the common bias.
+        anchors, anchor_blocks: in the order of the log. Distances to an anchor without a position are left out.
+        errors: of the ranges; their loss and common bias also apply to ranges between anchors.
 
     Returns:
-        the parameter blocks that came with them.
+        the parameter blocks that were added.
     """
     placed = {
         anchor.anchor_id: _End(block, None)
@@ -92,7 +92,7 @@ def add_distances(
 
 @dataclass(frozen=True)
 class _End:
-    """One end of a distance: a parameter block, and where on it; None where the block is the point itself."""
+    """One end of a distance: a parameter block, and the end's position in that rig; None if the block is the end."""
 
     block: Array
     in_rig_m: Array | None
@@ -125,15 +125,15 @@ def _add_taped(bundle: BundleAdjustment, distances: MeasuredDistances, anchors: 
 
 
 def _in_rig(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:
-    """Where a camera sits in its rig: one of which another photo is the other end's."""
+    """Return a camera's position in its rig, for a distance to another photo of the same rig."""
     sensor, rig = image.data_id.sensor_id, metric.rig(metric.frame(image.frame_id).rig_id)
-    # Itself: sensor_from_rig() hands out a copy.
+    # The pose itself is needed as a parameter block: sensor_from_rig() returns a copy.
     pose = None if rig.is_ref_sensor(sensor) else rig.non_ref_sensors[sensor]
     return _End(np.zeros(3), None) if pose is None else _End(pose.params, np.zeros(3))
 
 
 def _camera(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:
-    """A photo's projection centre, which hangs on its rig."""
+    """Return a photo's projection centre as a point of its rig."""
     pose = pose_of(metric.frame(image.frame_id))
     return _End(pose.params, pose * image.projection_center())
 

@@ -1,4 +1,4 @@
-"""Unbends a drifted map before the full problem is solved, and finds what the ranges are worth on the way."""
+"""Removal of drift before the full problem is solved, with an estimate of the ranges' errors."""
 
 from __future__ import annotations
 
@@ -31,27 +31,28 @@ from rangesfm.refine.vision_information import (
 )
 
 _MAX_NUM_ROUNDS = 12
-# Relative; the noise itself is not known better from some hundred ranges.
+# Relative change of the errors that ends the iteration: with some hundred ranges the noise is not known better.
 SAME_ERRORS = 0.05
-# Of the ranges' stddev. A turn of the whole world by centimetres takes the full problem, of which all points have to
-# follow it, tens of iterations; here it takes one step.
+# Movement of a keyframe, in standard deviations of a range, at which the solver stops. A turn of the whole world by
+# centimetres costs the full problem tens of iterations, since all points have to follow; here it costs one step.
 _TOLERANCE = 0.001
-# Likewise. The same goes for a part of the map that turns about a weak link.
+# Bending, in the same unit, below which the map is moved as a whole. The full problem has the same difficulty with a
+# part of the map that turns about a weak link.
 _MIN_BEND = 0.05
-# Likewise, as a tolerance: from here on the residuals show the same errors.
+# Tolerance, in the same unit, from which on the residuals show the same errors.
 _ROUGH_TOLERANCE = 0.05
 _NUM_TRIANGULATIONS = 5
 
 
 @dataclass(frozen=True)
 class Unbent:
-    """What was found.
+    """Result of the removal of drift.
 
     Attributes:
-        errors: of the ranges. num_absorbed: degrees of freedom that the map takes from them.
-        anchors: where they are now.
-        bend_m: root mean square distance of keyframes from where one similarity would have put them.
-        num_steps: of the keyframe graph's solver.
+        errors: of the ranges. num_absorbed: degrees of freedom of the ranges that the map absorbs.
+        anchors: with their new positions and biases.
+        bend_m: root mean square distance of the keyframes from their best fit by one similarity.
+        num_steps: of the solver of the keyframe graph.
     """
 
     errors: RangeErrors
@@ -62,14 +63,15 @@ class Unbent:
 
 
 def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Unbent:
-    """Solve the keyframe graph and move the model after it, in place.
+    """Solve the keyframe graph and move the model accordingly, in place.
 
-    The errors are estimated anew with every solution. While drift is large, so are residuals and with them the
-    stddevs: the robust loss, which counts in stddevs, tightens as the map straightens and takes no drift for an
-    outlier. From there a bounded loss, which is that of the scale and of the full problem, sets aside what is one.
+    The errors are estimated again with every solution. While the drift is large, the residuals and their standard
+    deviations are large too. So the robust loss, which is relative to the standard deviations, tightens as the map
+    straightens, and does not take drift for outliers. Then a bounded loss, as in the scale stage and in the full
+    problem, removes the outliers.
 
     Args:
-        rays: all that the photos see. errors: of the ranges that take part.
+        rays: all observations of the photos. errors: of the ranges that take part.
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Unbent(errors, 0.0, problem.radio.anchors, 0.0, 0)
@@ -88,10 +90,10 @@ def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) 
 def unbend_again(
     problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
 ) -> tuple[AnchorEstimate, ...]:
-    """Likewise, with errors that are known by now, and from where the model and these anchors are; the moved anchors.
+    """Solve the keyframe graph again from the current model, with known errors; return the moved anchors.
 
-    Where the errors change, the whole map turns by a little: nothing here, and tens of refused steps in the full
-    problem, whose points follow a turn along straight lines.
+    New errors turn the whole map slightly. That is one step here, but tens of rejected steps in the full problem, whose
+    points follow a turn along straight lines.
     """
     graph = _graph(problem, rays, errors, anchors)
     state = solve_graph(graph, graph.start(), tolerance_m=_tolerance_m(errors)).state
@@ -102,7 +104,7 @@ def unbend_again(
 def _graph(
     problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
 ) -> KeyframeGraph:
-    """Of the model as it is."""
+    """Set up the keyframe graph of the current model."""
     ranges = problem.ranges
     takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))[rays.point]
     seen = rays.subset(np.flatnonzero(takes_part))
@@ -120,7 +122,7 @@ def _graph(
 def _move(
     problem: RefinementProblem, rays: Observations, vision: VisionInformation, after: Poses, errors: RangeErrors
 ) -> None:
-    """As a whole, to which the photos are indifferent, or, where it bends, keyframe by keyframe."""
+    """Move the model: as a whole, which photos do not notice, or keyframe by keyframe if it bends."""
     metric, before = problem.metric, vision.origin
     whole = _as_a_whole(before, after, 0 if problem.first_pose_is_fixed else None)
     if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(errors.stddev_m)):
@@ -130,11 +132,11 @@ def _move(
     held = first.copy()
     transform(metric, whole)
     if problem.first_pose_is_fixed:
-        first[:] = held  # which rounding may have changed
+        first[:] = held  # rounding may have changed it
 
 
 def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similarity:
-    """Most of the way that the keyframes went: turned as they are in the mean; one that is held stays."""
+    """Return the similarity with the mean turn that comes closest to the keyframes' movement; a held one stays."""
     if held_frame is None:
         turn = Rotation.from_matrix(after.world_from_rig @ np.swapaxes(before.world_from_rig, 1, 2)).mean().as_matrix()
         start, end = before.centers.mean(axis=0), after.centers.mean(axis=0)
@@ -142,16 +144,16 @@ def _as_a_whole(before: Poses, after: Poses, held_frame: int | None) -> Similari
         turn, start, end = np.eye(3), before.centers[held_frame], after.centers[held_frame]
     turned = (before.centers - start) @ turn.T
     likeness = float(np.sum(turned * (after.centers - end)))
-    # Of a point, or turned inside out, there is none.
+    # There is no scale for a single point or for a map turned inside out.
     scale = likeness / float(np.sum(turned**2)) if likeness > 0 and are_apart(before.centers) else 1.0
     return Similarity(scale, turn, end - scale * turn @ start)
 
 
 def _solve_with_own_errors(graph: KeyframeGraph) -> tuple[GraphSolution, RangeErrors]:
-    """A map and the errors that its residuals show: roughly, with the wide loss, then the bounded; at last precisely.
+    """Estimate the map and the errors that its residuals show: with the wide loss, the bounded one, then precisely.
 
-    Where so many ranges are wrong that the wide loss follows them, the map as it came is likelier, and the bounded one
-    starts from there, with the errors as they came.
+    If so many ranges are wrong that the wide loss follows them, the given map is more likely than its result. Then the
+    bounded loss starts from the given map and errors.
     """
     errors, start = graph.errors, graph.start()
     wide, shown = _alternate(graph, replace(errors, loss=wider(errors.loss)), start)
@@ -169,7 +171,7 @@ def _solve_with_own_errors(graph: KeyframeGraph) -> tuple[GraphSolution, RangeEr
 
 
 def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> tuple[GraphSolution, RangeErrors]:
-    """Between the map and the errors that its residuals show, with the steps of all rounds."""
+    """Alternate between solving the graph and estimating the errors; the solution counts the steps of all rounds."""
     num_steps = 0
 
     def fit(errors: RangeErrors, before: GraphSolution | None) -> GraphSolution:
@@ -194,7 +196,7 @@ def _tolerance_m(errors: RangeErrors, share: float = _TOLERANCE) -> float:
 
 
 def _bend(before: Array, after: Array) -> float:
-    """RMS distance that no similarity explains; of a path too short for one, nothing does not."""
+    """Return the root mean square distance that no similarity explains; 0 for fewer than three keyframes."""
     return rmse(align_points(before, after).apply(before) - after) if len(before) > 2 else 0.0
 
 
@@ -206,12 +208,12 @@ def carry_model(
     after: Poses,
     local_scale: Array,
 ) -> None:
-    """Move frames and points of a model, in place: a solver that works on its arrays sees it.
+    """Move frames and points of a model in place, so that a solver that uses their arrays sees the change.
 
     Args:
-        frame_ids: (n,) of the poses. observations: of the model's points in them.
-        before, after: poses of the frames as the model has them, and as it shall.
-        local_scale: (n,) by how much the map grows around each frame.
+        frame_ids: (n,) ids of the frames. observations: of the model's points in these frames.
+        before, after: current and new poses of the frames.
+        local_scale: (n,) growth of the map around each frame.
     """
     points = _triangulated(observations, after, _carried(observations, before, after, local_scale))
     quaternions = Rotation.from_matrix(np.swapaxes(after.world_from_rig, 1, 2)).as_quat()
@@ -226,7 +228,7 @@ def carry_model(
 
 
 def _carried(observations: Observations, before: Poses, after: Poses, local_scale: Array) -> Array:
-    """(p, 3) points, each moved rigidly and in scale with the first keyframe that sees it."""
+    """Return the (p, 3) points, each moved rigidly with the first keyframe that sees it and scaled about it."""
     points = observations.points.copy()
     seen, first = np.unique(observations.point, return_index=True)
     frame = observations.frame[first]
@@ -237,7 +239,7 @@ def _carried(observations: Observations, before: Poses, after: Poses, local_scal
 
 
 def _triangulated(observations: Observations, poses: Poses, start: Array) -> Array:
-    """(p, 3) points that fit the rays best, by damped Gauss-Newton steps that are taken where they help."""
+    """Return the (p, 3) points that fit the rays best, by damped Gauss-Newton steps that are kept where they help."""
     n, num_points = len(observations.frame), len(start)
     adder = sparse.csr_array((np.ones(n), (observations.point, np.arange(n))), shape=(num_points, n))
     points, cost = start, _costs(observations, poses, start, adder)
@@ -259,6 +261,6 @@ def _triangulated(observations: Observations, poses: Poses, start: Array) -> Arr
 
 
 def _costs(observations: Observations, poses: Poses, points: Array, adder: sparse.csr_array) -> Array:
-    """(p,) robust cost of each point; infinite for one behind a camera that sees it."""
+    """Return the (p,) robust cost of each point; infinite for a point behind a camera that sees it."""
     residuals = ray_residuals(observations, project(observations, poses, points)[1])
     return np.asarray(adder @ np.log1p(np.sum(residuals**2, axis=1)))

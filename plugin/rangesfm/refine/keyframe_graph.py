@@ -1,8 +1,8 @@
-"""The keyframe graph: poses bound by what the photos say about neighbours, and drawn by ranges.
+"""The keyframe graph: poses constrained by the photos' information about neighbours, and by ranges.
 
-It is the joint problem with the points eliminated once, and stated so that a bent map costs what its local
-deformation costs. Solved before the full bundle adjustment it unbends drift in cheap steps, which the full problem,
-whose points have to follow every turn of the world, takes only in many.
+It is the joint problem with the points eliminated once, stated so that bending a map costs only its local deformation.
+Solved before the full bundle adjustment, it removes drift in cheap steps. The full problem needs many steps for this,
+because its points have to follow every turn of the world.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rangesfm.refine.vision_information import Poses, VisionInformation
 _MAX_NUM_STEPS = 60
 _INITIAL_DAMPING = 1e-8
 _MAX_DAMPING = 1e6
-# For the number of parameters that the ranges determine: random vectors to estimate a trace with.
+# Number of random vectors for the estimated trace (number of parameters that the ranges determine).
 _NUM_PROBES = 12
 
 
@@ -40,7 +40,7 @@ class GraphState:
     Attributes:
         poses: of n keyframes.
         anchors_m: (m, 3). biases_m: (m,).
-        common_bias_m: by how much the mean of all free biases' priors has moved.
+        common_bias_m: change of the prior mean that all free biases share.
     """
 
     poses: Poses
@@ -51,15 +51,15 @@ class GraphState:
 
 @dataclass(frozen=True)
 class KeyframeGraph:
-    """The problem.
+    """The least squares problem.
 
     Attributes:
-        vision: what the photos say.
+        vision: information from the photos.
         antennas: of the k ranges that take part, by indices of the graph's keyframes.
-        range_m: (k,) measured. errors: of these.
+        range_m: (k,) measured. errors: of these ranges.
         anchors: m, with priors as for ``refine_with_ranges``.
-        held_frame: a keyframe that stays where it is; None: none does.
-        gravity: which way is up in the first keyframe; None: nobody knows.
+        held_frame: index of a keyframe that is held fixed; None: none is.
+        gravity: the upward direction in the first keyframe; None if unknown.
     """
 
     vision: VisionInformation
@@ -71,17 +71,17 @@ class KeyframeGraph:
     gravity: Gravity | None
 
     def start(self) -> GraphState:
-        """The map as it was given."""
+        """Return the map as it was given."""
         positions = np.array([anchor.position_m for anchor in self.anchors])
         biases = np.array([anchor.range_bias_m for anchor in self.anchors])
         return GraphState(self.vision.origin, positions, biases, 0.0)
 
     def residuals_m(self, state: GraphState) -> Array:
-        """(k,) predicted minus measured."""
+        """Return the (k,) residuals, predicted minus measured, metres."""
         return self.ranges_at(state)[0]
 
     def ranges_at(self, state: GraphState) -> tuple[Array, RangeGradient]:
-        """``residuals_m``, and how the k distances grow."""
+        """Return ``residuals_m``, and the derivatives of the k distances."""
         index = self.errors.anchor_index
         at = self.antennas.positions(state.poses.centers, state.poses.world_from_rig)
         gradient = RangeGradient.of(at - state.anchors_m[index])
@@ -90,11 +90,11 @@ class KeyframeGraph:
 
 @dataclass(frozen=True)
 class GraphSolution:
-    """Where the steps ended.
+    """The solution of a keyframe graph.
 
     Attributes:
-        state: the estimate. num_steps: accepted and not.
-        num_absorbed: how many of the ranges' degrees of freedom the parameters take up, at the start of the last step.
+        state: the estimate. num_steps: accepted and rejected ones.
+        num_absorbed: degrees of freedom of the ranges that the parameters absorb, at the start of the last step.
     """
 
     state: GraphState
@@ -103,10 +103,10 @@ class GraphSolution:
 
 
 def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) -> GraphSolution:
-    """Levenberg-Marquardt on the graph.
+    """Solve the graph by Levenberg-Marquardt steps.
 
     Args:
-        tolerance_m: it stops once no keyframe moves further in a step that succeeds, or in all that are to come.
+        tolerance_m: the solver stops when no keyframe moves further in a successful step, or in all steps to come.
     """
     layout = _Layout.of(graph)
     state, damping = start, _INITIAL_DAMPING
@@ -131,14 +131,14 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
 
 
 def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Array]:
-    """How functions of the poses err, by first order at the start.
+    """Return the errors of linear functions of the poses, to first order at the start.
 
     Args:
-        gradients: (6 n, k) by turn (in the keyframe's own frame) and shift of each pose.
+        gradients: (6 n, k) derivatives by the turn (in the keyframe's own frame) and the shift of each pose.
 
     Returns:
-        (k, k) covariance by what the photos get wrong alone; and (num_ranges, k) by how much they grow for each metre
-        by which a range is longer. What nothing determines is as if it were determined a little.
+        (k, k) covariance from the errors of the photos alone; and (num_ranges, k) change of the functions per metre by
+        which each range is longer. Undetermined directions are treated as weakly determined.
     """
     layout = _Layout.of(graph)
     terms = _Terms.at(graph, layout, graph.start())
@@ -153,14 +153,14 @@ def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Arr
 
 @dataclass(frozen=True)
 class _Layout:
-    """Columns: 6 for each pose (turn in its own frame, shift of its centre), 3 for each anchor, biases, their common.
+    """Order of the unknowns: 6 per pose (turn in its own frame, shift), 3 per anchor, the biases, their common part.
 
     Attributes:
-        first_anchor, first_bias: where these begin. num: of all.
-        free: which take part. world_is_free: whether no keyframe is held.
-        of_ranges: (k, 16) on which each range depends: two poses, an anchor, its bias.
-        order, starts: of the ranges, those between the same keyframes to the same anchor together: their derivatives
-            have the same columns.
+        first_anchor, first_bias: first columns of these. num: of all columns.
+        free: columns that are estimated. world_is_free: whether no keyframe is held fixed.
+        of_ranges: (k, 16) columns of each range: two poses, an anchor, its bias.
+        order, starts: order of the ranges in which those with the same keyframes and anchor are together, and the first
+            of each such group. Their derivatives have the same columns.
     """
 
     first_anchor: int
@@ -195,7 +195,7 @@ class _Layout:
         return cls(first_anchor, first_bias, num, np.flatnonzero(is_free), world_is_free, of_ranges, order, starts)
 
     def squares(self, rows: sparse.csr_array) -> sparse.coo_array:
-        """J^T J of the derivatives of the ranges, dense among those alike."""
+        """Return J^T J of the ranges, from dense products within each group of equal columns."""
         values = rows.data.reshape(self.of_ranges.shape)[self.order]
         blocks = np.array([alike.T @ alike for alike in np.split(values, self.starts[1:])])
         column = self.of_ranges[self.order[self.starts]]
@@ -205,12 +205,12 @@ class _Layout:
 
 @dataclass(frozen=True)
 class _Terms:
-    """Cost (half the sum of squares, robust), gradient and Gauss-Newton Hessian over all columns.
+    """Cost (half the robust sum of squares), gradient and Gauss-Newton Hessian over all columns.
 
     Attributes:
-        seen: derivative of the relative poses. vision: their information.
-        whitened: (k, columns) derivative of the ranges' residuals, robust weights included.
-        prior: derivative of the priors' residuals.
+        seen: derivatives of the relative poses. vision: their information matrix.
+        whitened: (k, columns) derivatives of the ranges' residuals, times the roots of the robust weights.
+        prior: derivatives of the priors' residuals.
     """
 
     cost: float
@@ -242,16 +242,17 @@ class _Terms:
 
     @cached_property
     def hessian(self) -> Array | sparse.csr_array:
-        """Only of states from which a step is taken."""
+        """Gauss-Newton Hessian; computed only for states from which a step is taken."""
         of_photos = resized(normal_matrix(self.seen, self.vision), self.layout.num)
         return of_photos + self.layout.squares(self.whitened) + self.prior.T @ self.prior
 
 
 def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:
-    """(6 u,) turn and shift of each relative pose from its origin, in the reference's frame, and their derivative.
+    """Return (6 u,) turns and shifts of relative poses against their origin, in the reference's frame, with derivative.
 
-    The derivative is by the n poses, in blocks of 6 by 6, whose products are several times faster than number by
-    number. Shifts are measured in the local scale of the map around the reference, which the photos do not see.
+    The derivative is by the n poses, in blocks of 6 by 6, whose products are several times faster than of single
+    numbers. Shifts are divided by the local scale of the map around the reference, because photos do not see that
+    scale.
     """
     r, k = vision.reference, vision.frame
     turn, shift = _relative(poses, r, k)
@@ -273,31 +274,31 @@ def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, spa
 
 
 def _relative(poses: Poses, reference: Indices, frame: Indices) -> tuple[Array, Array]:
-    """Turn and shift of keyframes as seen from others."""
+    """Return turn and shift of keyframes relative to others."""
     to_reference = np.swapaxes(poses.world_from_rig[reference], 1, 2)
     shift = np.einsum("uij,uj->ui", to_reference, poses.centers[frame] - poses.centers[reference])
     return to_reference @ poses.world_from_rig[frame], shift
 
 
 def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -> Array:
-    """(n,) how much larger the map has become around each keyframe."""
+    """Return the (n,) growth of the map around each keyframe."""
     n = len(vision.origin)
     now = np.bincount(vision.reference, np.sum(shift**2, axis=1), minlength=n)
     before = np.bincount(vision.reference, np.sum(shift_before**2, axis=1), minlength=n)
-    least = rounding_of(vision.origin.centers) ** 2  # all of one place have no scale
+    least = rounding_of(vision.origin.centers) ** 2  # keyframes in one place have no scale
     known = (now > least) & (before > least)
     return np.sqrt(np.divide(now, before, where=known, out=np.ones(n)))
 
 
 def local_scales(vision: VisionInformation, poses: Poses) -> Array:
-    """(n,) how much larger than at the origin the map is around each keyframe, by its neighbours."""
+    """Return the (n,) scale of the map around each keyframe relative to the origin, from its neighbours."""
     _, shift = _relative(poses, vision.reference, vision.frame)
     _, shift_before = _relative(vision.origin, vision.reference, vision.frame)
     return _local_scale(vision, shift, shift_before)
 
 
 def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:
-    """(k,) residuals in stddevs, and their derivative."""
+    """Return the (k,) residuals of the ranges in standard deviations, and their derivatives."""
     antennas, stddev_m = graph.antennas, graph.errors.stddev_m
     residuals_m, by = graph.ranges_at(state)
     value = np.empty((len(residuals_m), 16))
@@ -314,7 +315,7 @@ def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
 
 
 def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tuple[Array, sparse.csr_array]:
-    """Residuals of the priors in stddevs, and their derivative."""
+    """Return the residuals of the priors in standard deviations, and their derivatives."""
     residuals: list[float] = []
     entries: list[tuple[int, int, float]] = []
     free = set(layout.free.tolist())
@@ -343,15 +344,15 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
 
 
 def _factor(terms: _Terms, damping: float) -> Factored:
-    """With more damping where rounding makes it indefinite, as it does in a map without sense."""
+    """Factor the Hessian, with more damping if rounding makes it indefinite, as happens in a meaningless map."""
     part = terms.hessian[terms.layout.free][:, terms.layout.free]
     diagonal = part.diagonal()
-    # The floor keeps a pose that nothing holds in place.
+    # The floor keeps a pose without constraints in place.
     damped = part + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
     try:
         return factor(damped)
     except SingularError:
-        if damping > _MAX_DAMPING:  # then it is not of numbers
+        if damping > _MAX_DAMPING:  # then the matrix has entries that are not finite
             raise
         return _factor(terms, max(10 * damping, _INITIAL_DAMPING))
 
@@ -366,10 +367,10 @@ def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:
 
 
 def _turned(poses: Poses, turns: Array, shifts: Array, *, is_free: bool) -> Poses:
-    """Poses after (n, 3) turns, each in its own frame, and shifts.
+    """Return the poses after (n, 3) turns, each in its own frame, and shifts.
 
-    A map that is free goes round on arcs, by what all of its poses turn in the mean: the photos are indifferent to a
-    turn of the whole world, and refuse its straight lines.
+    In a free map, the mean turn of all poses moves their centres on arcs, not on straight lines: photos are indifferent
+    to a turn of the whole world, but not to the deformation that straight lines would cause.
     """
     in_world = np.einsum("nij,nj->ni", poses.world_from_rig, turns)
     common = in_world.mean(axis=0) if is_free else np.zeros(3)
@@ -381,7 +382,7 @@ def _turned(poses: Poses, turns: Array, shifts: Array, *, is_free: bool) -> Pose
 
 
 def _num_absorbed(terms: _Terms, factored: Factored) -> float:
-    """Trace of the ranges' hat matrix, by random probes (Hutchinson 1990)."""
+    """Estimate the trace of the ranges' hat matrix with random vectors (Hutchinson 1990)."""
     rng = np.random.default_rng(0)
     whitened = terms.whitened[:, terms.layout.free]
     probes = rng.choice([-1.0, 1.0], (whitened.shape[0], _NUM_PROBES))

@@ -1,4 +1,4 @@
-"""How firmly the photos of a map hold it together, as the ranges on it see it."""
+"""Bending of a map that its photos allow, as it affects the ranges."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustmen
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
 MAX_NUM_IMAGES = 1500
-"""Of photos that all see the same an inverse takes a minute, of twice as many ten."""
-# By how much a map is bent further than its reprojection errors let expect: about 1 where features err each on its own,
-# as simulated ones do, 8 to 12 on three scenes of real stills (Strecha et al. 2008), with little between.
+"""With all photos overlapping, an inverse of this size takes a minute, of twice the size ten minutes."""
+# How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
+# independent errors of features, as in simulations; 8 to 12 in three scenes of real photos (Strecha et al. 2008).
 _FACTOR, _SPREAD = 2.0, 0.8
 
 
 @dataclass(frozen=True)
 class PhotoBending:
-    """Of a map with points: what its bundle adjustment leaves open.
+    """Bending of a map with points, from its bundle adjustment.
 
     Attributes:
-        photos: at the map as it is. frame_ids: of the path.
+        photos: linearised at the map as it is. frame_ids: of the path.
         path: in the model's world, which is the first camera's frame. world_from_model: rotation to the map's world.
-        metres_per_unit: of the map's world, by the model's unit.
-        is_at_optimum: whether the photos have the map where they want it.
+        metres_per_unit: metres of the map's world per unit of the model.
+        is_at_optimum: whether the map is at the photos' own minimum.
     """
 
     photos: PhotosAlone
@@ -69,10 +69,10 @@ def bending_of_model(
     options: RefineOptions,
     num_threads: int,
 ) -> MapBending:
-    """Of a map as a mapper left it: by its photos, or by chance where it has no points or too many photos.
+    """Return the bending of a mapper's model, from its photos; a random walk if it has no points or too many photos.
 
     Args:
-        trajectory: in the model's world.
+        trajectory: of the model, in its world.
     """
     path = in_first_camera(trajectory)
     try:
@@ -90,14 +90,14 @@ def bending_of_model(
 def by_photos(
     bundle: BundleAdjustment, trajectory: Trajectory, metres_per_unit: float, *, is_at_optimum: bool
 ) -> PhotoBending:
-    """Of a bundle adjustment of photos alone.
+    """Return the bending of a map from its bundle adjustment of photos alone.
 
     Args:
-        trajectory: in the world of the map.
-        metres_per_unit: of that world, by the unit of the model that ranges are related to.
+        trajectory: of the map, in its world.
+        metres_per_unit: metres of that world per unit of the model to which the ranges refer.
 
     Raises:
-        GeometryError: the photos leave more open than where the map is and how large, or are too many.
+        GeometryError: the photos do not determine the map up to a similarity, or are too many.
     """
     metric = bundle.metric
     if metric.num_reg_images() > MAX_NUM_IMAGES and not inverse_is_affordable(overlaps_in(metric), MAX_NUM_IMAGES):

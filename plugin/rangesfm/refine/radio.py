@@ -1,4 +1,4 @@
-"""Ranges as residuals of the full problem: where the antenna was, and what is estimated with them beside the map."""
+"""Ranges as residuals of the full problem, with the antennas' positions and the radio's own parameters."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from rangesfm.refine.bundle_adjustment import BundleAdjustment
 
 @dataclass(frozen=True)
 class Antennas:
-    """The antenna of n ranges: ``(1 - weight) * p_before + weight * p_after + offset``, ``p = c + R tag_in_cam``.
+    """Positions of n antennas: ``(1 - weight) * p_before + weight * p_after + offset`` with ``p = c + R tag_in_cam``.
 
     Attributes:
-        before, after: (n,) keyframes of the trajectory; -1 without a place.
-        weight: (n,) in [0, 1].
-        tag_in_cam_m: (n, 3).
-        offset_in_world_m: (n, 3) what the curved path has beyond the straight line; it stays as the map bends.
+        before, after: (n,) indices of keyframes of the trajectory; -1 for a range without a place.
+        weight: (n,) interpolation fraction in [0, 1].
+        tag_in_cam_m: (n, 3) lever arms in the camera's frame.
+        offset_in_world_m: (n, 3) difference of the curved path from the straight line; constant while the map bends.
     """
 
     before: Indices
@@ -40,7 +40,7 @@ class Antennas:
     offset_in_world_m: Array
 
     def positions(self, centers: Array, world_from_cam: Array) -> Array:
-        """(n, 3) in the world of (k, 3) centres and (k, 3, 3) rotations."""
+        """Return the (n, 3) antenna positions in the world of (k, 3) centres and (k, 3, 3) rotations."""
         before, after = (
             centers[ends] + np.einsum("nij,nj->ni", world_from_cam[ends], self.tag_in_cam_m)
             for ends in (self.before, self.after)
@@ -49,19 +49,19 @@ class Antennas:
         return np.asarray((1 - weight) * before + weight * after + self.offset_in_world_m)
 
     def subset(self, rows: Indices) -> Antennas:
-        """Of some of the ranges."""
+        """Return the antennas of some of the ranges."""
         return Antennas(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def antennas(
     trajectory: Trajectory, observations: RangeObservations, metric_from_sfm: Similarity, tags_in_cam_m: Array
 ) -> Antennas:
-    """Antennas of all ranges.
+    """Return the antennas of all ranges.
 
     Args:
         trajectory, observations: of the unscaled model.
-        metric_from_sfm: to the world of the poses that will be asked for.
-        tags_in_cam_m: (num_tags, 3), in the order of the log's tags.
+        metric_from_sfm: similarity to the world of the poses for which positions will be computed.
+        tags_in_cam_m: (num_tags, 3) lever arms, in the order of the log's tags.
     """
     tags_in_cam = tags_in_cam_m[observations.log.tag_index]
     on_line = Antennas(
@@ -74,13 +74,13 @@ def antennas(
 
 @dataclass(frozen=True)
 class RadioEstimate:
-    """All that the ranges depend on beside the poses.
+    """All parameters of the ranges besides the poses.
 
     Attributes:
         anchors: in the order of the log.
         tags_in_cam_m: (num_tags, 3) antennas in the rig frame.
-        time_shift_s: how much later than thought the ranges were taken.
-        short_range_error_m: amplitude of ``exp(-distance / SHORT_RANGE_LENGTH_M)``, what short ranges read too long.
+        time_shift_s: how much later than assumed the ranges were taken.
+        short_range_error_m: amplitude of ``exp(-distance / SHORT_RANGE_LENGTH_M)``, by which short ranges are too long.
     """
 
     anchors: tuple[AnchorEstimate, ...]
@@ -91,11 +91,11 @@ class RadioEstimate:
 
 @dataclass(frozen=True)
 class RadioRanges:
-    """The ranges that take part.
+    """The ranges of a refinement.
 
     Attributes:
         observations, trajectory: of the unscaled model.
-        antennas: of all ranges, by the lever arms as given.
+        antennas: of all ranges, with the lever arms as given.
     """
 
     observations: RangeObservations
@@ -104,21 +104,21 @@ class RadioRanges:
 
     @property
     def rows(self) -> Indices:
-        """(k,) ranges that take part: all that have a place."""
+        """(k,) rows of the ranges that take part: all that have a place."""
         return self.observations.placed_rows
 
     @property
     def interval_s(self) -> Array:
-        """(n,) between the keyframes around each range; 0 at a keyframe."""
+        """(n,) times between the keyframes around each range, seconds; 0 at a keyframe."""
         times = self.trajectory.timestamps_s
         if times is None:
             return np.zeros(len(self.antennas.before))
         return times[self.antennas.after] - times[self.antennas.before]
 
     def places(self, path: Trajectory, radio: RadioEstimate) -> tuple[Array, Array]:
-        """(n, 3) of the tag and (n, 3) of the camera's centre on a metric path.
+        """Return the (n, 3) positions of the tag and of the camera's centre at each range, on a metric path.
 
-        What the path's curve has beyond straight lines between keyframes counts as the tag's.
+        The camera's are on straight lines between keyframes; only the tag's include the curve of the path.
         """
         weight, between = self.antennas.weight.copy(), self.antennas.before != self.antennas.after
         if radio.time_shift_s:
@@ -130,7 +130,7 @@ class RadioRanges:
         return at.positions(path.centers, path.world_from_cam), centers_m
 
     def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
-        """(n,) ranges that a metric model predicts, as the residuals do; NaN without a place."""
+        """Return the (n,) ranges predicted by a metric model, interpolated like the residuals; NaN without a place."""
         index = self.observations.log.anchor_index
         at, _ = self.places(self.trajectory.as_in(metric), radio)
         from_anchor = at - np.array([a.position_m for a in radio.anchors]).reshape(-1, 3)[index]
@@ -148,7 +148,7 @@ def predicted_ranges(
     tag_in_cam_m: npt.ArrayLike,
     anchors: Sequence[AnchorEstimate],
 ) -> Array:
-    """(n,) ranges that a metric model predicts, interpolated as the residuals are; NaN without a place.
+    """Return the (n,) ranges predicted by a metric model, interpolated like the residuals; NaN without a place.
 
     Arguments as for ``refine_with_ranges``.
     """
@@ -163,7 +163,7 @@ def radio_as_given(
     tag_in_cam_m: npt.ArrayLike,
     anchors: Sequence[AnchorEstimate],
 ) -> tuple[RadioRanges, RadioEstimate]:
-    """Arguments as for ``refine_with_ranges``."""
+    """Return ranges and radio parameters as given; arguments as for ``refine_with_ranges``."""
     tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
     placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
     return RadioRanges(observations, trajectory, placed), RadioEstimate(tuple(anchors), tags_in_cam_m)
@@ -172,7 +172,7 @@ def radio_as_given(
 def radio_blocks(
     radio: RadioEstimate, metric: pycolmap.Reconstruction, trajectory: Trajectory, options: RefineOptions
 ) -> ceres.RangeBlocks:
-    """Parameter blocks that start from an estimate, and the poses that a model has."""
+    """Return parameter blocks with the values of an estimate, and the blocks of a model's poses."""
     return ceres.RangeBlocks(
         poses=[pose_of(metric.frame(int(frame_id))).params for frame_id in trajectory.frame_ids],
         anchors=[anchor.position_m.copy() for anchor in radio.anchors],
@@ -186,11 +186,11 @@ def radio_blocks(
 
 @dataclass(frozen=True)
 class AddedRadio:
-    """What came into the full problem with the ranges.
+    """Parameters and residuals of the ranges and distances in the full problem.
 
     Attributes:
-        blocks: parameters, which the solver changes in place. others: those of further residuals.
-        residual_rows: (k,) where the residuals of the ranges that take part are among the problem's.
+        blocks: of the ranges; the solver changes them in place. others: of other residuals.
+        residual_rows: (k,) indices of the ranges' residuals among those of the problem.
     """
 
     blocks: ceres.RangeBlocks
@@ -199,12 +199,12 @@ class AddedRadio:
 
     @property
     def all_but_anchors(self) -> list[Array]:
-        """Every block that is no point of the world."""
+        """Every parameter block that is not a point of the world."""
         wanted = [block for block in (self.blocks.time_shift, self.blocks.amplitude) if block is not None]
         return [*self.blocks.biases, *self.blocks.tags_in_cam, *wanted, *self.others]
 
     def estimate(self, before: RadioEstimate) -> RadioEstimate:
-        """As the solver left them."""
+        """Return the parameters with the solver's values."""
         blocks = self.blocks
         return RadioEstimate(
             moved_anchors(before.anchors, blocks.anchors, [bias[0] for bias in blocks.biases]),
@@ -217,13 +217,13 @@ class AddedRadio:
 def add_ranges(
     bundle: BundleAdjustment, ranges: RadioRanges, errors: RangeErrors, blocks: ceres.RangeBlocks
 ) -> Indices:
-    """Ranges in units of pixels: one stddev of either weighs the same.
+    """Add ranges as residuals, scaled so that one standard deviation of a range weighs as much as one of a pixel.
 
     Args:
-        errors: of those that take part.
+        errors: of the ranges that take part.
 
     Returns:
-        (k,) where the residual of each range that takes part is among the problem's.
+        (k,) index of each range's residual among those of the problem.
     """
     log, rows, at = ranges.observations.log, ranges.rows, ranges.antennas.subset(ranges.rows)
     placed = ceres.PlacedRanges(
@@ -256,11 +256,11 @@ def add_radio_priors(
     blocks: ceres.RangeBlocks,
     options: RefineOptions,
 ) -> None:
-    """Hold, draw or free whatever has residuals; stddevs in the unit of pixels.
+    """Fix each radio parameter, add its prior, or leave it free; standard deviations are scaled to pixels.
 
     Args:
-        tags_in_cam_m: (num_tags, 3) as given, on which the prior is centred.
-        common_bias_stddev_m: of what all biases share.
+        tags_in_cam_m: (num_tags, 3) lever arms as given, the means of their priors.
+        common_bias_stddev_m: of the bias that all ranges share.
     """
     for anchor, position in zip(radio.anchors, blocks.anchors, strict=True):
         _add_prior(bundle, position, anchor.prior_position_m, anchor.prior_position_stddev_m)
@@ -274,7 +274,7 @@ def add_radio_priors(
 def _add_bias_priors(
     bundle: BundleAdjustment, anchors: tuple[AnchorEstimate, ...], biases: Sequence[Array], common_stddev_m: float
 ) -> None:
-    """One of all biases that are estimated, as they share the tag's."""
+    """Add one joint prior for all estimated biases, because they share the tag's bias."""
     drawn = []
     for anchor, bias in zip(anchors, biases, strict=True):
         _add_prior(bundle, bias, None, anchor.prior_bias_stddev_m)
@@ -290,7 +290,7 @@ def _add_bias_priors(
 
 
 def _add_prior(bundle: BundleAdjustment, block: Array | None, mean: Array | None, stddev: float) -> None:
-    """Of a block, if it is part of the problem; a stddev of 0 holds it, no mean frees it."""
+    """Add the prior of a parameter block, if it is in the problem; stddev 0 fixes the block, no mean leaves it free."""
     problem = bundle.adjuster.problem
     if block is None or not problem.has_parameter_block(block):
         return
@@ -305,7 +305,7 @@ def _add_prior(bundle: BundleAdjustment, block: Array | None, mean: Array | None
 def moved_anchors(
     anchors: Sequence[AnchorEstimate], positions_m: Iterable[Array], biases_m: Iterable[float]
 ) -> tuple[AnchorEstimate, ...]:
-    """The anchors where they have been found."""
+    """Return the anchors with new positions and biases."""
     return tuple(
         replace(anchor, position_m=position, range_bias_m=float(bias))
         for anchor, position, bias in zip(anchors, positions_m, biases_m, strict=True)

@@ -1,4 +1,4 @@
-"""RefinementProblem: all that a refinement keeps to from one solution of the full problem to the next."""
+"""RefinementProblem: what stays the same in a refinement from one solution of the full problem to the next."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _PARAMETER_STEP = 1e-6
 
 @dataclass(frozen=True)
 class RefinementProblem:
-    """What stays the same from one solution to the next; only the model changes, in place.
+    """The fixed input of a refinement; only the model changes, in place.
 
     Attributes:
         metric: the model.
-        ranges: that take part. radio: anchors and tags as given, which their priors go by.
-        distances: measured ones, which the map keeps to.
+        ranges: those that take part. radio: anchors and tags as given, the means of their priors.
+        distances: measured ones, which are fitted too.
         first_pose_is_fixed: the gauge.
-        gravity: which way is up in the first camera; None where its pose is fixed, or nobody knows.
-        left_out_ids: 3-D points that take no part.
+        gravity: the upward direction in the first camera; None if unknown, or if that camera's pose is fixed.
+        left_out_ids: 3-D points that do not take part.
     """
 
     metric: pycolmap.Reconstruction
@@ -50,7 +50,7 @@ class RefinementProblem:
 
     @property
     def frame_ids(self) -> Indices:
-        """Those of the trajectory, then those without a time."""
+        """Ids of the frames of the trajectory, then of those without a time."""
         timed = self.ranges.trajectory.frame_ids
         return np.concatenate([timed, np.setdiff1d(np.array(self.metric.reg_frame_ids(), dtype=np.int64), timed)])
 
@@ -59,7 +59,7 @@ class RefinementProblem:
         return int(self.ranges.trajectory.frame_ids[0])
 
     def of_photos(self, max_num_iterations: int) -> BundleAdjustment:
-        """The bundle adjustment without anything else."""
+        """Set up the bundle adjustment of the photos alone."""
         return bundle_adjustment(
             self.metric,
             self.camera,
@@ -71,13 +71,13 @@ class RefinementProblem:
         )
 
     def add_to(self, bundle: BundleAdjustment, errors: RangeErrors, radio: RadioEstimate) -> AddedRadio:
-        """All else that was measured, from an estimate; ``errors`` are those of the ranges that take part."""
+        """Add all other measurements, starting from an estimate; ``errors`` are of the ranges that take part."""
         blocks = radio_blocks(radio, self.metric, self.ranges.trajectory, self.options)
         rows = add_ranges(bundle, self.ranges, errors, blocks)
         others = add_distances(bundle, self.distances, radio.anchors, blocks.anchors, errors)
         add_radio_priors(bundle, radio, self.radio.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
         add_calibration(bundle, self.camera)
-        if self.gravity is not None:  # what the first camera saw of the vertical; the stddev in the unit of pixels
+        if self.gravity is not None:  # measured upward direction in the first camera; its stddev is scaled to pixels
             cost = ceres.direction_cost(
                 direction_in_world=UP_IN_SITE,
                 direction_in_cam=self.gravity.up_in_first_camera,
@@ -88,16 +88,14 @@ class RefinementProblem:
         return AddedRadio(blocks, others, rows)
 
     def residual_errors(self, added: AddedRadio, errors: RangeErrors, bending_factor: float) -> ResidualErrors | None:
-        """How the residuals of the k ranges that took part err; the scale's uncertainty counts the same errors.
-
-        None where nobody has learnt what they get wrong together.
+        """Return the errors of the k ranges' residuals, as in the scale's uncertainty; None if they were not learnt.
 
         Args:
-            bending_factor: by how much the photos' residuals err more, which are the unit here.
+            bending_factor: factor of the errors of the photos' residuals, which are the unit here.
         """
         if errors.learned is None:
             return None
-        learned = errors.learned.without(*BENDS)  # the photos' own residuals err as well
+        learned = errors.learned.without(*BENDS)  # bending is already in the errors of the photos' residuals
         scaled = self.residuals_m(added.estimate(self.radio))[self.ranges.rows] / errors.stddev_m
         in_residuals = np.sqrt(errors.weight) * errors.loss.slopes(scaled) / errors.stddev_m
         covariance_m2, has_cell = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
@@ -106,12 +104,12 @@ class RefinementProblem:
         return ResidualErrors(added.residual_rows, of_cells, covariance_m2 / bending_factor**2, bending_factor**-2)
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
-        """(n,) predicted minus measured; NaN without a place."""
+        """Return the (n,) residuals, predicted minus measured, metres; NaN for ranges without a place."""
         return self.ranges.predicted_m(self.metric, radio) - self.ranges.observations.log.range_m
 
 
 def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
-    """Draw each camera of a given model to its parameters, where the adjustment refines it at all."""
+    """Add priors for the parameters of each camera that was given calibrated, if the adjustment refines it."""
     metric, problem = bundle.metric, bundle.adjuster.problem
     images = [metric.image(image_id) for image_id in metric.reg_image_ids()]
     as_given = cameras_as_given(options, ((image.name, metric.camera(image.camera_id)) for image in images))
@@ -123,22 +121,23 @@ def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
 
 
 def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) -> Array:
-    """(n,) of each parameter: at the photo's edge it moves a feature as far as the focal length's own stddev does.
+    """Return the (n,) standard deviations of a camera's parameters, given that of the focal length.
 
-    A calibration that is off somewhere near the edge leaves open by which of its parameters.
+    One standard deviation of any parameter moves a feature at the photo's edge equally far, because an error of the
+    calibration seen there does not tell which parameter is wrong.
     """
     edge = np.array([[0.5 * camera.width / camera.mean_focal_length(), 0.0, 1.0]])
     edge[0, 1] = 0.5 * camera.height / camera.mean_focal_length()
     shifts_px = np.array([_shift_px(camera, edge, index) for index in range(len(camera.params))])
     of_focal_lengths = np.linalg.norm(shifts_px[list(camera.focal_length_idxs())])
-    smallest = 1e-12 * of_focal_lengths  # one that moves nothing is as good as free
+    smallest = 1e-12 * of_focal_lengths  # a parameter without any effect gets a very large stddev
     stddevs: Array = focal_length_stddev_px * of_focal_lengths / np.maximum(shifts_px, smallest)
     stddevs[list(camera.focal_length_idxs())] = focal_length_stddev_px
     return stddevs
 
 
 def _shift_px(camera: pycolmap.Camera, points_in_cam: Array, index: int) -> float:
-    """How far a parameter moves the image of a point, pixels per unit."""
+    """Return how far a parameter moves the image of a point, pixels per unit."""
     other = pycolmap.Camera(camera.todict())
     other.params[index] += _PARAMETER_STEP * max(1.0, abs(camera.params[index]))
     step = other.params[index] - camera.params[index]

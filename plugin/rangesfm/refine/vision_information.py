@@ -1,8 +1,8 @@
-"""What the photos say about how neighbouring keyframes lie to each other, and how firmly.
+"""Information from the photos on the relative poses of neighbouring keyframes.
 
-The points are eliminated, track by track, at the map as it is. What remains binds the poses of the keyframes that see
-a point *relative to the first of them*. Said in that keyframe's own frame it stays true while the map bends: turns
-and shifts that all of them share cost nothing, nor does a common scale, which the points' depths follow.
+The points are eliminated, track by track, at the current map. What remains constrains the poses of the keyframes that
+see a point *relative to the first of them*. Expressed in that keyframe's frame, it stays valid while the map bends: a
+common turn or shift costs nothing, and neither does a common scale, which the points' depths follow.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import side_by_side
 
-# A long track is cut into overlapping pieces: what lies further apart hangs together through what is between.
+# A long track is cut into overlapping pieces of this length; distant keyframes are linked through those in between.
 _MAX_PIECE = 8
 _PIECE_STEP = 4
-# More pieces of a keyframe say nothing new about its neighbours; a share of them, weighing as much, is enough. Of fewer
-# in all none is spared, and of many keyframes no more are taken.
+# More pieces per keyframe tell nothing new about its neighbours, so an evenly thinned share with more weight is used.
+# Up to _ENOUGH_PIECES in all none are dropped, and more than _MAX_NUM_PIECES are never used.
 _NUM_PIECES_OF_KEYFRAME = 40
 _ENOUGH_PIECES, _MAX_NUM_PIECES = 8000, 20000
 _BATCH = 500
-# In stddevs: from here on an observation has half the say.
+# Residual, in standard deviations, at which an observation has half its weight.
 _ROBUST_WIDTH = 3.0
-# Of the median depth: no lens shows sharply what is so near.
+# Smallest plausible depth, as a share of the median depth: lenses are not sharp at less.
 _MIN_DEPTH = 0.01
-# From one photo to another: no feature is recognised in so different a size.
+# Largest plausible ratio of depths of a point in two photos: features of so different sizes are not matched.
 _MAX_DEPTH_RATIO = 10.0
 
 
@@ -45,7 +45,7 @@ class Poses:
 
     Attributes:
         world_from_rig: (n, 3, 3) rotations.
-        centers: (n, 3) origins of the rig frames (of the projection centre, for a single camera).
+        centers: (n, 3) origins of the rig frames (for a single camera, its projection centre).
     """
 
     world_from_rig: Array
@@ -57,15 +57,15 @@ class Poses:
 
 @dataclass(frozen=True)
 class Observations:
-    """n observations of p points, by point and then by keyframe, as rays: no camera model is left in them.
+    """n observations of p points as rays, ordered by point and keyframe; they do not need a camera model.
 
     Attributes:
         frame, point: (n,) indices of keyframe and point.
-        ray: (n, 2) point over depth in the camera.
-        weight: (n,) focal length over the stddev of a pixel coordinate.
-        cam_from_rig: (n, 3, 3) rotation and (n, 3) translation of the camera in its rig.
+        ray: (n, 2) camera coordinates x/z and y/z.
+        weight: (n,) focal length over the standard deviation of a pixel coordinate.
+        cam_from_rig_rotation, cam_from_rig_translation: (n, 3, 3), (n, 3) camera in its rig.
         points: (p, 3) in the world.
-        point_ids: (p,) of the model.
+        point_ids: (p,) ids in the model.
     """
 
     frame: Indices
@@ -78,11 +78,11 @@ class Observations:
     point_ids: Indices
 
     def with_pixel_stddev(self, pixel_stddev: float) -> Observations:
-        """Of features whose coordinates are known to so many of what they were taken to be known to."""
+        """Return a copy with another standard deviation of feature coordinates, in units of the present one."""
         return replace(self, weight=self.weight / pixel_stddev)
 
     def subset(self, rows: Indices) -> Observations:
-        """Some of the observations; points of the others are there still, seen by nobody."""
+        """Return some of the observations; all points stay, even those that are no longer seen."""
         of_each = ("frame", "point", "ray", "weight", "cam_from_rig_rotation", "cam_from_rig_translation")
         return replace(self, **{name: getattr(self, name)[rows] for name in of_each})
 
@@ -92,8 +92,8 @@ class VisionInformation:
     """Gaussian information on u relative poses (6 numbers each: turn, shift), linearised at ``origin``.
 
     Attributes:
-        origin: the poses at which the photos fit best.
-        reference, frame: (u,) keyframe ``frame`` seen from keyframe ``reference``.
+        origin: the poses of linearisation, at which the photos fit best.
+        reference, frame: (u,) pose of keyframe ``frame`` relative to keyframe ``reference``.
         matrix: (6 u, 6 u) sparse information, in blocks of 6 by 6.
     """
 
@@ -104,7 +104,7 @@ class VisionInformation:
 
 
 def model_poses(metric: pycolmap.Reconstruction, frame_ids: Iterable[int]) -> Poses:
-    """Poses of these frames."""
+    """Return the poses of the given frames."""
     rigid = [pose_of(metric.frame(int(frame_id))) for frame_id in frame_ids]
     world_from_rig = np.array([pose.rotation.matrix().T for pose in rigid])
     translations = np.array([pose.translation for pose in rigid])
@@ -112,10 +112,10 @@ def model_poses(metric: pycolmap.Reconstruction, frame_ids: Iterable[int]) -> Po
 
 
 def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Observations:
-    """All observations of 3-D points in these frames, each coordinate taken to be known to a pixel.
+    """Return all observations of 3-D points in these frames, with a standard deviation of one pixel.
 
     Raises:
-        SolverError: there is none.
+        SolverError: there are no observations.
     """
     index_of_frame = {int(frame_id): index for index, frame_id in enumerate(frame_ids)}
     point_ids = np.array(sorted(metric.points3D.keys()), dtype=np.int64)
@@ -149,7 +149,7 @@ def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> O
 
 
 def project(observations: Observations, poses: Poses, points: Array) -> tuple[Array, Array, Array]:
-    """(n, 3) points in the rig and (n, 3) in the camera, and (n, 2, 3) whitened derivative of the ray by the latter."""
+    """Return (n, 3) points in the rig, (n, 3) in the camera, and (n, 2, 3) weighted derivatives of rays by the latter."""
     frame = observations.frame
     in_rig = np.einsum("nji,nj->ni", poses.world_from_rig[frame], points[observations.point] - poses.centers[frame])
     in_cam = np.einsum("nij,nj->ni", observations.cam_from_rig_rotation, in_rig)
@@ -163,11 +163,11 @@ def project(observations: Observations, poses: Poses, points: Array) -> tuple[Ar
 
 
 def misplaced_points(observations: Observations, poses: Poses) -> Mask:
-    """(p,) whether a point lies in or behind a camera that sees it, or far nearer to it than to another: what a mapper
-    makes, now and then, of wrong matches.
+    """Return a (p,) mask of points in or behind a camera that sees them, or far nearer to it than to another.
 
-    A feature goes by its point's place over the depth. A step of centimetres may turn next to no depth into any: one
-    such point of ten thousand lets a solver take timid steps only, which end anywhere and pass for convergence.
+    Mappers sometimes make such points from wrong matches. A residual depends on the point's position over its depth, so
+    near zero depth a step of centimetres changes it without bound. One such point in ten thousand makes a solver take
+    small steps only, which end anywhere and look like convergence.
     """
     depth = project(observations, poses, observations.points)[1][:, 2]
     farthest = np.zeros(len(observations.points))
@@ -179,19 +179,19 @@ def misplaced_points(observations: Observations, poses: Poses) -> Mask:
 
 
 def ray_residuals(observations: Observations, in_cam: Array) -> Array:
-    """(n, 2) in stddevs; infinite behind the camera."""
+    """Return the (n, 2) residuals in standard deviations; infinite behind the camera."""
     with np.errstate(divide="ignore", invalid="ignore"):
         residuals = (in_cam[:, :2] / in_cam[:, 2:] - observations.ray) * observations.weight[:, None]
     return np.where(in_cam[:, 2:] > 0, residuals, np.inf)
 
 
 def robust_root_weights(residuals: Array) -> Array:
-    """(n,) roots of Cauchy weights of (n, 2) residuals in stddevs."""
+    """Return the (n,) square roots of the Cauchy weights of (n, 2) residuals in standard deviations."""
     return np.asarray(1 / np.sqrt(1 + np.sum(residuals**2, axis=1) / _ROBUST_WIDTH**2))
 
 
 def vision_information(observations: Observations, poses: Poses) -> VisionInformation:
-    """Eliminate the points of a map."""
+    """Eliminate the points of a map and return the information on its relative poses."""
     in_rig, in_cam, derivative = project(observations, poses, observations.points)
     root_weight = robust_root_weights(ray_residuals(observations, in_cam))
     to_rig = root_weight[:, None, None] * np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
@@ -212,14 +212,14 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
 
 
 def _added(key: Indices, blocks: Array) -> tuple[Indices, Array]:
-    """The different keys, ascending, and the sum of the (n, 6, 6) blocks of each."""
+    """Return the distinct keys, ascending, and the sum of the (n, 6, 6) blocks of each."""
     unique, where = np.unique(key, return_inverse=True)
     adder = sparse.csr_array((np.ones(len(key)), (where, np.arange(len(key)))), shape=(len(unique), len(key)))
     return unique, (adder @ blocks.reshape(-1, 36)).reshape(-1, 6, 6)
 
 
 def _pieces(point: Indices) -> dict[int, Indices]:
-    """Rows of the pieces of all tracks, (k, length) by length; observations come by point."""
+    """Return the rows of the pieces of all tracks, (k, length) by length; observations are ordered by point."""
     starts = np.flatnonzero(np.diff(point, prepend=-1))
     lengths = np.diff(np.append(starts, len(point)))
     pieces: dict[int, Indices] = {}
@@ -238,18 +238,18 @@ def _pieces(point: Indices) -> dict[int, Indices]:
 
 
 def _thinned(pieces: dict[int, Indices], num_keyframes: int) -> tuple[Iterator[Indices], float]:
-    """The pieces by length, evenly thinned where there are very many, and the share that is left."""
+    """Return the pieces by length, evenly thinned if there are very many, and the share that is kept."""
     num = sum(len(rows) for rows in pieces.values())
     step = max(-(-num // min(max(_NUM_PIECES_OF_KEYFRAME * num_keyframes, _ENOUGH_PIECES), _MAX_NUM_PIECES)), 1)
     return (rows[::step] for rows in pieces.values() if len(rows)), 1 / step
 
 
 def _eliminate(rows: Indices, frame: Indices, in_rig: Array, to_rig: Array, poses: Poses) -> tuple[Indices, Array]:
-    """Information on relative poses from pieces of one length.
+    """Compute the information on relative poses from pieces of one length.
 
     Args:
         rows: (k, m) observations of each piece.
-        in_rig: (n, 3). to_rig: (n, 2, 3) whitened derivative of a ray by the point in the rig.
+        in_rig: (n, 3) points. to_rig: (n, 2, 3) weighted derivative of a ray by the point in the rig.
 
     Returns:
         (l,) keys (reference, first, second keyframe) and (l, 6, 6) blocks.

@@ -1,4 +1,4 @@
-"""COLMAP's bundle adjustment with ranges: fixes the scale and bends drift back."""
+"""Bundle adjustment by COLMAP with ranges, which fixes the scale and removes drift."""
 
 from __future__ import annotations
 
@@ -34,41 +34,41 @@ from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
 from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
-# Solutions of the full problem, with the weights of ranges and pixels estimated anew in between.
+# Largest number of solutions of the full problem, between which the errors of ranges and pixels are estimated again.
 _MAX_NUM_ROUNDS = 3
-# What is still to be gained at the end, as a share of the smallest range stddev.
+# Largest movement of a keyframe left at the end, as a share of the smallest standard deviation of a range.
 _MAX_LAST_MOVEMENT = 0.01
-# Covariances of so many photos that all see the same take a minute, of twice as many ten.
+# With this many photos that all overlap the covariance takes a minute, with twice as many ten minutes.
 _MAX_NUM_IMAGES_FOR_COVARIANCE = 1500
 
 
 @dataclass(frozen=True)
 class RefineSummary:
-    """What the refinement did.
+    """Result of the refinement.
 
     Attributes:
-        num_iterations: of the solver on the full problem, successful and not.
+        num_iterations: of the solver on the full problem, successful and unsuccessful.
         num_graph_steps: of the solver on the keyframe graph before.
-        bend_m: by how much (root mean square) the keyframe graph saw the map bend, beyond any similarity.
-        initial_cost, final_cost: half the sum of squares, pixels at unit weight; at the start, with the weights of
-            then, and at the end.
+        bend_m: root mean square bending of the map in the keyframe graph, beyond any similarity.
+        initial_cost, final_cost: half the sum of squares, in pixels at unit weight: at the start with the weights at
+            that time, and at the end.
         reprojection_rms_px: root mean square length of the final reprojection errors.
-        pixel_stddev: of one coordinate of a feature, estimated from the residuals before.
+        pixel_stddev: standard deviation of a feature's coordinate, from the residuals before.
         errors: of all n ranges of the log, as weighted at the end.
-        seconds: of the solver.
-        converged: whether it stopped because nothing was left to gain.
-        message: the solver's own words.
-        misfits: why the ranges do not fit as their noise lets expect; empty if they do.
-        anchors: with refined positions and biases, and their stddevs by the covariance, if there is one.
+        seconds: time of the solver.
+        converged: whether the keyframes came to rest.
+        message: of the solver.
+        misfits: reasons why the ranges fit worse than their noise suggests; empty if they do not.
+        anchors: refined positions and biases, with standard deviations if there is a covariance.
         tags_in_cam_m: (num_tags, 3) lever arms, as given or estimated.
-        time_shift_s: how much later than thought the ranges were taken; None if that was not estimated.
-        short_range_error_m: of very short ranges, what they read too long, which dies out with a length of 1 m; None
-            if it was not estimated.
-        covariance: of poses, anchors and scale; None if it was not asked for, the model is too large or ranges and
+        time_shift_s: how much later than assumed the ranges were taken; None if not estimated.
+        short_range_error_m: amplitude of the excess of short ranges, which decays with a length of 1 m; None if not
+            estimated.
+        covariance: of poses, anchors and scale; None if not asked for, if the model is too large, or if ranges and
             photos leave something undetermined.
-        bending_factor: by how much more than the photos' residuals let expect the map was bent; 1 if nobody looked.
+        bending_factor: learnt bending over the bending that the photos' residuals suggest; 1 if unknown.
         observations: with status by the final weight of each range.
-        predicted_m: (n,) ranges by the refined model; NaN without a place.
+        predicted_m: (n,) ranges predicted by the refined model; NaN without a place.
         weights: (n,) robust weights in [0, 1]; NaN without a place.
     """
 
@@ -97,13 +97,13 @@ class RefineSummary:
 
 @dataclass(frozen=True)
 class AtRest:
-    """A refined map, when it has come to rest, and the k ranges that took part.
+    """A refined map that has come to rest, and the k ranges that took part.
 
     Attributes:
-        trajectory_m: its keyframes. scale: metres per unit of the unscaled model.
-        tags_m, centers_m: (k, 3) where tag and camera were.
+        trajectory_m: of its keyframes. scale: metres per unit of the unscaled model.
+        tags_m, centers_m: (k, 3) positions of tag and camera at each range.
         anchors: with their biases. errors: as weighted.
-        photos: alone.
+        photos: bundle adjustment of the photos alone.
     """
 
     trajectory_m: Trajectory
@@ -117,8 +117,11 @@ class AtRest:
 
 @dataclass(frozen=True)
 class Learnt:
-    """What was learnt at a map: the ranges' errors, None if nothing; and by how much more than its photos' residuals
-    let expect it is bent.
+    """What was learnt at a refined map.
+
+    Attributes:
+        errors: of the ranges; None if nothing was learnt.
+        bending_factor: learnt bending over the bending that the photos' residuals suggest.
     """
 
     errors: LearnedErrors | None
@@ -146,33 +149,32 @@ def refine_with_ranges(
     learn: Learn | None = None,
     num_threads: int = -1,
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-    """Bundle adjustment of a scaled model with range residuals.
+    """Refine a scaled model by bundle adjustment with range residuals.
 
-    Points that wrong matches put into a camera that sees them, or far nearer to it than to another, take no part.
+    Misplaced points (see ``misplaced_points``), as wrong matches make them, do not take part.
 
     Args:
         reconstruction: in the metric world; it is copied, not changed.
         trajectory, observations: of the unscaled model, as the scale stage had them.
         metric_from_sfm: from the world of ``observations`` to that of ``reconstruction``.
-        anchors: in the order of the log, in the metric world. One with a prior stddev of 0 is
-            held, one with a finite prior is drawn to it, others are free.
-        errors: of all ranges of the log, as the scale stage found them. Where they do not state their noise it is
-            estimated anew, each anchor's for itself, and shares and inflation with it.
+        anchors: in the order of the log, in the metric world. Prior standard deviation 0 fixes an anchor, a finite one
+            adds a prior, an infinite one leaves it free.
+        errors: of all ranges of the log, from the scale stage. Unless the noise is given, it is estimated again for
+            each anchor, together with shares and inflation.
         tag_in_cam_m: (3,) antenna in the camera (rig) frame; or (num_tags, 3), in the order of the log's tags.
-        first_pose_is_fixed: the gauge: True in the first camera's frame, False where
-            surveyed anchors hold the map.
-        gravity: which way is up in the first camera; counts where its pose is not fixed.
-        tape: taped distances, of which the map keeps to the control ones; as it does to the ranges between anchors
-            that the log holds.
-        learn: the ranges' errors anew, where the map has come to rest, for its covariance; None: those in ``errors``.
+        first_pose_is_fixed: the gauge: True in the first camera's frame, False where surveyed anchors determine the
+            frame.
+        gravity: the upward direction in the first camera; used if its pose is not fixed.
+        tape: taped distances, of which the control ones are fitted; ranges between anchors in the log are fitted too.
+        learn: estimates the ranges' errors at the refined map, for its covariance; None: those in ``errors`` are used.
 
     Returns:
         the refined model and the summary.
 
     Raises:
         SolverError: the solver failed.
-        InputError: an unknown key among the options passed through, a clock offset to estimate without times, or a
-            distance's end that is not in the model.
+        InputError: an option passed through to COLMAP is unknown, a clock offset is to be estimated without times, or
+            the end of a distance is not in the model.
     """
     options = options or RefineOptions()
     if options.time_offset_stddev_s and trajectory.timestamps_s is None:
@@ -199,7 +201,7 @@ def refine_with_ranges(
 
 
 def _errors_to_begin_with(problem: RefinementProblem, errors: RangeErrors, metres_per_unit: float) -> RangeErrors:
-    """Of the ranges that take part, on the map as it was given."""
+    """Return the errors of the ranges that take part, on the map as it was given."""
     ranges, options = problem.ranges, problem.options
     path = ranges.trajectory.as_in(problem.metric)
     tags_m = ranges.antennas.positions(path.centers, path.world_from_cam)
@@ -224,7 +226,7 @@ def _between_anchors(
 
 
 def _refine(problem: RefinementProblem, errors: RangeErrors, learn: Learn | None) -> RefineSummary:
-    """Unbend the map, then solve the full problem, both without the misplaced points."""
+    """Remove drift from the map, then solve the full problem, both without the misplaced points."""
     frame_ids = problem.frame_ids
     rays = model_observations(problem.metric, frame_ids)
     misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
@@ -235,7 +237,7 @@ def _refine(problem: RefinementProblem, errors: RangeErrors, learn: Learn | None
 
 @dataclass(frozen=True)
 class _Round:
-    """Where a solution of the full problem ended, all solutions so far, and iterations that are left."""
+    """Result of one solution of the full problem, all solutions so far, and the number of iterations that are left."""
 
     radio: RadioEstimate
     solutions: tuple[Solution, ...]
@@ -243,7 +245,7 @@ class _Round:
 
 
 def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent, learn: Learn | None) -> RefineSummary:
-    """Alternate between the full problem and the errors that its residuals show."""
+    """Alternate between solving the full problem and estimating the errors from its residuals."""
     added: AddedRadio
 
     def fit(errors: RangeErrors, before: _Round | None) -> _Round:
@@ -334,7 +336,7 @@ def _summary(
     *,
     is_still: bool,
 ) -> RefineSummary:
-    """Of what was done; ``is_still``: whether nothing was left to gain."""
+    """Summarise the refinement; ``is_still``: whether the keyframes came to rest."""
     observations, rows = problem.ranges.observations, problem.ranges.rows
     log, radio, options = observations.log, done.radio, problem.options
     residuals_m, weights, status = problem.residuals_m(radio), np.full(len(log), np.nan), observations.status.copy()
