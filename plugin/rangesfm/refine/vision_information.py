@@ -149,7 +149,7 @@ def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> O
 
 
 def project(observations: Observations, poses: Poses, points: Array) -> tuple[Array, Array, Array]:
-    """Return (n, 3) points in the rig, (n, 3) in the camera, and (n, 2, 3) weighted derivatives of rays by the latter."""
+    """Return (n, 3) points in the rig, (n, 3) in the camera, and (n, 2, 3) weighted derivatives of rays by these."""
     frame = observations.frame
     in_rig = np.einsum("nji,nj->ni", poses.world_from_rig[frame], points[observations.point] - poses.centers[frame])
     in_cam = np.einsum("nij,nj->ni", observations.cam_from_rig_rotation, in_rig)
