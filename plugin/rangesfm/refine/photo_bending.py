@@ -28,7 +28,7 @@ from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustmen
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
 MAX_NUM_IMAGES = 1500
-"""With all photos overlapping, an inverse of this size takes a minute, of twice the size ten minutes."""
+"""Largest map whose photos all overlap: its inverse takes a minute, that of twice as many photos ten minutes."""
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
 # independent errors of features, as in simulations; 8 to 12 in three scenes of real photos (Strecha et al. 2008).
 _FACTOR, _SPREAD = 2.0, 0.8

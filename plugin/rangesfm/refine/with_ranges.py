@@ -117,7 +117,7 @@ class AtRest:
 
 @dataclass(frozen=True)
 class Learnt:
-    """What was learnt at a refined map.
+    """The errors learnt at a refined map.
 
     Attributes:
         errors: of the ranges; None if nothing was learnt.

@@ -1,1 +1,1 @@
-"""Estimate the scale: from ranges and an unscaled path to metres per SfM unit."""
+"""The scale stage: metres per SfM unit from ranges and an unscaled path."""

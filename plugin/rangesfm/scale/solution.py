@@ -60,7 +60,7 @@ WHY_SCALE_IS_OPEN = {
     "flat": ("the path is flat", "go up and down too, or add an anchor"),
     "general": ("the path is too short or runs round the anchor", "vary it, or add an anchor"),
 }
-"""Reasons by kind of path why another scale fits as well, and what to do about it."""
+"""Reasons why another scale fits as well, and what to do about it, by the kind of path."""
 
 
 class OpenPlaceError(GeometryError):

@@ -1,1 +1,1 @@
-"""What ranges get wrong."""
+"""Errors of ranges: their components, noise, correlation, calibration and robust losses."""

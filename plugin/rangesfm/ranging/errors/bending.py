@@ -1,4 +1,4 @@
-"""How a map may be bent, as the ranges on it see it: what every range model is told of the map's own errors."""
+"""Bending of a map, as it affects the ranges: the errors of the map itself in every model of range errors."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ from rangesfm.ranging.errors.range_bins import Cells
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 
-# A turn about a straight path is seen by how the cameras turn alone: by so little that elsewhere it has no say.
+# Weight of turns against shifts in the fit of a similarity. Turns only matter for a turn about a straight path, which
+# nothing else shows; elsewhere this weight is too small to have an effect.
 _TURNS_COUNT = 1e-3
-# Steps of a random walk: cells are fewer still.
+# Largest number of steps of a random walk; the cells of ranges do not resolve more.
 _MAX_NUM_STEPS = 100
-# Start to end of a path: the relative change of the scale, the turn in radians and the shift as a share of the path's
-# length, in the median over maps of poses alone; and the spread of their logarithms. From its first to its last third
-# the real path of tests.studies.drifting_maps (ORB-SLAM, fr2_desk) changes by 0.6 % and 0.002 rad, simulated
-# halls by 0.6 to 1.0 % and 0.003 to 0.004 rad, laps of 0.5 and 2 m of drift by 0.3 to 0.9 % and 0.001 to 0.004 rad; the
-# shift that these leave was learnt at 0.0003 to 0.002 there. So few show no more than the order of magnitude.
+# Random drift from the start to the end of a path: relative change of the scale, turn in radians, and shift as a share
+# of the path's length (medians over maps of poses alone); _SPREAD is the standard deviation of their logarithms.
+# Source: tests.studies.drifting_maps. From its first to its last third the real path (ORB-SLAM, fr2_desk) changes by
+# 0.6 % and 0.002 rad, simulated halls by 0.6 to 1.0 % and 0.003 to 0.004 rad, laps with 0.5 and 2 m of drift by 0.3 to
+# 0.9 % and 0.001 to 0.004 rad. The remaining shift was learnt there as 0.0003 to 0.002. So few maps give the order of
+# magnitude.
 _OF_PATH = {"scale_drift": 0.004, "heading_drift": 0.002, "bending": 0.0005}
 _SPREAD = 1.0
 _OF_STEP = {"scale_drift": slice(0, 1), "heading_drift": slice(1, 4), "bending": slice(4, 7)}
@@ -42,10 +44,10 @@ def by_poses(
     tag_from_center: Array,
     on_path: OnPath,
 ) -> csr_array:
-    """(n, 6 k) by how much distances grow as each of k poses turns in its own frame, and shifts in the model's world.
+    """Return (n, 6 k) derivatives of the distances by k poses: turns in their own frames, shifts in the model's world.
 
     Args:
-        model_from_cam: (n, 3, 3). tag_from_center: (n, 3) metres, in the axes of the model.
+        model_from_cam: (n, 3, 3) rotations. tag_from_center: (n, 3) lever arms, metres, in the axes of the model.
     """
     num_poses = int(max(on_path.before.max(), on_path.after.max())) + 1
     by_shift = metric_from_model.scale * gradient.by_tag @ metric_from_model.rotation
@@ -63,12 +65,12 @@ def by_poses(
 
 @dataclass(frozen=True)
 class BendingOfCells:
-    """What a map's bending does to c cells of ranges.
+    """Effect of a map's bending on c cells of ranges.
 
     Attributes:
         components: of the ranges' errors, in metres.
-        formal_m2: (c, c) covariance by what the photos' residuals let expect; zero where nobody has looked at photos.
-        shift_m: (c,) by how much the predicted ranges grow as the map goes to where the photos alone would have it.
+        formal_m2: (c, c) covariance expected from the photos' residuals; zero if photos were not used.
+        shift_m: (c,) change of the predicted ranges if the map moves to the minimum of the photos alone.
     """
 
     components: tuple[Component, ...]
@@ -77,20 +79,24 @@ class BendingOfCells:
 
 
 class MapBending(Protocol):
-    """What is known of how a map is bent."""
+    """Prior knowledge of how a map is bent."""
 
     def of_cells(self, cells: Cells, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfCells:
-        """As cells of ranges see it.
+        """Return the bending in cells of ranges.
 
         Args:
-            by_pose: (n, 6 k) of each range, by the path's poses, as of ``by_poses``.
-            frame_is_free: whether the map's place is estimated, or hangs on the first pose.
+            by_pose: (n, 6 k) derivatives of each range by the path's poses, from ``by_poses``.
+            frame_is_free: whether the map's place is estimated; otherwise it is fixed to the first pose.
         """
         ...
 
 
 def component_of(name: str, covariance: Array, factor: float, spread: float) -> Component | None:
-    """A component in metres, of which so many times the covariance is expected; None if the cells do not see it."""
+    """Return a component in metres with ``factor`` as the median of its size; None if the cells are not affected.
+
+    Args:
+        covariance: (c, c) for a factor of 1. spread: standard deviation of the logarithm of the factor.
+    """
     size_m = float(np.sqrt(np.trace(covariance) / max(len(covariance), 1)))
     if not size_m > 0:
         return None
@@ -99,7 +105,7 @@ def component_of(name: str, covariance: Array, factor: float, spread: float) -> 
 
 
 def averaged(cells: Cells, by_range: csr_array, num_poses: int) -> Array:
-    """(c, 6 k) of (n, 6 k'), where the last of k poses may have no ranges."""
+    """Average (n, 6 k') derivatives over cells and return (c, 6 k); the last of the k poses may have no ranges."""
     of_range, shape = cells.of_range, (len(cells), len(cells.of_range))
     share = cells.weight / np.maximum(cells.worth, 1e-12)[of_range]
     sums = csr_array((share, (of_range, np.arange(len(of_range)))), shape=shape) @ by_range
@@ -107,13 +113,14 @@ def averaged(cells: Cells, by_range: csr_array, num_poses: int) -> Array:
 
 
 def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool) -> Array:
-    """(c, 6 k) of functions that do not see the map's scale and place any more.
+    """Return the (c, 6 k) derivatives of functions made independent of the map's scale and place.
 
-    The scale is that of the similarity that fits all centres best; so is the place where it is free, else it is that of
+    The scale is that of the similarity that fits all centres best. The place is also that of the similarity if it is
+    free; otherwise it is that of the first pose.
     the first pose.
 
     Args:
-        path: in the model's world.
+        path: the poses, in the model's world.
     """
     motions = _motions(path)
     weighted = motions * np.tile(np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3), len(path))[:, None] ** 2
@@ -126,7 +133,7 @@ def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool)
 
 
 def _motions(path: Trajectory) -> Array:
-    """(6 k, 7) how poses move with the logarithm of the scale, a turn and a shift about the first of them."""
+    """Return the (6 k, 7) motions of poses by the logarithm of the scale, a turn and a shift about the first pose."""
     motions = np.zeros((len(path), 6, 7))
     motions[:, :3, 1:4] = np.swapaxes(path.world_from_cam, 1, 2)
     motions[:, 3:] = similarity_motions(path.centers - path.centers[0])
@@ -139,15 +146,16 @@ def _size(path: Trajectory) -> float:
 
 @dataclass(frozen=True)
 class WalkBending:
-    """Of a map of poses alone: from pose to pose its scale, its heading and its place go astray by chance.
+    """Random-walk drift of a map of poses alone.
 
-    What goes astray at a pose takes all that comes after with it, so that these are random walks along the path.
+    Scale, heading and place change randomly from pose to pose. A change at one pose carries all later poses along, so
+    these are random walks along the path.
 
     Attributes:
-        given: the path as it came, in the model's world.
-        steps: (s, 7) by how much it is bent back at each of some poses: logarithm of the scale, turn and shift, in
-            units of the walks' stddevs from start to end; None: not at all.
-        frame_is_free: as of ``of_cells``, for the path as bent back.
+        given: the original path, in the model's world.
+        steps: (s, 7) corrections at some of the poses: logarithm of the scale, turn and shift, in units of the walks'
+            standard deviations from start to end; None: no correction.
+        frame_is_free: as in ``of_cells``, for the corrected path.
     """
 
     given: Trajectory
@@ -165,18 +173,18 @@ class WalkBending:
         return BendingOfCells(tuple(each for each in found if each is not None), nothing, shift_m)
 
     def factors(self, cells: Cells, by_pose: csr_array, *, frame_is_free: bool) -> Array:
-        """(c, s, 7) by how much cells grow with each step."""
+        """Return the (c, s, 7) derivatives of the cells by each step."""
         path = self.path
         functions = without_similarity(averaged(cells, by_pose, len(path)), path, frame_is_free=frame_is_free)
         starts, unit = self._steps_of_path
         return np.asarray(_after(functions, path, starts) * unit)
 
     def bent_back(self, factors: Array, pulls: Array, errors: LearnedSizes, *, frame_is_free: bool) -> WalkBending:
-        """By the likeliest steps.
+        """Return the walk corrected by the most likely steps.
 
         Args:
-            factors: of the cells. pulls: (c,) residuals, solved by their covariance.
-            errors: stddevs in metres by name, as learnt.
+            factors: of the cells. pulls: (c,) residuals multiplied by their inverse covariance.
+            errors: learnt standard deviations in metres, by name.
         """
         steps = -np.einsum("csi,c->si", factors, pulls)
         for name, which in _OF_STEP.items():
@@ -186,7 +194,7 @@ class WalkBending:
 
     @cached_property
     def _steps_of_path(self) -> tuple[Indices, Array]:
-        """(s,) poses at which it is bent, and (s, 7) stddevs there if those from start to end are 1."""
+        """Indices (s,) of the poses with a step, and (s, 7) standard deviations for a walk of 1 from start to end."""
         steps = np.linalg.norm(np.diff(self.given.centers, axis=0), axis=1)
         starts = np.unique(np.linspace(0, len(steps), min(len(steps), _MAX_NUM_STEPS) + 1).astype(np.int64))[:-1]
         length = float(steps.sum())
@@ -195,7 +203,7 @@ class WalkBending:
 
     @cached_property
     def path(self) -> Trajectory:
-        """As bent back, as large as it came, and lying as it came."""
+        """The corrected path, with the size and the place of the original path."""
         given = self.given
         if self.steps is None:
             return given
@@ -209,7 +217,11 @@ class WalkBending:
 
 
 def bent_path(path: Trajectory, starts: Indices, steps: Array) -> Trajectory:
-    """With all poses after each of some moved as one, about that one, by (s, 7) logarithm of scale, turn and shift."""
+    """Return the path with all poses after each of some moved together.
+
+    Args:
+        starts: (s,) poses about which the later ones move. steps: (s, 7) logarithm of scale, turn and shift.
+    """
     centers, rotations = path.centers.copy(), path.world_from_cam.copy()
     total = IDENTITY
     ends = np.append(starts[1:], len(path) - 1)
@@ -224,7 +236,7 @@ def bent_path(path: Trajectory, starts: Indices, steps: Array) -> Trajectory:
 
 
 def _after(functions: Array, path: Trajectory, starts: Indices) -> Array:
-    """(c, s, 7) how functions change as all poses after each of s move as one, about that one."""
+    """Return the (c, s, 7) change of functions as all poses after each of s move together about that pose."""
     parts = functions.reshape(len(functions), len(path), 6)
     turns = np.einsum("cki,kji->ckj", parts[:, :, :3], path.world_from_cam)
     centers = path.centers - path.centers[0]

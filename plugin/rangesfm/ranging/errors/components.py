@@ -1,7 +1,7 @@
-"""What ranges get wrong: the components of their errors, each with what the population of radios lets expect of it.
+"""The components of the ranges' errors, each with its typical size over a population of radios.
 
-An error of two cells is covariant as their anchors, places, directions, distances and times are alike. Each survey
-learns its own stddevs on top of what the population shows.
+The errors of two cells are correlated if their anchors, places, directions, distances or times are similar. Each survey
+learns its own standard deviations, with the population as prior.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ from scipy.spatial.distance import cdist
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.range_bins import Cells
 
+# Decay length of the short-range error, metres, and correlation time of errors that last for seconds.
 _SHORT_M = 1.0
 _TIME_S = 3.0
-# As a warming radio has it.
+# Correlation time of the slow drift, seconds, as of a warming radio.
 _DRIFT_S = 60.0
-# Of the tag's place, and of 1 minus the cosine between directions in the camera: as echoes and antennas' lobes have it.
+# Correlation lengths: of errors by the tag's position (metres), as for echoes; of errors by direction in the camera (1
+# minus the cosine), as for the lobes of antennas.
 _PLACE_M, _LOBE = 0.5, 0.1
-# Radians away from the way an anchor faces.
+# Angular width, radians, of the delay of an anchor's antenna away from the direction it faces.
 _OFF_AXIS_RAD = 1.0
-# In logarithms of distance.
+# Correlation length of the error curve in the logarithm of the distance.
 _SMOOTH = 1.0
 _MIN_DISTANCE_M = 0.05
-# Metres (slope: share of the distance), as learnt against the true distances from one start for all, by
-# ``python -m tests.studies.shown_errors``. A dash stands where a log has one tag, whose bias is that of all ranges. The
-# logs are those of ``examples/radios.md``.
+# Standard deviations in metres (slope: share of the distance), learnt against the true distances, with one start for
+# all, by ``python -m tests.studies.shown_errors``. A dash stands where a log has one tag, whose bias is then the common
+# bias. The logs are described in ``examples/radios.md``.
 _SHOWN = """
 log         room_env1 room_calibration starloc_s5 rcv_sequence1 rcv_sequence3 lias_mid plaza1 starloc_fast_s1
 radio       room      room             starloc    rcv           rcv           lias     plaza  starloc_fast
@@ -50,23 +52,23 @@ tag_antenna 0.033     0.029            0.021      0.023         0.018         0.
 """
 _NOT_SHOWN = "-"
 LOGS = tuple(_SHOWN.split()[1:9])
-# Of the logarithms: eight logs do not show how alike other radios are.
+# Smallest standard deviation of the logarithms: eight logs do not show how similar other radios are.
 _LEAST_SPREAD = 0.5
 
 
 @dataclass(frozen=True)
 class Component:
-    """One way in which ranges err.
+    """One component of the errors of ranges.
 
     Attributes:
-        name: of its stddev in ``result.json``.
-        median: stddev, metres (``slope``: share of the distance), over radios.
-        spread: stddev of the logarithm of that over radios.
-        calibrated_median: the same once a learnt error curve is taken off: its change from one day, mounting and
-            room to the next. None: no matter.
-        is_of_anchor: whether each anchor has it for itself, more where its ranges are noisier.
-        correlation: (c, c) of cells, for a stddev of 1.
-        words: for people.
+        name: of its standard deviation in ``result.json``.
+        median: over radios, of its standard deviation in metres (``slope``: share of the distance).
+        spread: standard deviation of the logarithm of that over radios.
+        calibrated_median: the median after a learnt error curve was subtracted: the change from one day, mounting and
+            room to the next. None: the calibration makes no difference.
+        is_of_anchor: whether it is independent for each anchor, and larger where the anchor's ranges are noisier.
+        correlation: returns the (c, c) covariance of cells for a standard deviation of 1.
+        words: description for people.
     """
 
     name: str
@@ -87,12 +89,12 @@ def _same_link(cells: Cells) -> Array:
 
 
 def _fading(values: Array, within: float) -> Array:
-    """(c, c) of a random function of (c,) values, rough at any scale."""
+    """Return the (c, c) covariance of a rough random function of (c,) values (exponential)."""
     return np.exp(-np.abs(values[:, None] - values) / within)
 
 
 def _smooth(values: Array, within: float) -> Array:
-    """The same of a smooth one."""
+    """Return the (c, c) covariance of a smooth random function of (c,) values (squared exponential)."""
     return np.exp(-0.5 * (np.abs(values[:, None] - values) / within) ** 2)
 
 
@@ -111,13 +113,13 @@ def _short(cells: Cells) -> Array:
 
 
 def _by_direction(directions: Array) -> Array:
-    """Of a random polynomial of the direction, half of its variance linear and half quadratic in the unit vector."""
+    """Return the covariance of a random polynomial of the direction, half linear and half quadratic in its variance."""
     cosine = directions @ directions.T
     return cosine / 2 + (3 * cosine**2 - 1) / 4
 
 
 def _off_axis(cells: Cells) -> Array:
-    """Anchors face the path: of one make, they are late alike towards where they do not face."""
+    """Return the covariance of delays away from the direction an anchor faces; anchors of one make are alike."""
     same = _same(cells.anchor_index)
     facing = same @ cells.from_anchor
     cosine = np.sum(cells.from_anchor * facing, axis=1) / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)
@@ -125,7 +127,7 @@ def _off_axis(cells: Cells) -> Array:
 
 
 def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, ...]:
-    """All of them, with median and spread over radios by name."""
+    """Return all components, given median and spread over radios by name."""
 
     def of(
         name: str,
@@ -169,17 +171,17 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
 
 
 def stddevs_in(log: str) -> dict[str, float]:
-    """Of each component, as one of LOGS shows it."""
+    """Return the standard deviation of each component, by name, in one of LOGS."""
     _, _, *components = (line.split() for line in _SHOWN.strip().splitlines())
     of_log = {name: sizes[LOGS.index(log)] for name, *sizes in components}
     return {name: float(size) for name, size in of_log.items() if size != _NOT_SHOWN}
 
 
 def population(without: str | None = None) -> dict[str, tuple[float, float]]:
-    """Median of each component's stddev, and stddev of its logarithm, over the logs.
+    """Return the median of each component's standard deviation over the logs, and the stddev of its logarithm.
 
     Args:
-        without: a log; all of its radio are left out.
+        without: a log; all logs of its radio are left out.
     """
     logs, radios, *components = (line.split() for line in _SHOWN.strip().splitlines())
     left_out = None if without is None else radios[logs.index(without)]
@@ -199,29 +201,29 @@ BENDS = {
     "heading_drift": "the map's heading, drifting along the path",
     "bending": "the map's own bending",
 }
-"""Components that are the map's, not the ranges', with words for people: what it does to them depends on the map."""
+"""Components that are errors of the map, not of the ranges, with descriptions; their effect depends on the map."""
 
 LEARNT_CURVE = "learnt_curve"
-"""What is left of an error curve that has been taken off, as it was learnt with it."""
+"""Remaining error of an error curve that was subtracted, as learnt with the curve."""
 
 GIVEN = "given"
-"""No component of the ranges' errors: what is known beforehand of the map and the anchors."""
+"""Uncertainty of what was given on map and anchors; not a component of the ranges' errors."""
 
 
 REWEIGHTING = "reweighting"
-"""None either: by how much the best weights for these errors would change the scale."""
+"""Change of the scale by the best weights for these errors; not a component of the ranges' errors."""
 
 
 CLOCKS = "clocks"
-"""None either: by how far the clocks' offset may be another."""
+"""Uncertainty of the camera-radio time offset; not a component of the ranges' errors."""
 
 
 PLACES = "places"
-"""Not a component of the ranges' errors: the uncertainty of the camera's places, of keyframes and between them."""
+"""Uncertainty of the camera's positions at and between keyframes; not a component of the ranges' errors."""
 
 
 def component_words(names: Iterable[str]) -> dict[str, str]:
-    """What each component is, for people."""
+    """Return descriptions of components for people, by name."""
     words = {component.name: component.words for component in COMPONENTS} | BENDS
     words |= {
         LEARNT_CURVE: "the learnt error curve",

@@ -1,4 +1,4 @@
-"""ErrorCurve: by how much a radio reads long or short at each distance, and ranges freed from it."""
+"""ErrorCurve: the mean error of a radio by distance, and its subtraction from ranges."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rangesfm.options import BIAS_M, LENGTH_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.range_log import RangeLog
 
 COLUMNS = ("distance_m", "error_m", "stddev_m", "noise_stddev_m")
-# How fast a curve may run away beyond where it was learnt, for each e-fold of distance. The DW1000's own
-# error changes by 0.05 to 0.1 m for each (Decawave application note APS011).
+# Standard deviation by which the curve may change outside its knots, per e-fold of distance. The DW1000's own error
+# changes by 0.05 to 0.1 m per e-fold (Decawave application note APS011).
 DRIFT_STDDEV_M = 0.1
 _MUCH_OUTSIDE = 0.02
 
@@ -26,8 +26,8 @@ class ErrorCurve:
 
     Attributes:
         distance_m: (k,) true distances, ascending, k >= 2.
-        error_m: (k,) measured minus true there.
-        stddev_m: (k,) of ``error_m``: an error that all ranges of this length share.
+        error_m: (k,) measured minus true distance there.
+        stddev_m: (k,) standard deviation of ``error_m``, which all ranges of this length share.
         noise_stddev_m: (k,) scatter of single ranges about the curve.
     """
 
@@ -37,12 +37,12 @@ class ErrorCurve:
     noise_stddev_m: Array
 
     def true_distance(self, range_m: Array) -> tuple[Array, Array]:
-        """Invert ``range = distance + error(distance)``.
+        """Solve ``range = distance + error(distance)`` for the distance.
 
-        Beyond its ends the curve keeps its last value, and is less and less certain.
+        Outside its ends the curve keeps its last value, with increasing uncertainty.
 
         Returns:
-            (n,) distances, not less than a tenth of the range, and (n,) stddevs of the correction.
+            (n,) distances, at least a tenth of the range, and (n,) standard deviations of the correction.
         """
         knots = self.distance_m + self.error_m
         error = np.interp(range_m, knots, self.error_m)
@@ -51,13 +51,13 @@ class ErrorCurve:
         return distance, np.hypot(np.interp(range_m, knots, self.stddev_m), DRIFT_STDDEV_M * beyond)
 
     def share_outside(self, range_m: Array) -> float:
-        """Share of ranges of lengths at which the curve was not learnt."""
+        """Return the share of ranges with lengths outside the curve."""
         knots = self.distance_m + self.error_m
         return float(np.mean((range_m < knots[0]) | (range_m > knots[-1]))) if len(range_m) else 0.0
 
 
 def correct_ranges(log: RangeLog, curve: ErrorCurve) -> tuple[RangeLog, list[str]]:
-    """The log as a radio without this error would have written it, and what the user should know."""
+    """Return the log with the error subtracted, and notes for the user."""
     distance, stddev = curve.true_distance(log.range_m)
     notes = []
     if (outside := curve.share_outside(log.range_m)) > _MUCH_OUTSIDE:
@@ -69,18 +69,18 @@ def correct_ranges(log: RangeLog, curve: ErrorCurve) -> tuple[RangeLog, list[str
 
 
 def write_error_curve(curve: ErrorCurve, path: str | Path) -> None:
-    """Write ``distance_m,error_m,stddev_m,noise_stddev_m``."""
+    """Write a table with columns ``distance_m,error_m,stddev_m,noise_stddev_m``."""
     rows = np.column_stack([curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m])
     write_table(Path(path), COLUMNS, ([f"{value:.5f}" for value in row] for row in rows.tolist()))
 
 
 def is_error_curve_file(head: str) -> bool:
-    """Whether a file that begins like this is an error curve."""
+    """Return True if a file that begins like this is an error curve."""
     return has_columns(head, COLUMNS)
 
 
 def read_error_curve(path: str | Path) -> ErrorCurve:
-    """Read what ``write_error_curve`` writes.
+    """Read a file in the format of ``write_error_curve``.
 
     Raises:
         InputError: with the line, for distances that do not ascend, negative stddevs, and a curve so steep

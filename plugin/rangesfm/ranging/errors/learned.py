@@ -1,4 +1,4 @@
-"""How large each component of the ranges' errors is in a survey: learnt from residuals, on what radios let expect."""
+"""Learning of the size of each error component in a survey, from its residuals and the population of radios."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from rangesfm.ranging.errors.bending import BendingOfCells
 from rangesfm.ranging.errors.components import BENDS, COMPONENTS, LEARNT_CURVE, Component
 from rangesfm.ranging.errors.range_bins import Cells
 
-# Noise of single ranges up to which a radio is one of the population. Of one with more all else may be off by more, and
-# faster than in proportion: an old one with five times the noise reads 7 % long, where the others are right to a
-# percent.
+# Noise of single ranges up to which a radio belongs to the population. With more noise all other components may be
+# larger too, by more than in proportion: an old radio with five times the noise reads 7 % too long, while the others
+# are right to a percent.
 _USUAL_NOISE_M, _WIDENING_POWER = 0.1, 1.5
 _MAX_NUM_ITERATIONS = 100
 _TOLERANCE = 1e-9
-# Logarithms of stddevs, beside the median: farther away the likelihood is flat.
+# Bounds of the logarithms of standard deviations, relative to the median; farther away the likelihood is flat.
 _FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 4.0
-# Of unknowns, of unit length: what a combination of them changes less than this changes nothing.
+# Relative singular value below which a combination of unknowns has no effect.
 _DEPENDENT = 1e-7
-# Of the trace of a covariance, which rounding may leave singular.
+# Share of a covariance's trace that is added to its diagonal, as rounding may leave it singular.
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
 class LearnedErrors:
-    """What c cells of ranges get wrong.
+    """Errors of c cells of ranges.
 
     Attributes:
         cells: of the ranges.
-        of_range: (n,) the cell of each range; -1 of one that took no part.
-        names, stddevs: of the components; metres, ``slope`` a share of the distance; of what is not learnt, of cells on
-            average.
-        covariances_m2: (k, c, c) that each of them adds.
-        unlikeliness: what is expected has against these stddevs, as -2 times a logarithm.
+        of_range: (n,) cell of each range; -1 for a range that did not take part.
+        names, stddevs: of the components, in metres (``slope``: share of the distance). For covariances that were not
+            learnt, the root mean square over cells.
+        covariances_m2: (k, c, c) contribution of each.
+        unlikeliness: -2 times the logarithm of the prior probability of these standard deviations.
     """
 
     cells: Cells
@@ -50,16 +50,16 @@ class LearnedErrors:
 
     @property
     def covariance_m2(self) -> Array:
-        """(c, c) of all of them."""
+        """(c, c) covariance of all components together, square metres."""
         return np.asarray(self.covariances_m2.sum(axis=0))
 
     @property
     def stddev_of_component(self) -> dict[str, float]:
-        """By name."""
+        """Standard deviation of each component, by name."""
         return dict(zip(self.names, self.stddevs.tolist(), strict=True))
 
     def without(self, *names: str) -> LearnedErrors:
-        """But for some components."""
+        """Return the errors without some components."""
         kept = [row for row, each in enumerate(self.names) if each not in names]
         return replace(
             self,
@@ -69,21 +69,21 @@ class LearnedErrors:
         )
 
     def subset(self, rows: Indices) -> LearnedErrors:
-        """Of some of the ranges."""
+        """Return the errors of some of the ranges."""
         return replace(self, of_range=self.of_range[rows])
 
     def spread(self, rows: Indices, num: int) -> LearnedErrors:
-        """The same as ``rows`` of ``num`` ranges, of which the others take no part."""
+        """Return the errors as ``rows`` of ``num`` ranges; the others do not take part."""
         of_range = np.full(num, -1, dtype=np.int64)
         of_range[rows] = self.of_range
         return replace(self, of_range=of_range)
 
     def stddev_of(self, influence: Array) -> dict[str, float]:
-        """What each component does to a number that moves by (n,) ``influence`` for each metre of a range."""
+        """Return the effect of each component on a number that changes by (n,) ``influence`` per metre of a range."""
         return self.stddev_of_cells(self.cells.total(influence))
 
     def stddev_of_cells(self, of_cells: Array) -> dict[str, float]:
-        """The same by (c,) influence for each metre of a cell."""
+        """Return the effect of each component on a number that changes by (c,) ``of_cells`` per metre of a cell."""
         variances = np.einsum("i,kij,j->k", of_cells, self.covariances_m2, of_cells)
         return dict(zip(self.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
 
@@ -99,24 +99,26 @@ def learn_errors(
     others_m2: Mapping[str, Array] | None = None,
     bending: BendingOfCells | None = None,
 ) -> LearnedErrors:
-    """Restricted maximum likelihood (Patterson and Thompson, 1971) with lognormal priors on the stddevs.
+    """Estimate the components by restricted maximum likelihood with lognormal priors on the standard deviations.
+
+    Source: Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal", 1971.
 
     Args:
-        off_m: (n,) measured minus predicted, without any bias.
-        design: (n, p) by how much each predicted range grows with the unknowns of the map.
-        prior_design: (r, p) what is known of these beforehand, in stddevs.
-        noise_m: of single ranges.
-        curve_stddev_m: (n,) of a learnt error curve that has been taken off; None if none has.
-        ruled_out: components that the user knows not to be there.
-        others_m2: (c, c) covariances of what else there is, by name, of which nothing is to be learnt.
-        bending: of the map; None: it is not bent.
+        off_m: (n,) measured minus predicted range, without any bias.
+        design: (n, p) derivatives of the predicted ranges by the unknowns of the map.
+        prior_design: (r, p) derivatives of the priors by these, in standard deviations.
+        noise_m: standard deviation of single ranges.
+        curve_stddev_m: (n,) of a learnt error curve that was subtracted; None if none was.
+        ruled_out: names of components that the user knows to be absent.
+        others_m2: (c, c) covariances of further errors, by name, which are not learnt.
+        bending: of the map; None: the map is not bent.
     """
     expected = ExpectedErrors.of(cells, curve_stddev_m, ruled_out, others_m2, bending)
     return expected.learnt(cells.mean(off_m), cells.mean(design), prior_design, noise_m)
 
 
 def usual_stddevs(*, is_calibrated: bool) -> dict[str, float]:
-    """Of all components by name: roots of the mean variances over radios (of a lognormal stddev)."""
+    """Return the usual standard deviation of all components by name: the root mean variance over radios (lognormal)."""
     return _usual(COMPONENTS, is_calibrated=is_calibrated)
 
 
@@ -126,13 +128,13 @@ def _usual(components: Iterable[Component], *, is_calibrated: bool) -> dict[str,
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """What radios let expect of c cells before anything is measured: k components of which there is to learn.
+    """Errors to expect in c cells before anything is measured, with k components to be learnt.
 
     Attributes:
-        components: these. of_components: (k, c, c) covariances for a stddev of 1 of each.
-        known: (c, c) covariances that nothing is to be learnt of, by name.
-        shift_m: (c,) by how much predicted ranges grow as the map goes to where the photos alone would have it.
-        is_calibrated: whether a learnt error curve has been taken off.
+        components: to be learnt. of_components: (k, c, c) covariances for a standard deviation of 1 of each.
+        known: (c, c) covariances that are not learnt, by name.
+        shift_m: (c,) change of the predicted ranges if the map moves to the minimum of the photos alone.
+        is_calibrated: whether a learnt error curve was subtracted.
     """
 
     cells: Cells
@@ -151,8 +153,8 @@ class ExpectedErrors:
         others_m2: Mapping[str, Array] | None = None,
         bending: BendingOfCells | None = None,
     ) -> ExpectedErrors:
-        """As of ``learn_errors``."""
-        # One tag's own bias is that of all ranges.
+        """Set up the expected errors; arguments as for ``learn_errors``."""
+        # With one tag, its own bias is the common bias.
         left_out = {*ruled_out, *(() if np.ptp(cells.tag_index) else ("tag_bias",))}
         components = tuple(component for component in COMPONENTS if component.name not in left_out)
         components += () if bending is None else bending.components
@@ -167,7 +169,7 @@ class ExpectedErrors:
         return cls(cells, components, np.array(of_components), known, shift_m, curve_stddev_m is not None)
 
     def usual(self, stddevs: Mapping[str, float]) -> LearnedErrors:
-        """Roots of the mean variances over radios, or by name what is known better."""
+        """Return the errors with usual standard deviations, or with given ones by name."""
         usual = _usual(self.components, is_calibrated=self.is_calibrated) | dict(stddevs)
         sizes = np.array([usual[component.name] for component in self.components])
         return self._of(sizes, sizes[:, None, None] ** 2 * self.of_components)
@@ -175,12 +177,12 @@ class ExpectedErrors:
     def learnt(
         self, off_m: Array, design: Array, prior_design: Array, noise_m: float, most_unusual: float = np.inf
     ) -> LearnedErrors:
-        """As of ``learn_errors``, with (c,) and (c, p) of cells of the map as it is.
+        """Learn the errors as in ``learn_errors``, from (c,) and (c, p) cells of the map as it is.
 
         Args:
-            most_unusual: how far above its median any stddev may be, in spreads over radios.
+            most_unusual: largest standard deviation above its median, in spreads over radios.
         """
-        # A map bends no more for a bad radio, and the noise says itself how large it is.
+        # Bending does not depend on the radio, and the noise is measured itself.
         widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
         widened = [1.0 if c.name in (*BENDS, "white") else widening**2 for c in self.components]
         likelihood = _Likelihood(
@@ -200,7 +202,7 @@ class ExpectedErrors:
         return replace(found, unlikeliness=float(np.sum(np.square(off_expected))))
 
     def _of(self, stddevs: Array, covariances: Array) -> LearnedErrors:
-        """With what is known otherwise."""
+        """Return the errors with the covariances that are not learnt added."""
         names = (*(component.name for component in self.components), *self.known)
         return LearnedErrors(
             self.cells,
@@ -219,7 +221,7 @@ def _median(component: Component, is_calibrated: bool) -> float:
 
 @dataclass(frozen=True)
 class _Likelihood:
-    """Of the logarithms of k stddevs, given c cells."""
+    """Posterior likelihood of the logarithms of k standard deviations, given c cells."""
 
     of_components: Array
     log_medians: Array
@@ -230,7 +232,7 @@ class _Likelihood:
     prior_design: Array
 
     def most_likely(self, most_unusual: float) -> Array:
-        """(k,)"""
+        """Return the (k,) most likely logarithms, at most ``most_unusual`` spreads above their medians."""
         above = np.minimum(most_unusual * self.spreads, _FARTHEST_ABOVE)
         bounds = np.column_stack([self.log_medians - _FARTHEST_BELOW, self.log_medians + above])
         options = {"maxiter": _MAX_NUM_ITERATIONS, "ftol": _TOLERANCE}
@@ -256,9 +258,9 @@ class _Likelihood:
         return negative, np.exp(2 * logs) * slopes + off_median / self.spreads
 
     def mean_stddevs(self, logs: Array) -> Array:
-        """(k,) roots of the mean variances, where these logarithms are the likeliest.
+        """Return (k,) roots of the mean variances, given the most likely logarithms.
 
-        What a survey does not show is as likely twice as large as half as large, and the larger does more.
+        Where a survey does not determine a standard deviation, twice as much is as likely as half, and has more effect.
         """
         _, inverse = self._factored(logs)
         whitened, spread, _ = self._unknowns(inverse)
@@ -268,14 +270,14 @@ class _Likelihood:
         return np.asarray(np.exp(logs + np.diag(np.linalg.inv(information + np.diag(self.spreads**-2)))))
 
     def _factored(self, logs: Array) -> tuple[Array, Array]:
-        """(c, c) lower factor and inverse of the covariance."""
+        """Return the (c, c) lower Cholesky factor and the inverse of the covariance."""
         covariance = np.tensordot(np.exp(2 * logs), self.of_components, axes=1) + self.known
         covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
         lower = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
         return lower, _inverse_of(lower)
 
     def _unknowns(self, inverse: Array) -> tuple[Array, Array, float]:
-        """(c, p) whitened design, (p, p) covariance, and the logarithm of the determinant of its inverse."""
+        """Return the (c, p) whitened design, the (p, p) covariance, and the log-determinant of the latter's inverse."""
         whitened = inverse @ self.design
         information: Array = self.design.T @ whitened + self.prior_design.T @ self.prior_design
         lower = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
@@ -283,16 +285,16 @@ class _Likelihood:
 
 
 def _inverse_of(lower: Array) -> Array:
-    """(n, n) of what (n, n) is the lower Cholesky factor of."""
+    """Return the inverse of L @ L.T, given the lower Cholesky factor L, shape (n, n)."""
     below = np.tril(lapack.dpotri(lower, lower=True)[0])
     return np.asarray(below + np.tril(below, -1).T)
 
 
 def _independent(design: Array, prior_design: Array) -> tuple[Array, Array]:
-    """The same functions of the unknowns, by as many unknowns as they depend on.
+    """Return the designs in a basis of independent unknowns.
 
-    Where several explain the same, as a map that turns and its anchors, normal equations would be singular but for
-    rounding, and what they say noise.
+    If several unknowns have the same effect, such as a turn of the map and of all its anchors, the normal equations are
+    singular up to rounding.
     """
     stacked = np.vstack([design, prior_design])
     lengths = np.linalg.norm(stacked, axis=0)

@@ -1,7 +1,7 @@
-"""How noisy ranges are: found from their own residuals, or from the log alone.
+"""The noise of ranges, estimated from residuals, or from a log alone.
 
-From the log, by how much they miss a smooth curve through their neighbours. Nor is any range better than its rounding,
-of radios that report whole centimetres or decimetres.
+From a log, noise is the distance of ranges from a smooth curve through their neighbours. For radios that report whole
+centimetres or decimetres, the rounding error is a lower limit.
 """
 
 from __future__ import annotations
@@ -15,77 +15,76 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.range_log import RangeLog
 
-# Radios read up to 0.15 m short below about 2 m, every anchor alike, by an amount that depends
-# on the antennas (Decawave application note APS011). An error common to all short ranges does
-# not average out, so they are trusted far less than their scatter says.
+# Standard deviation, metres, at distance 0, and its decay length: radios read up to 0.15 m short below about 2 m, all
+# anchors alike, by an amount that depends on the antennas (Decawave application note APS011). An error common to all
+# short ranges does not average out, so they are trusted far less than their scatter suggests.
 _SHORT_RANGE_STDDEV_M = 2.0
 SHORT_RANGE_LENGTH_M = 1.0
-# Of a range of which nothing is known yet. Ranges that may be off together by more say nothing on the noise of others.
+# Assumed noise before an estimate. Ranges with a larger common error are not used to estimate the noise.
 START_STDDEV_M = 0.1
 MIN_STDDEV_M = 1e-9
-# Of a Gaussian distribution over the median of its absolute values.
+# Ratio of standard deviation to median absolute value of a normal distribution.
 _STDDEV_PER_MAD = 1.4826
-# In stddevs, root mean square: where residuals are no larger, rounding and the solver's last step are all that they
-# have in common.
+# Root mean square of residuals, in standard deviations, below which they are only rounding and the solver's tolerance.
 NO_ERROR = 1e-3
 _MAX_INFLATION = 30.0
-# Of fewer there is nothing to resample.
+# Smallest number of stretches of time for an estimate of the correlation.
 _MIN_NUM_STRETCHES = 8
-# Of the mixture of noise and outliers: residuals that it is fitted to.
+# Largest number of residuals to which the mixture of noise and outliers is fitted.
 _MAX_MIXED = 4000
 _NUM_MIXTURE_ROUNDS = 60
 # The smallest tenth of Gaussian residuals lies within this many stddevs of zero.
 _FIRST_SHARE, _FIRST_QUANTILE = 0.1, 0.1257
-# Outliers err by this many stddevs in the mean, or they would be noise.
+# Mean error of outliers, in standard deviations of the noise, at least; smaller errors would be noise.
 _MIN_OUTLIER_STDDEVS = 3.0
-# Of fewer residuals a mixture can find anything.
+# With fewer residuals a mixture is not determined.
 _MIN_MIXED = 20
 _MIN_DENSITY = 1e-300
-# From the log alone.
+# For the estimate from the log alone.
 _WINDOW = 11
 _MAX_NUM_WINDOWS = 20_000
-_MAX_STRETCH = 3.0  # a window so much longer than the typical one has a gap in it
+_MAX_STRETCH = 3.0  # a window longer than this many typical ones has a gap in it
 _CAUCHY_SCALE = 2.4
 _NUM_PARABOLA_ROUNDS = 8
 _TINY = 1e-9
 _STEPS_M = (0.1, 0.01)
 _MIN_NUM_ROUNDED = 20
-_ROUNDED_TO_M = 1e-5  # what 32-bit numbers leave of a range of some hundred metres
+_ROUNDED_TO_M = 1e-5  # rounding of 32-bit numbers, for ranges of some hundred metres
 
 
 def robust_stddev(residuals: npt.ArrayLike) -> float:
-    """Stddev of the Gaussian bulk of (n,): median absolute deviation from zero, scaled; never quite 0."""
+    """Return the stddev of the Gaussian bulk of (n,) residuals: scaled median absolute deviation from 0, never 0."""
     return float(robust_stddevs(np.reshape(residuals, (1, -1)))[0, 0]) if np.size(residuals) else MIN_STDDEV_M
 
 
 def robust_stddevs(residuals: Array) -> Array:
-    """(..., 1) the same of each row of (..., n)."""
+    """Return the (..., 1) robust standard deviations of the rows of (..., n) residuals."""
     stddevs: Array = _STDDEV_PER_MAD * np.median(np.abs(residuals), axis=-1, keepdims=True)
     return np.maximum(stddevs, MIN_STDDEV_M)
 
 
 def short_range_stddev(range_m: Array) -> Array:
-    """(n,) how far a range of this length may be off for being short, metres."""
+    """Return the (n,) standard deviation, metres, of the systematic error of short ranges."""
     return _SHORT_RANGE_STDDEV_M * np.exp(-range_m / SHORT_RANGE_LENGTH_M)
 
 
 def shared_stddev(log: RangeLog) -> Array:
-    """(n,) what all ranges of about this length may be off together: as the error curve says, else for being short."""
+    """Return the (n,) stddev of errors that ranges of similar length share, by the error curve or for short ranges."""
     return short_range_stddev(log.range_m) if log.shared_stddev_m is None else log.shared_stddev_m
 
 
 def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
-    """(m, m) turns range biases, each of its own stddev and a part that all share, into independent ones of stddev 1.
+    """Return the (m, m) matrix that whitens range biases, each with its own stddev and all with a common part.
 
     Args:
-        own_stddev_m: (m,) more than 0.
+        own_stddev_m: (m,) positive.
     """
     covariance = np.diag(own_stddev_m**2) + common_stddev_m**2
     return np.linalg.inv(np.linalg.cholesky(covariance)) if len(own_stddev_m) else np.zeros((0, 0))
 
 
 def stretch_labels(times_s: Array, length_s: float) -> Indices:
-    """(n,) labels of stretches of time, in which errors may go together: at least eight."""
+    """Return (n,) labels of stretches of time in which errors may be correlated; there are at least eight."""
     since = times_s - times_s.min()
     length_s = max(min(length_s, float(since.max()) / _MIN_NUM_STRETCHES), 1e-9)
     return np.asarray(np.floor(since / length_s).astype(np.int64))
@@ -94,15 +93,14 @@ def stretch_labels(times_s: Array, length_s: float) -> Indices:
 def correlation_inflation(
     scaled_residuals: Array, weights: Array, groups: Indices, shares: Array | None = None
 ) -> float:
-    """How much larger the stddev of a mean is than independent errors would make it.
+    """Return the ratio of the standard deviation of a mean to its value for independent errors.
 
-    Residuals of one anchor and one stretch of time (a group) tend to err together. The
-    variance of the groups' sums over the sum of variances is the square of what is returned.
+    Residuals of one anchor in one stretch of time (a group) tend to err alike. The result is the square root of the
+    variance of the groups' sums over the sum of variances.
 
     Args:
-        scaled_residuals: (n,) in stddevs. weights: (n,) robust. groups: (n,) int labels.
-        shares: (n,) by how much each counts besides, if not all alike: formally, one with half of it has twice the
-            variance.
+        scaled_residuals: (n,) in standard deviations. weights: (n,) robust. groups: (n,) int labels.
+        shares: (n,) further weights, if not all alike: a share of one half formally means twice the variance.
     """
     influence = scaled_residuals * weights
     shares = np.ones(len(influence)) if shares is None else shares
@@ -116,12 +114,12 @@ def correlation_inflation(
 
 @dataclass(frozen=True)
 class InlierNoise:
-    """What a mixture of noise and outliers says of residuals.
+    """Result of fitting a mixture of noise and outliers to residuals.
 
     Attributes:
         stddev: of the Gaussian bulk about zero, metres.
-        num: how many residuals belong to it, in the mean.
-        log_likelihood: of all residuals; of two ways to explain the same ranges, the higher one is the likelier.
+        num: expected number of residuals that belong to the bulk.
+        log_likelihood: of all residuals; it compares two explanations of the same ranges.
     """
 
     stddev: float
@@ -130,15 +128,15 @@ class InlierNoise:
 
 
 def inlier_noise(residuals: Array) -> InlierNoise:
-    """The Gaussian bulk about zero, however small a share of the residuals (n,), metres, it is.
+    """Estimate the Gaussian bulk about zero of (n,) residuals, metres, however small its share is.
 
-    A mixture of a Gaussian about zero and two exponential distributions, one for too long and one for too short
-    ranges, fitted by expectation maximisation (Dempster, Laird and Rubin, 1977). The median absolute deviation, which
-    it replaces, takes outliers for noise well before they are half of all.
+    A mixture of a Gaussian about zero and two exponential distributions, one for too long and one for too short ranges,
+    is fitted by expectation maximisation (Dempster, Laird and Rubin, 1977). The median absolute deviation would take
+    outliers for noise well before they are half of all residuals.
     """
     if len(residuals) < _MIN_MIXED:
         return _gaussian(residuals)
-    # Ordered, so that thinning keeps the distribution and the order of the ranges has no say.
+    # Sorted, so that thinning keeps the distribution and the result does not depend on the order.
     sizes = np.abs(residuals)
     thinned = np.sort(residuals)[np.linspace(0, len(residuals) - 1, min(len(residuals), _MAX_MIXED)).astype(np.int64)]
     stddev = max(float(np.quantile(sizes, _FIRST_SHARE)) / _FIRST_QUANTILE, MIN_STDDEV_M)
@@ -158,7 +156,7 @@ def inlier_noise(residuals: Array) -> InlierNoise:
 
 
 def _densities(residuals: Array, stddev: float, means: Array, shares: Array) -> Array:
-    """(3, n) of noise, of too short and of too long ranges."""
+    """Return the (3, n) weighted densities: of noise, of too long and of too short ranges."""
     gaussian = np.exp(-0.5 * (residuals / stddev) ** 2) / (np.sqrt(2 * np.pi) * stddev)
     sides = np.array([residuals > 0, residuals < 0])
     outlying = sides * np.exp(-np.abs(residuals) / means[:, None]) / means[:, None]
@@ -177,18 +175,18 @@ def _mean_or_zero(values: Array) -> float:
 
 
 def estimate_noise_m(timestamp_s: Array, range_m: Array) -> float | None:
-    """Robust stddev of the ranges between one tag and one anchor.
+    """Estimate a robust standard deviation of the ranges between one tag and one anchor.
 
-    A parabola is fitted robustly to every 11 ranges in a row; the middle one's distance from it, corrected
-    for its own pull on the fit, is a sample of the noise. Errors that last longer than a window, such as a
-    bias, are not seen; motion that is no parabola within a window counts as noise.
+    A parabola is fitted robustly to every 11 consecutive ranges. The middle range's distance from it, corrected for
+    its own effect on the fit, is a sample of the noise. Errors that last longer than a window, such as a bias, are not
+    seen; motion that is no parabola within a window counts as noise.
 
     Args:
         timestamp_s: (n,) in any order.
         range_m: (n,).
 
     Returns:
-        Metres; None for fewer than two windows' worth of ranges, or if they are absurd.
+        Metres; None for fewer ranges than two windows, or for absurd values.
     """
     if len(range_m) < 2 * _WINDOW:
         return None
@@ -198,14 +196,14 @@ def estimate_noise_m(timestamp_s: Array, range_m: Array) -> float | None:
     span = times[:, -1] - times[:, 0]
     whole = np.flatnonzero(span <= _MAX_STRETCH * np.median(span))
     chosen = whole[:: -(-len(whole) // _MAX_NUM_WINDOWS)]
-    with np.errstate(over="ignore", invalid="ignore"):  # times or ranges that no radio can mean
+    with np.errstate(over="ignore", invalid="ignore"):  # times or ranges that no radio gives
         misses = _misses_of_parabola(times[chosen], ranges[chosen])
         noise = robust_stddev(misses - np.median(misses))
     return noise if np.isfinite(noise) else None
 
 
 def _misses_of_parabola(times: Array, ranges: Array) -> Array:
-    """What the middle of each row of (m, 11) ranges is off a robust parabola, as if it had not pulled on it, (m,)."""
+    """Return (m,) distances of the middle of each row of (m, 11) ranges from a robust parabola through the others."""
     middle = _WINDOW // 2
     centred = times - times[:, middle : middle + 1]
     scaled = centred / np.maximum(np.abs(centred).max(axis=1, keepdims=True), _TINY)
@@ -219,12 +217,12 @@ def _misses_of_parabola(times: Array, ranges: Array) -> Array:
         residuals = ranges - offset - (powers @ coefficients)[..., 0]
         weights = 1 / (1 + (residuals / (_CAUCHY_SCALE * robust_stddevs(residuals))) ** 2)
     plain = np.einsum("mij,mik->mjk", powers, powers) + _TINY * np.eye(3)
-    pull = np.linalg.inv(plain)[:, 0, 0]  # of the middle, where the powers are 1, 0, 0
+    pull = np.linalg.inv(plain)[:, 0, 0]  # effect of the middle range on its fit; its powers are 1, 0, 0
     return np.asarray(residuals[:, middle] / np.sqrt(np.maximum(1 - pull, _TINY)), np.float64)
 
 
 def find_quantization_m(range_m: Array) -> float | None:
-    """The step (0.1 or 0.01 m) of which all ranges are multiples; None if of neither, or too few to tell."""
+    """Return the step (0.1 or 0.01 m) of which all ranges are multiples; None if there is none or too few ranges."""
     if len(range_m) < _MIN_NUM_ROUNDED:
         return None
     for step in _STEPS_M:
@@ -234,5 +232,5 @@ def find_quantization_m(range_m: Array) -> float | None:
 
 
 def quantization_stddev_m(step_m: float) -> float:
-    """Of the rounding error, which is uniform over one step."""
+    """Return the standard deviation of the rounding error, which is uniform over one step."""
     return step_m / math.sqrt(12)

@@ -1,4 +1,4 @@
-"""How much the ranges of one place tell beyond the first: walls and antennas make them err there alike."""
+"""Correlation of the ranges from one place: walls and antennas make them err alike."""
 
 from __future__ import annotations
 
@@ -8,49 +8,49 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import NO_ERROR
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 
-# Some wavelengths: the echoes that meet the direct path change at that scale. On real logs, anything from 0.1 to 0.5 m
-# gives scales within 0.7 % of each other.
+# Edge of a place, metres: some wavelengths, the scale at which echoes that overlap the direct path change. On real logs
+# any value from 0.1 to 0.5 m gives scales within 0.7 % of each other.
 _PLACE_SIZE_M = 0.2
-# In cells: paths at a height of 1.6 m, or of the first camera's 0, do not lie on the grid, where rounding would
-# choose the cell.
+# Offset of the grid, in cells: a path at a height of 1.6 m, or at the first camera's 0, lies on grid planes, where
+# rounding would choose the cell.
 _OFF_GRID = 1e-9
-# Of fewer ranges a correlation is a guess.
+# With fewer ranges a correlation cannot be estimated.
 _MIN_NUM = 20
 
 
 def place_labels(tags_m: Array, anchor_index: Indices) -> Indices:
-    """(n,) the same number for ranges to one anchor from one cell of a grid.
+    """Return (n,) labels, equal for ranges to one anchor from one cell of a grid.
 
     Args:
-        tags_m: (n, 3) antenna in the metric world. anchor_index: (n,).
+        tags_m: (n, 3) antenna positions in the metric world. anchor_index: (n,).
     """
     labels = anchor_index
     for axis in np.floor(tags_m / _PLACE_SIZE_M + _OFF_GRID).astype(np.int64).T:
-        # One axis after the other, as one number of all of them would not hold a site of great extent.
+        # The axes are combined one after the other, since a single number for all would overflow at large sites.
         cells, row = np.unique(axis, return_inverse=True)
         labels = np.unique(labels * len(cells) + row, return_inverse=True)[1]
     return np.asarray(labels, dtype=np.int64)
 
 
 def shares_by_residuals(labels: Indices, scaled_residuals: Array, loss: RobustLoss) -> Array:
-    """(n,) weight of each range beside its noise, by how much those of one place err alike.
+    """Return the (n,) weight of each range besides its noise, from the correlation of ranges within a place.
 
     Args:
-        labels: (n,) of places, counted from 0. scaled_residuals: (n,) in stddevs.
-        loss: that of the fit, which tones outliers down.
+        labels: (n,) of places, counted from 0. scaled_residuals: (n,) in standard deviations.
+        loss: that of the fit, which reduces outliers.
     """
     toned_down = scaled_residuals * loss.weights(scaled_residuals)
     return shares_of_places(labels, correlation_in_place(toned_down, labels))
 
 
 def correlation_in_place(errors: Array, labels: Indices) -> float:
-    """Share of the variance of errors about zero that those of one place have in common, from 0 to 1.
+    """Return the share, 0 to 1, of the errors' variance about zero that errors of one place have in common.
 
-    The intraclass correlation by analysis of variance (Donner, "A review of inference procedures for the intraclass
-    correlation coefficient in the one-way random effects model", 1986), its mean known to be zero.
+    This is the intraclass correlation by analysis of variance (Donner, "A review of inference procedures for the
+    intraclass correlation coefficient in the one-way random effects model", 1986), with the mean known to be zero.
 
     Args:
-        errors: (n,) without outliers or with these toned down. labels: (n,) of places, counted from 0.
+        errors: (n,) without outliers or with outliers reduced. labels: (n,) of places, counted from 0.
     """
     counts = np.bincount(labels)
     num_places = len(counts)
@@ -66,10 +66,10 @@ def correlation_in_place(errors: Array, labels: Indices) -> float:
 
 
 def shares_of_places(labels: Indices, correlation: float) -> Array:
-    """(n,) weight of each range so that a place counts by what its mean is worth.
+    """Return the (n,) weight of each range so that a place counts as much as the mean of its ranges.
 
-    Of c ranges with this correlation the mean is worth c / (1 + correlation (c - 1)) single ones. The weights are
-    such that a weighted estimate's formal covariance is right for independent errors as well.
+    The mean of c ranges with this correlation is worth c / (1 + correlation (c - 1)) independent ones. The weights are
+    normalised so that a weighted estimate's formal covariance is also right for independent errors.
     """
     counts = np.bincount(labels)[labels]
     worth = 1 / (1 + correlation * (counts - 1))

@@ -1,4 +1,4 @@
-"""The error curve of a radio, learnt from ranges of known length."""
+"""Estimation of a radio's error curve from ranges of known length."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from rangesfm.ranging.errors.range_errors import fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.range_log import RangeLog
 
-# Knots a sixth of an e-fold apart follow every curve that antennas and received power make.
+# Knots this far apart, in the logarithm of the distance, follow every curve that antennas and received power produce.
 _LOG_SPACING = 1 / 6
-# Change of the slope over one e-fold of distance, stddev; and of an anchor's own delay.
+# Standard deviations of the change of the slope over one e-fold of distance, and of an anchor's own delay.
 _BEND_STDDEV_M = 0.15
 _BIAS_STDDEV_M = 0.05
-# The level and the slope of the curve: next to nothing is assumed.
+# Prior standard deviation of the curve's level and slope: almost no assumption.
 _LEVEL_STDDEV_M = 10.0
-# A tag that is no further away stands on the anchor, where a distance has no logarithm to speak of.
+# A tag nearer than this is at the anchor, where the logarithm of the distance has no meaning.
 _AT_ANCHOR_M = 1e-3
 _MIN_RANGES = 100
 _MIN_RANGES_OF_KNOT = 20
@@ -37,15 +37,15 @@ _MIN_ANCHORS_TO_LEAVE_OUT = 3
 
 @dataclass(frozen=True)
 class RadioCalibration:
-    """What was learnt about a radio.
+    """Result of the calibration of a radio.
 
     Attributes:
-        curve: its error by distance.
-        num_ranges: that the curve rests on.
+        curve: error of the radio by distance.
+        num_ranges: number of ranges used for the curve.
         noise_stddev_m: scatter of a range about the curve and its anchor's bias.
-        outlier_share: ranges that do not fit, as those without line of sight.
-        anchor_bias_m: what each anchor reads too long beyond the curve.
-        distance_m, error_m: (n,) of each range: true length, and measured minus true.
+        outlier_share: share of ranges that do not fit, such as those without line of sight.
+        anchor_bias_m: bias of each anchor beyond the curve.
+        distance_m, error_m: (n,) of each range: true distance, and measured minus true.
     """
 
     curve: ErrorCurve
@@ -59,13 +59,13 @@ class RadioCalibration:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Linear in knot values and anchor biases.
+    """Linear least squares problem for knot values and anchor biases.
 
     Attributes:
-        design: (n, k + m).
-        error_m: (n,) measured minus true.
-        prior: (p, k + m) rows with stddev 1 about zero.
-        groups: (n,) labels of stretches of one anchor's ranges whose errors go together.
+        design: (n, k + m) derivatives of the errors.
+        error_m: (n,) measured minus true distance.
+        prior: (p, k + m) derivatives of the priors' residuals, which have standard deviation 1.
+        groups: (n,) labels of stretches of one anchor's ranges with correlated errors.
     """
 
     design: Array
@@ -78,15 +78,15 @@ class _Problem:
 def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> RadioCalibration:
     """Learn the mean error of a radio as a smooth function of distance.
 
-    A piecewise linear curve in the logarithm of distance with a penalty on its bends, common to all
-    anchors, and a bias of each anchor, under a Cauchy loss, so that ranges without line of sight have
-    little say. The stddev is the larger of two: by the curve's covariance, widened by the errors'
-    correlation in time; and by leaving out each anchor in turn.
+    The curve is piecewise linear in the logarithm of distance with a penalty on its bends, and common to all anchors.
+    Each anchor has a bias in addition. A Cauchy loss reduces the effect of ranges without line of sight. The standard
+    deviation is the larger of two: from the curve's covariance, widened for the errors' correlation in time; and from
+    leaving out each anchor in turn.
 
     Args:
         log: n ranges.
-        tags_m: (n, 3) the tag's antenna at each of them, in the anchors' frame; NaN where unknown.
-        anchors: with positions.
+        tags_m: (n, 3) positions of the tag's antenna, in the anchors' frame; NaN where unknown.
+        anchors: all with positions.
 
     Raises:
         InputError: an anchor of the log has no position.
@@ -110,7 +110,7 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
 
 
 def _errors(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> tuple[Array, Array]:
-    """(n,) true distances, and measured minus true; NaN where unknown."""
+    """Return (n,) true distances, and measured minus true distances; NaN where unknown."""
     by_id = {anchor.anchor_id: anchor.position_m for anchor in anchors}
     positions = []
     for anchor_id in log.anchor_ids:
@@ -123,7 +123,7 @@ def _errors(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) -> tuple[Ar
 
 
 def _knots(distance: Array) -> Array:
-    """(k,) distances evenly spaced by their logarithm, over all but the few shortest and longest ranges."""
+    """Return (k,) distances with even spacing of their logarithms, over all but the few shortest and longest ranges."""
     ends = np.quantile(distance, [_EDGE_SHARE, 1 - _EDGE_SHARE])
     low, high = np.log(ends)
     if not high - low > 2 * _LOG_SPACING:
@@ -135,7 +135,7 @@ def _knots(distance: Array) -> Array:
 
 def _problem(log: RangeLog, used: Indices, distance: Array, error: Array, index: Indices, knots: Array) -> _Problem:
     num_anchors = len(log.anchor_ids)
-    # Linear in the distance between knots, as the curve is applied.
+    # The curve is linear in the distance between knots, as it is when it is applied.
     hats = np.column_stack([np.interp(distance, knots, unit) for unit in np.eye(len(knots))])
     is_anchor = np.eye(num_anchors)[index]
     if log.timestamp_s is None:
@@ -146,7 +146,10 @@ def _problem(log: RangeLog, used: Indices, distance: Array, error: Array, index:
 
 
 def _prior(knots: Array, num_anchors: int) -> Array:
-    """Indices of stddev 1: bends of the curve as of a slope that walks at random, its ends, and the biases."""
+    """Return rows of the prior with standard deviation 1: for the curve's bends, its ends and the biases.
+
+    The bends are those of a slope that changes as a random walk.
+    """
     step = np.log(knots[1] / knots[0])
     bends = np.diff(np.eye(len(knots)), 2, axis=0) / (_BEND_STDDEV_M * step**1.5)
     ends = np.eye(len(knots))[[0, -1]] / _LEVEL_STDDEV_M
@@ -160,20 +163,20 @@ def _information(problem: _Problem, weights: Array, stddev: float) -> Array:
 
 @dataclass(frozen=True)
 class _Scatter:
-    """Of ranges about a curve: stddev, and by how much their correlation widens stddevs."""
+    """Scatter of ranges about a curve: its standard deviation, and the widening by correlation."""
 
     noise_m: float
     inflation: float
 
     @property
     def stddev_m(self) -> float:
-        """Correlated errors are worth fewer ranges, so that the curve does not follow each of them."""
+        """Standard deviation for the weights: correlated errors count as fewer ranges, and so do not bend the curve."""
         return self.noise_m * self.inflation
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Values of all unknowns (k + m,), the robust weights (n,) they were found with, and what they leave (n,)."""
+    """Values of all unknowns (k + m,), the robust weights (n,) of the fit, and its residuals (n,)."""
 
     values: Array
     weights: Array
@@ -181,7 +184,7 @@ class _Fit:
 
 
 def _fit(problem: _Problem) -> tuple[_Fit, _Scatter]:
-    """Values and robust weights, and the scatter that they leave."""
+    """Return the fit with its robust weights, and the scatter of its residuals."""
 
     def fit(scatter: _Scatter, before: _Fit | None) -> _Fit:
         start_m = problem.error_m - np.median(problem.error_m) if before is None else before.residuals_m
@@ -201,7 +204,7 @@ def _fit(problem: _Problem) -> tuple[_Fit, _Scatter]:
 
 
 def _spread_by_anchor(problem: _Problem, index: Indices, num_knots: int) -> Array:
-    """(k,) jackknife stddev of the curve over anchors; 0 with too few of them."""
+    """Return the (k,) jackknife standard deviation of the curve over anchors; 0 with too few of them."""
     present = np.unique(index)
     if len(present) < _MIN_ANCHORS_TO_LEAVE_OUT:
         return np.zeros(num_knots)
@@ -215,7 +218,7 @@ def _spread_by_anchor(problem: _Problem, index: Indices, num_knots: int) -> Arra
 
 
 def _noise_by_knot(problem: _Problem, residuals: Array, num_knots: int, noise: float) -> Array:
-    """(k,) scatter about the curve of the ranges nearest to each knot; that of all where they are few."""
+    """Return the (k,) scatter of the ranges nearest to each knot; the scatter of all where they are few."""
     nearest = np.argmax(problem.design[:, :num_knots], axis=1)
     parts = [residuals[nearest == k] for k in range(num_knots)]
     return np.array([robust_stddev(part) if len(part) >= _MIN_RANGES_OF_KNOT else noise for part in parts])

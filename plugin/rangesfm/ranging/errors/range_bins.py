@@ -1,4 +1,4 @@
-"""Cells: ranges to one anchor from one stretch of time, as one number each, so that how they err can be computed."""
+"""Cells: averages of ranges to one anchor in one stretch of time, few enough to compute their joint covariance."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from scipy.sparse import csr_array
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import robust_stddev
 
-# Their covariance is a full matrix, and learning it takes its inverse some twenty times.
+# The covariance of the cells is a full matrix, and learning it takes some twenty inversions.
 MAX_NUM_CELLS = 450
 _SHORTEST_S = 0.5
 _LONGER = 1.25
 _MIN_NOISINESS, _MAX_NOISINESS = 0.5, 3.0
-# Of fewer ranges of an anchor its noise is a guess.
+# With fewer ranges of an anchor its noise cannot be estimated.
 _MIN_NUM_OF_ANCHOR = 20
 
 
@@ -24,14 +24,14 @@ class Cells:
     """c averages of n ranges.
 
     Attributes:
-        of_range: (n,) the cell of each range.
-        weight: (n,) by which the ranges of a cell are averaged.
-        worth: (c,) ranges that a cell is worth: the sum of their weights.
+        of_range: (n,) cell of each range.
+        weight: (n,) weights of the averages.
+        worth: (c,) sum of the weights in each cell, an equivalent number of ranges.
         anchor_index, tag_index: (c,).
-        time_s: (c,) since the first range; without times, photos since the first.
-        distance_m: (c,) from anchor to tag.
+        time_s: (c,) mean time since the first range; without times, photos since the first.
+        distance_m: (c,) mean distance from anchor to tag.
         from_anchor: (c, 3) unit vectors from anchor to tag. in_cam: (c, 3) the same in the camera's frame.
-        noisiness: (c,) noise of the cell's anchor over that of all.
+        noisiness: (c,) noise of the cell's anchor relative to all anchors.
     """
 
     of_range: Indices
@@ -49,20 +49,21 @@ class Cells:
         return len(self.worth)
 
     def mean(self, values: Array) -> Array:
-        """(c, ...) of (n, ...) values of each range."""
+        """Return the (c, ...) weighted means of (n, ...) values of the ranges."""
         flat = values.reshape(len(values), -1)
         sums = np.stack([np.bincount(self.of_range, self.weight * column, len(self)) for column in flat.T], axis=1)
         means: Array = sums / np.maximum(self.worth, 1e-12)[:, None]
         return means.reshape(len(self), *values.shape[1:])
 
     def shared_by_places(self, towards: Array, placing_m: Array, gap: Indices) -> Array:
-        """Return the covariance (c, c), metres^2, of what uncertain places of the antenna do to the cells.
+        """Return the covariance (c, c), square metres, of the cells due to uncertain positions of the antenna.
 
-        Ranges from one gap between keyframes share one error of their place, a vector; those of different gaps do not.
+        Ranges from one gap between keyframes share one position error, a vector; errors of different gaps are
+        independent.
 
         Args:
-            towards: (n, 3) unit vectors from anchor to tag. placing_m: (n,) stddev of each coordinate of the place.
-            gap: (n,) the gap that each range is from.
+            towards: (n, 3) unit vectors from anchor to tag. placing_m: (n,) standard deviation of each coordinate.
+            gap: (n,) index of each range's gap.
         """
         share = self.weight * placing_m / np.maximum(self.worth[self.of_range], 1e-12)
         covariance = np.zeros((len(self), len(self)))
@@ -72,7 +73,7 @@ class Cells:
         return covariance
 
     def total(self, values: Array) -> Array:
-        """(c,) sums of (n,) values of each range."""
+        """Return the (c,) sums of (n,) values of the ranges."""
         return np.bincount(self.of_range, values, len(self)).astype(np.float64)
 
 
@@ -86,11 +87,11 @@ def cells(
     noise_of_anchor: Array,
     max_num: int = MAX_NUM_CELLS,
 ) -> Cells:
-    """At most so many that their covariance is soon computed.
+    """Average ranges in cells, with stretches of time long enough that there are at most ``max_num`` cells.
 
     Args:
         anchor_index, tag_index, time_s: (n,). from_anchor_m: (n, 3) from anchor to tag.
-        cam_from_world: (n, 3, 3) rotations. weight: (n,) robust. noise_of_anchor: (m,) over that of all.
+        cam_from_world: (n, 3, 3) rotations. weight: (n,) robust weights. noise_of_anchor: (m,) relative noise.
     """
     since = time_s - time_s.min()
     distance = np.linalg.norm(from_anchor_m, axis=1)
@@ -120,7 +121,7 @@ def cells(
 
 
 def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Array:
-    """(m,) scatter of each anchor's ranges over that of all."""
+    """Return the (m,) scatter of each anchor's ranges relative to all anchors."""
     scatter = np.full(num_anchors, np.nan)
     for k in range(num_anchors):
         own = residuals_m[anchor_index == k]
@@ -133,7 +134,7 @@ def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Ar
 
 
 def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array, max_num: int) -> Indices:
-    """(n,) counted from 0, of the shortest stretches of time that do not make too many cells."""
+    """Return (n,) cell numbers from 0, for the shortest stretches of time that do not make too many cells."""
     link = anchor_index * (int(tag_index.max()) + 2) + tag_index + 1
     length_s = _SHORTEST_S
     while True:

@@ -1,4 +1,4 @@
-"""RangeErrors: how far ranges are to be trusted, found from their own residuals (variance components)."""
+"""RangeErrors: the errors and weights of ranges, estimated from their residuals (variance components)."""
 
 from __future__ import annotations
 
@@ -29,18 +29,20 @@ _Errors = TypeVar("_Errors")
 _Fit = TypeVar("_Fit")
 
 _MIN_STDDEV_M = 1e-3
-# In stddevs: an anchor whose noise differs less from that of all has the noise of all.
+# An anchor gets its own noise only if it differs from that of all by this many standard deviations.
 _SIGNIFICANT = 3.0
-# Of fewer ranges of one anchor its noise is not told from outliers.
+# With fewer ranges of an anchor its noise cannot be told from outliers.
 _MIN_NUM_OF_ANCHOR = 20
 _NUM_MEAN_ROUNDS = 10
 _MIN_ORDINARY = 0.3
-# Errors may go together in stretches of time of this length; where the log names photos, those of a photo do.
+# Length of stretches of time, seconds, in which errors may be correlated; where the log names photos, each photo is
+# one.
 _STRETCH_S = 10.0
-# Median block residuals beyond this many stddevs are no noise.
+# A median residual of a stretch above this many standard deviations is not noise.
 _MAX_BLOCK_STDDEVS = 3.0
 _MIN_BLOCK = 5
-# Real radios' errors stay alike for seconds; that makes their residuals twice as large as their scatter, not this.
+# Errors of real radios last for seconds, which makes residuals twice as large as their scatter, but not this many
+# times.
 _MAX_STDDEV_OVER_SCATTER = 5.0
 _MIN_SCATTER_M = 0.01
 _MIN_DIFFERENCES = 20
@@ -48,25 +50,27 @@ _MIN_DIFFERENCES = 20
 
 @dataclass(frozen=True)
 class RangeErrors:
-    """How n ranges err, and so what each of them weighs: the scale stage finds it and hands it to the refinement.
+    """Errors of n ranges, and the weights that follow; the scale stage passes them on to the refinement.
 
-    To the cost of a map a range adds half of ``weight * loss(residual / stddev)``.
+    The cost of a map contains half of ``weight * loss(residual / stddev)`` for each range.
 
     Attributes:
-        stddev_m: (n,) of each range, as weighted; NaN of one without a place.
-        share: (n,) by how much each counts beside its stddev, as ranges from one place err alike.
-        inflation: of the stddev of whatever many ranges say, by their errors' correlation in time.
-        given_m: (n,) noise as the log or the survey states it; NaN where it is estimated.
-        shared_m: (n,) what ranges of about this length may be off together.
-        placing_m: (n,) how well the place is known at which each was taken, each coordinate.
-        anchor_index: (n,). block: (n,) label of each range's stretch of time. place: (n,) label of where it was taken.
-        loss: of single ranges, in their stddevs. With a wide one the noise is what all residuals show, so that what
-            drifts away is no outlier; with a bounded one that of the ranges that fit.
-        common_bias_stddev_m: of the bias that all anchors share (mean 0), of which their own priors say nothing.
-        noise_m: of a range without special cases, as a map shows it that may only grow, turn and move; one that may
-            bend shows no more.
-        log_likelihood: of the likeliest residuals that the bounded loss has seen of these ranges.
-        learned: what the scale stage has learnt of all that they get wrong together; None before.
+        stddev_m: (n,) standard deviation of each range, as weighted; NaN for a range without a place.
+        share: (n,) weight besides the standard deviation, as ranges from one place err alike.
+        inflation: factor on the standard deviation of estimates from many ranges, for their errors' correlation in
+            time.
+        given_m: (n,) noise stated by the log or the survey; NaN where it is estimated.
+        shared_m: (n,) standard deviation of the error that ranges of about this length share.
+        placing_m: (n,) standard deviation of each coordinate of the place of each range.
+        anchor_index: (n,). block: (n,) label of each range's stretch of time. place: (n,) label of its place.
+        loss: of single ranges, in their standard deviations. With a wide loss the noise is the scatter of all
+            residuals, so that drift is not taken for outliers; with a bounded loss it is the scatter of the ranges that
+            fit.
+        common_bias_stddev_m: prior of the bias that all anchors share (mean 0), besides their own priors.
+        noise_m: standard deviation of an ordinary range on a map that is only scaled, turned and moved; an upper limit
+            for maps that bend.
+        log_likelihood: highest one of residuals of these ranges so far with the bounded loss.
+        learned: components learnt in the scale stage; None before.
     """
 
     stddev_m: Array
@@ -86,10 +90,10 @@ class RangeErrors:
 
     @classmethod
     def begin(cls, observations: RangeObservations, rows: Indices, range_model: RangeModelOptions) -> RangeErrors:
-        """Of some of the ranges, before any map is looked at.
+        """Return the errors of some of the ranges, before a map is used.
 
         Args:
-            rows: (n,) of the observations, all with a place.
+            rows: (n,) rows of the observations, all with a place.
         """
         log = observations.log
         given = log.range_stddev_m[rows]
@@ -113,31 +117,31 @@ class RangeErrors:
 
     @property
     def weight(self) -> Array:
-        """(n,) by how much each counts against all that is no range, beside its stddev."""
+        """(n,) weight of each range against everything that is not a range, besides its standard deviation."""
         return self.share / self.inflation**2
 
     @property
     def group(self) -> Indices:
-        """(n,) label of the stretch of one anchor's ranges that err together."""
+        """(n,) label of the stretch of one anchor's ranges that err alike."""
         return np.asarray(self.block * (self.anchor_index.max() + 1) + self.anchor_index)
 
     @property
     def is_estimated(self) -> Mask:
-        """(n,) whose noise is found from the residuals."""
+        """(n,) True where the noise is estimated from the residuals."""
         return np.isnan(self.given_m)
 
     def robust_weights(self, residuals_m: Array) -> Array:
-        """(n,) in (0, 1], 1 for a range that fits."""
+        """Return (n,) robust weights in (0, 1]; 1 for a range that fits."""
         return self.loss.weights(residuals_m / self.stddev_m)
 
     def subset(self, rows: Indices) -> RangeErrors:
-        """Of some of the ranges."""
+        """Return the errors of some of the ranges."""
         part: dict[str, Any] = {name: values[rows] for name, values in self._of_each_range()}
         part["place"] = np.unique(part["place"], return_inverse=True)[1]
         return replace(self, learned=None if self.learned is None else self.learned.subset(rows), **part)
 
     def spread(self, rows: Indices, num: int) -> RangeErrors:
-        """The same as ``rows`` of ``num`` ranges, of which the others have no place: NaN, or label 0."""
+        """Return the errors as ``rows`` of ``num`` ranges; the others have no place, and get NaN or label 0."""
         spread: dict[str, Any] = {}
         for name, values in self._of_each_range():
             spread[name] = np.full(num, np.nan if values.dtype == np.float64 else 0, dtype=values.dtype)
@@ -149,33 +153,33 @@ class RangeErrors:
         return [(name, value) for name, value in values if isinstance(value, np.ndarray)]
 
     def at(self, tags_m: Array, placing_m: Array) -> RangeErrors:
-        """Of ranges that were taken at these places (n, 3) in the metric world, known to (n,) metres."""
+        """Return the errors of ranges taken at places (n, 3) in the metric world, with (n,) standard deviations, m."""
         return replace(self, place=place_labels(tags_m, self.anchor_index), placing_m=placing_m)
 
     def without_shared(self) -> RangeErrors:
-        """Of a map with which what short ranges share is estimated as a number of its own."""
+        """Return the errors for a map that estimates the common error of short ranges as a parameter."""
         stddev = np.sqrt(np.maximum(self.stddev_m**2 - self.shared_m**2, _MIN_STDDEV_M**2))
         return replace(self, stddev_m=stddev, shared_m=np.zeros_like(self.shared_m))
 
     def for_bending_map(self, loss: RobustLoss) -> RangeErrors:
-        """To begin with, under another loss, where a map may bend: it explains the ranges no worse than it did."""
+        """Return the errors to start with on a map that may bend, under another loss; their noise is an upper limit."""
         beyond = (self.stddev_m**2 - self.shared_m**2 - self.placing_m**2)[self.is_estimated]
         noise_m = float(np.sqrt(max(np.median(beyond), _MIN_STDDEV_M**2))) if len(beyond) else np.inf
         return replace(self, loss=loss, noise_m=noise_m, log_likelihood=-np.inf)
 
     def noise_of_all(self, residuals_m: Array) -> InlierNoise:
-        """Of the ranges without special cases, as a map that may not bend shows it."""
+        """Estimate the noise of ordinary ranges from the residuals of a map that may not bend."""
         return inlier_noise(residuals_m[self._ordinary(np.ones(len(residuals_m), dtype=bool), self.shared_m)])
 
     def noise_of_estimated(self, residuals_m: Array) -> InlierNoise:
-        """Likewise, of those that do not state their noise."""
+        """Estimate the noise of the ordinary ranges that do not state theirs."""
         return inlier_noise(residuals_m[self._ordinary_estimated()])
 
     def _ordinary_estimated(self) -> Indices:
         return self._ordinary(self.is_estimated, np.hypot(self.shared_m, self.placing_m))
 
     def _ordinary(self, among: Mask, together_m: Array) -> Indices:
-        """Ranges that may be off together by little, and so tell the noise of others."""
+        """Return the rows of ranges with a small common error, which show the noise."""
         among = among if among.any() else np.ones(len(among), dtype=bool)
         usual = np.where(self.is_estimated, START_STDDEV_M, self.given_m)
         ordinary = among & (together_m < usual)
@@ -183,14 +187,14 @@ class RangeErrors:
         return np.flatnonzero(ordinary if is_enough else among)
 
     def seen_by_rigid_map(self, residuals_m: Array, prior_cost: float) -> RangeErrors:
-        """As the residuals of a map show them that may only grow, turn and move: all anchors have one noise.
+        """Estimate the errors from residuals of a map that was only scaled, turned and moved; anchors have one noise.
 
-        What one anchor's residuals have beyond the others' is mostly the map's own bend. Where most ranges are wrong, a
-        fit can follow them, find the noise larger, take in more of them, and so on. Such a fit is less likely than the
-        state that it came from, and then the noise stays as that showed it.
+        A larger scatter of one anchor is mostly due to the map's own bending. If most ranges are wrong, a fit can
+        follow them, find a larger noise, include more of them, and so on. Such a fit is less likely than the state it
+        started from; then the noise of that state is kept.
 
         Args:
-            residuals_m: (n,). prior_cost: what priors have against the map, which counts in its likelihood.
+            residuals_m: (n,). prior_cost: cost of the priors, which is part of the likelihood.
         """
         seen = self.noise_of_all(residuals_m)
         likelihood, noise_m = seen.log_likelihood - prior_cost, seen.stddev
@@ -202,13 +206,13 @@ class RangeErrors:
         return replace(self, stddev_m=stddev, share=share, noise_m=noise_m, log_likelihood=likelihood)
 
     def seen_by_bending_map(self, residuals_m: Array, num_absorbed: float) -> RangeErrors:
-        """As the residuals of a map show them that follows the ranges: each anchor may have a noise of its own.
+        """Estimate the errors from the residuals of a map that bends to the ranges; each anchor may have its own noise.
 
-        While drift is large, so are residuals, and with the wide loss the noise is what all of them show. With the
-        bounded loss it is that of the bulk; a fit that is less likely than the one before leaves all as it is.
+        While drift is large, so are the residuals, and with the wide loss the noise is their scatter. With the bounded
+        loss it is that of the bulk. A fit that is less likely than the one before leaves the errors unchanged.
 
         Args:
-            residuals_m: (n,). num_absorbed: degrees of freedom that the fit took from them.
+            residuals_m: (n,). num_absorbed: degrees of freedom that the fit absorbed.
         """
         if not self.is_estimated.any():
             return self
@@ -223,7 +227,7 @@ class RangeErrors:
         return replace(self._with_noise(noise_m, residuals_m, num_absorbed), log_likelihood=seen.log_likelihood)
 
     def _with_noise(self, noise_m: Array, residuals_m: Array, num_absorbed: float) -> RangeErrors:
-        """With this noise (n,) of the residuals, and the correlation that it leaves in them."""
+        """Return the errors with a given noise (n,) of the residuals, and with the correlation that remains."""
         n = len(residuals_m)
         widening = np.sqrt(n / max(n - num_absorbed, 0.1 * n))
         noise_m = np.maximum(widening * noise_m, _MIN_STDDEV_M)
@@ -232,16 +236,16 @@ class RangeErrors:
         return replace(self, stddev_m=stddev, share=share).inflated(residuals_m)
 
     def inflated(self, residuals_m: Array) -> RangeErrors:
-        """With what is left of the correlation in time once the places count for what they are worth."""
+        """Return the errors with the correlation in time that remains after weighting by place."""
         scaled = residuals_m / self.stddev_m
         inflation = correlation_inflation(scaled, self.loss.weights(scaled), self.group, self.share)
         return replace(self, inflation=inflation)
 
     def _noise_ratios(self, residuals_m: Array, noise_m: float) -> Array:
-        """(m,) noise of each anchor over that of all; 1 where the difference may be chance.
+        """Return the (m,) noise of each anchor relative to all; 1 where the difference may be chance.
 
-        Noise is what scatters about the anchor's own mean: what its ranges have in common is no noise, and taken for
-        it would silence whoever disagrees.
+        Noise is the scatter about the anchor's own mean. A common error of its ranges is not noise, and would otherwise
+        reduce the weight of any anchor that disagrees.
         """
         rows = self._ordinary_estimated()
         index, own = self.anchor_index[rows], residuals_m[rows].copy()
@@ -253,21 +257,21 @@ class RangeErrors:
             if np.count_nonzero(index == k) < _MIN_NUM_OF_ANCHOR:
                 continue
             alone = inlier_noise(own[index == k])
-            # What tells outliers from noise takes some 2.7 times as many values as the variance to be as certain.
+            # The variance of the mixture's noise estimate is some 2.7 times that of an ordinary standard deviation.
             chance = self.inflation * np.sqrt(2.7 / (2 * max(alone.num, 1.0)))
             ratio = alone.stddev / together.stddev
             ratios[k] = ratio if abs(np.log(ratio)) > _SIGNIFICANT * chance else 1.0
         return ratios
 
     def _bulk_mean(self, residuals_m: Array, noise_m: float) -> float:
-        """Of the residuals that fit, found from zero."""
+        """Return the mean of the residuals that fit, iterating from zero."""
         mean = 0.0
         for _ in range(_NUM_MEAN_ROUNDS if len(residuals_m) else 0):
             mean = float(np.average(residuals_m, weights=self.loss.weights((residuals_m - mean) / noise_m)))
         return mean
 
     def change(self, other: RangeErrors) -> float:
-        """Largest relative change of a weight from these to others."""
+        """Return the largest relative difference of a weight from that of other errors."""
         ratio = np.sqrt(self.weight / other.weight) * other.stddev_m / self.stddev_m
         return float(np.max(np.abs(np.log(ratio)), initial=0.0))
 
@@ -280,16 +284,16 @@ def fit_with_own_errors(
     max_num_rounds: int,
     is_last: Callable[[_Errors, _Errors, _Fit], bool] = lambda before, seen, fitted: False,
 ) -> tuple[_Fit, _Errors, _Errors]:
-    """Alternate between a fit by what is known of the errors, and the errors that its residuals show.
+    """Alternate between fitting with given errors and estimating the errors from the fit's residuals.
 
     Args:
-        fit: by these errors, from the fit before (None at first).
-        estimate: the errors that a fit shows, given those it was made by.
-        errors: to begin with.
-        is_last: whether a fit is good enough, by its errors, by those that it shows, and by itself.
+        fit: returns a fit with these errors, started from the fit before (None at first).
+        estimate: returns the errors that a fit shows, given those it was made with.
+        errors: to start with.
+        is_last: returns whether a fit is good enough, given its errors, those that it shows, and the fit.
 
     Returns:
-        the last fit, the errors that it was made by, and those that it shows.
+        the last fit, the errors that it was made with, and those that it shows.
     """
     fitted = fit(errors, None)
     seen = estimate(errors, fitted)
@@ -302,10 +306,10 @@ def fit_with_own_errors(
 
 
 def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple[str, ...]:
-    """Why ranges that took part do not fit as their noise lets expect; empty if they do.
+    """Return reasons why the ranges fit worse than their noise suggests; empty if they do not.
 
     Args:
-        errors, residuals_m: of the k ranges that took part. time_order: (k,) anything that grows with time.
+        errors, residuals_m: of the k ranges that take part. time_order: (k,) values that increase with time.
     """
     if not len(residuals_m):
         return ()
