@@ -76,7 +76,7 @@ class Journal:
             self.progress.message(text)
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Return a duration as text: "12.3 s", "5 min 03 s" or "2 h 07 min"."""
     if seconds < 60:
         return f"{seconds:.1f} s"

@@ -11,7 +11,7 @@ import pytest
 
 from rangesfm.batch.batch_state import BatchState, Status
 from rangesfm.batch.jobs import Job
-from rangesfm.batch.run_batch import write_results
+from rangesfm.batch.run_batch import write_batch_results
 from rangesfm.errors import Failure
 from rangesfm.options import OutputOptions
 from rangesfm.survey.settings import Survey
@@ -52,7 +52,7 @@ class Page(HTMLParser):
 
 
 def test_csv_and_json_have_a_row_for_each_survey(batch_state: BatchState, tmp_path: Path) -> None:
-    write_results(batch_state, tmp_path)
+    write_batch_results(batch_state, tmp_path)
     with (tmp_path / "batch.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     summary = json.loads((tmp_path / "batch.json").read_text())
@@ -69,7 +69,7 @@ def test_csv_and_json_have_a_row_for_each_survey(batch_state: BatchState, tmp_pa
 
 
 def test_the_page_escapes_names_and_links_to_reports_that_are_there(batch_state: BatchState, tmp_path: Path) -> None:
-    write_results(batch_state, tmp_path)
+    write_batch_results(batch_state, tmp_path)
     page = Page((tmp_path / "batch.html").read_text())
     assert "script" not in page.tags
     assert BAD_NAME in page.texts
@@ -78,8 +78,8 @@ def test_the_page_escapes_names_and_links_to_reports_that_are_there(batch_state:
 
 
 def test_the_page_loads_itself_anew_until_the_batch_is_over(batch_state: BatchState, tmp_path: Path) -> None:
-    write_results(batch_state, tmp_path)
+    write_batch_results(batch_state, tmp_path)
     assert Page((tmp_path / "batch.html").read_text()).has_refresh
     batch_state.end_all(Status.INTERRUPTED, "interrupted")
-    write_results(batch_state, tmp_path)
+    write_batch_results(batch_state, tmp_path)
     assert not Page((tmp_path / "batch.html").read_text()).has_refresh

@@ -9,7 +9,7 @@ import pytest
 from tests.installed import with_gpus, with_installed
 
 from rangesfm.ceres import installation_checks
-from rangesfm.ceres.installation_checks import InstallationCheck, diagnose, versions
+from rangesfm.ceres.installation_checks import InstallationCheck, diagnose, recorded_versions
 from rangesfm.errors import SolverError
 
 
@@ -45,7 +45,7 @@ def test_the_build_with_cuda_is_well_and_goes_by_its_name(monkeypatch: pytest.Mo
     with_installed(monkeypatch, pycolmap=None, pycolmap_cuda12="4.2.1")
     check = check_named("pycolmap")
     assert (check.ok, check.found) == (True, "4.2.1 (pycolmap-cuda12)")
-    assert versions()["pycolmap"] == check.found
+    assert recorded_versions()["pycolmap"] == check.found
 
 
 def test_two_builds_over_each_other_are_not_well(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,6 +140,6 @@ def test_a_python_that_is_not_listed_is_refused(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_versions_are_texts_and_name_every_part() -> None:
-    found = versions()
+    found = recorded_versions()
     assert found.keys() >= {"python", "rangesfm", "pycolmap", "pyceres", "numpy", "scipy", "Pillow", "compiled_part"}
     assert all(isinstance(value, str) and value for value in found.values())

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from rangesfm.ceres import Step, solve
+from rangesfm.ceres import Step, solve_adjuster
 
 if TYPE_CHECKING:
     from tests.ceres.conftest import AdjusterOf, PoseBlock
@@ -30,7 +30,7 @@ def test_it_ends_where_the_adjuster_itself_ends(
         steps.append(step)
         return False
 
-    summary = solve(adjuster_of(reconstruction), is_enough)
+    summary = solve_adjuster(adjuster_of(reconstruction), is_enough)
     theirs = adjuster_of(copy).solve()
     assert isinstance(theirs, pycolmap.CeresBundleAdjustmentSummary)
     assert summary.final_cost == pytest.approx(theirs.ceres_summary.final_cost, rel=1e-6, abs=1e-12)
@@ -50,7 +50,7 @@ def test_it_ends_as_soon_as_it_is_enough_with_the_parameters_of_that_step(
         seen.append(point.xyz.copy())
         return step.is_successful
 
-    summary = solve(adjuster_of(reconstruction), is_enough)
+    summary = solve_adjuster(adjuster_of(reconstruction), is_enough)
     assert summary.termination_type.name == "USER_SUCCESS"
     assert summary.num_successful_steps == 2  # Ceres counts the start as one
     assert not np.array_equal(seen[-1], before)
@@ -64,4 +64,4 @@ def test_what_is_raised_in_between_ends_it_and_comes_through(
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        solve(adjuster_of(perturbed(reconstruction)), is_enough)
+        solve_adjuster(adjuster_of(perturbed(reconstruction)), is_enough)

@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rangesfm.comparison.comparison_page import write_comparison
-from rangesfm.comparison.many_models import ModelsComparison, compare_many, read_models
+from rangesfm.comparison.many_models import ModelsComparison, compare_many, read_named_models
 from rangesfm.comparison.model_ranges import ranges_of_survey
 from rangesfm.distances.tape import read_tape
 from rangesfm.errors import InputError
@@ -73,7 +73,7 @@ def result(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory
 
 
 def compared(*paths: Path) -> ModelsComparison:
-    return compare_many(read_models(paths))
+    return compare_many(read_named_models(paths))
 
 
 def test_a_known_similarity_is_found_and_nothing_has_moved_after_it(models: tuple[Path, Path, Path]) -> None:
@@ -124,7 +124,7 @@ def test_a_log_is_held_against_models_that_no_run_has_made(
 ) -> None:
     files = walked_survey.folder
     survey = survey_of(files)
-    named = read_models(models)
+    named = read_named_models(models)
     assert named[0].model is not None
     ranges = ranges_of_survey(survey, read_ranging_inputs(survey), named[0].model, models[0])
     (first, similar, moved) = compare_many(named, ranges).rows
@@ -149,17 +149,17 @@ def test_a_taped_distance_is_found_in_each_model_and_placed_by_the_ranges(
     first, last = (compared(*models[:2]).models[0].path.image_names[i] for i in (0, -1))
     taped = tmp_path / "taped.csv"
     taped.write_text(f"from,to,distance_m\n{first},{last},5.0\n")
-    (row,) = compare_many(read_models([result, *models[:2]]), tape=read_tape(taped)).taped
+    (row,) = compare_many(read_named_models([result, *models[:2]]), tape=read_tape(taped)).taped
     metric, whole, half = row.lengths
     assert whole is not None
     assert half == pytest.approx(whole / 2)
     assert row.lengths_m == pytest.approx((metric, metric, metric), rel=1e-6)
     assert row.measured_m == 5.0
-    (unplaced,) = compare_many(read_models(models[:2]), tape=read_tape(taped)).taped
+    (unplaced,) = compare_many(read_named_models(models[:2]), tape=read_tape(taped)).taped
     assert unplaced.lengths_m is None
     taped.write_text(f"from,to,distance_m\n{first},nowhere,5.0\n")
     with pytest.raises(InputError, match=r"taped.csv:2: an end is 'nowhere'.*model"):
-        compare_many(read_models(models[:2]), tape=read_tape(taped))
+        compare_many(read_named_models(models[:2]), tape=read_tape(taped))
 
 
 def test_the_command_takes_the_log_and_the_tape(
@@ -209,7 +209,7 @@ def test_a_file_of_positions_is_a_model_too(models: tuple[Path, Path, Path], wal
     assert row.reprojection_rms_px is None
     assert row.base_from_model.scale == pytest.approx(1 / walked_survey.site_from_sfm.scale, rel=1e-6)
     with pytest.raises(InputError, match="the first must be a model or a result folder"):
-        read_models([reference, models[0]])
+        read_named_models([reference, models[0]])
 
 
 def test_models_of_other_photos_are_refused(models: tuple[Path, Path, Path], tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from tests.studies.erring_surveys import SITES, run, surveyed
 from rangesfm.diagnostics import hypothesis_tests
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.hypothesis import Hypothesis
-from rangesfm.diagnostics.hypothesis_tests import FALSE_ALARMS, Factorization, noncentrality, row_of
+from rangesfm.diagnostics.hypothesis_tests import FALSE_ALARM_RATE, Factorization, noncentrality, row_of
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.diagnostics.mistakes import find_mistakes
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
@@ -98,4 +98,4 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
         )
         tests = Factorization(drawn).test(tried, 0)
         alarms += any(test.statistic > most for test, most in zip(tests, thresholds, strict=True))
-    assert stats.binom.sf(alarms - 1, num, FALSE_ALARMS) > 0.001
+    assert stats.binom.sf(alarms - 1, num, FALSE_ALARM_RATE) > 0.001

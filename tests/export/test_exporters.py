@@ -16,7 +16,14 @@ from tests.outputs import names_in, paths_in
 from tests.result_document import anchor_entry, result_document
 
 from rangesfm.errors import InputError
-from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, EXPORTERS, export_model, write_model, write_positions
+from rangesfm.export import (
+    COVARIANCE_FORMATS,
+    EXPORTED_NAMES,
+    EXPORTERS,
+    export_model,
+    write_camera_positions,
+    write_model,
+)
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.workflows.export_result import export_result
 
@@ -165,7 +172,7 @@ def test_model_aligner_positions_are_those_of_the_photos(tmp_path: Path, model: 
 def test_a_name_that_colmap_would_split_is_refused(tmp_path: Path, model: pycolmap.Reconstruction) -> None:
     next(iter(model.images.values())).name = "my photo.jpg"
     with pytest.raises(InputError, match=r"'my photo\.jpg'"):
-        write_positions(model, tmp_path / "positions.txt")
+        write_camera_positions(model, tmp_path / "positions.txt")
     assert list(tmp_path.iterdir()) == []
 
 

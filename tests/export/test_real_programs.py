@@ -26,7 +26,7 @@ from tests.export.models import synthesized
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.export import MetricMap, export_map
-from rangesfm.export.metric_map import points_of
+from rangesfm.export.metric_map import colored_points
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
 
@@ -109,7 +109,7 @@ def test_colmap_moves_the_unscaled_model_to_the_metric_one_by_the_transform_of_i
     run("colmap", "model_transformer", *paths)
     moved = pycolmap.Reconstruction(tmp_path / "moved")
     np.testing.assert_allclose(centers_of(moved), centers_of(map_.reconstruction), atol=1e-9)
-    np.testing.assert_allclose(points_of(moved)[0], points_of(map_.reconstruction)[0], atol=1e-9)
+    np.testing.assert_allclose(colored_points(moved)[0], colored_points(map_.reconstruction)[0], atol=1e-9)
 
 
 @needs_colmap
@@ -174,6 +174,6 @@ def vertices_of(path: Path) -> Array:
 def test_trimesh_reads_points_cameras_and_anchors(map_: MetricMap, tmp_path: Path) -> None:
     points, cameras, anchors = map(vertices_of, export(map_, tmp_path, "ply", "ply_cameras", "ply_anchors"))
     assert [len(points), len(cameras), len(anchors)] == [NUM_POINTS, NUM_PHOTOS, 2]
-    np.testing.assert_allclose(pdist(points), pdist(points_of(map_.reconstruction)[0]), rtol=1e-9)
+    np.testing.assert_allclose(pdist(points), pdist(colored_points(map_.reconstruction)[0]), rtol=1e-9)
     np.testing.assert_allclose(pdist(cameras), pdist(map_.trajectory.centers), rtol=1e-9)
     np.testing.assert_allclose(pdist(anchors), [5.0], rtol=1e-9)

@@ -122,7 +122,7 @@ def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
     from rangesfm.geometry.similarity import Similarity
     from rangesfm.geometry.trajectory import trajectory_from_reconstruction
     from rangesfm.options import CameraOptions, RefineOptions
-    from rangesfm.refine.bundle_adjustment import bundle_adjustment, solve
+    from rangesfm.refine.bundle_adjustment import bundle_adjustment, solve_bundle_adjustment
 
     assert isinstance(model, pycolmap.Reconstruction)
     path = trajectory_from_reconstruction(model)
@@ -138,7 +138,7 @@ def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
     with contextlib.suppress(RangesfmError):
         options = RefineOptions(max_num_iterations=2)
         problem = bundle_adjustment(metric, CameraOptions(), options, fixed_frame_id=None, num_threads=1)
-        solve(problem, tolerance_m=1e-3)
+        solve_bundle_adjustment(problem, tolerance_m=1e-3)
 
 
 def _refine(survey: Path, model_path: Path) -> int:

@@ -39,7 +39,7 @@ from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine import with_ranges
 from rangesfm.refine.graph_presolve import Unbent, unbend_again
-from rangesfm.refine.radio import predicted_ranges
+from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import Observations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
@@ -264,7 +264,7 @@ class TestWithoutNoise:
         log, similarity = survey.observations.log, survey.metric_from_sfm
         places = [associate(log, survey.trajectory, tag) for tag in tags]
         each = [
-            predicted_ranges(metric, survey.trajectory, places[k], similarity, tags[k], survey.anchors(0.0))
+            ranges_predicted_by_model(metric, survey.trajectory, places[k], similarity, tags[k], survey.anchors(0.0))
             for k in range(2)
         ]
         assert np.nanmedian(np.abs(each[1] - each[0])) > 0.1
@@ -867,7 +867,7 @@ class TestProblem:
 
     def test_predictions_by_the_true_model_are_the_true_ranges(self) -> None:
         survey = make_survey(num_keyframes=41, radio=Radio(rate_hz=3.0), at_keyframes=False)
-        predicted = predicted_ranges(
+        predicted = ranges_predicted_by_model(
             rescale(survey.sfm, survey.metric_from_sfm),
             survey.trajectory,
             survey.observations,

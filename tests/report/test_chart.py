@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from rangesfm.report.chart import joined_labels, panel_spec, points_of
+from rangesfm.report.chart import drawn_points, joined_labels, panel_spec
 from rangesfm.report.plot import VIEW_SIZE, Figure, Mark, Panel, Series, equal_view, running_median
 
 
@@ -26,8 +26,8 @@ def test_dots_beyond_an_axis_are_drawn_at_its_edge_and_each_for_itself_and_lines
 
 def test_a_missing_point_breaks_a_line_and_is_no_dot() -> None:
     points = np.array([[0.0, 0.0], [2.0, np.nan], [3.0, 0.0]])
-    np.testing.assert_array_equal(points_of(Series("a", "after", points, "line")), points)
-    np.testing.assert_array_equal(points_of(Series("a", "after", points)), points[[0, 2]])
+    np.testing.assert_array_equal(drawn_points(Series("a", "after", points, "line")), points)
+    np.testing.assert_array_equal(drawn_points(Series("a", "after", points)), points[[0, 2]])
 
 
 @pytest.mark.parametrize("points", [np.array([[5.0, -3.0]]), np.zeros((0, 2)), np.full((3, 2), np.nan)])

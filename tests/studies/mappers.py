@@ -37,7 +37,7 @@ from rangesfm.geometry.reference import Reference, read_reference, write_referen
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.vision.mapping import map_photos, mapping_options, read_models
+from rangesfm.vision.mapping import map_photos, mapping_options, read_mapped_models
 from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import NO_RIGS
 from rangesfm.vision.steps import Workspace
@@ -174,7 +174,7 @@ def main() -> None:
             for method in arguments.methods:
                 seconds, peak_mb = cost_of(folder, method, arguments.leaf_size)
                 costs[method].append((num_photos, seconds))
-                models = read_models(folder / "sparse")
+                models = read_mapped_models(folder / "sparse")
                 sizes = "+".join(str(model.num_reg_images()) for model in models)
                 row = f"{num_photos:6} {method:12} {seconds:8.1f} s {peak_mb:7.0f} MB   {sizes} registered"
                 print(f"{row}   RMSE {rmse_m(folder, models[0]):.3f}", end="", flush=True)

@@ -34,14 +34,14 @@ _NOTE = (
 )
 
 
-def render(batch_state: BatchState, folder: Path) -> str:
+def render_batch(batch_state: BatchState, folder: Path) -> str:
     """Return the page as HTML; while the batch runs the page reloads itself.
 
     Args:
         folder: folder of the page, to which its links are relative.
     """
     heading = f"{len(batch_state.rows)} surveys"
-    return report_page.render(
+    return report_page.render_page(
         "batch.html",
         title=f"{heading} – rangesfm batch",
         heading=heading,

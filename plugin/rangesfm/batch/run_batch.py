@@ -14,10 +14,10 @@ from distributed import Client, Future, KilledWorker, wait
 from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch import workers
-from rangesfm.batch.batch_page import render
+from rangesfm.batch.batch_page import render_batch
 from rangesfm.batch.batch_state import BatchListener, BatchState, Status, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job, Share, share_this_machine
-from rangesfm.ceres.installation_checks import versions
+from rangesfm.ceres.installation_checks import recorded_versions
 from rangesfm.errors import FAILED, Failure
 from rangesfm.files.atomic import sole_writer, write_text
 from rangesfm.files.records import write_json
@@ -29,7 +29,7 @@ _MAX_STOP_S = 30.0  # longer than a worker waits for an interrupted survey
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"
 
 
-def write_results(batch_state: BatchState, folder: Path) -> None:
+def write_batch_results(batch_state: BatchState, folder: Path) -> None:
     """Write ``batch.csv``, ``batch.json`` and ``batch.html``; while the batch runs the page reloads itself."""
     rows = batch_state.rows
     cells = [["" if value is None else str(value) for value in row.cells().values()] for row in rows]
@@ -37,11 +37,11 @@ def write_results(batch_state: BatchState, folder: Path) -> None:
     summary = {
         **{f"num_{status.value}": batch_state.num(status) for status in Status},
         "seconds": batch_state.seconds,
-        "versions": versions(),
+        "versions": recorded_versions(),
         "surveys": [row.cells() for row in rows],
     }
     write_json(summary, folder / JSON_NAME)
-    write_text(render(batch_state, folder), folder / PAGE_NAME)
+    write_text(render_batch(batch_state, folder), folder / PAGE_NAME)
 
 
 def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, listener: BatchListener) -> BatchState:
@@ -61,7 +61,7 @@ def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, lis
         if not batch_state.is_over:
             with _workers(options, jobs, listener) as (client, share):
                 _Crew(client, batch_state, output_path, listener, share).run(jobs, options.restart)
-        write_results(batch_state, output_path)
+        write_batch_results(batch_state, output_path)
         listener.show(batch_state)
     return batch_state
 
@@ -101,7 +101,7 @@ class _Crew:
     def run(self, jobs: Sequence[Job], restart: bool) -> None:
         """Run the surveys until all are over."""
         try:
-            write_results(self._state, self._output_path)
+            write_batch_results(self._state, self._output_path)
             self._client.subscribe_topic(self._batch, self._inbox.put)
             for index, job in enumerate(jobs):
                 if job.survey is not None:
@@ -112,7 +112,7 @@ class _Crew:
             self._listener.message("stopping the workers")
             self._stop()
             self._state.end_all(Status.INTERRUPTED, "interrupted")
-            write_results(self._state, self._output_path)
+            write_batch_results(self._state, self._output_path)
             self._listener.show(self._state)
             raise
 
@@ -137,7 +137,7 @@ class _Crew:
             else:
                 self._take_end(item)
         if ended:
-            write_results(self._state, self._output_path)
+            write_batch_results(self._state, self._output_path)
         self._listener.show(self._state)
 
     def _take_end(self, future: Future) -> None:

@@ -27,7 +27,7 @@ from rangesfm.ceres.adjuster_problem import (
     add_residual_block,
     keep_from_elimination,
     num_columns,
-    solve,
+    solve_adjuster,
     tangent_jacobian,
 )
 from rangesfm.ceres.installation_checks import check_compatibility
@@ -50,7 +50,7 @@ __all__ = [
     "keep_from_elimination",
     "num_columns",
     "range_cost",
-    "solve",
+    "solve_adjuster",
     "tangent_jacobian",
 ]
 

@@ -273,7 +273,7 @@ class Step:
     expected_gain: float
 
 
-def solve(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bool]) -> Any:
+def solve_adjuster(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bool]) -> Any:
     """Solve as ``adjuster.solve`` does, asking after each step whether that is enough.
 
     Args:

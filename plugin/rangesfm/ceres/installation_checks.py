@@ -58,7 +58,7 @@ def diagnose() -> list[InstallationCheck]:
     return checks
 
 
-def versions() -> dict[str, str]:
+def recorded_versions() -> dict[str, str]:
     """Versions that a result depends on, for the record; "not installed" where one is missing."""
     return {
         "python": platform.python_version(),

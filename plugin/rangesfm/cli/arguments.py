@@ -73,7 +73,7 @@ class Commands:
         self._subparsers = self.parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
         self.by_name: dict[str, Parser] = {}
         for module in _MODULES:
-            import_module(f"rangesfm.cli.{module}").add_commands(self)
+            getattr(import_module(f"rangesfm.cli.{module}"), f"add_{module}_commands")(self)
 
     def add(self, name: str, execute: Execute, help: str) -> Parser:
         """Add a command and return its parser, with the options that all commands have.

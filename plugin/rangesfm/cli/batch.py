@@ -15,7 +15,7 @@ from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import add_flags, add_restart_argument, overrides_from_arguments
 from rangesfm.cli.terminal import Screen, counts
 from rangesfm.errors import InputError
-from rangesfm.progress import Progress, duration
+from rangesfm.progress import Progress, format_duration
 
 if TYPE_CHECKING:
     from rangesfm.batch.batch_state import BatchState, SurveyState
@@ -28,8 +28,8 @@ _INTERVAL_S = 0.2
 _MAX_NUM_LINES = 20
 
 
-def add_commands(commands: Commands) -> None:
-    parser = commands.add("batch", execute, "run many surveys at once, on this machine or on a cluster")
+def add_batch_commands(commands: Commands) -> None:
+    parser = commands.add("batch", _batch, "run many surveys at once, on this machine or on a cluster")
     parser.add_argument(
         "surveys", nargs="+", metavar="SURVEY.toml", help="survey files, each with its own [output] path"
     )
@@ -53,7 +53,7 @@ def add_commands(commands: Commands) -> None:
     add_flags(parser, without=_OF_A_SURVEY)
 
 
-def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+def _batch(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Run many surveys, each as rangesfm run does. A survey that fails does not stop the others. The outcome of
     each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.
 
@@ -150,7 +150,10 @@ class BatchTerminal:
 
 def _going_on(batch_state: BatchState) -> list[str]:
     running = [state for state in batch_state.states if state.began_s is not None]
-    lines = [f"  {_stage(state)}{_counted(state)}, {duration(batch_state.seconds_running(state))}" for state in running]
+    lines = [
+        f"  {_stage(state)}{_counted(state)}, {format_duration(batch_state.seconds_running(state))}"
+        for state in running
+    ]
     return [*lines[:_MAX_NUM_LINES], _summary(batch_state)]
 
 
@@ -167,7 +170,7 @@ def _counted(state: SurveyState) -> str:
 
 def _ended(state: SurveyState) -> str:
     row = state.row
-    seconds = "" if row.seconds is None else f" after {duration(row.seconds)}"
+    seconds = "" if row.seconds is None else f" after {format_duration(row.seconds)}"
     what = (row.exit_status == 0 and row.verdict) or row.status.value
     reason = f": {row.reason}" if row.reason and row.reason != what else ""
     return f"{row.survey}: {what}{seconds}{reason}"
@@ -178,5 +181,7 @@ def _summary(batch_state: BatchState) -> str:
     num_failed = sum(bool(row.exit_status) for row in batch_state.rows)
     failed = f", {num_failed} of them failed" if num_failed else ""
     left = batch_state.seconds_left()
-    time_left = "" if left is None or batch_state.is_over else f", {duration(left)} left"
-    return f"{num_over} of {len(batch_state.rows)} surveys over{failed}, {duration(batch_state.seconds)}{time_left}"
+    time_left = "" if left is None or batch_state.is_over else f", {format_duration(left)} left"
+    return (
+        f"{num_over} of {len(batch_state.rows)} surveys over{failed}, {format_duration(batch_state.seconds)}{time_left}"
+    )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rangesfm.workflows.check import CheckedSurvey
 
 
-def add_commands(commands: Commands) -> None:
+def add_begin_commands(commands: Commands) -> None:
     init = commands.add("init", _init, "write a survey file from folders of photos and logs")
     init.add_argument("folders", nargs="+", metavar="FOLDER", help="folders with photos, log, anchors, ...")
     init.add_argument("--output_path", metavar="PATH", help="survey file, or its folder (default: the first FOLDER)")

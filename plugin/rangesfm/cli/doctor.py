@@ -9,11 +9,11 @@ from rangesfm.errors import SolverError
 from rangesfm.progress import Progress
 
 
-def add_commands(commands: Commands) -> None:
-    commands.add("doctor", execute, "check the installation: versions, and whether the compiled part fits them")
+def add_doctor_commands(commands: Commands) -> None:
+    commands.add("doctor", _doctor, "check the installation: versions, and whether the compiled part fits them")
 
 
-def execute(args: argparse.Namespace, progress: Progress) -> Outcome:
+def _doctor(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Check versions and threads, and that the compiled part shares its types with pycolmap and pyceres.
 
     example:

@@ -10,7 +10,7 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
 
-def add_commands(commands: Commands) -> None:
+def add_planning_commands(commands: Commands) -> None:
     plan = commands.add("plan", _plan, "say before a survey how accurate it will be, and what to change")
     plan.add_argument("plan", nargs="?", metavar="PLAN.toml", help="file with anchors, path and radio")
     plan.add_argument("--from", dest="result", metavar="RESULT", help="plan another survey like this finished one")

@@ -43,7 +43,7 @@ _TOWARD = {
 }
 
 
-def add_commands(commands: Commands) -> None:
+def add_ranges_commands(commands: Commands) -> None:
     ranges = commands.add("ranges", _ranges, "print what is in a radio log, and write it as canonical CSV")
     _add_log_arguments(ranges)
     ranges.add_argument("--anchors", metavar="CSV", help="file of anchors, by which ranges between anchors are known")

@@ -21,7 +21,7 @@ _OF_A_RUN = ("ranges.check_share", "ranges.check_anchors", "ranges.check_times_s
 _WITHOUT_LOG = ("--distances", "--markers")
 
 
-def add_commands(commands: Commands) -> None:
+def add_results_commands(commands: Commands) -> None:
     measure = commands.add("measure", _measure, "measure distances and height differences in a map")
     measure.add_argument("result", metavar="RESULT", help="output folder of a run")
     measure.add_argument(
@@ -176,7 +176,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
-    from rangesfm.comparison.many_models import compare_many, read_models
+    from rangesfm.comparison.many_models import compare_many, read_named_models
     from rangesfm.comparison.model_ranges import ranges_of_survey
     from rangesfm.comparison.with_reference import compare, format_table
     from rangesfm.distances.tape import read_tape
@@ -188,7 +188,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     if of_log and "--ranges" not in given:
         raise InputError(f"{', '.join(of_log)} given without a log to use it for, expected --ranges LOG as well")
     survey = survey_from_arguments(args)
-    models, ranges, tape = read_models(paths), None, None
+    models, ranges, tape = read_named_models(paths), None, None
     if survey.ranges.path is not None and models[0].model is not None:
         ranges = ranges_of_survey(survey, read_ranging_inputs(survey), models[0].model, paths[0])
     if survey.scale.distances is not None:

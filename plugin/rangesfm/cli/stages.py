@@ -28,7 +28,7 @@ _JOIN_KEYS = (
 )
 
 
-def add_commands(commands: Commands) -> None:
+def add_stages_commands(commands: Commands) -> None:
     run = commands.add("run", _run, "make a metric model from photos and ranges: the whole pipeline")
     add_survey_arguments(run)
     add_restart_argument(run)

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, TextIO
 
 from rangesfm.errors import one_line
-from rangesfm.progress import duration
+from rangesfm.progress import format_duration
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -118,7 +118,7 @@ class TerminalProgress:
     def end_stage(self, *, failed: bool = False) -> None:
         """Print that the current stage, if there is one, has ended."""
         ending = "stopped after " if failed else ""
-        line = f"{self._stage}: {ending}{duration(self._clock() - self._stage_start)}"
+        line = f"{self._stage}: {ending}{format_duration(self._clock() - self._stage_start)}"
         self._screen.say([] if self._stage is None else [line])
         self._stage = None
 
@@ -144,5 +144,5 @@ def counts(num_done: int, num_total: int | None, seconds: float = 0.0) -> str:
         return str(num_done)
     text = f"{num_done}/{num_total}, {100 * num_done // num_total} %"
     if seconds > 0 and 0 < num_done < num_total:
-        text += f", {duration(seconds * (num_total - num_done) / num_done)} left"
+        text += f", {format_duration(seconds * (num_total - num_done) / num_done)} left"
     return text

@@ -17,7 +17,7 @@ from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.entries import ComparisonRow, median, rms
-from rangesfm.result.model_path import path_of_model
+from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 
@@ -119,7 +119,7 @@ def compare_folder(output_path: Path, reference_path: Path | None = None) -> Fol
         raise InputError("the run did not refine (no sparse_metric/0): a reference is needed to compare", output_path)
     rows: tuple[ComparisonRow, ...] = ()
     if reference_path is not None:
-        path = path_of_model(scaled, result)
+        path = path_in_result(scaled, result)
         path_of_refined = None if refined is None else path.as_in(refined)
         rows = papers_table(path, path_of_refined, read_reference(reference_path), frame=result.summary.frame)
     changed = None if refined is None else compare_models(scaled, refined, range_residuals_m=_used_residuals(result))

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.comparison.many_models import ModelsComparison, carried_by
-from rangesfm.export.metric_map import points_of
+from rangesfm.export.metric_map import colored_points
 from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
-from rangesfm.report.report_page import Section, render, write_page
+from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.scene import Scene, ScenePath, view_of
 
 COLORS = ("after", "before", "third", "fourth")
@@ -32,7 +32,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
     similarity, *lengths = comparison.tables
     figures = [*_moved_figure(comparison), _path_figure(comparison, aligned, frame)]
     with sole_writer(folder):
-        page = render(
+        page = render_page(
             "comparison.html",
             title=f"{title} – rangesfm comparison",
             heading=title,
@@ -55,7 +55,7 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) 
     """Return the scene with the first model's map and all paths. Its own path is last: on that, cameras are chosen."""
     base = comparison.models[0]
     assert base.model is not None
-    points_m, points_rgb = points_of(base.model)
+    points_m, points_rgb = colored_points(base.model)
     paths = [
         ScenePath(f"model-{i}", model.name, _color(i), path, has_orientations=model.model is not None)
         for i, (model, path) in enumerate(zip(comparison.models, aligned))

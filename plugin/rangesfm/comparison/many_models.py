@@ -23,7 +23,7 @@ from rangesfm.geometry.similarity import Similarity, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.result.entries import rms
-from rangesfm.result.model_path import path_of_model
+from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 
@@ -142,7 +142,7 @@ class ModelsComparison:
         return "\n\n".join(align_rows([table.header, *table.rows]) for table in self.tables if table.rows)
 
 
-def read_models(paths: Sequence[Path]) -> tuple[NamedModel, ...]:
+def read_named_models(paths: Sequence[Path]) -> tuple[NamedModel, ...]:
     """Read COLMAP models, final models of result folders, and files of camera positions (CSV or TUM).
 
     Raises:
@@ -184,7 +184,7 @@ def _read_model(path: Path) -> NamedModel:
         model = result.read_metric_model()
         if model is None:
             raise InputError("the result holds no metric model", path)
-        return NamedModel(str(path), path_of_model(model, result), model, result)
+        return NamedModel(str(path), path_in_result(model, result), model, result)
     model = read_model(path)
     return NamedModel(str(path), trajectory_from_reconstruction(model), model, None)
 

@@ -207,7 +207,7 @@ def to_other_side_m(lever_arm_m: float) -> float:
     return MISMEASURED_M + 2 * lever_arm_m
 
 
-def lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
+def wrong_lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield for each tag: it is elsewhere on the camera."""
     return (_lever_arm(problem, k) for k in np.unique(problem.cells.tag_index).tolist())
 
@@ -316,7 +316,7 @@ STANDING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (
     range_shares,
     anchors_in_another_scale,
     heights_never_measured,
-    lever_arms,
+    wrong_lever_arms,
     radios_warming,
     people_in_between,
     clocks,

@@ -64,7 +64,7 @@ def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     rows = (*before, *map(_row_of_cause, found.causes), *others, *after)
     reasons = [f"{row.words}: {row.remedy}" for row in (*before, *(row for row in after if row.rejected))]
     if found.causes:
-        reasons.insert(len(before), sentence(found.causes))
+        reasons.insert(len(before), causes_in_words(found.causes))
     return TrustVerdict(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows)
 
 
@@ -89,7 +89,7 @@ def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[Mistak
     ]
 
 
-def sentence(causes: Sequence[Cause]) -> str:
+def causes_in_words(causes: Sequence[Cause]) -> str:
     """Return the likeliest cause with its remedy as a sentence; causes that cannot be told apart are all named."""
     sure = f"{np.sqrt(_statistic(causes[0])):.0f} stddevs"
     if len(causes) == 1:

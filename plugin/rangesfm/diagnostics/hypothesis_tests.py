@@ -20,7 +20,7 @@ from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized
 
-FALSE_ALARMS = 0.02
+FALSE_ALARM_RATE = 0.02
 # Baarda's significance level of a single test, and the probability that it misses a mistake of the smallest size.
 _ALPHA, _BETA = 0.001, 0.2
 _NUM_DRAWS = 1000
@@ -222,7 +222,7 @@ def _thresholds(bases: Sequence[Array], nums: Array, seed: int) -> Array:
     smallest = np.ones(_NUM_DRAWS)
     for num in np.unique(nums[nums > 0]):
         smallest = np.minimum(smallest, special.chdtrc(num, statistics[:, nums == num].max(axis=1)))
-    alpha = float(np.quantile(smallest, FALSE_ALARMS))
+    alpha = float(np.quantile(smallest, FALSE_ALARM_RATE))
     of_num = {num: special.chdtri(num, alpha) if num else np.inf for num in np.unique(nums).tolist()}
     return np.array([of_num[num] for num in nums.tolist()])
 

@@ -10,7 +10,7 @@ from scipy import special
 from rangesfm.diagnostics.diagnosis import TrustVerdict
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
 from rangesfm.distances.tape import Tape, TapedDistance
-from rangesfm.scale.scale_by_lengths import FALSE_ALARMS, LengthScale
+from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 _MEASURE_AGAIN = "look whether it was mistyped, or measure it again"
@@ -76,7 +76,7 @@ def _against_ranges(estimate: ScaleEstimate) -> Iterator[MistakeTest]:
         "lengths against ranges",
         "",
         (apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
-        float(special.chdtri(1, FALSE_ALARMS)),
+        float(special.chdtri(1, LENGTH_FALSE_ALARM_RATE)),
         words=f"by the measured lengths the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the ranges; their "
         f"errors together explain {100 * stddev:.1f} % (1 stddev)",
         remedy="measure a length again, and calibrate the radio (rangesfm ranges calibrate)",

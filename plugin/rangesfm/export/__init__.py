@@ -10,11 +10,17 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, RangesfmError, failure_of
 from rangesfm.export.apply import apply_to, best_similarity
-from rangesfm.export.colmap import write_model, write_positions, write_project, write_transform, write_undistorted
+from rangesfm.export.colmap import (
+    write_camera_positions,
+    write_model,
+    write_project,
+    write_transform,
+    write_undistorted,
+)
 from rangesfm.export.gis import write_features, write_laz
 from rangesfm.export.metric_map import MetricMap, in_frame
 from rangesfm.export.photogrammetry import write_nerfstudio, write_opensfm, write_opf
-from rangesfm.export.ply import write_anchors, write_cameras, write_points
+from rangesfm.export.ply import write_anchor_vertices, write_cameras, write_points
 from rangesfm.export.trajectories import COVARIANCE_FORMATS, write_covariances, write_kitti, write_trajectory
 from rangesfm.files.atomic import make_output_folder
 from rangesfm.geometry.similarity import Similarity
@@ -30,9 +36,9 @@ __all__ = [
     "check_formats",
     "export_map",
     "export_model",
+    "write_camera_positions",
     "write_model",
     "write_points",
-    "write_positions",
 ]
 
 Exporter = Callable[[MetricMap, Path], Path | tuple[Path, ...]]
@@ -53,13 +59,13 @@ EXPORTERS: dict[str, Exporter] = {
     ),
     "ply": lambda map_, folder: write_points(map_.reconstruction, folder / "points.ply"),
     "ply_cameras": lambda map_, folder: write_cameras(map_.trajectory, folder / "cameras.ply"),
-    "ply_anchors": lambda map_, folder: write_anchors(map_.anchors_m or {}, folder / "anchors.ply"),
+    "ply_anchors": lambda map_, folder: write_anchor_vertices(map_.anchors_m or {}, folder / "anchors.ply"),
     "laz": lambda map_, folder: write_laz(map_, folder / "points.laz"),
     "gpkg": lambda map_, folder: write_features(map_, folder / "survey.gpkg", "GPKG"),
     "geojson": lambda map_, folder: write_features(map_, folder / "survey.geojson", "GeoJSON"),
     "kml": lambda map_, folder: write_features(map_, folder / "survey.kml", "KML"),
     "transform": lambda map_, folder: write_transform(map_.metric_from_sfm, folder),
-    "model_aligner": lambda map_, folder: write_positions(map_.reconstruction, folder / "positions.txt"),
+    "model_aligner": lambda map_, folder: write_camera_positions(map_.reconstruction, folder / "positions.txt"),
     "nerfstudio": lambda map_, folder: write_nerfstudio(map_, folder),
     "opensfm": lambda map_, folder: write_opensfm(map_, folder / "reconstruction.json"),
     "opf": lambda map_, folder: write_opf(map_, folder / "opf"),

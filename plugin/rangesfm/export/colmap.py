@@ -73,7 +73,7 @@ def write_transform(metric_from_sfm: Similarity | None, folder: Path) -> tuple[P
     return paths
 
 
-def write_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
+def write_camera_positions(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
     """Write the camera positions in metres, ``image_name x y z`` for each registered photo, in order of the names.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap, points_of
+from rangesfm.export.metric_map import MetricMap, colored_points
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.georeference import GEOGRAPHIC, is_geographic
 
@@ -33,7 +33,7 @@ def write_laz(map_: MetricMap, path: Path) -> Path:
         raise InputError("the format 'laz' needs laspy: pip install 'rangesfm[geo]'") from None
     if not laspy.LazBackend.detect_available():
         raise InputError("the format 'laz' needs lazrs besides laspy: pip install 'rangesfm[geo]'")
-    places, colors = points_of(map_.reconstruction)
+    places, colors = colored_points(map_.reconstruction)
     xyz, steps = _coordinates(map_, places)
     header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT_WITH_COLOR)
     header.scales = steps

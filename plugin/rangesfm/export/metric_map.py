@@ -81,7 +81,7 @@ def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
 
 
-def points_of(model: pycolmap.Reconstruction) -> tuple[Array, npt.NDArray[np.uint8]]:
+def colored_points(model: pycolmap.Reconstruction) -> tuple[Array, npt.NDArray[np.uint8]]:
     """Return positions (n, 3) and colours (n, 3) of the 3-D points of a model, in order of their ids."""
     points = [model.point3D(point_id) for point_id in sorted(model.point3D_ids())]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)

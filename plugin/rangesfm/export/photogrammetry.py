@@ -14,7 +14,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap, points_of, registered_images
+from rangesfm.export.metric_map import MetricMap, colored_points, registered_images
 from rangesfm.export.ply import write_points
 from rangesfm.files.atomic import new_folder
 from rangesfm.files.records import write_json
@@ -106,7 +106,7 @@ def write_opensfm(map_: MetricMap, path: Path) -> Path:
         InputError: OpenSfM does not support a camera model.
     """
     model, origin = map_.reconstruction, map_.georeference
-    images, (places, colors) = registered_images(model), points_of(model)
+    images, (places, colors) = registered_images(model), colored_points(model)
     reconstruction: dict[str, Any] = {
         "cameras": {str(i): _camera(model.cameras[i]) for i in sorted({image.camera_id for image in images})},
         "shots": {image.name: _shot(image, map_) for image in images},

@@ -14,7 +14,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import points_of
+from rangesfm.export.metric_map import colored_points
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.similarity import Similarity, overflow_raised
 from rangesfm.geometry.trajectory import Trajectory
@@ -35,7 +35,7 @@ _MAX_SINGLE = 8192.0
 
 def write_points(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
     """Write the 3-D points with their colours, in order of their ids."""
-    return _write_vertices(path, *points_of(reconstruction))
+    return _write_vertices(path, *colored_points(reconstruction))
 
 
 def write_cameras(trajectory: Trajectory, path: Path) -> Path:
@@ -43,7 +43,7 @@ def write_cameras(trajectory: Trajectory, path: Path) -> Path:
     return _write_vertices(path, trajectory.centers, CAMERA_COLOR, normals=trajectory.world_from_cam[:, :, 2])
 
 
-def write_anchors(anchors_m: Mapping[str, Array], path: Path) -> Path:
+def write_anchor_vertices(anchors_m: Mapping[str, Array], path: Path) -> Path:
     """Write one vertex for each anchor, in the order of the mapping; a comment in the file names them in this order."""
     xyz = np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3)
     names = " ".join(anchor_id.encode("ascii", "backslashreplace").decode() for anchor_id in anchors_m)

@@ -11,7 +11,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.planning.expected import Expected, compare
+from rangesfm.planning.expected import Expected, expect_roughly
 from rangesfm.planning.paths import way_along
 from rangesfm.planning.placement import spread_places
 from rangesfm.planning.planned import PlannedSurvey
@@ -85,7 +85,7 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
 
 
 def _compared(planned: PlannedSurvey, bending: dict[str, float]) -> Expected | None:
-    return compare(replace(planned, component_stddevs={**planned.component_stddevs, **bending}))
+    return expect_roughly(replace(planned, component_stddevs={**planned.component_stddevs, **bending}))
 
 
 def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:

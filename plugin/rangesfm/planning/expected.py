@@ -133,7 +133,7 @@ def _stddevs(variances: Array) -> Array:
     return np.where(stddevs < OPEN, stddevs, np.inf)
 
 
-def compare(planned: PlannedSurvey) -> Expected | None:
+def expect_roughly(planned: PlannedSurvey) -> Expected | None:
     """Compute ``expect`` for a rigid map with fewer ranges and cells, in a tenth of the time, to compare plans.
 
     None if a run will find too few ranges.

@@ -8,7 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.planning.expected import compare
+from rangesfm.planning.expected import expect_roughly
 from rangesfm.planning.paths import places_on_way, way_along
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.progress import Progress, SilentProgress
@@ -102,7 +102,7 @@ def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> P
 
 def _badness(planned: PlannedSurvey) -> float:
     """Return the sum of the logarithms of both standard deviations; that of the position is at most the site's size."""
-    expected = compare(planned)
+    expected = expect_roughly(planned)
     if expected is None:
         return np.inf
     size_m = float(np.linalg.norm(np.ptp(planned.places_m, axis=0)))

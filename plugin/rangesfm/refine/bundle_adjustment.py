@@ -46,7 +46,7 @@ _NUM_STEPS_LEFT = (0.1, 10.0)
 
 
 @dataclass(frozen=True)
-class Solution:
+class SolverRun:
     """Result of a run of the solver.
 
     Attributes:
@@ -155,7 +155,7 @@ def _tie_points(
     return itertools.cycle(itertools.islice(filter(adjuster.problem.has_parameter_block, own), _MAX_NUM_TIE_POINTS))
 
 
-def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
+def solve_bundle_adjustment(problem: BundleAdjustment, tolerance_m: float) -> SolverRun:
     """Solve in place until the keyframes come to rest.
 
     The cost alone is no measure of this. A millionth of it may still move a map by metres, while points near the
@@ -169,10 +169,10 @@ def solve(problem: BundleAdjustment, tolerance_m: float) -> Solution:
     """
     start = time.monotonic()
     monitor = ConvergenceMonitor(problem.metric, problem.pixel_stddev, tolerance_m)
-    summary = ceres.solve(problem.adjuster, monitor.is_over)
+    summary = ceres.solve_adjuster(problem.adjuster, monitor.is_over)
     if not summary.IsSolutionUsable():
         raise SolverError(f"the bundle adjustment with ranges failed: {summary.message}")
-    return Solution(
+    return SolverRun(
         num_iterations=summary.num_successful_steps + summary.num_unsuccessful_steps,
         initial_cost=summary.initial_cost,
         final_cost=summary.final_cost,
@@ -193,8 +193,8 @@ def _message(monitor: ConvergenceMonitor, tolerance_m: float, of_solver: str) ->
 
 
 def solve_until_still(
-    problem: BundleAdjustment, before: Solution, tolerance_m: float, num_left: int
-) -> tuple[list[Solution], bool]:
+    problem: BundleAdjustment, before: SolverRun, tolerance_m: float, num_left: int
+) -> tuple[list[SolverRun], bool]:
     """Solve again from where the solver stopped, with a wide trust region, until the keyframes come to rest.
 
     A solver whose steps have become small reports convergence; only a free step shows whether that is true. Steps are
@@ -207,12 +207,12 @@ def solve_until_still(
     Returns:
         the further solutions, and whether the keyframes came to rest at a minimum.
     """
-    solutions: list[Solution] = []
+    solutions: list[SolverRun] = []
     is_over = is_still = before.is_still
     centers = keyframe_centers(problem.metric)
     while not is_over and num_left > 0:
         _settle_radio(problem)
-        solutions.append(found := solve(problem, tolerance_m))
+        solutions.append(found := solve_bundle_adjustment(problem, tolerance_m))
         num_left -= max(found.num_iterations, 1)
         last, centers = centers, keyframe_centers(problem.metric)
         is_at_rest = farthest(last, centers) <= tolerance_m
@@ -233,7 +233,7 @@ def _settle_radio(problem: BundleAdjustment) -> None:
     ]
     for block in held:
         ceres_problem.set_parameter_block_constant(block)
-    ceres.solve(problem.adjuster, lambda _: False)
+    ceres.solve_adjuster(problem.adjuster, lambda _: False)
     for block in held:
         ceres_problem.set_parameter_block_variable(block)
 

@@ -140,7 +140,7 @@ class RadioRanges:
         return np.where(self.observations.before >= 0, predicted, np.nan)
 
 
-def predicted_ranges(
+def ranges_predicted_by_model(
     metric: pycolmap.Reconstruction,
     trajectory: Trajectory,
     observations: RangeObservations,
@@ -214,7 +214,7 @@ class AddedRadio:
         )
 
 
-def add_ranges(
+def add_range_residuals(
     bundle: BundleAdjustment, ranges: RadioRanges, errors: RangeErrors, blocks: ceres.RangeBlocks
 ) -> Indices:
     """Add ranges as residuals, scaled so that one standard deviation of a range weighs as much as one of a pixel.

@@ -19,7 +19,14 @@ from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.refine.distances import MeasuredDistances, add_distances
-from rangesfm.refine.radio import AddedRadio, RadioEstimate, RadioRanges, add_radio_priors, add_ranges, radio_blocks
+from rangesfm.refine.radio import (
+    AddedRadio,
+    RadioEstimate,
+    RadioRanges,
+    add_radio_priors,
+    add_range_residuals,
+    radio_blocks,
+)
 
 _PARAMETER_STEP = 1e-6
 
@@ -73,7 +80,7 @@ class RefinementProblem:
     def add_to(self, bundle: BundleAdjustment, errors: RangeErrors, radio: RadioEstimate) -> AddedRadio:
         """Add all other measurements, starting from an estimate; ``errors`` are of the ranges that take part."""
         blocks = radio_blocks(radio, self.metric, self.ranges.trajectory, self.options)
-        rows = add_ranges(bundle, self.ranges, errors, blocks)
+        rows = add_range_residuals(bundle, self.ranges, errors, blocks)
         others = add_distances(bundle, self.distances, radio.anchors, blocks.anchors, errors)
         add_radio_priors(bundle, radio, self.radio.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
         add_calibration(bundle, self.camera)

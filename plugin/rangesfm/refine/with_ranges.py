@@ -27,7 +27,7 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors, misfits
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
-from rangesfm.refine.bundle_adjustment import BundleAdjustment, Solution, solve, solve_until_still
+from rangesfm.refine.bundle_adjustment import BundleAdjustment, SolverRun, solve_bundle_adjustment, solve_until_still
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
 from rangesfm.refine.graph_presolve import SAME_ERRORS, Unbent, unbend, unbend_again
 from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
@@ -240,7 +240,7 @@ class _Round:
     """Result of one solution of the full problem, all solutions so far, and the number of iterations that are left."""
 
     radio: RadioEstimate
-    solutions: tuple[Solution, ...]
+    solutions: tuple[SolverRun, ...]
     num_left: int
 
 
@@ -258,7 +258,7 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent,
             before = replace(before, radio=replace(before.radio, anchors=anchors))
             bundle = problem.of_photos(before.num_left)
         added = problem.add_to(bundle, errors, before.radio)
-        solution = solve(bundle, _tolerance_m(problem, errors))
+        solution = solve_bundle_adjustment(bundle, _tolerance_m(problem, errors))
         num_left = before.num_left - solution.num_iterations
         return _Round(added.estimate(before.radio), (*before.solutions, solution), num_left)
 

@@ -86,7 +86,7 @@ def _page_chart(panel: Panel) -> Spec:
         "title": panel.title,
         "labels": panel.labels,
         "keeps_shape": panel.keeps_shape,
-        "series": [{"name": one.name, "is_data": one.is_data, **_packed(points_of(one))} for one in panel.series],
+        "series": [{"name": one.name, "is_data": one.is_data, **_packed(drawn_points(one))} for one in panel.series],
         "marks": [{"name": mark.title, "x": mark.x, "y": mark.y} for mark in panel.marks],
     }
 
@@ -104,7 +104,7 @@ def _packed(points: Array) -> Spec:
     return {"origin": origin.tolist(), "points": pack(points - origin, "float32")}
 
 
-def points_of(series: Series) -> Array:
+def drawn_points(series: Series) -> Array:
     """Return the points to draw, (n, 2). Unknown points break a line, and are left out of dots."""
     is_known = np.isfinite(series.points).all(axis=1)
     return series.points[is_known] if series.kind == "dots" else series.points
@@ -273,7 +273,7 @@ def figure_spec(figure: Figure) -> Spec:
 
     def sheet(panel: Panel) -> Spec:
         panel = replace(panel, size=(min(panel.size[0], MAX_WIDTH_PX), panel.size[1]))
-        points = [points_of(one).tolist() for one in panel.series]
+        points = [drawn_points(one).tolist() for one in panel.series]
         rows = [[{"x": x, "y": y if math.isfinite(y) else None} for x, y in of_one] for of_one in points]
         return panel_spec(panel, lambda i: {"values": rows[i]}) | {"title": panel.title}
 

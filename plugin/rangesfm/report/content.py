@@ -15,7 +15,7 @@ from rangesfm.arrays import Array
 from rangesfm.export.metric_map import points_of
 from rangesfm.files.folders import real_path
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.result.model_path import path_of_model
+from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
 
@@ -75,9 +75,9 @@ class Content:
         self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)
         self.range_times_s = _range_times(self.ranges, result.timestamps_s or {}) if self.ranges else np.zeros(0)
         scaled, refined = models = [result.read_model(stage) for stage in ("sparse_scaled", "sparse_metric")]
-        self.scaled, self.refined = (None if model is None else path_of_model(model, result) for model in models)
+        self.scaled, self.refined = (None if model is None else path_in_result(model, result) for model in models)
         self.final = self.refined or self.scaled
-        self.points_m, self.points_rgb = points_of(refined or scaled or pycolmap.Reconstruction())
+        self.points_m, self.points_rgb = colored_points(refined or scaled or pycolmap.Reconstruction())
         self.cameras = tuple(_cameras(scaled, refined))
         reference = result.read_reference()
         self.reference_m = None if reference is None else reference.positions_m

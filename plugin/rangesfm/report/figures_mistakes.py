@@ -20,7 +20,7 @@ _ROW_HEIGHT_PX = 22.0
 _COLORS = {"found": "before", "not found": "after", "would not be found, however large": "rejected"}
 
 
-def mistakes(content: Content) -> Figure | None:
+def mistakes_figure(content: Content) -> Figure | None:
     """Return the figure of the mistakes: evidence on the left, largest hidden effect on the scale on the right.
 
     The mistakes found come first, then those that may change the scale most, up to ``MAX_NUM_ROWS``. None where no test

@@ -14,7 +14,7 @@ CANDIDATE_AXIS = (-1.0, 4.0)
 """Ends of the axis of candidates, in units of the scale. Candidates themselves are unbounded."""
 
 
-def scale_per_anchor(content: Content) -> Figure | None:
+def scale_per_anchor_figure(content: Content) -> Figure | None:
     """Return the figure of the scale from each anchor alone, beside the joint scale and its standard deviation."""
     scale = content.summary.scale
     joint, stddev = scale.value, scale.larger_stddev

@@ -10,7 +10,7 @@ from pathlib import Path
 from rangesfm.files.atomic import make_output_folder
 from rangesfm.files.folders import real_path
 from rangesfm.progress import Progress
-from rangesfm.report.report_page import render, write_page
+from rangesfm.report.report_page import render_page, write_page
 from rangesfm.report.text import duration
 
 PAGE_NAME = "live.html"
@@ -71,7 +71,7 @@ class LivePage:
 
     def _write(self, headline: str, *, reload: str | None) -> None:
         self._last_written = self._clock()
-        page = render(
+        page = render_page(
             "live.html",
             title="rangesfm run",
             heading=real_path(self.path.parent).name,

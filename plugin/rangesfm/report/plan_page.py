@@ -17,7 +17,7 @@ from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
-from rangesfm.report.report_page import Section, render, write_page
+from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, duration, fixed, percent, rough
 
@@ -46,7 +46,7 @@ def render_plan(plan: SurveyPlan) -> str:
         _advice("What would gain most for the scale", plan.advice_for_scale),
         _advice("What would gain most for the place of the keyframe known least", plan.advice_for_place),
     ]
-    return render(
+    return render_page(
         "plan.html",
         title=f"{title} – rangesfm plan",
         heading=f"Plan: {title}",

@@ -41,7 +41,12 @@ class Section(NamedTuple):
 _SECTIONS: dict[str, tuple[Callable[[Content], Figure | report_tables.ReportTable | None], ...]] = {
     "Path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale, report_tables.comparison),
     "Scale": (
-        *(figures_scale.scale_per_anchor, figures_scale.consensus, figures_scale.clock_curve, figures_scale.candidates),
+        *(
+            figures_scale.scale_per_anchor_figure,
+            figures_scale.consensus,
+            figures_scale.clock_curve,
+            figures_scale.candidates,
+        ),
         *(report_tables.scale_by_kind, report_tables.error_budget),
         *(report_tables.two_candidates, report_tables.sensitivity),
     ),
@@ -49,7 +54,7 @@ _SECTIONS: dict[str, tuple[Callable[[Content], Figure | report_tables.ReportTabl
         *(figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
         *(report_tables.range_statuses, report_tables.ranges_per_anchor),
     ),
-    "Mistakes": (figures_mistakes.mistakes, report_tables.mistakes),
+    "Mistakes": (figures_mistakes.mistakes_figure, report_tables.mistakes),
     "Anchors": (report_tables.anchors, report_tables.distances),
     "Run": (
         *(report_tables.stages, report_tables.refinement, report_tables.versions),
@@ -81,7 +86,7 @@ def sections_of(content: Content) -> list[Section]:
 def render_report(content: Content) -> str:
     """Return the HTML text of the report of a result."""
     scene = scene_of(content)
-    return render(
+    return render_page(
         "report.html",
         title=f"{content.title} – rangesfm report",
         heading=content.title,
@@ -107,7 +112,7 @@ def _tiles(content: Content) -> list[tuple[str, str, str]]:
     ]
 
 
-def render(template: str, *, sections: Sequence[Section] = (), **values: Any) -> str:
+def render_page(template: str, *, sections: Sequence[Section] = (), **values: Any) -> str:
     """Return the HTML text of a whole self-contained page.
 
     Args:

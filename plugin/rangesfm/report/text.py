@@ -66,7 +66,7 @@ def decimals_for(stddev: float | None, *, default: int) -> int:
 def duration(seconds: float | None) -> str:
     """Return a duration as text ("5 min 03 s") with spaces at which the browser breaks no line."""
     number = _known(seconds)
-    return NOTHING if number is None else progress.duration(number).replace(" ", "\u00a0")
+    return NOTHING if number is None else progress.format_duration(number).replace(" ", "\u00a0")
 
 
 def sentence(text: str) -> str:

@@ -10,7 +10,7 @@ from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import PhotoTimes
 
 
-def path_of_model(model: pycolmap.Reconstruction, result: ResultFolder) -> Trajectory:
+def path_in_result(model: pycolmap.Reconstruction, result: ResultFolder) -> Trajectory:
     """Return the camera's path in a model of a result.
 
     Raises:

@@ -26,7 +26,7 @@ BENDING = 0.008
 _BENDING_SPREAD, _ALIKE_WITHIN = 0.6, 0.25
 _NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 21, 8, 2
 # Share of surveys without any mistake in which a correct length is set aside.
-FALSE_ALARMS = 0.02
+LENGTH_FALSE_ALARM_RATE = 0.02
 _NUM_SUSPECTS = 3
 
 
@@ -96,7 +96,7 @@ def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> Leng
     lengths = _Lengths.of(distances, rows, float(np.linalg.norm(path_shape(centers).stddevs)))
     # Threshold of a squared Student's t: the size of the bending is estimated from the other lengths and its prior.
     degrees_of_freedom = 1 / (2 * _BENDING_SPREAD**2) + max(len(rows) - 2, 0)
-    threshold = float(special.stdtrit(degrees_of_freedom, FALSE_ALARMS / (2 * len(rows))) ** 2)
+    threshold = float(special.stdtrit(degrees_of_freedom, LENGTH_FALSE_ALARM_RATE / (2 * len(rows))) ** 2)
     kept = np.ones(len(rows), dtype=bool)
     ratios = np.log(lengths.metric / lengths.model)
     while kept.sum() > 2 and (~kept).sum() + 1 < len(rows) / 2:

@@ -42,7 +42,7 @@ def create_database(
             database.write_frame(frame)
 
 
-def write_positions(path: Path, positions: Iterable[tuple[float, float, float] | None]) -> None:
+def write_position_priors(path: Path, positions: Iterable[tuple[float, float, float] | None]) -> None:
     """Write the position of each photo, in the order of their ids, as COLMAP does for photos that it adds itself.
 
     Args:

@@ -213,7 +213,7 @@ def _map_at_once(space: Workspace, image_path: Path, options: WholePipelineOptio
         return [read_model(path) for path in sorted(folder.iterdir()) if path.is_dir()]
 
 
-def read_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
+def read_mapped_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:
     """Read the models that ``map_photos`` wrote, in their order."""
     folders = [folder for folder in models_path.iterdir() if folder.name.isdecimal()]
     return tuple(read_model(folder) for folder in sorted(folders, key=lambda folder: int(folder.name)))

@@ -16,7 +16,7 @@ from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.given_database import opened
-from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_models
+from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_mapped_models
 from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
@@ -96,7 +96,7 @@ def reconstruct(
         space = unpublished.space
         photos, inputs = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space)
         _map(space, photos, inputs, camera, mapper, rigs, seed, adjustment)
-        found, log_path = read_models(unpublished.models_path), output.path / LOG_NAME
+        found, log_path = read_mapped_models(unpublished.models_path), output.path / LOG_NAME
         files = unpublished.files()
         if files and deferred:
             output.defer(files)
@@ -165,7 +165,7 @@ def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: Mappin
         with pycolmap.Database.open(without_rigs.database) as database:
             pycolmap.apply_rig_config([], database)
         map_photos(without_rigs, photos, options)
-        model = read_models(without_rigs.models)[0]
+        model = read_mapped_models(without_rigs.models)[0]
     rigs.rescale(model)
     why_not = (
         "mapped without the rig, no photos that its cameras took at once are in one model: add the cameras' poses"

@@ -21,7 +21,7 @@ from rangesfm.vision.database import (
     create_database,
     name_photos,
     remove_database,
-    write_positions,
+    write_position_priors,
 )
 from rangesfm.vision.features import extract_features
 from rangesfm.vision.given_database import GivenDatabase
@@ -129,7 +129,7 @@ class RenewedDatabase:
     def _create(self, path: Path) -> None:
         create_database(path, self.photos.names, self.cameras.cameras, self.cameras.of_photo)
         self.rigs.apply(path)
-        write_positions(path, (exif_position(self.photos.folder / name) for name in self.photos.names))
+        write_position_priors(path, (exif_position(self.photos.folder / name) for name in self.photos.names))
 
     def _take_over(self, earlier: Mapping[str, Any], fresh: Path) -> int:
         """Copy features and matches of unchanged photos; return the number of photos with features."""

@@ -11,7 +11,7 @@ from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats,
 from rangesfm.export.metric_map import in_frame
 from rangesfm.files.atomic import sole_writer
 from rangesfm.options import ExportOptions
-from rangesfm.result.model_path import path_of_model
+from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import CenterCovariances
 from rangesfm.vision.steps import DATABASE_NAME
@@ -84,7 +84,7 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
     reconstruction, summary = result.read_metric_model(), result.summary
     if reconstruction is None:
         raise InputError("there is no metric model (sparse_metric/0 or sparse_scaled/0) to export", result.path)
-    path_of_model(reconstruction, result)  # raises an error where no photo has a time: the trajectory would be empty
+    path_in_result(reconstruction, result)  # raises an error where no photo has a time: the trajectory would be empty
     covariances = result.read(CenterCovariances)
     return MetricMap(
         reconstruction,

@@ -25,7 +25,7 @@ from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.result.model_path import path_of_model
+from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
@@ -102,7 +102,7 @@ def _read(name: str, result: ResultFolder) -> FinishedRun:
     model, ranges = _unscaled_model(result), result.read(RangesAsUsed)
     if ranges is None:
         raise InputError("there is no ranges.csv, expected the output_path of a run", result.path)
-    path = path_of_model(model, result)
+    path = path_in_result(model, result)
     if not is_one_after_the_other(path):
         expected = "expected the result of one survey: join all surveys at once"
         raise InputError(

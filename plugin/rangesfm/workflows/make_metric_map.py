@@ -13,7 +13,7 @@ from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
-from rangesfm.diagnostics.diagnosis import TrustVerdict, sentence, trust_in
+from rangesfm.diagnostics.diagnosis import TrustVerdict, causes_in_words, trust_in
 from rangesfm.diagnostics.finished_map import Doubt, doubts_of_map, doubts_of_pieces, place_of_map, why_broken
 from rangesfm.diagnostics.length_tests import trust_in_lengths
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
@@ -31,7 +31,7 @@ from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.refine.photo_bending import bending_of_model, by_photos
-from rangesfm.refine.radio import predicted_ranges
+from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult, Rivals
 from rangesfm.scale.at_map import MapWithRanges, estimate_at
@@ -306,7 +306,7 @@ def scale_by_survey(
     if offset is not None and offset.rivals:
         rivals = scale_by_rivals(survey, inputs, path, offset, estimate.value)
     scaled = rescale(path.sfm, estimate.metric_from_sfm)
-    predicted = predicted_ranges(
+    predicted = ranges_predicted_by_model(
         scaled,
         path.trajectory,
         estimate.observations,
@@ -347,7 +347,7 @@ def _with_cause(error: GeometryError, survey: Survey, on_map: RangesOnMap | None
         trust = _trust_in(survey, on_map)
     except np.linalg.LinAlgError:
         return error
-    return GeometryError(f"{error}; {sentence(trust.causes)}") if trust is not None and trust.causes else error
+    return GeometryError(f"{error}; {causes_in_words(trust.causes)}") if trust is not None and trust.causes else error
 
 
 def _ranges_on_scaled(

@@ -20,7 +20,7 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.result.model_path import path_of_model
+from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.scale.scale_verdict import CALIBRATE
@@ -42,7 +42,7 @@ def plan_of_result(path: str | Path) -> PlannedSurvey:
     model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
     if model is None or ranges is None or not ranges.is_used.any():
         raise InputError("has no metric model or no used ranges, expected a finished result", path)
-    trajectory = path_of_model(model, folder)
+    trajectory = path_in_result(model, folder)
     if not is_one_after_the_other(trajectory):
         expected = "expected the result of one survey"
         raise InputError(f"two of its photos have the same time, as in a map of several cameras, {expected}", path)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.ceres.installation_checks import versions
+from rangesfm.ceres.installation_checks import recorded_versions
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
@@ -82,7 +82,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
             distances=distances,
             **({"comparison": comparison} if comparison else {}),
             georeference=georeference,
-            versions=versions(),
+            versions=recorded_versions(),
             settings=recorded_settings(survey),
             inputs=recorded_inputs(input_hashes(survey), survey),
             seconds=journal.all_seconds(),

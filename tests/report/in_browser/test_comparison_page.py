@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rangesfm.comparison.comparison_page import write_comparison
-from rangesfm.comparison.many_models import compare_many, read_models
+from rangesfm.comparison.many_models import compare_many, read_named_models
 
 if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser
@@ -23,7 +23,7 @@ def test_all_paths_are_drawn_and_each_can_be_taken_away(
     sizes = {"num_keyframes": 30, "num_ranges_per_anchor": 20, "num_points": 500}
     result = make_result("result", **sizes)
     models = [result, result / "sparse_scaled" / "0", result / "reference.csv"]
-    page = write_comparison(compare_many(read_models(models)), tmp_path / "page")
+    page = write_comparison(compare_many(read_named_models(models)), tmp_path / "page")
     browser.open(page)
     assert browser.console() == []
     assert {url for url in browser.requests() if not url.startswith("data:")} == {page.as_uri()}

@@ -123,7 +123,7 @@ def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: Associati
     return PathSamples(start_s, step_s, np.where(known, places.centers, 0.0), tag_from_center, is_known)
 
 
-def ranges_on_path(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int) -> TimedRanges:
+def ranges_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int) -> TimedRanges:
     """Return the first ranges that are on the path at an offset, at most ``max_num``."""
     return ranges.take(np.flatnonzero(path.knows(ranges.times_s + offset_s))[:max_num])
 

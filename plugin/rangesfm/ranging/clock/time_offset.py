@@ -18,7 +18,14 @@ from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
 from rangesfm.ranging.clock.fit import OffsetFit, drift_note, fit_clocks, refine_offset
-from rangesfm.ranging.clock.search import CostCurve, PathSamples, TimedRanges, moving_path, ranges_on_path, scan_offsets
+from rangesfm.ranging.clock.search import (
+    CostCurve,
+    PathSamples,
+    TimedRanges,
+    moving_path,
+    ranges_at_offset,
+    scan_offsets,
+)
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 
@@ -173,7 +180,7 @@ def _offset_of_motion(
     fits: list[OffsetFit] = []
     for num_done, offset_s in enumerate(candidates):
         progress.update(num_done, len(candidates))
-        near = ranges_on_path(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE)
+        near = ranges_at_offset(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE)
         if len(near.range_m):
             best = max((fit for fit in fits if fit.is_testable), key=lambda fit: fit.score, default=None)
             fits.append(refine_offset(near, path, offset_s, best))
@@ -186,7 +193,7 @@ def _offset_of_motion(
             "at no time offset do the ranges follow the camera's path (it hardly moves, its photos are "
             f"too far apart, or the log belongs to other photos): {REMEDY}"
         )
-    near = ranges_on_path(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL)
+    near = ranges_at_offset(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL)
     final, timing, drift, reference_s = fit_clocks(near, path, best.offset_s)
     is_certain = bool(timing.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m)
     found = f"(about {final.offset_s:+.2f} s, stddev {timing.stddev_s:.2g} s)"
