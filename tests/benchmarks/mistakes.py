@@ -24,7 +24,7 @@ from tests.simulated.path import loop_path
 from tests.studies.erring_surveys import SITES
 
 from rangesfm.demo.simulated_radio import Radio, simulate_ranges
-from rangesfm.diagnostics.diagnosis import trust_in
+from rangesfm.diagnostics.diagnosis import diagnose_ranges
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
@@ -112,7 +112,7 @@ def main() -> None:
             write_ranges_csv(replace(log, range_m=log.range_m + longer_m * late), folder / "uwb.csv")
             tests, refinement = list[float](), list[float]()
             with (
-                mock.patch("rangesfm.workflows.make_metric_map.trust_in", timed(trust_in, tests)),
+                mock.patch("rangesfm.workflows.make_metric_map.diagnose_ranges", timed(diagnose_ranges, tests)),
                 mock.patch(
                     "rangesfm.workflows.make_metric_map.refine_with_ranges", timed(refine_with_ranges, refinement)
                 ),

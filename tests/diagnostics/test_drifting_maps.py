@@ -40,7 +40,7 @@ def test_a_refinement_that_bends_drift_back_is_kept_however_far_it_changes_the_s
 
 
 def test_no_mistake_is_named_that_nobody_made(refined: MetricResult) -> None:
-    assert known(refined.trust).causes == ()
+    assert known(refined.diagnosis).causes == ()
     assert refined.estimate.verdict == "good", refined.estimate.reasons
 
 
@@ -65,7 +65,7 @@ def test_a_path_of_poses_is_scaled_to_where_ranges_bend_it_back(drift_m: float) 
     """The likeliest similarity is used, and the drift from there is stated as a fact."""
     lap = without_points(lap_of_drift(drift_m, 2, "site", num_keyframes=150))
     found = run(lap, 0)
-    assert known(found.trust).causes == ()
+    assert known(found.diagnosis).causes == ()
     low, high = found.estimate.interval_95
     assert low < true_scale(lap) < high
     assert found.estimate.uncertainty.half_width_95 < 0.02

@@ -9,7 +9,7 @@ import pytest
 from tests.known import known
 from tests.studies.erring_surveys import SITES, run, surveyed
 
-from rangesfm.diagnostics.length_tests import trust_in_lengths
+from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.scale.scale_by_lengths import scale_by_lengths
@@ -20,7 +20,7 @@ def test_of_a_tape_between_points_that_are_not_in_the_map_nothing_is_said() -> N
     assert estimate is not None
     assert estimate.lengths is None
     elsewhere = Tape((TapedDistance(("door", "window"), 2.0, 0.01, "control", 2),))
-    found = trust_in_lengths(estimate, elsewhere)
+    found = diagnose_lengths(estimate, elsewhere)
     assert (found.tests, found.reasons) == ((), ())
 
 
@@ -31,7 +31,7 @@ def test_what_a_length_could_do_unfound_is_what_the_scale_does_when_it_is_so_muc
     located = LocatedDistances.of(lengths_m, stddevs_m, model_length=lengths_m / 2)
     tape = Tape(tuple(TapedDistance((f"{k}a", f"{k}b"), float(lengths_m[k]), 0.01, "control", k) for k in range(3)))
     scale = known(scale_by_lengths(located, centers))
-    found = {test.subject: test for test in trust_in_lengths(replace(estimate, lengths=scale), tape).tests}
+    found = {test.subject: test for test in diagnose_lengths(replace(estimate, lengths=scale), tape).tests}
     for k, step_m in enumerate(1e-4 * np.eye(3)):
         longer = known(scale_by_lengths(replace(located, distance_m=lengths_m + step_m), centers))
         test = found[f"{k}a to {k}b"]

@@ -13,7 +13,7 @@ from tests.studies.mistakes import kinds
 
 from rangesfm.diagnostics.alternatives import alternatives
 from rangesfm.diagnostics.catalogue import STANDING
-from rangesfm.diagnostics.diagnosis import TrustVerdict
+from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.linearized import linearized
 from rangesfm.diagnostics.mistakes import _settled_test
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
@@ -22,14 +22,14 @@ HALL, YARD, DRONE = SITES
 SEED = 3
 
 
-def trust(given: Given) -> TrustVerdict:
-    found = run(given, SEED).trust
+def diagnosis(given: Given) -> Diagnosis:
+    found = run(given, SEED).diagnosis
     assert found is not None
     return found
 
 
 def test_a_clean_survey_is_not_doubted() -> None:
-    found = trust(surveyed(DRONE, SEED))
+    found = diagnosis(surveyed(DRONE, SEED))
     assert found.reasons == ()
     assert not any(test.rejected for test in found.tests)
     assert len({(test.name, test.subject) for test in found.tests}) == len(found.tests)
@@ -39,7 +39,7 @@ def test_the_worst_that_could_hide_is_named_where_it_does_more_than_a_good_scale
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("rangesfm.diagnostics.diagnosis.DOUBTFUL_ABOVE", 0.0)
-    found = trust(surveyed(DRONE, SEED))
+    found = diagnosis(surveyed(DRONE, SEED))
     (reason,) = found.reasons
     assert reason.startswith("a mistake could stay hidden here")
     hidden = [test for test in found.tests if f"({test.name} {test.subject}".strip() in reason]
@@ -52,7 +52,7 @@ def test_the_worst_that_could_hide_is_named_where_it_does_more_than_a_good_scale
 def test_a_clock_that_is_off_is_named_with_its_size() -> None:
     given = surveyed(DRONE, SEED)
     given.time_offset_s = 0.15
-    found = trust(given)
+    found = diagnosis(given)
     assert [cause.name for cause in found.causes] == ["clock offset"]
     assert found.causes[0].correction.time_shift_s == pytest.approx(-0.15, abs=0.03)
 
@@ -65,7 +65,7 @@ def test_a_lever_arm_with_the_wrong_sign_is_named_as_such() -> None:
     given.range_m -= np.linalg.norm(
         given.tags_m - given.world_from_cam @ (3 * np.array(DRONE.tag_in_cam_m)) - given.true_anchors_m["B"], axis=1
     )
-    found = trust(given)
+    found = diagnosis(given)
     assert "lever arm's axes" in {cause.name for cause in found.causes}
     assert "wrong sign" in found.reasons[0]
 
@@ -73,7 +73,7 @@ def test_a_lever_arm_with_the_wrong_sign_is_named_as_such() -> None:
 def test_what_no_survey_with_one_unknown_anchor_can_show_is_not_claimed() -> None:
     given = surveyed(DRONE, SEED)
     given.range_m = 1.05 * given.range_m
-    found = trust(given)
+    found = diagnosis(given)
     assert found.reasons == ()
     share = next(test for test in found.tests if test.name == "range share")
     assert share.effect_on_scale is None or share.effect_on_scale > 0.2
@@ -83,14 +83,14 @@ def test_most_ranges_without_line_of_sight_are_a_finding() -> None:
     given = surveyed(DRONE, SEED)
     rng = np.random.default_rng(0)
     given.range_m = given.range_m + (rng.random(len(given.range_m)) < 0.7) * rng.exponential(1.0, len(given.range_m))
-    assert "no radio does" in trust(given).reasons[0]
+    assert "no radio does" in diagnosis(given).reasons[0]
 
 
 def test_an_anchor_that_is_mostly_blocked_is_named_before_what_that_looks_like() -> None:
     given = surveyed(HALL, SEED)
     rng, num = np.random.default_rng(0), len(given.range_m)
     given.range_m = given.range_m + (given.is_of("A1") & (rng.random(num) < 0.7)) * rng.exponential(1.5, num)
-    likeliest = trust(given).tests[0]
+    likeliest = diagnosis(given).tests[0]
     assert (likeliest.name, likeliest.subject) == ("anchor's outliers", "A1")
     assert likeliest.words.startswith(f"{100 * known(likeliest.size):.0f} % of the ranges to anchor A1 ")
 
@@ -99,13 +99,13 @@ def test_ranges_to_another_anchor_under_a_label_are_named() -> None:
     given = surveyed(HALL, SEED)
     (mistake,) = [each for each in kinds(given.ids) if each.name == "a third of A1 is of A2"]
     mistake.make(given, 1.0, np.random.default_rng(SEED))
-    assert "as long as those to A2" in trust(given).reasons[0]
+    assert "as long as those to A2" in diagnosis(given).reasons[0]
 
 
 def test_a_step_of_all_ranges_is_found_at_its_own_time() -> None:
     given = surveyed(DRONE, SEED)
     given.range_m = given.range_m + 0.5 * (given.time_s > np.quantile(given.time_s, 0.5))
-    assert "from 50 s after the first range on the ranges read about 0.5" in trust(given).reasons[0]
+    assert "from 50 s after the first range on the ranges read about 0.5" in diagnosis(given).reasons[0]
 
 
 # With the first seed and y, changing x and z as well fits so much better by chance that the whole place is named.
@@ -113,7 +113,7 @@ def test_a_step_of_all_ranges_is_found_at_its_own_time() -> None:
 def test_the_coordinate_that_was_typed_wrong_is_named(axis: int, letter: str, seed: int) -> None:
     given = surveyed(replace(YARD, rate_hz=3.0), seed)
     given.anchors_m["S"] = given.anchors_m["S"] + 2.0 * np.eye(3)[axis]
-    found = trust(given)
+    found = diagnosis(given)
     assert f"anchor S's {letter} is given as {given.anchors_m['S'][axis]:.3f}" in found.reasons[0]
     assert found.causes[0].correction.anchors_m == {"S": None}
 
@@ -122,7 +122,7 @@ def test_two_labels_that_were_swapped_are_named() -> None:
     given = surveyed(YARD, SEED)
     anchors = given.anchors_m
     given.anchors_m = {**anchors, "N": anchors["E"], "E": anchors["N"]}
-    found = trust(given)
+    found = diagnosis(given)
     assert found.causes[0].subject == "E, N"
     np.testing.assert_array_equal(found.causes[0].correction.anchors_m["E"], anchors["E"])
 
@@ -133,7 +133,7 @@ def test_photos_in_reverse_are_named(needs_search: bool) -> None:
     given = surveyed(HALL, 5)
     given.time_s = given.time_s.min() + given.time_s.max() - given.time_s
     given.needs_search = needs_search
-    assert [cause.name for cause in trust(given).causes] == ["photos reversed"]
+    assert [cause.name for cause in diagnosis(given).causes] == ["photos reversed"]
 
 
 @pytest.mark.parametrize("site", [HALL, YARD])
@@ -143,7 +143,7 @@ def test_labels_that_are_one_line_off_are_named(site: Site) -> None:
     at = list(given.anchors_m.values())
     given.anchors_m = dict(zip(given.anchors_m, [*at[1:], at[0]], strict=True))
     given.needs_search = True
-    found = trust(given)
+    found = diagnosis(given)
     assert found.causes[0].name == "lines shifted"
     assert "in the line after it" in found.reasons[0]
 
@@ -151,7 +151,7 @@ def test_labels_that_are_one_line_off_are_named(site: Site) -> None:
 def test_long_ranges_and_small_coordinates_are_named_together() -> None:
     given = surveyed(YARD, SEED)
     given.range_m = 1.06 * given.range_m
-    assert {cause.name for cause in trust(given).causes} == {"range share", "anchors' scale"}
+    assert {cause.name for cause in diagnosis(given).causes} == {"range share", "anchors' scale"}
 
 
 @pytest.mark.parametrize(("factor", "words"), [(0.94, "small"), (1.06, "large")])
@@ -159,7 +159,7 @@ def test_coordinates_that_are_too_small_are_not_called_too_large(factor: float, 
     given = surveyed(YARD, SEED)
     true_m = given.anchors_m
     given.anchors_m = {name: factor * place_m for name, place_m in true_m.items()}
-    found = trust(given)
+    found = diagnosis(given)
     said = re.search(r"anchors' coordinates are about ([0-9.]+) % too (\w+)", found.reasons[0])
     assert said is not None
     assert said[2] == words
@@ -176,10 +176,10 @@ def test_an_anchor_that_reads_long_is_named_unless_radios_do_so() -> None:
     given = surveyed(HALL, SEED)
     of_a1 = given.is_of("A1")
     given.range_m = given.range_m + 0.8 * of_a1
-    likeliest = trust(given).causes[0]
+    likeliest = diagnosis(given).causes[0]
     assert (likeliest.name, likeliest.subject) == ("anchor bias", "A1")
     given.range_m = given.range_m - 0.74 * of_a1
-    assert trust(given).reasons == ()
+    assert diagnosis(given).reasons == ()
 
 
 @pytest.mark.parametrize(
@@ -199,14 +199,14 @@ def test_a_mistake_is_the_likeliest_cause(kind: str, size: float, name: str) -> 
     (mistake,) = [each for each in kinds(given.ids) if each.name == kind]
     mistake.make(given, size, np.random.default_rng(SEED))
     given.needs_search = mistake.of is None
-    assert trust(given).causes[0].name == name
+    assert diagnosis(given).causes[0].name == name
 
 
 def test_a_clock_that_runs_as_no_quartz_does_is_not_named_so() -> None:
     """Times stretched by 2 % are a mistake and are found, but no clock drifts by 20 000 ppm."""
     given = surveyed(HALL, SEED)
     given.time_s = given.time_s.mean() + 1.02 * (given.time_s - given.time_s.mean())
-    found = trust(given)
+    found = diagnosis(given)
     assert found.reasons
     assert "ppm" not in " ".join(found.reasons)
     (row,) = [test for test in found.tests if test.name == "clock drift"]
@@ -219,7 +219,7 @@ def test_a_tag_that_is_found_farther_than_its_camera_is_large_did_not_slip() -> 
     given = surveyed(YARD, SEED)
     (slip,) = [each for each in kinds(given.ids) if each.name == "tag slips"]
     slip.make(given, 3.0, np.random.default_rng(SEED))
-    found = trust(given)
+    found = diagnosis(given)
     assert found.reasons
     assert "tag slipped" not in {cause.name for cause in found.causes}
     assert all(test.size is None or test.size < 0.75 for test in found.tests if test.name == "tag slipped")

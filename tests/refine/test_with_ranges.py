@@ -38,7 +38,7 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine import with_ranges
-from rangesfm.refine.graph_presolve import Unbent, unbend_again
+from rangesfm.refine.graph_presolve import Presolved, presolve_again
 from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import Observations
@@ -158,8 +158,8 @@ def make_survey(
     )
 
 
-def unbend_with_known_errors(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Unbent:
-    return Unbent(errors, 0.0, unbend_again(problem, rays, errors, problem.radio.anchors), 0.0, 0)
+def presolve_with_known_errors(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Presolved:
+    return Presolved(errors, 0.0, presolve_again(problem, rays, errors, problem.radio.anchors), 0.0, 0)
 
 
 def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
@@ -633,7 +633,7 @@ class TestWithNoise:
     ) -> None:
         """The two cases test the first unbending, and the one after ranges are reweighted."""
         if errors_are_known:
-            monkeypatch.setattr(with_ranges, "unbend", unbend_with_known_errors)
+            monkeypatch.setattr(with_ranges, "presolve", presolve_with_known_errors)
         survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=stddev_m), num_epochs=4)
         turn = Rotation.from_rotvec(np.deg2rad([0.5, -0.3, 0.4])).as_matrix()
         askew = replace(

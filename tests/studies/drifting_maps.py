@@ -285,10 +285,12 @@ def told(survey: Made, kind: str, seed: int) -> Line:
         "places_covered": None if known is None else _covered(off_m, known),
         "verdict": estimate.verdict,
         "reasons": list(estimate.reasons),
-        "causes": [] if metric.trust is None else [f"{c.name} {c.subject}".strip() for c in metric.trust.causes],
+        "causes": []
+        if metric.diagnosis is None
+        else [f"{c.name} {c.subject}".strip() for c in metric.diagnosis.causes],
         "of_evidence": []
-        if metric.trust is None
-        else [t.name for t in metric.trust.tests if t.rejected and not t.stddev],
+        if metric.diagnosis is None
+        else [t.name for t in metric.diagnosis.tests if t.rejected and not t.stddev],
     }
 
 

@@ -16,7 +16,7 @@ from tests.simulated.surveys import LASTING_S, error_curve, lasting
 from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.diagnostics.bent_path import bent_to_ranges, estimate_by_bent
-from rangesfm.diagnostics.diagnosis import TrustVerdict, trust_in
+from rangesfm.diagnostics.diagnosis import Diagnosis, diagnose_ranges
 from rangesfm.diagnostics.finished_map import by_similarity, doubts_of_map
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.errors import GeometryError
@@ -188,7 +188,7 @@ class Run:
 
     given: Given
     estimate: ScaleEstimate | None
-    trust: TrustVerdict | None
+    diagnosis: Diagnosis | None
     on_map: RangesOnMap | None = None
     refusal: str = ""
 
@@ -204,11 +204,11 @@ class Run:
     def doubts(self) -> list[str]:
         """List everything that speaks against the map of a survey that is not refined."""
         assert self.estimate is not None
-        assert self.trust is not None
+        assert self.diagnosis is not None
         no_points = PointErrors(np.zeros(0), np.zeros((0, 3)), np.inf)
         of_map = doubts_of_map(self.estimate, None, no_points, noise_is_given=False)
         of_scale = self.estimate.reasons if self.estimate.verdict != "good" else ()
-        return [*self.trust.reasons, *of_scale, *(doubt.reason for doubt in of_map)]
+        return [*self.diagnosis.reasons, *of_scale, *(doubt.reason for doubt in of_map)]
 
     @property
     def place_in_stddevs(self) -> float:
@@ -242,7 +242,7 @@ def run(given: Given, seed: int) -> Run:
     on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, given.trajectory, bending)
     on_map = bent_to_ranges(on_map)
     estimate = estimate_by_bent(estimate, on_map, options)
-    return Run(given, estimate, trust_in(on_map, seed=seed), on_map)
+    return Run(given, estimate, diagnose_ranges(on_map, seed=seed), on_map)
 
 
 def _near_truth(given: Given) -> Callable[[RangeProblem, int], list[RangeState]]:

@@ -419,10 +419,10 @@ def told(
 ) -> Line:  # fmt: skip
     """Return the figures of a run that the report needs."""
     line: Line = {"survey": survey, "kind": kind, "seed": seed, "factor": factor, "size": size}
-    if run_.trust is None or run_.estimate is None:
+    if run_.diagnosis is None or run_.estimate is None:
         return {**line, "refused": run_.refusal, "smallest": None}
-    tests = run_.trust.tests
-    causes = [f"{c.name} {c.subject}".strip() for c in run_.trust.causes]
+    tests = run_.diagnosis.tests
+    causes = [f"{c.name} {c.subject}".strip() for c in run_.diagnosis.causes]
     rejected = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected]
     of_evidence = [f"{t.name} {t.subject}".strip() for t in tests if t.rejected and t.stddev is None]
     named = [name for name in dict.fromkeys([*rejected, *causes]) if name in causes or name in of_evidence]

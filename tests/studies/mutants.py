@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PACKAGE = Path("plugin/rangesfm")
-PACKAGES = ("scale", "refine", "ranging/errors", "ranging/anchors", "ranging/clock", "trust", "ceres")
+PACKAGES = ("scale", "refine", "ranging/errors", "ranging/anchors", "ranging/clock", "diagnostics", "ceres")
 USED_BY = {
     "scale": ("join",),
     "ranging/errors": ("scale", "refine"),

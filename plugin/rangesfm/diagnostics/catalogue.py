@@ -82,8 +82,8 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
         correction=lambda size: Correction({name: at + size}),
         most=most_m,
         adoption=unknown,
-        unawares=UNSEEN_MOVE_M,
-        narrower=tuple(map(coordinate, range(3))),
+        max_unnoticed=UNSEEN_MOVE_M,
+        sub_hypotheses=tuple(map(coordinate, range(3))),
     )
 
 
@@ -240,7 +240,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
         remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
         correction=lambda size: Correction(tag_moves_m={on_map.tag_ids[k]: size}),
         most=_LARGEST_RIG_M + length_m,
-        unawares=to_other_side_m(length_m),
+        max_unnoticed=to_other_side_m(length_m),
     )
 
 
@@ -276,7 +276,7 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
         correction=longer(lambda: is_behind),
         most=_MOST_BODY_M,
         is_linear=True,
-        unawares=MISMEASURED_M,
+        max_unnoticed=MISMEASURED_M,
     )
 
 

@@ -31,7 +31,7 @@ _OF_SINGLE_RANGES = ("range noise", "anchor's outliers", _MIXED_UP)
 
 
 @dataclass(frozen=True)
-class TrustVerdict:
+class Diagnosis:
     """The tests of a map and the mistakes that they found.
 
     Attributes:
@@ -46,14 +46,14 @@ class TrustVerdict:
     causes: tuple[Cause, ...] = ()
     rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
-    def with_more(self, more: TrustVerdict) -> TrustVerdict:
+    def with_more(self, more: Diagnosis) -> Diagnosis:
         """Return the verdict with tests of something other than ranges added."""
         tests = (*more.tests, *self.tests)
         return replace(self, tests=tests, reasons=(*self.reasons, *more.reasons))
 
 
 @with_one_blas_thread
-def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
+def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     """Test for all mistakes that ranges on a map can show."""
     found = find_mistakes(on_map, seed=seed)
     shown = list(_evidence(found.problem))
@@ -65,7 +65,7 @@ def trust_in(on_map: RangesOnMap, *, seed: int = 0) -> TrustVerdict:
     reasons = [f"{row.words}: {row.remedy}" for row in (*before, *(row for row in after if row.rejected))]
     if found.causes:
         reasons.insert(len(before), causes_in_words(found.causes))
-    return TrustVerdict(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows)
+    return Diagnosis(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:

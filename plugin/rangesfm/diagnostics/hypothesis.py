@@ -69,9 +69,9 @@ class Hypothesis:
         most: largest possible size, as the length of the vector of numbers. A larger estimate is not this mistake.
         unit: of the numbers.
         adoption: returns the changes to make if the mistake is adopted; None: those of ``correction``.
-        unawares: a mistake larger than this is noticed without a test, so it need not be feared.
-        finer: yields the same mistake at times between those that are searched; None if it has no time.
-        narrower: hypotheses with fewer numbers, which explain as much if the mistake was of their kind.
+        max_unnoticed: a mistake larger than this is noticed without a test, so it need not be feared.
+        refine_time: yields the same mistake at times between those that are searched; None if it has no time.
+        sub_hypotheses: hypotheses with fewer numbers, which explain as much if the mistake was of their kind.
         is_linear: whether one step finds its size, however large it is.
         is_in_interval: whether the scale's interval already includes its usual size, or it changes the unit of length.
     """
@@ -85,9 +85,9 @@ class Hypothesis:
     subject: str = ""
     unit: str = "m"
     adoption: Callable[[Array], Correction] | None = None
-    unawares: float = np.inf
-    finer: Callable[[], Iterator[Hypothesis]] | None = None
-    narrower: tuple[Hypothesis, ...] = ()
+    max_unnoticed: float = np.inf
+    refine_time: Callable[[], Iterator[Hypothesis]] | None = None
+    sub_hypotheses: tuple[Hypothesis, ...] = ()
     is_linear: bool = False
     is_in_interval: bool = False
 
@@ -107,7 +107,7 @@ class Hypothesis:
     @property
     def most_unnoticed(self) -> float:
         """Largest possible size that nobody notices without a test."""
-        return min(self.most, self.unawares)
+        return min(self.most, self.max_unnoticed)
 
     @property
     def num(self) -> int:

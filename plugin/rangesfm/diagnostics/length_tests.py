@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import special
 
-from rangesfm.diagnostics.diagnosis import TrustVerdict
+from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
@@ -16,7 +16,7 @@ from rangesfm.scale.scale_estimate import ScaleEstimate
 _MEASURE_AGAIN = "look whether it was mistyped, or measure it again"
 
 
-def trust_in_lengths(estimate: ScaleEstimate, tape: Tape | None) -> TrustVerdict:
+def diagnose_lengths(estimate: ScaleEstimate, tape: Tape | None) -> Diagnosis:
     """Return the tests of measured lengths; empty if there are none.
 
     Args:
@@ -24,7 +24,7 @@ def trust_in_lengths(estimate: ScaleEstimate, tape: Tape | None) -> TrustVerdict
     """
     lengths = estimate.lengths
     if lengths is None or tape is None:
-        return TrustVerdict((), ())
+        return Diagnosis((), ())
     taped = [tape.distances[row] for row in lengths.rows.tolist()]
     rows = list(_of_each(lengths, taped))
     left_out = [
@@ -39,7 +39,7 @@ def trust_in_lengths(estimate: ScaleEstimate, tape: Tape | None) -> TrustVerdict
     # Printed tags are shown only if something was found: their sides are many and alike.
     told = [row for row, one in zip(rows, taped, strict=True) if row.rejected or not one.is_printed]
     told.sort(key=lambda row: row.threshold - row.statistic)
-    return TrustVerdict((*told, *against), reasons)
+    return Diagnosis((*told, *against), reasons)
 
 
 def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[MistakeTest]:

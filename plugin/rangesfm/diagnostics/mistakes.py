@@ -126,9 +126,9 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
 
 def _at_best_time(factorized: Factorization, hypothesis: Hypothesis) -> Hypothesis:
     """Return a hypothesis at the time that fits best; ranges between its true time and a tried one fit neither way."""
-    if hypothesis.finer is None:
+    if hypothesis.refine_time is None:
         return hypothesis
-    tests = factorized.estimates([hypothesis, *hypothesis.finer()])
+    tests = factorized.estimates([hypothesis, *hypothesis.refine_time()])
     return max(tests, key=lambda test: test.statistic).hypothesis
 
 
@@ -218,7 +218,7 @@ def _settled_in_steps(problem: Linearized, original: Hypothesis) -> _Settled:
         sizes = sizes + test.sizes
         moved = replace(problem.on_map, state=_stepped(at, factorized, hypothesis, test.sizes).state)
         at = at_state(at, corrected(moved, original.correction(sizes)))
-        found = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.narrower))
+        found = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.sub_hypotheses))
         hypothesis = next((each for each in found if each.key == original.key), None) or original.at_size(at, sizes)
     return _Settled(at, hypothesis, sizes, is_settled=False)
 
@@ -231,9 +231,9 @@ def _stepped(at: Linearized, factorized: Factorization, hypothesis: Hypothesis, 
 
 def _narrowed(problem: Linearized, cause: Cause, before: float) -> Cause:
     """Return a cause with fewer numbers if one explains as much; otherwise the cause itself."""
-    if cause.test is None or not cause.test.hypothesis.narrower:
+    if cause.test is None or not cause.test.hypothesis.sub_hypotheses:
         return cause
-    tried = [_settled_test(problem, h) for h in cause.test.hypothesis.narrower]
+    tried = [_settled_test(problem, h) for h in cause.test.hypothesis.sub_hypotheses]
     tried = [each for each in tried if each[0].is_possible]
     if not tried:
         return cause

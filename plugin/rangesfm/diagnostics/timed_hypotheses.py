@@ -99,7 +99,7 @@ def _elsewhere(
         by_shift: (c, 3) derivatives of the predicted ranges along these axes.
         around: as in ``_changes``.
     """
-    words, remedy, unawares = _MOVES[name]
+    words, remedy, max_unnoticed = _MOVES[name]
     whose = _name(problem, anchor)
 
     def back(later: Callable[[], Mask], size: Array) -> Correction:
@@ -117,8 +117,8 @@ def _elsewhere(
             correction=partial(back, later),
             most=most_m,
             adoption=partial(_left_out, later),
-            unawares=unawares,
-            finer=partial(_elsewhere, problem, anchor, name, most_m, axes, by_shift, around=time),
+            max_unnoticed=max_unnoticed,
+            refine_time=partial(_elsewhere, problem, anchor, name, most_m, axes, by_shift, around=time),
         )
 
 
@@ -145,7 +145,7 @@ def _steps(problem: Linearized, anchor: int | None, around: float | None = None)
             correction=longer(later),
             most=longest_m(problem, anchor),
             is_linear=True,
-            finer=partial(_steps, problem, anchor, around=time),
+            refine_time=partial(_steps, problem, anchor, around=time),
         )
 
 
@@ -197,7 +197,7 @@ def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hy
             most=duration_s(problem),
             unit="s",
             is_linear=True,
-            finer=partial(clock_jumps, problem, around=time),
+            refine_time=partial(clock_jumps, problem, around=time),
         )
 
 

@@ -45,7 +45,7 @@ _NUM_TRIANGULATIONS = 5
 
 
 @dataclass(frozen=True)
-class Unbent:
+class Presolved:
     """Result of the removal of drift.
 
     Attributes:
@@ -62,7 +62,7 @@ class Unbent:
     num_steps: int
 
 
-def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Unbent:
+def presolve(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Presolved:
     """Solve the keyframe graph and move the model accordingly, in place.
 
     The errors are estimated again with every solution. While the drift is large, the residuals and their standard
@@ -74,11 +74,11 @@ def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) 
         rays: all observations of the photos. errors: of the ranges that take part.
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
-        return Unbent(errors, 0.0, problem.radio.anchors, 0.0, 0)
+        return Presolved(errors, 0.0, problem.radio.anchors, 0.0, 0)
     graph = _graph(problem, rays, errors, problem.radio.anchors)
     fit, errors = _solve_with_own_errors(graph)
     _move(problem, rays, graph.vision, fit.state.poses, errors)
-    return Unbent(
+    return Presolved(
         errors=errors,
         num_absorbed=fit.num_absorbed,
         anchors=moved_anchors(problem.radio.anchors, fit.state.anchors_m, fit.state.biases_m),
@@ -87,7 +87,7 @@ def unbend(problem: RefinementProblem, rays: Observations, errors: RangeErrors) 
     )
 
 
-def unbend_again(
+def presolve_again(
     problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
 ) -> tuple[AnchorEstimate, ...]:
     """Solve the keyframe graph again from the current model, with known errors; return the moved anchors.

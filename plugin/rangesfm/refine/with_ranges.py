@@ -29,7 +29,7 @@ from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, SolverRun, solve_bundle_adjustment, solve_until_still
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
-from rangesfm.refine.graph_presolve import SAME_ERRORS, Unbent, unbend, unbend_again
+from rangesfm.refine.graph_presolve import SAME_ERRORS, Presolved, presolve, presolve_again
 from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
 from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
@@ -232,7 +232,7 @@ def _refine(problem: RefinementProblem, errors: RangeErrors, learn: Learn | None
     misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
     problem = replace(problem, left_out_ids=frozenset(rays.point_ids[misplaced].tolist()))
     bundle = problem.of_photos(problem.options.max_num_iterations)
-    return _adjust(problem, bundle, unbend(problem, rays.with_pixel_stddev(bundle.pixel_stddev), errors), learn)
+    return _adjust(problem, bundle, presolve(problem, rays.with_pixel_stddev(bundle.pixel_stddev), errors), learn)
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ class _Round:
     num_left: int
 
 
-def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent, learn: Learn | None) -> RefineSummary:
+def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Presolved, learn: Learn | None) -> RefineSummary:
     """Alternate between solving the full problem and estimating the errors from its residuals."""
     added: AddedRadio
 
@@ -254,7 +254,7 @@ def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Unbent,
             before = _Round(replace(problem.radio, anchors=start.anchors), (), problem.options.max_num_iterations)
         else:
             rays = model_observations(problem.metric, problem.frame_ids).with_pixel_stddev(bundle.pixel_stddev)
-            anchors = unbend_again(problem, rays, errors, before.radio.anchors)
+            anchors = presolve_again(problem, rays, errors, before.radio.anchors)
             before = replace(before, radio=replace(before.radio, anchors=anchors))
             bundle = problem.of_photos(before.num_left)
         added = problem.add_to(bundle, errors, before.radio)
@@ -327,7 +327,7 @@ def _covariance(
 
 def _summary(
     problem: RefinementProblem,
-    start: Unbent,
+    start: Presolved,
     bundle: BundleAdjustment,
     done: _Round,
     errors: RangeErrors,

@@ -12,7 +12,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
-from rangesfm.diagnostics.diagnosis import TrustVerdict
+from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.finished_map import Place
 from rangesfm.diagnostics.linearized import RangesOnMap
 from rangesfm.distances.tape import Tape
@@ -63,7 +63,7 @@ class MetricResult:
         place: how well the place of the map in the site frame is known; None where the frame is that of the first
             camera, or where it has not been judged yet.
         models: all models that were to be joined to this one; empty where there was only one.
-        trust: result of the tests of mistakes on the final map.
+        diagnosis: result of the tests of mistakes on the final map.
         tape: the measured lengths, with those left out that cannot be in the map; None without any.
         rivals: other likely time offsets; None without any.
         on_map: the ranges on the scaled map; None where that map is only the start of a refinement, or without ranges.
@@ -82,7 +82,7 @@ class MetricResult:
     why_broken: tuple[str, ...] = ()
     place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
-    trust: TrustVerdict | None = None
+    diagnosis: Diagnosis | None = None
     tape: Tape | None = None
     rivals: Rivals | None = None
     on_map: RangesOnMap | None = None

@@ -89,7 +89,7 @@ class ResultSummary(Record):
             ranges=entries.RangesEntry.of(found),
             check_ranges=entries.CheckRangesEntry.of(found),
             refine=entries.RefineEntry.of(found),
-            tests=tuple(map(entries.MistakeEntry.model_validate, found.trust.tests if found.trust else ())),
+            tests=tuple(map(entries.MistakeEntry.model_validate, found.diagnosis.tests if found.diagnosis else ())),
             models=tuple(entries.ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
             **others,
         )

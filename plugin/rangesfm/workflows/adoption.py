@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.diagnostics.diagnosis import TrustVerdict
+from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import Correction
 from rangesfm.errors import GeometryError
 from rangesfm.join.join_models import PathOfModel
@@ -27,15 +27,15 @@ def with_likeliest_cause(
     The verdict on the new map is doubtful, with the change as a reason. Of two mistakes that the ranges hardly tell
     apart the likelier one is corrected, too; the user has asked for it and is told.
     """
-    if metric.trust is None or not metric.trust.causes:
+    if metric.diagnosis is None or not metric.diagnosis.causes:
         return inputs, metric
     if metric.models:
         journal.warn("no mistake is corrected: the map is joined from several models")
         return inputs, metric
-    cause = metric.trust.causes[0]
-    corrected = _corrected_inputs(inputs, cause.correction, metric.trust.rows)
+    cause = metric.diagnosis.causes[0]
+    corrected = _corrected_inputs(inputs, cause.correction, metric.diagnosis.rows)
     try:
-        moved = replace(path, observations=_observations(survey, corrected, path, metric, metric.trust))
+        moved = replace(path, observations=_observations(survey, corrected, path, metric, metric.diagnosis))
         is_refined = metric.refined is not None
         adopted = metric_map(survey, corrected, moved, metric.time_offset, journal, refine=is_refined)
     except GeometryError as error:
@@ -65,10 +65,10 @@ def _corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indic
 
 
 def _observations(
-    survey: Survey, inputs: RangingInputs, path: PathOfModel, metric: MetricResult, trust: TrustVerdict
+    survey: Survey, inputs: RangingInputs, path: PathOfModel, metric: MetricResult, diagnosis: Diagnosis
 ) -> RangeObservations:
     """Return the corrected ranges on the path. Ranges that the correction leaves out get the status of check ranges."""
-    correction, rows = trust.causes[0].correction, trust.rows
+    correction, rows = diagnosis.causes[0].correction, diagnosis.rows
     offset, times, known_s = metric.time_offset, inputs.log.timestamp_s, metric.time_offset_s or 0.0
     shift_s = _spread(np.broadcast_to(correction.time_shift_s, len(rows)), rows, len(inputs.log))
     offset_s = shift_s + (known_s if offset is None or times is None else offset.at(times))

@@ -13,9 +13,9 @@ from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
-from rangesfm.diagnostics.diagnosis import TrustVerdict, causes_in_words, trust_in
+from rangesfm.diagnostics.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
 from rangesfm.diagnostics.finished_map import Doubt, doubts_of_map, doubts_of_pieces, place_of_map, why_broken
-from rangesfm.diagnostics.length_tests import trust_in_lengths
+from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.distances.tape import Tape
@@ -344,10 +344,14 @@ def _refused_with_cause(
 
 def _with_cause(error: GeometryError, survey: Survey, on_map: RangesOnMap | None) -> GeometryError:
     try:
-        trust = _trust_in(survey, on_map)
+        diagnosis = _diagnose(survey, on_map)
     except np.linalg.LinAlgError:
         return error
-    return GeometryError(f"{error}; {causes_in_words(trust.causes)}") if trust is not None and trust.causes else error
+    return (
+        GeometryError(f"{error}; {causes_in_words(diagnosis.causes)}")
+        if diagnosis is not None and diagnosis.causes
+        else error
+    )
 
 
 def _ranges_on_scaled(
@@ -361,8 +365,8 @@ def _ranges_on_scaled(
     return bent_to_ranges(on_map)
 
 
-def _trust_in(survey: Survey, on_map: RangesOnMap | None) -> TrustVerdict | None:
-    return None if on_map is None else trust_in(on_map, seed=survey.output.seed)
+def _diagnose(survey: Survey, on_map: RangesOnMap | None) -> Diagnosis | None:
+    return None if on_map is None else diagnose_ranges(on_map, seed=survey.output.seed)
 
 
 def scale_by_rivals(
@@ -485,13 +489,13 @@ def judge_map(survey: Survey, metric: MetricResult, known_doubts: Sequence[Doubt
         GeometryError: the scale is less certain than asked for.
     """
     metric, on_map = _estimated(survey, metric)
-    trust = trust_in_lengths(metric.estimate, metric.tape)
+    diagnosis = diagnose_lengths(metric.estimate, metric.tape)
     try:
-        if (of_ranges := _trust_in(survey, on_map)) is not None:
-            trust = of_ranges.with_more(trust)
+        if (of_ranges := _diagnose(survey, on_map)) is not None:
+            diagnosis = of_ranges.with_more(diagnosis)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not tested, because the ranges determine too little: {error}")
-    journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *trust.reasons)
+    journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *diagnosis.reasons)
     log, by_rivals = metric.observations.log, () if metric.rivals is None else metric.rivals.doubts
     doubts: list[Doubt] = []
     if metric.why_broken:
@@ -508,9 +512,9 @@ def judge_map(survey: Survey, metric: MetricResult, known_doubts: Sequence[Doubt
     centers_m = metric.trajectory.as_in(metric.final).centers
     bent_by_m = np.zeros(0) if on_map is None else bends_m(on_map)
     place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, doubts, bent_by_m)
-    judged = replace(metric, place=place, trust=trust).doubted(by_rivals)
+    judged = replace(metric, place=place, diagnosis=diagnosis).doubted(by_rivals)
     judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
-    return judged.doubted(trust.reasons)
+    return judged.doubted(diagnosis.reasons)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
