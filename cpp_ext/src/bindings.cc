@@ -1,4 +1,5 @@
-// Python factories of the cost functions and of a manifold, with their documentation. Arguments are checked by gate.h.
+// Python factories of the cost functions and of a manifold, with their documentation. Arguments are checked by
+// argument_checks.h.
 //
 // No class is bound. The factories return ceres::CostFunction or ceres::Manifold, types that pyceres registers, and
 // pass on the ownership: pyceres wraps the object in its own holder and deletes it. plugin/rangesfm/_cpp.pyi is made
@@ -18,10 +19,10 @@
 #include <type_traits>
 #include <utility>
 
-#include "gate.h"
-#include "rangesfm/beside_points.h"
+#include "argument_checks.h"
 #include "rangesfm/direction_cost.h"
 #include "rangesfm/distance_cost.h"
+#include "rangesfm/elimination_order.h"
 #include "rangesfm/joint_prior_cost.h"
 #include "rangesfm/range_cost.h"
 #include "rangesfm/robust_loss.h"
@@ -242,8 +243,8 @@ PYBIND11_MODULE(_cpp, m) {
         arg("direction_in_world"), arg("direction_in_cam"), arg("stddev_rad"));
   m.def("joint_prior_cost", &rangesfm::MakeJointPriorCost, kOwn, rangesfm::kJointPriorCostDoc, py::kw_only(),
         arg("mean"), arg("whitening"));
-  m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, kOwn, "See beside_points.h.", py::kw_only(), arg("size_a"),
+  m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, kOwn, "See elimination_order.h.", py::kw_only(), arg("size_a"),
         arg("size_b"));
-  m.def("padded_manifold", &rangesfm::MakePaddedManifold, kOwn, "See beside_points.h.", py::kw_only(), arg("size"),
+  m.def("padded_manifold", &rangesfm::MakePaddedManifold, kOwn, "See elimination_order.h.", py::kw_only(), arg("size"),
         arg("tangent_size"));
 }

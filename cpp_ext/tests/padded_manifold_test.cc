@@ -7,7 +7,7 @@
 #include <cmath>
 #include <vector>
 
-#include "rangesfm/beside_points.h"
+#include "rangesfm/elimination_order.h"
 
 namespace rangesfm {
 namespace {

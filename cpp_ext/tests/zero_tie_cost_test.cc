@@ -1,7 +1,7 @@
 #include <gtest/gtest.h>
 
 #include "cost_testing.h"
-#include "rangesfm/beside_points.h"
+#include "rangesfm/elimination_order.h"
 
 namespace rangesfm {
 namespace {
