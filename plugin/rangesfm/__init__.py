@@ -42,7 +42,7 @@ _HOME = {
     "initialize_scale": "rangesfm.scale.initialize",
     "measure": "rangesfm.workflows.measure",
     "plan_survey": "rangesfm.planning.survey_plan",
-    "read_anchors": "rangesfm.ranging.anchors.anchor",
+    "read_anchors": "rangesfm.ranging.anchors.anchor_file",
     "read_image_times_csv": "rangesfm.vision.image_times",
     "read_plan": "rangesfm.planning.plan_file",
     "read_ranges": "rangesfm.ranging.readers",

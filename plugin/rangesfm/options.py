@@ -84,6 +84,10 @@ def _span(times: tuple[float, ...]) -> tuple[float, ...]:
     return times
 
 
+_TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "d", "iso", "dmy", "mdy"]
+_LengthUnit = Literal["m", "cm", "mm", "ft"]
+
+
 class KeyframeOptions(Options, table="images"):
     """Choice of the photos that become keyframes. All keys that are given apply together."""
 
@@ -104,7 +108,15 @@ class ImageOptions(KeyframeOptions):
     model: Annotated[Path | None, KeyMeta(flag="input_path", metavar="MODEL", role="model")] = None
     """Folder of a COLMAP model, such as sparse/0, to start from; no photos are needed then."""
     times: Annotated[Path | None, KeyMeta(flag="image_times", role="file")] = None
-    """CSV image_name,timestamp_s with the times of the photos (default: EXIF, else file names)."""
+    """CSV image_name,timestamp_s with the times of the photos, or another table of photos and times (default: by
+    rate_hz if given, else EXIF, else file names)."""
+    times_columns: Annotated[dict[str, str], KeyMeta(flag="image_times_columns", metavar="QUANTITY=NAME,..")] = Field(
+        default_factory=dict
+    )
+    """Names of the columns of times (numbers, where they have no names) for image_name, timestamp and possibly date
+    and nanoseconds (default: recognised)."""
+    times_unit: Annotated[_TimeUnit | None, KeyMeta(flag="image_times_unit")] = None
+    """Unit of the times, as timestamp_unit in [ranges] (default: by column name or values)."""
     rig_config: Annotated[Path | None, KeyMeta(flag="rig_config_path", metavar="JSON", role="file")] = None
     """COLMAP's rig_config.json, lengths in metres. Photos of a rig whose names are the same after their image_prefix
     were taken at the same time, that of the reference camera's photo. A given cam_from_rig is kept while mapping, and
@@ -112,10 +124,17 @@ class ImageOptions(KeyframeOptions):
     a first model made without the rig."""
     baseline_stddev_m: _Positive = 0.001
     """Standard deviation of the known distance of each camera of a rig from the reference camera."""
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e3), KeyMeta(flag="image_rate_hz")] = 2.0
-    """Photos per second taken from a video or a bag: the sharpest image of each interval."""
+    rate_hz: Annotated[Annotated[float, Field(ge=1e-3, le=1e3)] | None, KeyMeta(flag="image_rate_hz")] = None
+    """Photos per second. From a video or a bag so many are taken, the sharpest image of each interval (default: 2). For
+    a folder of photos it is the fixed rate at which they were taken, in the order of the numbers in their names
+    (default: the photos have times)."""
     topic: Annotated[str | None, KeyMeta(flag="image_topic")] = None
     """Topic of the images, for a bag with several image topics."""
+
+    @property
+    def extraction_rate_hz(self) -> float:
+        """Return the number of photos per second that are taken from a video or a bag."""
+        return 2.0 if self.rate_hz is None else self.rate_hz
 
 
 class CameraOptions(Options, table="camera"):
@@ -192,10 +211,10 @@ class LogOptions(Options, table="ranges"):
     """Names of the log's columns (numbers, where they have no names) for timestamp (or image_name), anchor_id, range,
     tag_id, range_stddev, los; range:A1 for a column that holds the ranges of anchor A1. A log without ranges needs the
     time stamps of two-way ranging: tx1, rx1, tx2, rx2 and possibly tx3, rx3."""
-    timestamp_unit: Literal["s", "ms", "us", "ns", "min", "h", "d", "iso", "dmy", "mdy"] | None = None
+    timestamp_unit: _TimeUnit | None = None
     """Unit of the log's times. d: days, also as Excel and MATLAB count them; iso: dates and times; dmy, mdy: the same
     with dates that begin with the day or the month (default: by format, column name or values)."""
-    range_unit: Literal["m", "cm", "mm", "ft"] | None = None
+    range_unit: _LengthUnit | None = None
     """Unit of the log's ranges (default: by format, column name or values)."""
     separator: Annotated[
         Annotated[str, Field(min_length=1, max_length=1)] | None, KeyMeta(metavar="CHARACTER", expected="one character")
@@ -272,8 +291,15 @@ class AnchorOptions(Options, table="anchors"):
     """The anchors."""
 
     path: Annotated[Path | None, KeyMeta(flag="anchors", role="file")] = None
-    """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m]; empty coordinates mean an unknown
-    position (default: the anchors in the log, all unknown)."""
+    """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], or another table of points or a
+    GSI file; empty coordinates mean an unknown position (default: the anchors in the log, all unknown)."""
+    columns: Annotated[dict[str, str], KeyMeta(flag="anchor_columns", metavar="QUANTITY=NAME,..")] = Field(
+        default_factory=dict
+    )
+    """Names of the columns of the file (numbers, where they have no names) for anchor_id, x, y, z, position_stddev,
+    range_bias and range_bias_stddev; x is east and y north, if they are such (default: recognised)."""
+    unit: Annotated[_LengthUnit | None, KeyMeta(flag="anchor_unit")] = None
+    """Unit of the coordinates (default: that in the names of the columns, else m)."""
     frame: Annotated[Literal["site", "first_camera", "unknown"] | None, KeyMeta(flag="anchor_frame")] = None
     """Frame of the anchors' coordinates (default: site if the file has any position, else unknown)."""
     crs: Annotated[str | None, KeyMeta(flag="anchor_crs")] = None

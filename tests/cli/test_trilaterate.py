@@ -16,7 +16,7 @@ from rangesfm.cli import main
 from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.ranging.anchors.anchor import read_anchors
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.vision.image_times import read_image_times_csv

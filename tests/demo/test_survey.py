@@ -25,7 +25,7 @@ from rangesfm.demo.survey import (
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer, write_text
 from rangesfm.geometry.reference import read_reference
-from rangesfm.ranging.anchors.anchor import read_anchors
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.survey.settings import read_survey
 

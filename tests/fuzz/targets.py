@@ -17,7 +17,8 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.apply import apply_to
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.errors.error_curve import ErrorCurve, read_error_curve
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_summary import summarize_ranges

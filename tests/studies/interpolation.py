@@ -30,7 +30,8 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.ranging.readers import read_ranges

@@ -33,7 +33,8 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions, ScaleOptions
-from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.components import components, population
 from rangesfm.ranging.errors.error_curve import ErrorCurve, correct_ranges

@@ -16,7 +16,7 @@ from tests.studies.erring_surveys import Given
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.ranging.anchors.anchor import read_anchors
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.readers import read_ranges
 
 EVERY = 10

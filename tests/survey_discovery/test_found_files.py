@@ -55,7 +55,7 @@ def test_photos_are_found_in_the_folder_that_holds_them_also_behind_a_link(tmp_p
     assert look_into([survey]).paths == {"images.path": [survey / "images"]}
 
 
-def test_results_of_runs_hidden_files_single_pictures_and_prose_are_no_inputs(tmp_path: Path) -> None:
+def test_what_is_not_used_is_listed_with_the_reason_without_results_of_runs_and_hidden_files(tmp_path: Path) -> None:
     write_photos(tmp_path / "out" / "images", 2)
     (tmp_path / "out" / "result.json").write_text("{}")
     (tmp_path / "out" / "images.csv").write_text(CONTENTS["images.times"])
@@ -66,7 +66,14 @@ def test_results_of_runs_hidden_files_single_pictures_and_prose_are_no_inputs(tm
     write_photos(tmp_path, 1)
     found = look_into([tmp_path])
     assert found.paths == {}
-    assert found.notes == ()
+    assert found.notes == (
+        "not used: IMG_0.jpg (a folder of photos has 2 or more)",
+        "not used: README.md, database.db, empty.csv (no input that is known)",
+    )
+    for k in range(200):
+        (tmp_path / f"depth_{k}.npy").touch()
+    (note,) = (note for note in look_into([tmp_path]).notes if "known" in note)
+    assert note.startswith("not used: README.md, database.db, depth_0.npy, depth_1.npy and 199 more (.csv, .npy)")
 
 
 def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
@@ -79,8 +86,8 @@ def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
     assert found.paths == {}
     photos, videos = found.notes
     assert found.models == (tmp_path / "sparse",)
-    assert photos == ".heic files are not read (1, such as IMG_1.HEIC): convert them to JPEG"
-    assert videos.startswith(".insv files are not read (2, such as walk.INSV): extract plain photos")
+    assert photos == "not used: IMG_1.HEIC (convert them to JPEG)"
+    assert videos.startswith("not used: walk.INSV, walk2.insv (extract plain photos")
 
 
 def test_a_bag_is_a_log_if_it_has_ranges(tmp_path: Path) -> None:
@@ -112,7 +119,7 @@ def test_a_table_that_may_be_a_log_is_told_unless_there_is_one(tmp_path: Path) -
     assert "not known for sure" in note
     assert f"rangesfm ranges {tmp_path / 'unknown.csv'} says what is missing" in note
     (tmp_path / "uwb.csv").write_text(CONTENTS["ranges.path"])
-    assert look_into([tmp_path]).notes == ()
+    assert look_into([tmp_path]).notes == ("not used: unknown.csv (a table whose columns are not known for sure)",)
 
 
 def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:

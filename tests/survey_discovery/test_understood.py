@@ -78,7 +78,7 @@ def test_a_folder_of_nothing_is_refused_with_what_is_there(tmp_path: Path) -> No
     (tmp_path / "walk.insv").touch()
     with pytest.raises(InputError, match="found no photos, no radio log") as caught:
         understand([tmp_path], {})
-    assert ".insv files are not read" in caught.value.advice[0]
+    assert "not used: walk.insv (extract plain photos" in caught.value.advice[0]
 
 
 def test_of_several_cameras_that_of_the_photos_size_is_taken(tmp_path: Path) -> None:

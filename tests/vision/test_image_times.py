@@ -102,7 +102,7 @@ class TestCsv:
         [
             ("", "images.csv: the file is empty"),
             ("image_name,timestamp_s\n", "images.csv: no rows below the header"),
-            ("image_name,time_ms\na.jpg,1\n", "images.csv:1: no column timestamp_s; found image_name, time_ms"),
+            ("image_name,size_px\na.jpg,1\n", "no columns with photos and times; found image_name, size_px"),
             (
                 "image_name,timestamp_s\na.jpg,noon\n",
                 "images.csv:2: timestamp_s is 'noon', expected a number",

@@ -116,7 +116,7 @@ def normalize(argv: Sequence[str]) -> list[str]:
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
-    """Read normalised arguments.
+    """Read normalised arguments; the attribute ``typed`` has them all as one command, for advice.
 
     Raises:
         InputError: an unknown command or option (the text names the nearest known one), or a bad value.
@@ -128,6 +128,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     args, unknown = commands.parser.parse_known_args([two, *argv[2:]] if two in commands.by_name else list(argv))
     if not hasattr(args, "command"):
         commands.parser.error("a command is missing, expected one of " + ", ".join(commands.by_name))
+    args.typed = ["rangesfm", *argv]
     if unknown:
         commands.by_name[args.command].error(_unknown(unknown[0], commands.by_name[args.command]))
     return args

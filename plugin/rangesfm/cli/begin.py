@@ -26,6 +26,7 @@ def add_begin_commands(commands: Commands) -> None:
     init = commands.add("init", _init, "write a survey file from folders of photos and logs")
     init.add_argument("folders", nargs="+", metavar="FOLDER", help="folders with photos, log, anchors, ...")
     init.add_argument("--output_path", metavar="PATH", help="survey file, or its folder (default: the first FOLDER)")
+    init.add_argument("--force", action="store_true", help="write a survey file anew that is there already")
     add_flags(init, without=("output.path",))
     check = commands.add("check", _check, "say in seconds what a run would read, and what is wrong with it")
     add_survey_arguments(check)
@@ -34,7 +35,8 @@ def add_begin_commands(commands: Commands) -> None:
 def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Look into folders for photos, the radio's log, anchors, times, calibration and true positions, and write a
     survey file with comments that can be run. Files are recognised by their content. Prints what was understood,
-    what is assumed and what is missing. Flags give what the folders do not hold. An existing file is not changed.
+    what is assumed, what is missing and which files are not used. Flags give what the folders do not hold. An existing
+    file is not changed without --force.
 
     example:
       rangesfm init my_survey --tag_in_cam 0.03,-0.12,-0.05
@@ -42,25 +44,43 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.files.atomic import write_text
     from rangesfm.files.output_folder import free_output
     from rangesfm.survey.settings import read_survey
-    from rangesfm.survey_discovery.survey_file import NAME, survey_text
+    from rangesfm.survey_discovery.found_files import SURVEY_NAME
+    from rangesfm.survey_discovery.survey_file import survey_text
     from rangesfm.survey_discovery.understood import understand
     from rangesfm.workflows.check import check_survey
 
     folders = [Path(folder) for folder in args.folders]
     path = Path(args.output_path or folders[0])
-    path = path if path.suffix == ".toml" else path / NAME
-    if os.path.lexists(path):
-        raise InputError("is there already and is left as it is; --output_path PATH writes another", path)
-    understood = understand(folders, overrides_from_arguments(args))
+    path = path if path.suffix == ".toml" else path / SURVEY_NAME
+    if os.path.lexists(path) and not args.force:
+        raise InputError(
+            "is there already and is left as it is; --force writes it anew, --output_path PATH writes another", path
+        )
+    understood = understand(folders, overrides_from_arguments(args), args.typed)
     understood.survey()  # raises an error about bad values before anything is written
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
+    kept = _make_way(path) if path.is_file() else None
     write_text(survey_text({**understood.values, "output.path": free_output(folder)}, folder), path)
     checked = check_survey(read_survey(path))
-    lines = [f"wrote {path}", *told(checked, fault="missing"), *(f"note: {note}" for note in understood.notes)]
+    lines = [f"wrote {path}" + (f", and kept the earlier one as {kept.name}" if kept else "")]
+    lines += [*told(checked, fault="missing"), *(f"note: {note}" for note in understood.notes)]
     command = shlex.join(["rangesfm", "check" if checked.faults else "run", str(path)])
     missing = "write down what is missing (a flag is a key of the same name), then " if checked.faults else ""
     return Outcome([*lines, f"next: {missing}{command}"])
+
+
+def _make_way(path: Path) -> Path | None:
+    """Rename a survey file that somebody has changed since it was written, and return its new path; else None."""
+    from rangesfm.files.output_folder import absolute, writer_of
+
+    with writer_of(path) as output:
+        if output.is_own(absolute(path)):
+            return None
+    names = (f"{path.name}.old{number}" for number in ("", *map(str, range(2, 1000))))
+    kept = next(place for name in names if not os.path.lexists(place := path.with_name(name)))
+    path.rename(kept)
+    return kept
 
 
 def _check(args: argparse.Namespace, progress: Progress) -> Outcome:

@@ -30,6 +30,7 @@ _LOG_KEYS = (
     *("ranges.ranging_interval_s", "ranges.stamp_unit", "ranges.stamp_bits", "ranges.propagation_speed"),
     "ranges.t_off_s",
 )
+_ANCHOR_FILE_KEYS = ("anchors.columns", "anchors.unit")
 _LENGTHS = ("number", "min m", "median m", "max m")
 _TOWARD = {
     "above": (0.0, 0.0, 1.0),
@@ -47,6 +48,7 @@ def add_ranges_commands(commands: Commands) -> None:
     ranges = commands.add("ranges", _ranges, "print what is in a radio log, and write it as canonical CSV")
     _add_log_arguments(ranges)
     ranges.add_argument("--anchors", metavar="CSV", help="file of anchors, by which ranges between anchors are known")
+    add_flags(ranges, *_ANCHOR_FILE_KEYS)
     ranges.add_argument("--output_path", metavar="CSV", help="write the ranges to this file")
     ranges.add_argument("--plot", metavar="FILE", help="draw the ranges over time into this file (PNG or SVG)")
     calibrate = commands.add(
@@ -54,6 +56,7 @@ def add_ranges_commands(commands: Commands) -> None:
     )
     _add_log_arguments(calibrate)
     calibrate.add_argument("--anchors", required=True, metavar="CSV", help="surveyed anchors: anchor_id,x_m,y_m,z_m")
+    add_flags(calibrate, *_ANCHOR_FILE_KEYS)
     calibrate.later.append(partial(_add_position_arguments, max_interpolation_gap_s=0.2))
     calibrate.add_argument("--output_path", required=True, metavar="CSV", help="write the curve to this file")
     calibrate.add_argument(
@@ -207,6 +210,14 @@ def _read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> Range
     return read_log(survey_from_arguments(args).ranges.changed(path=Path(args.log[0])), anchor_ids, files=args.log)
 
 
+def _read_anchors(args: argparse.Namespace) -> tuple[Anchor, ...]:
+    """Read the anchor file that the arguments name."""
+    from rangesfm.ranging.anchors.anchor_file import read_anchors
+
+    options = survey_from_arguments(args).anchors
+    return read_anchors(args.anchors, columns=options.columns, unit=options.unit)
+
+
 def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
     """Read the n ranges of one tag, and return them with the position of the tag at each, (n, 3); NaN if unknown."""
     from rangesfm.geometry.reference import read_reference
@@ -226,12 +237,11 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \
         --output_path ranges.csv
     """
-    from rangesfm.ranging.anchors.anchor import read_anchors
     from rangesfm.ranging.range_summary import summarize_ranges
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
 
     _require_apart(args, args.anchors)
-    anchors = read_anchors(args.anchors) if args.anchors is not None else ()
+    anchors = _read_anchors(args) if args.anchors is not None else ()
     log = _read_log(args, [anchor.anchor_id for anchor in anchors])
     lines = [
         *_summary(summarize_ranges(log), _notes_of(log)),
@@ -318,12 +328,11 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \
         --output_path curve.csv
     """
-    from rangesfm.ranging.anchors.anchor import read_anchors
     from rangesfm.ranging.errors.error_curve import write_error_curve
     from rangesfm.ranging.errors.radio_calibration import calibrate_ranges
 
     _require_apart(args, args.anchors, args.positions)
-    anchors = read_anchors(args.anchors)
+    anchors = _read_anchors(args)
     log, tags_m = _read_placed_log(args)
     calibration = calibrate_ranges(log, tags_m, anchors)
     lines = [*_notes_of(log), *_calibrated(calibration, len(log)), "", f"written to {args.output_path}"]
@@ -365,7 +374,7 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv
       rangesfm run survey.toml --anchors anchors.csv --anchor_frame site
     """
-    from rangesfm.ranging.anchors.anchor import write_anchors
+    from rangesfm.ranging.anchors.anchor_file import write_anchors
     from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate_anchors
 
     _require_apart(args, args.positions)

@@ -222,18 +222,19 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
         InputError: the file cannot be read, or a key or a flag is wrong.
     """
     from rangesfm.survey.settings import read_survey, survey_from_tables
-    from rangesfm.survey_discovery.survey_file import NAME
+    from rangesfm.survey_discovery.found_files import SURVEY_NAME
 
     overrides = overrides_from_arguments(args)
     path = None if getattr(args, "survey", None) is None else Path(args.survey)
-    path = path / NAME if path is not None and (path / NAME).is_file() else path
+    path = path / SURVEY_NAME if path is not None and (path / SURVEY_NAME).is_file() else path
     if path is None:
         return survey_from_tables({}, Path.cwd(), overrides)
     if path.is_dir():
         from rangesfm.files.output_folder import free_output
         from rangesfm.survey_discovery.understood import understand
 
-        understood = understand([path], {"output.path": free_output(path.absolute()), **overrides})
+        given = {"output.path": free_output(path.absolute()), **overrides}
+        understood = understand([path], given, getattr(args, "typed", None))
         if progress is not None:
             for note in understood.notes:
                 progress.message(note)

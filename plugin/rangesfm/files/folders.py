@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,13 @@ from rangesfm.errors import InputError
 
 LEFT_BY_RUNS = frozenset({"result.json", "reconstruct.json", "photos.json"})
 """Names of files that mark a folder as the result of an earlier run."""
+IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+"""Endings of the names of photos, in small letters."""
+
+
+def natural_order(name: str) -> tuple[list[str], str]:
+    """Return a key by which names are sorted as people number them: frame_2 before frame_10."""
+    return [part.zfill(20) for part in re.split(r"(\d+)", name)], name
 
 
 def real_path(path: Path) -> Path:

@@ -1,7 +1,7 @@
 """Tables in text: reading and writing of CSV and similar files, and the layout of tables that commands print.
 
-A table in a file has a header row. ``#`` comments and blank lines may be anywhere. A byte order mark, any line ending
-and quoted cells are understood. Every error is an InputError with the line.
+A table in a file has a header row. ``#`` comments and blank lines may be anywhere. A byte order mark, any line ending,
+Windows-1252 and quoted cells are understood. Every error is an InputError with the line.
 
 A written table is read back unchanged. A first cell that begins with ``#`` is quoted, because its row would otherwise
 be a comment. Text that a spreadsheet would compute as a formula gets an apostrophe in front. Spreadsheets mark text in
@@ -38,6 +38,9 @@ _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 # Beginning of a formula, also in the full-width characters of East Asian keyboards, after any apostrophes.
 _FORMULA = re.compile(r"'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20]")
 _MAY_BEGIN_FORMULA = frozenset("'=+-@\uff1d\uff0b\uff0d\uff20 \u3000\xa0\t")
+_WINDOWS = "cp1252"
+# Signs of Windows-1252 beside its letters that occur in tables: units, quotes, dashes, and the blank of thousands.
+_WINDOWS_SIGNS = "\xb0\xb2\xb3\xb5\xb1\xa7\xb7\xa0\u20ac\u2018\u2019\u201c\u201d\u201e\u2013\u2014\u2026"
 _UNPACKED = (".gz", ".bz2", ".xz")  # numpy unpacks files with these endings, even if they are not packed
 
 
@@ -298,7 +301,9 @@ def repeated(keys: Iterable[Hashable]) -> tuple[int, int] | None:
 
 
 def read_text(path: str | Path, *, errors: str = "strict") -> str:
-    """Read a whole UTF-8 file (or UTF-16 with its byte order mark) with line feeds as line ends, without the mark.
+    """Read a whole text file with line feeds as line ends, without a byte order mark.
+
+    It is UTF-8, UTF-16 with its byte order mark, or Windows-1252, in which many spreadsheets save CSV.
 
     Args:
         errors: "strict": bytes that are not text raise an InputError; "replace": they are replaced.
@@ -307,15 +312,18 @@ def read_text(path: str | Path, *, errors: str = "strict") -> str:
     try:
         text = data.decode(_encoding(data), errors)
     except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise InputError(f"not UTF-8 text (byte 0x{data[error.start]:02x}): save it as UTF-8", path, line) from None
+        if not _is_windows_text(data):
+            line = data.count(b"\n", 0, error.start) + 1
+            raise InputError(f"not UTF-8 text (byte 0x{data[error.start]:02x}): save it as UTF-8", path, line) from None
+        text = data.decode(_WINDOWS)
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
 def read_head(path: str | Path) -> str:
     """Read the first part of a file like ``read_text``; bytes that are not text are replaced."""
     data = _read_bytes(path, _HEAD_BYTES)
-    return data.decode(_encoding(data), errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    encoding = _WINDOWS if _is_windows_text(data) else _encoding(data)
+    return data.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def header_names(text: str, separator: str | None = None) -> list[str]:
@@ -362,6 +370,24 @@ def _read_bytes(path: str | Path, num: int = -1) -> bytes:
 
 def _encoding(data: bytes) -> str:
     return "utf-16" if data.startswith(_UTF16_MARKS) else "utf-8-sig"
+
+
+def _is_windows_text(data: bytes) -> bool:
+    """Return whether the beginning of a file is no UTF-8 but text in Windows-1252 as people write it in tables."""
+    try:
+        data.decode(_encoding(data))
+        return False
+    except UnicodeDecodeError as error:
+        if error.reason == "unexpected end of data":  # the beginning ends inside a character of UTF-8
+            return False
+    if data.startswith(_UTF16_MARKS) or any(byte < 32 and byte not in b"\t\n\r\f" for byte in set(data)):
+        return False
+    try:
+        unusual = set(data.decode(_WINDOWS)) - set(map(chr, range(128)))
+    except UnicodeDecodeError:
+        return False
+    # The last character, byte 0xff, is what erased memory holds, and hardly any language writes it.
+    return all((character.isalpha() and character != "\xff") or character in _WINDOWS_SIGNS for character in unusual)
 
 
 def _has_content(line: str) -> bool:

@@ -17,7 +17,8 @@ from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
-from rangesfm.ranging.anchors.anchor import Anchor, read_anchors
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
 from rangesfm.survey.settings import absolute_value, parse_toml, refuse_unknown_tables
 

@@ -402,6 +402,8 @@ class AnchorSettings(_Table):
     path: Text | None
     frame: Text | None
     crs: Text | None
+    columns: dict[Text, Text] = Field(default_factory=dict)
+    unit: Text | None = None
 
 
 class TagSettings(_Table):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,13 +18,20 @@ from rangesfm.files.folders import walk
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
-from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
+from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
+from rangesfm.ranging.anchors.anchor_file import AnchorList, read_anchor_list
 from rangesfm.ranging.anchors.site import Site, local_site
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.image_times import ImageTimes, find_image_times, read_image_times_csv
+from rangesfm.vision.image_times import (
+    ImageTimes,
+    find_image_times,
+    list_images,
+    read_image_times_csv,
+    times_at_rate,
+)
 from rangesfm.vision.rigs import read_rigs
 
 if TYPE_CHECKING:
@@ -53,6 +60,7 @@ class RangingInputs:
         tape: taped distances; None if not given.
         reference: true positions; None if not given.
         notes: lines that the user should know.
+        assumed: lines about how log and anchor file were read.
     """
 
     log: RangeLog
@@ -63,6 +71,7 @@ class RangingInputs:
     tape: Tape | None
     reference: Reference | None
     notes: tuple[str, ...]
+    assumed: tuple[str, ...] = ()
 
 
 def read_ranging_inputs(survey: Survey) -> RangingInputs:
@@ -74,7 +83,8 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     """
     survey.require_metres()
     _check_rigs_are_metric(survey)
-    given = read_anchors(survey.anchors.path) if survey.anchors.path is not None else None
+    listed = _listed_anchors(survey)
+    given = None if listed is None else listed.anchors
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
     if survey.ranges.path is None:
         log = RangeLog.from_arrays([], [], image_name=[])
@@ -101,7 +111,15 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_reference(survey.report.reference)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
-    return RangingInputs(log.in_time_order(), tag_in_cam_m, anchors, frame, site, tape, reference, notes)
+    assumed = (*log.notes, *(() if listed is None else listed.notes))
+    log = log.in_time_order()
+    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed)
+
+
+def _listed_anchors(survey: Survey) -> AnchorList | None:
+    """Return the content of the anchor file, or None if there is none."""
+    anchors = survey.anchors
+    return None if anchors.path is None else read_anchor_list(anchors.path, columns=anchors.columns, unit=anchors.unit)
 
 
 def _check_rigs_are_metric(survey: Survey) -> None:
@@ -219,7 +237,9 @@ def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path 
         ids = " and ".join(log.anchor_ids[log.anchor_index[row]] for row in rows)
         ranges_m = " and ".join(f"{log.range_m[row]:.3g}" for row in rows)
         message = f"anchors {ids} are {apart_m[is_close][0]:.6g} m apart here, and the ranges to them {ranges_m} m"
-        raise InputError(f"{message}: are the positions in {unit}? expected metres", path)
+        raise InputError(
+            f"{message}: are the positions in {unit}? expected metres, or their unit (--anchor_unit)", path
+        )
 
 
 def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
@@ -231,10 +251,21 @@ def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
 
 def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
     """Return the times of the photos of a model. The table of times may have other photos, too."""
-    frames = photos_by_frame(sfm)
-    if survey.images.times is not None:
-        return read_image_times_csv(survey.images.times, frames=frames)
-    return find_image_times(survey.images.path or model_path, tuple(sorted(frames)))
+    frames, images = photos_by_frame(sfm), survey.images
+    if images.times is not None:
+        return read_image_times_csv(images.times, frames=frames, columns=images.times_columns, unit=images.times_unit)
+    if images.rate_hz is None:
+        return find_image_times(images.path or model_path, tuple(sorted(frames)))
+    if images.path is None:
+        raise InputError("image_rate_hz counts all photos, also those that are not in the model: give --images FOLDER")
+    taken = read_rigs(images.rig_config).frames(list_images(images.path))
+    times = times_at_rate(tuple(taken), images.rate_hz)
+    time_of = {photo: time for first, time in times.by_name().items() for photo in taken[first]}
+    known = {first: time_of[photo] for first, photos in frames.items() for photo in photos if photo in time_of}
+    if not known:
+        raise InputError(f"none of the model's photos, such as {next(iter(frames))}, is in this folder", images.path)
+    ordered = sorted(known, key=known.__getitem__)
+    return replace(times, image_names=tuple(ordered), timestamps_s=np.array([known[name] for name in ordered]))
 
 
 def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
@@ -291,7 +322,7 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
 
 def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_are_of_log: bool) -> list[str]:
     silent = [anchor.anchor_id for anchor in anchors if anchor.anchor_id not in log.anchor_ids]
-    notes = [*log.notes, *([f"no ranges to anchor {', '.join(silent)}"] if silent else [])]
+    notes = [*([f"no ranges to anchor {', '.join(silent)}"] if silent else [])]
     silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
     for kind, what in (

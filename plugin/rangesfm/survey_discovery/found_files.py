@@ -1,9 +1,14 @@
-"""Discovery of inputs in folders: each file is recognised by its content and listed under its key of a survey file."""
+"""Discovery of inputs in folders: each file is recognised by its content and listed under its key of a survey file.
+
+Files that cannot be used are listed, too, each with the reason.
+"""
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,34 +16,54 @@ from pathlib import Path
 from rangesfm.distances.tape import DISTANCE_COLUMNS, MARKER_COLUMNS
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, is_bag_folder
-from rangesfm.files.folders import LEFT_BY_RUNS, walk
+from rangesfm.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
 from rangesfm.files.text_tables import has_columns, read_head
 from rangesfm.geometry.reference import is_reference_file
-from rangesfm.ranging.anchors.anchor import ANCHOR_ALIASES, ANCHOR_COLUMNS
+from rangesfm.ranging.anchors import anchor_file
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
+from rangesfm.ranging.readers.layout import Layout, find_layout
+from rangesfm.ranging.readers.lists import UnclearListError
+from rangesfm.ranging.readers.table import TABLE
 from rangesfm.sources.bag import has_images
 from rangesfm.sources.source import is_video
 from rangesfm.survey_discovery.calibration_files import CameraCalibration, read_calibrations
-from rangesfm.vision.image_times import IMAGE_EXTENSIONS, is_image_times_file
+from rangesfm.vision import photo_list
 from rangesfm.vision.photo_files import MIN_NUM_PHOTOS
 
-PHOTOS, MODEL, LOG = "images.path", "images.model", "ranges.path"
+PHOTOS, MODEL, LOG, TIMES, ANCHORS = "images.path", "images.model", "ranges.path", "images.times", "anchors.path"
 _NOT_READ = {
     ".insv": "extract plain photos with their times from these 360 degree videos",
     **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "convert them to JPEG"),
+    **dict.fromkeys((".xlsx", ".xls", ".ods", ".numbers"), "save the sheet as CSV"),
+    **dict.fromkeys((".xml", ".jxl", ".dxf", ".dwg", ".shp", ".kml", ".kmz", ".gpx", ".rw5"), "export points as CSV"),
 }
-_TABLE_EXTENSIONS = (".csv", ".tsv", ".txt", ".log", ".dat")
+_UNKNOWN = "no input that is known"
+SURVEY_NAME = "survey.toml"
+# Largest number of names of unused files that are listed for one reason.
+_MAX_NUM_NAMED = 4
 # Largest number of notes on tables that may be the log, where no log was recognised.
 _MAX_NUM_UNSURE = 3
+# A table without names that is like a log and like a list of points has more rows than this if it is a log.
+_MOST_POINTS = 16
+# Other files may be prose, in which any line may look like a row.
+_TABLE_EXTENSIONS = (
+    *(".csv", ".tsv", ".txt", ".log", ".dat", ".tab", ".json", ".asc", ".gsi", ".pts", ".pnt", ".pun", ".koo", ".coo"),
+    *(".crd", ".xyz", ".neh", ".enz"),
+)
 # Tables that are recognised by their header row, after it is known that the file is not a log.
 _TABLES: dict[str, Callable[[str], bool]] = {
     "scale.markers": partial(has_columns, required=MARKER_COLUMNS),
     "scale.distances": partial(has_columns, required=DISTANCE_COLUMNS),
     "ranges.error_curve": is_error_curve_file,
     "report.reference": is_reference_file,
-    "anchors.path": partial(has_columns, required=ANCHOR_COLUMNS, aliases=ANCHOR_ALIASES),
-    "images.times": is_image_times_file,
+    ANCHORS: anchor_file.is_canonical,
+    TIMES: photo_list.is_canonical,
+}
+# Lists in tables of any layout: how their columns are found, and how they are read.
+_LISTS: dict[str, tuple[Callable[[Path, Layout], object], Callable[[Path], object]]] = {
+    ANCHORS: (anchor_file.find_anchor_columns, anchor_file.read_anchor_list),
+    TIMES: (photo_list.find_photo_columns, photo_list.read_photo_list),
 }
 
 
@@ -50,17 +75,23 @@ class Found:
         paths: folders of photos, videos, and other files, by dotted key of a survey file.
         calibrations: cameras of each file with a calibration.
         models: folders of COLMAP models.
-        notes: a line for each thing that is there and cannot be used.
+        unclear: lists that are not understood for sure, by dotted key of a survey file.
+        notes: lines about what is there and cannot be used; each such file is listed with the reason.
     """
 
     paths: dict[str, list[Path]]
     calibrations: dict[Path, tuple[CameraCalibration, ...]]
     models: tuple[Path, ...]
+    unclear: dict[str, list[UnclearListError]]
     notes: tuple[str, ...]
 
 
-def look_into(folders: Sequence[Path]) -> Found:
+def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
     """Find possible inputs in folders and all their subfolders. Hidden files and results of runs are left out.
+
+    Args:
+        folders: to look into.
+        without: paths that are known already, and are left out.
 
     Raises:
         InputError: a path is not a folder.
@@ -68,13 +99,16 @@ def look_into(folders: Sequence[Path]) -> Found:
     paths: dict[str, list[Path]] = defaultdict(list)
     calibrations: dict[Path, tuple[CameraCalibration, ...]] = {}
     models: list[Path] = []
+    unclear: dict[str, list[UnclearListError]] = defaultdict(list)
+    unused: dict[str, list[Path]] = defaultdict(list)
     notes: list[str] = []
-    unsure: list[str] = []
-    not_read: dict[str, list[Path]] = defaultdict(list)
+    unsure: dict[Path, InputError] = {}
     for path in _entries(folders):
+        if path in without:
+            continue
         try:
-            if path.suffix.lower() in _NOT_READ:
-                not_read[path.suffix.lower()].append(path)
+            if reason := _reason_by_name(path):
+                unused[reason].append(path)
             elif path.is_dir() and not is_bag_folder(path):
                 (models if _is_model(path) else paths[PHOTOS]).append(path)
             elif is_video(path):
@@ -82,25 +116,56 @@ def look_into(folders: Sequence[Path]) -> Found:
             elif cameras := read_calibrations(path):
                 calibrations[path] = cameras
             else:
-                if is_bag(path) and has_images(path):
-                    paths[PHOTOS].append(path)
+                has_photos = is_bag(path) and has_images(path)
+                paths[PHOTOS] += [path] if has_photos else []
                 if key := _key_of(path):
                     paths[key].append(path)
+                elif not has_photos:
+                    unused[_UNKNOWN].append(path)
+        except UnclearListError as error:
+            unclear[ANCHORS if error.what == anchor_file.WHAT else TIMES].append(error)
         except InputError as error:
             if error.advice:
-                unsure.append(f"{error}; if it is the radio's log, rangesfm ranges {path} says what is missing")
+                unsure[path] = error
             else:
                 notes.append(str(error))
-    for suffix, those in not_read.items():
-        notes.append(f"{suffix} files are not read ({len(those)}, such as {those[0].name}): {_NOT_READ[suffix]}")
-    notes += [] if LOG in paths else unsure[:_MAX_NUM_UNSURE]
-    return Found(dict(paths), calibrations, tuple(models), tuple(notes))
+    if LOG not in paths:
+        for path in [*unsure][:_MAX_NUM_UNSURE]:
+            notes.append(f"{unsure.pop(path)}; if it is the radio's log, rangesfm ranges {path} says what is missing")
+    unused["a table whose columns are not known for sure"] += unsure
+    notes += [f"not used: {_listed(those, folders)} ({reason})" for reason, those in unused.items() if those]
+    found = {key: those for key, those in paths.items() if those}
+    return Found(found, calibrations, tuple(models), unclear, tuple(notes))
+
+
+def shown(path: Path, folders: Sequence[Path]) -> str:
+    """Return a path as it is from the one of the folders that it is in."""
+    inside = [os.path.relpath(path, folder) for folder in folders if path.is_relative_to(folder)]
+    return inside[0] if inside else str(path)
+
+
+def _listed(paths: Sequence[Path], folders: Sequence[Path]) -> str:
+    names = [shown(path, folders) for path in paths]
+    if len(names) <= _MAX_NUM_NAMED + 1:
+        return ", ".join(names)
+    endings = ", ".join(sorted({path.suffix.lower() or path.name for path in paths[_MAX_NUM_NAMED:]}))
+    return f"{', '.join(names[:_MAX_NUM_NAMED])} and {len(names) - _MAX_NUM_NAMED} more ({endings})"
+
+
+def _reason_by_name(path: Path) -> str | None:
+    """Return why a file is not used, if its name already says so."""
+    if path.suffix.lower() in _NOT_READ and not path.is_dir():
+        return _NOT_READ[path.suffix.lower()]
+    if path.suffix.lower() in IMAGE_EXTENSIONS and not path.is_dir():
+        return f"a folder of photos has {MIN_NUM_PHOTOS} or more"
+    return None
 
 
 def _key_of(path: Path) -> str | None:
     """Return the dotted key of a survey file that takes such a file, or None if it is not recognised.
 
     Raises:
+        UnclearListError: it may be a list of anchors or of photo times, but is not understood.
         InputError: it may be a log, but is not understood.
     """
     if is_bag(path):
@@ -109,20 +174,62 @@ def _key_of(path: Path) -> str | None:
     head = read_head(path)
     if not head.strip() or "\0" in head:
         return None
+    unsure = None
     try:
-        find_log_reader(path)
-        return LOG
+        reader = find_log_reader(path)
+        if reader.name != TABLE.name:
+            return LOG
     except InputError as error:
         unsure = error
+    is_table = path.suffix.lower() in _TABLE_EXTENSIONS
+    if unsure is None:  # columns that look like those of a log may be those of a list
+        return _list_like_log(path) or LOG
     if key := next((key for key, is_such in _TABLES.items() if is_such(head)), None):
         return key
-    if unsure.advice and path.suffix.lower() in _TABLE_EXTENSIONS:
+    with nullcontext() if is_table else suppress(UnclearListError):
+        if key := _list_of(path):
+            return key
+    if unsure.advice and is_table:
         raise unsure
     return None
 
 
+def _list_like_log(path: Path) -> str | None:
+    """Return the key as ``_list_of`` for a table that may also be a log by its columns.
+
+    Raises:
+        UnclearListError: it is a short table without names that may be a list.
+    """
+    layout = find_layout(path)
+    is_short = layout is not None and not layout.has_names and len(layout.columns[0].cells) <= _MOST_POINTS
+    with nullcontext() if is_short else suppress(UnclearListError):
+        return _list_of(path) if is_short or (layout is not None and layout.has_names) else None
+    return None
+
+
+def _list_of(path: Path) -> str | None:
+    """Return the dotted key for a list in a table of any layout, or None if the file is none.
+
+    Raises:
+        UnclearListError: the columns or a unit are not known for sure.
+    """
+    layout = find_layout(path)
+    if layout is None:
+        return None
+    for key, (find, read) in _LISTS.items():
+        if find(path, layout) is not None:
+            try:
+                read(path)
+            except UnclearListError:
+                raise
+            except InputError:  # an error in a cell; rangesfm check reports it
+                pass
+            return key
+    return None
+
+
 def _entries(folders: Sequence[Path]) -> Iterator[Path]:
-    """Yield files, bags, models and folders of photos in folders. Links are followed once.
+    """Yield files, bags, models and folders of photos in folders, without survey files. Links are followed once.
 
     Raises:
         InputError: a path is not a folder.
@@ -140,7 +247,8 @@ def _entries(folders: Sequence[Path]) -> Iterator[Path]:
             photos = {name for name in names if name.lower().endswith(IMAGE_EXTENSIONS)}
             if len(photos) >= MIN_NUM_PHOTOS:
                 yield folder
-            yield from (folder / name for name in names if name not in photos)
+                names = [name for name in names if name not in photos]
+            yield from (folder / name for name in names if name != SURVEY_NAME)
 
 
 def _is_model(folder: Path) -> bool:

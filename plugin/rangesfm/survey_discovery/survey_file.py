@@ -13,7 +13,6 @@ from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
 from rangesfm.survey.settings import KEYS
 
-NAME = "survey.toml"
 # Keys that most surveys need at some time. Where no value is known, they are written as comments with these examples.
 _OFFERED: Mapping[str, Any] = {
     "images.path": "images",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import glob
 import os
+import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +14,10 @@ from typing import Any
 
 from rangesfm.errors import InputError
 from rangesfm.ranging.readers import read_ranges
+from rangesfm.ranging.readers.lists import UnclearListError
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
-from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, Found, look_into
+from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, Found, look_into, shown
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.photo_files import usable_photos
 
@@ -52,38 +54,55 @@ class Understood:
         return survey_from_tables({}, Path.cwd(), self.values)
 
 
-def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understood:
+def understand(
+    folders: Sequence[Path], given: Mapping[str, object], command: Sequence[str] | None = None
+) -> Understood:
     """Look into folders and choose the inputs of a run.
 
     Args:
         folders: to look into.
         given: values by dotted key from the user; inputs of these keys are not looked for.
+        command: words of the command that the user has typed, for advice; None: rangesfm init with the folders.
 
     Raises:
-        InputError: there are no inputs, or there are several of a kind and it is not clear which one to take. The
-            advice of the error asks for it.
+        InputError: there are no inputs, or there are several of a kind and it is not clear which one to take, or a
+            file that looks like anchors or photo times is not understood for sure. The advice of the error asks for it.
     """
+    command = command or ["rangesfm", "init", *map(str, folders)]
     folders = [Path(os.path.abspath(folder)) for folder in folders]
-    found = look_into(folders)
     roles = {item.dotted: item.role for item in KEYS}
     values = {key: value if roles[key] is None else Path(os.path.abspath(str(value))) for key, value in given.items()}
+    found = look_into(folders, {path for path in values.values() if isinstance(path, Path)})
     notes, questions = list(found.notes), []
     for item in KEYS:
         key, paths = item.dotted, found.paths.get(item.dotted, [])
-        if key in values or not paths or (key == "scale.markers" and "scale.distances" not in values):
+        if not paths:
+            continue
+        if key in values or (key == "scale.markers" and "scale.distances" not in values):
+            why = f"--{item.flag} names another" if key in values else "marks are the ends of taped distances"
+            notes.append(f"not used: {', '.join(shown(path, folders) for path in paths)} ({why})")
             continue
         paths = _tops(paths, folders) if key == PHOTOS else paths
         chosen = _chosen(key, paths)
         if chosen is None:
-            names = ", ".join(_shown(path, folders) for path in paths)
+            names = ", ".join(shown(path, folders) for path in paths)
             questions.append(f"{names}: any of them may be [{item.table}] {item.name}; say which by --{item.flag} PATH")
             continue
         values[key] = chosen
         if chosen in paths and len(paths) > 1:
-            others = ", ".join(_shown(path, folders) for path in paths if path != chosen)
+            others = ", ".join(shown(path, folders) for path in paths if path != chosen)
             notes.append(f"{chosen.name} is used; left out: {others}")
+    unclear = {key: those for key, those in found.unclear.items() if key not in values}
+    questions += [line for key, those in unclear.items() for line in _questions(key, those, folders, command)]
     if questions:
-        raise InputError("more than one survey could be meant", folders[0], advice=questions)
+        several = "more than one survey could be meant"
+        first = next((those[0] for those in unclear.values()), None)
+        raise first.asking(questions) if first else InputError(several, folders[0], advice=questions)
+    notes += [
+        f"not used: {shown(error.path or Path(), folders)} ({error.message})"
+        for key, those in found.unclear.items()
+        for error in those
+    ]
     if found.models and PHOTOS not in values:
         values.setdefault(MODEL, found.models[0])
     notes += [
@@ -95,6 +114,25 @@ def understand(folders: Sequence[Path], given: Mapping[str, object]) -> Understo
         raise InputError("found no photos, no radio log and no lengths in it", folders[0], advice=notes)
     _add_camera(values, found, notes)
     return Understood(values, tuple(notes))
+
+
+def _questions(
+    key: str, unclear: Sequence[UnclearListError], folders: Sequence[Path], command: Sequence[str]
+) -> Iterator[str]:
+    """Yield lines that ask how lists are to be read, with the command for each way."""
+    flag = next(item.flag for item in KEYS if item.dotted == key)
+    for error in unclear:
+        path = Path(error.path or "")
+        yield from (f"{shown(path, folders)}: {line}" for line in error.about)
+        for choice in error.choices:
+            yield f"{choice.when}: {shlex.join([*command, f'--{flag}', _typed(path), *choice.flags])}"
+    what = unclear[0].what
+    yield f"if no such file holds {what}: move it out of the folder, or name the file of {what} by --{flag} PATH"
+
+
+def _typed(path: Path) -> str:
+    """Return a path as a user in the working folder types it."""
+    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
 
 
 def _chosen(key: str, paths: Sequence[Path]) -> Path | None:
@@ -155,7 +193,9 @@ def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
     if len(arms) == 1 and not values.keys() & {*_LEVER_ARMS}:
         values["tag.tag_in_cam_m"] = arms[0]
         notes.append(f"the lever arm is that of {path.name}")
-    if {"camera.model", "camera.params", MODEL} & values.keys():  # a COLMAP model has its own cameras
+    if known := {"camera.model", "camera.params", MODEL} & values.keys():
+        why = "a COLMAP model has its own cameras" if MODEL in known else "the camera is given"
+        notes.append(f"{path.name}: its camera is not used ({why})")
         return
     size_px = _size_px(values)
     fitting = [camera for camera in cameras if None in (camera.size_px, size_px) or camera.size_px == size_px]
@@ -177,8 +217,3 @@ def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:
         return None
     photos = usable_photos(values[PHOTOS], list_images(values[PHOTOS]))
     return Counter(photos.sizes).most_common(1)[0][0]
-
-
-def _shown(path: Path, folders: Sequence[Path]) -> str:
-    inside = [os.path.relpath(path, folder) for folder in folders if path.is_relative_to(folder)]
-    return inside[0] if inside else str(path)

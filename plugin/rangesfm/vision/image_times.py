@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
@@ -16,15 +16,12 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
-from rangesfm.files.folders import walk
-from rangesfm.files.text_tables import TextTable, has_columns, read_table
+from rangesfm.files.folders import IMAGE_EXTENSIONS, natural_order, walk
+from rangesfm.files.text_tables import TextTable
 from rangesfm.options import TIME_S
 from rangesfm.vision.photo_files import exif_tags
+from rangesfm.vision.photo_list import read_photo_list
 
-IMAGE_EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-
-_COLUMNS = ("image_name", "timestamp_s")
-_ALIASES = {"filename": "image_name", "timestamp": "timestamp_s"}
 _FINEST_RESOLUTION_S = 1e-3
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL = 0x9003, 0x9291, 0x9011
 # The years 2001 to 2096 in seconds since 1970. With this interval a time in ms, us or ns is never taken for a time in
@@ -47,7 +44,7 @@ class ImageTimes:
         image_names: n names, relative to the folder of the photos, with forward slashes.
         timestamps_s: (n,) seconds on the camera's clock, strictly increasing.
         resolution_s: the finest step of that clock as written down, at least 0.001.
-        source: "csv", "exif" or "file_names".
+        source: "csv", "rate", "exif" or "file_names".
         num_left_out: photos that have no time, or the same time as another photo.
         notes: one-line remarks on these times for the user.
     """
@@ -101,54 +98,77 @@ def find_image_times(
     names: Sequence[str],
     csv_path: str | Path | None = None,
     frames: Mapping[str, Sequence[str]] | None = None,
+    *,
+    rate_hz: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    unit: str | None = None,
 ) -> ImageTimes:
-    """Find the times of the photos ``names`` in ``folder``, from the CSV file if given, else from EXIF or the names.
+    """Find the times of the photos ``names`` in ``folder``.
+
+    They are from the CSV file if given, else by the fixed rate if given, else from EXIF or the names.
 
     Args:
-        frames: as for ``read_image_times_csv``.
+        rate_hz: fixed rate at which the photos were taken; ``names`` are then all of them.
+        frames, columns, unit: as for ``read_image_times_csv``.
 
     Raises:
         InputError: none of these gives times, or the CSV file is not valid.
     """
     if csv_path is not None:
-        return read_image_times_csv(csv_path, names, frames)
+        return read_image_times_csv(csv_path, names, frames, columns=columns, unit=unit)
+    if rate_hz is not None:
+        return times_at_rate(names, rate_hz)
     with suppress(InputError):
         return times_from_exif(folder, names)
     with suppress(InputError):
         return times_from_file_names(names)
     raise InputError(
-        f"no time for {names[0]}: expected a CSV file image_name,timestamp_s, or EXIF DateTimeOriginal "
-        "in the photos, or file names that are times (like 1403715273262142976.png)",
+        f"no time for {names[0]}: expected a CSV file image_name,timestamp_s, or EXIF DateTimeOriginal in the photos, "
+        "or file names that are times (like 1403715273262142976.png), or a fixed rate of the photos (--image_rate_hz)",
         folder,
     )
 
 
-def is_image_times_file(head: str) -> bool:
-    """Return whether a file with this beginning is a table of image times."""
-    return has_columns(head, _COLUMNS, _ALIASES)
+def times_at_rate(names: Sequence[str], rate_hz: float) -> ImageTimes:
+    """Return times of photos that were taken at a fixed rate, the first one at 0.
+
+    Args:
+        names: all photos that were taken; the order is that of the numbers in their names.
+        rate_hz: photos per second.
+    """
+    ordered = sorted(names, key=natural_order)
+    note = f"image times are by the given rate of {rate_hz:g} photos a second, from {ordered[0]} to {ordered[-1]}"
+    return ImageTimes(tuple(ordered), np.arange(len(ordered)) / rate_hz, _FINEST_RESOLUTION_S, "rate", notes=(note,))
 
 
 def read_image_times_csv(
-    path: str | Path, names: Sequence[str] | None = None, frames: Mapping[str, Sequence[str]] | None = None
+    path: str | Path,
+    names: Sequence[str] | None = None,
+    frames: Mapping[str, Sequence[str]] | None = None,
+    *,
+    columns: Mapping[str, str] | None = None,
+    unit: str | None = None,
 ) -> ImageTimes:
-    """Read ``image_name,timestamp_s`` (the header may say ``filename`` and ``timestamp`` as well).
+    """Read ``image_name,timestamp_s``, or another table with names of photos and times.
+
+    Where photos are known, a name in the table may have other folders in front, or no ending.
 
     Args:
-        path: the CSV file; other columns are ignored.
+        path: the file; other columns are ignored.
         names: the existing photos; None: the names in the file are not checked.
         frames: groups of photos taken at once, each by the name of the photo among ``names`` that stands for it and
             belongs to it. A group gets the time of its first photo that has one.
+        columns, unit: as for ``read_photo_list``.
 
     Raises:
         InputError: with the line: a column is missing, a cell is not a time in seconds, a photo does not exist while
             one of ``names`` has no time, or a photo or a time appears twice.
     """
-    table = read_table(path, _COLUMNS, aliases=_ALIASES, separator=None)
-    if not len(table):
-        raise InputError("no rows below the header, expected one per photo", path)
-    image_names, times = table.text("image_name"), table.numbers("timestamp_s", bounds=TIME_S)
+    listed = read_photo_list(path, columns=columns, unit=unit)
+    table, times = listed.table, listed.times_s
     frames = frames or {}
     frame_of = {photo: first for first, photos in frames.items() for photo in photos}
+    image_names = _names_of_photos(listed.image_names, {*(names or ()), *frame_of})
     _refuse_repetitions(table, image_names, times.tolist(), frame_of)
     known, unknown = set(image_names), list[int]()
     if names is not None:
@@ -158,21 +178,44 @@ def read_image_times_csv(
         # If every photo has a time, the unknown names belong to photos that were removed. If one has none, an unknown
         # name is probably misspelt.
         if unknown and not all({name, *frames.get(name, ())} & timed for name in names):
-            raise table.error(unknown[0], "image_name", f"the name of a photo in the folder, like '{names[0]}'")
-    texts = table.text("timestamp_s")
+            column = listed.columns["image_name"]
+            raise table.error(unknown[0], column, f"the name of a photo in the folder, like '{names[0]}'")
     stamps = {
-        name: _Stamp(time, _resolution(text))
-        for name, time, text in zip(image_names, times.tolist(), texts, strict=True)
+        name: _Stamp(time, resolution)
+        for name, time, resolution in zip(image_names, times.tolist(), listed.resolution_s.tolist(), strict=True)
         if name in known
     }
     stamps = {name: stamp for name, stamp in stamps.items() if name not in frame_of} | {
         first: stamps[own[0]] for first, photos in frames.items() if (own := [p for p in photos if p in stamps])
     }
     ordered = _in_time_order(stamps, names or tuple(stamps), "csv")
-    if not unknown:
-        return ordered
-    note = f"{len(unknown)} of the {len(image_names)} names in {table.path.name} belong to no photo in the folder"
-    return replace(ordered, notes=(note, *ordered.notes))
+    notes = [*listed.notes]
+    if unknown:
+        num = f"{len(unknown)} of the {len(image_names)}"
+        notes.append(f"{num} names in {table.path.name} belong to no photo in the folder")
+    return replace(ordered, notes=(*notes, *ordered.notes))
+
+
+def _names_of_photos(listed: Sequence[str], photos: Collection[str]) -> list[str]:
+    """Return the photo that each name in a table means; the name itself if there is none, or more than one.
+
+    A name may have further folders in front, separated by either slash, or no folder, or no ending.
+    """
+    without_ending, without_folder = dict[str, set[str]](), dict[str, set[str]]()
+    for photo in photos:
+        base = photo.rpartition("/")[2]
+        without_ending.setdefault(os.path.splitext(photo)[0], set()).add(photo)
+        for short in (base, os.path.splitext(base)[0]):
+            without_folder.setdefault(short, set()).add(photo)
+    found = []
+    for name in listed:
+        parts = name.replace("\\", "/").split("/")
+        tails = ["/".join(parts[k:]) for k in range(len(parts))]
+        meant = [{tail} for tail in tails if tail in photos] or [without_ending.get(tail, set()) for tail in tails]
+        meant += [without_folder.get(name, set())]
+        only = next(filter(None, meant), set())
+        found.append(next(iter(only)) if len(only) == 1 else name)
+    return found
 
 
 def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:

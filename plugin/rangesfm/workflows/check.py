@@ -74,8 +74,8 @@ def check_survey(survey: Survey) -> CheckedSurvey:
             photos = _check_photos(survey, checked)
     with checked.finding_faults():
         inputs = read_inputs(survey, journal)
-        checked.assumed += inputs.log.notes
-        checked.warnings[:] = [text for text in checked.warnings if text not in inputs.log.notes]
+        checked.assumed += inputs.assumed
+        checked.warnings[:] = [text for text in checked.warnings if text not in inputs.assumed]
         if len(inputs.log):
             _tell_of_radio(survey, inputs, checked)
         checked.facts += _facts_of_others(survey, inputs)
@@ -136,7 +136,7 @@ def _check_mapper(survey: Survey, photos: Photos, checked: CheckedSurvey) -> Non
 
 def _check_source(survey: Survey, path: Path, checked: CheckedSurvey) -> None:
     """Add the facts about a video or a bag that are known before its photos are extracted."""
-    source, rate_hz = open_source(path, survey.images.topic), survey.images.rate_hz
+    source, rate_hz = open_source(path, survey.images.topic), survey.images.extraction_rate_hz
     num = f"about {source.num_photos(rate_hz)} photos at {rate_hz:g} Hz"
     checked.facts.append(f"photos of {path.name}: {source.what}; {num}, extracted when a run begins")
     checked.facts += [*source.notes]

@@ -20,7 +20,8 @@ from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.join.join_models import PathOfModel
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress
-from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors
+from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
+from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
@@ -273,7 +274,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress)
 def _anchors(survey: Survey, finished: Sequence[FinishedRun], log: RangeLog) -> tuple[tuple[Anchor, ...], str]:
     """Return the anchors with what is known of them, and the frame of their positions."""
     if survey.anchors.path is not None:
-        given = read_anchors(survey.anchors.path)
+        given = read_anchors(survey.anchors.path, columns=survey.anchors.columns, unit=survey.anchors.unit)
     elif survey.anchors.frame == "unknown":
         given = ()
     else:
@@ -322,7 +323,7 @@ def _anchors_of(one: FinishedRun) -> tuple[Anchor, ...]:
         )
     if not path.is_file():
         raise InputError(f"its file of anchors does not exist any more, {path}: give --anchors CSV", one.result.path)
-    return read_anchors(path)
+    return read_anchors(path, columns=anchors.columns, unit=anchors.unit)
 
 
 def _common(settings: Iterable[str | None]) -> str | None:

@@ -55,7 +55,7 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite(survey)
     inputs = read_ranging_inputs(survey)
-    journal.warn(*inputs.notes, *notes_before_work(survey, inputs))
+    journal.warn(*inputs.assumed, *inputs.notes, *notes_before_work(survey, inputs))
     return inputs
 
 
@@ -126,7 +126,7 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
         return survey
     if survey.images.times is not None:
         raise InputError("its images have their own times, expected no [images] times", path)
-    rate_hz, topic = survey.images.rate_hz, survey.images.topic
+    rate_hz, topic = survey.images.extraction_rate_hz, survey.images.topic
     places = places_for_photos(survey.output.path)
     with journal.timed("photos"):
         taken_before = (place for place in places if earlier_photos(path, place, rate_hz=rate_hz, topic=topic))
@@ -162,7 +162,15 @@ def find_keyframes(
         names = tuple(frames)
         image_times = None
         with nullcontext() if survey.images.times or log_names_photos is False else suppress(InputError):
-            image_times = find_image_times(folder, names, survey.images.times, frames)
+            image_times = find_image_times(
+                folder,
+                names,
+                survey.images.times,
+                frames,
+                rate_hz=survey.images.rate_hz,
+                columns=survey.images.times_columns,
+                unit=survey.images.times_unit,
+            )
         if image_times is None or (log_names_photos and not survey.images.times and image_times.num_left_out):
             return select_keyframes(names, survey.images), None
         keyframes = select_keyframes(image_times, survey.images)

@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame, read_anchors, write_anchors
+from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
+from rangesfm.ranging.anchors.anchor_file import read_anchors, write_anchors
 
 HEADER = "anchor_id,x_m,y_m,z_m"
 FULL_HEADER = HEADER + ",position_stddev_m,range_bias_m,range_bias_stddev_m"
@@ -83,7 +84,8 @@ def test_file_that_names_no_anchor_is_refused(tmp_path: Path) -> None:
 
 
 def test_missing_coordinate_column_is_named(tmp_path: Path) -> None:
-    assert "no column z_m" in str(refusal(write(tmp_path, "anchor_id,x_m,y_m\n1,2,3\n")))
+    error = refusal(write(tmp_path, "anchor_id,x_m,y_m\n1,2,3\n"))
+    assert "not sure: no column seems to be z (height)" in error.advice
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag_folder
+from rangesfm.files.folders import natural_order
 from rangesfm.files.text_tables import read_head
 from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -186,7 +186,7 @@ def files_of_log(path: Path) -> list[Path]:
         return [path]
     if not found:
         raise InputError("no file there, expected the files of a log", path)
-    return sorted(found, key=lambda file: ([part.zfill(20) for part in re.split(r"(\d+)", file.name)], file.name))
+    return sorted(found, key=lambda file: natural_order(file.name))
 
 
 def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: str | None = None) -> Reader:

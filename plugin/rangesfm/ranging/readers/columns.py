@@ -26,7 +26,7 @@ from rangesfm.ranging.readers.times import (
     CivilClock,
     date_order,
 )
-from rangesfm.ranging.readers.units import UNITS_PER_METRE, Ask, days_before_1970, range_unit, time_unit
+from rangesfm.ranging.readers.units import SLOWEST_S, UNITS_PER_METRE, Ask, days_before_1970, range_unit, time_unit
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -88,7 +88,10 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
             table = table.where([cell != "" for cell in table.text(named["range"], empty="")])
     name = {key: column for key, column in named.items() if column in table}
     units = layout.units if layout else {}
-    timestamps = _timestamps(table, name, units, options, notes) if "timestamp" in name else None
+    timestamps = None
+    if "timestamp" in name:
+        ask = partial(options.which_unit, path, "timestamp")
+        timestamps, _ = read_timestamps(table, name, units, options.timestamp_unit, notes, ask)
     image_name = table.text(name["image_name"]) if timestamps is None else None
     num_ends = max(1, len(columns.wide))
     row = np.repeat(np.arange(len(table)), num_ends)
@@ -204,18 +207,38 @@ def _ranges_by_stamps(table: TextTable, name: Mapping[str, str], options: StampO
     return np.nan_to_num(ranges, nan=0.0)
 
 
-def _timestamps(
-    table: TextTable, name: Mapping[str, str], units: Mapping[str, str], options: ReadOptions, notes: list[str]
-) -> Array:
-    column, said = name["timestamp"], options.timestamp_unit
-    ask = partial(options.which_unit, table.path, "timestamp")
+def read_timestamps(
+    table: TextTable,
+    name: Mapping[str, str],
+    units: Mapping[str, str],
+    said: str | None,
+    notes: list[str],
+    ask: Ask,
+    *,
+    slowest_s: float = SLOWEST_S,
+) -> tuple[Array, str]:
+    """Return the times (n,) of the rows of a table in seconds, and the unit in which they are written.
+
+    Args:
+        table: the rows.
+        name: name of the column of timestamp and, if there are any, of date and nanoseconds.
+        units: unit after the numbers of each column, by its name.
+        said: unit that the user gave; None: found from names and values.
+        notes: gets a line for the user on what was assumed.
+        ask: returns the error about an ambiguous unit.
+        slowest_s: largest plausible median step between times.
+
+    Raises:
+        InputError: a cell is not a time, or the unit is ambiguous.
+    """
+    column = name["timestamp"]
     if said in CIVIL_UNITS or "date" in name or (said is None and not table.begins_with_number(column)):
-        return _civil_times(table, name, said, notes, ask)
+        return _civil_times(table, name, said, notes, ask), "s"
     times = table.numbers(column, expected=f"a time in {said or 's'}")
-    unit = said or time_unit(f"{column} {units.get(column, '')}".strip(), times, notes, ask)
+    unit = said or time_unit(f"{column} {units.get(column, '')}".strip(), times, notes, ask, slowest_s)
     seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
     table.refuse(~TIME_S.hold(seconds), column, f"a time in {unit}")
-    return seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds
+    return (seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds), unit
 
 
 def _civil_times(table: TextTable, name: Mapping[str, str], unit: str | None, notes: list[str], ask: Ask) -> Array:

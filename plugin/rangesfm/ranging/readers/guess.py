@@ -56,17 +56,17 @@ def guess_columns(layout: Layout) -> Guess:
     """Guess the quantities in the columns of a table."""
     guess = Guess()
     free = [column for column in layout.columns if column.kind != "nothing"]
-    for find in (_find_time, _find_pairs, _find_range, _find_nodes) if layout.has_names else ():
+    for find in (find_time, _find_pairs, _find_range, _find_nodes) if layout.has_names else ():
         free = find(free, guess)
     _find_by_values(free, guess, layout.has_names)
     return guess
 
 
-def _find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
+def find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
+    """Find the time by the names of columns, or else names of photos, and return the other columns."""
     ranked = sorted((rank, k) for k, column in enumerate(free) if (rank := _time_rank(column)) is not None)
     if not ranked:
-        ends = (".jpg", ".jpeg", ".png")
-        photos = [column for column in free if all(cell.lower().endswith(ends) for cell in column.cells)]
+        photos = [column for column in free if column.names_photos]
         guess.columns |= {"image_name": photos[0].name} if photos else {}
         return [column for column in free if column not in photos]
     time, *others = (free[k] for _, k in ranked)
@@ -80,6 +80,11 @@ def _find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     if also := [column for column in others if column not in fractions]:
         guess.notes.append(f"the times are taken from {time.name}; there are also {_names(also)}")
     return [column for column in free if column not in (time, *others, *dates, *fractions)]
+
+
+def is_named_time(column: ColumnSample) -> bool:
+    """Return whether a column holds times by its name."""
+    return bool(terms.TIME & {*column.words}) and _time_rank(column) is not None
 
 
 def _time_rank(column: ColumnSample) -> tuple[float, int] | None:
@@ -100,10 +105,10 @@ def _time_rank(column: ColumnSample) -> tuple[float, int] | None:
 def _find_pairs(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     """Find several pairs of columns with an anchor and its range, of the same number or next to each other."""
     nodes = {_numbers(column): column for column in free if _names_anchor(column)}
-    values = [column for column in free if _is_range(column)]
+    values = [column for column in free if is_range(column)]
     pairs = [(nodes[number], value) for value in values if (number := _numbers(value)) in nodes]
     if len(pairs) < len(values) or len({node.name for node, _ in pairs}) < len(pairs):
-        pairs = [(node, value) for node, value in pairwise(free) if _names_anchor(node) and _is_range(value)]
+        pairs = [(node, value) for node, value in pairwise(free) if _names_anchor(node) and is_range(value)]
     if len(pairs) < 2 or len({tuple(_without_numbers(column) for column in pair) for pair in pairs}) > 1:
         return free
     _take_pairs(pairs, guess)
@@ -136,7 +141,7 @@ def _find_range(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     if guess.wide:
         return free
     numbers = [column for column in free if column.kind == "numbers" and not terms.NO_RANGE & {*column.words}]
-    named = [column for column in numbers if _is_range(column)]
+    named = [column for column in numbers if is_range(column)]
     stamps = {name: column.name for column in free if (name := column.name.lower()) in ("tx1", "rx1", "tx2", "rx2")}
     groups = [group for group in _groups(numbers) if all(map(_may_be_wide, group))]
     in_groups = {column.name for group in groups for column, _ in group}
@@ -158,7 +163,7 @@ def _find_range(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     return [column for column in free if column not in named and column.name not in in_groups]
 
 
-def _is_range(column: ColumnSample) -> bool:
+def is_range(column: ColumnSample) -> bool:
     """Return whether a column holds ranges by its name; ``d`` and ``r`` count only alone or with a unit."""
     words = {*_without_numbers(column)}
     if column.kind != "numbers" or terms.NO_RANGE & words:
@@ -243,7 +248,7 @@ def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
         if anchor and anchor[0] not in ids["anchor"] and tag
         else EndpointRoles.TAG_AND_ANCHOR
     )
-    anchor, tag = _by_id_rather_than_index(anchor), _by_id_rather_than_index(tag)
+    anchor, tag = by_id_rather_than_index(anchor), by_id_rather_than_index(tag)
     if guess.wide and max(len(anchor), len(nameless)) > 1:
         guess.doubts.append("the anchor of a column of ranges seems to be given in another column")
     for role, columns in (("anchor_id", anchor), ("tag_id", tag), ("antenna", ids["antenna"][: bool(tag)])):
@@ -267,7 +272,8 @@ def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     return [column for column in free if not any(column in columns for columns in ids.values())]
 
 
-def _by_id_rather_than_index(columns: list[ColumnSample]) -> list[ColumnSample]:
+def by_id_rather_than_index(columns: list[ColumnSample]) -> list[ColumnSample]:
+    """Return the columns of ids without those that only number the rows, unless there are no others."""
     return [column for column in columns if not {"idx", "index", "no", "num", "nr"} & {*column.words}] or columns
 
 
@@ -277,7 +283,7 @@ def _find_by_values(free: list[ColumnSample], guess: Guess, has_names: bool) -> 
     If the table has names, the names should have told, so that such a finding is not sure.
     """
     if not {"timestamp", "image_name"} & {*guess.columns}:
-        rising = [column for column in free if column.kind == "times" or _is_rising(column)]
+        rising = [column for column in free if column.kind == "times" or is_rising(column)]
         counters = [column for column in rising if column.is_whole and np.all(np.diff(column.numbers) == 1)]
         rising = [column for column in rising if column not in counters] or rising
         fractions = [after for time, after in pairwise(free) if time in rising[:1] and _is_nanoseconds(after)]
@@ -347,7 +353,8 @@ def _ids_by_values(ids: list[ColumnSample], guess: Guess) -> None:
             guess.doubts.append(f"columns {tag.name} and {anchor.name} may be the tag and the anchor")
 
 
-def _is_rising(column: ColumnSample) -> bool:
+def is_rising(column: ColumnSample) -> bool:
+    """Return whether the numbers of a column rise from row to row, with few exceptions."""
     if column.kind != "numbers" or len(column.numbers) < 2 or column.numbers[-1] <= column.numbers[0]:
         return False
     return bool(np.mean(np.diff(column.numbers) >= 0) > 0.95)

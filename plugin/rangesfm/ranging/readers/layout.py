@@ -1,6 +1,7 @@
 """Layout of a table of text, found from its first rows: separator, header row, and the form of the cells.
 
-Logs in which every value comes with its name are tables, too: JSON, ``rostopic echo``, ``anchor=A1 range=2.34``.
+Logs in which every value comes with its name are tables, too: JSON, ``rostopic echo``, ``anchor=A1 range=2.34``, and
+GSI files of surveying instruments.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
+from rangesfm.files.folders import IMAGE_EXTENSIONS
 from rangesfm.files.text_tables import TextTable, read_head, read_text
+from rangesfm.ranging.readers.gsi import gsi_records, is_gsi
 from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
@@ -37,7 +40,14 @@ _MAX_NUM_WORDS = 20  # lines of text before the table
 _MAX_SHARE_OF_WORDS = 0.02  # lines of text inside the table, as a share of all
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", re.ASCII)
-_WITH_UNIT = re.compile(rf"({_NUMBER.pattern}) ?([A-Za-z]+)", re.ASCII)
+# Numbers whose thousands are set apart: 2,600,000.5, 2.600.000,5, and 2'600'000.5 or with blanks.
+_THOUSANDS = {
+    ",": re.compile(r"[-+]?\d{1,3}(?:,\d{3})+\.\d+", re.ASCII),
+    ".": re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+", re.ASCII),
+    "'\u2019 \xa0\u202f": re.compile(r"[-+]?\d{1,3}(?:['\u2019 \xa0\u202f]\d{3})+(?:[.,]\d+)?", re.ASCII),
+}
+_GROUPED = re.compile(r"[-+]?\d[\d,.'\u2019 \xa0\u202f]*", re.ASCII)
+_WITH_UNIT = re.compile(rf"({_DECIMAL_COMMA.pattern}|{_NUMBER.pattern}) ?([A-Za-z]+)", re.ASCII)
 _DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}", re.ASCII)
 _UNITS = {*TIMES, *LENGTHS, "dbm"} - {"d", "h"}  # 1d may be an id
 
@@ -49,6 +59,32 @@ _MIN_SHARE_NAMED = 0.9  # smallest share of lines or blocks with named values in
 
 
 @dataclass(frozen=True)
+class Cure:
+    """Conversion of the cells of a column to the usual form; a cell that has another form is left as it is.
+
+    Attributes:
+        unit: unit after each number, which is removed.
+        thousands: characters that set thousands apart, which are removed; "" if there are none.
+        commas: whether numbers have decimal commas.
+        are_dates: whether the cells are dates in another form than 2026-01-31.
+    """
+
+    unit: str = ""
+    thousands: str = ""
+    commas: bool = False
+    are_dates: bool = False
+
+    def __call__(self, cell: str) -> str:
+        if self.are_dates:
+            return spelt_date(cell) or cell
+        found = _WITH_UNIT.fullmatch(cell) if self.unit else None
+        number = found[1] if found and found[2] == self.unit else cell
+        if self.thousands and _GROUPED.fullmatch(number):
+            number = re.sub(f"[{re.escape(self.thousands)}]", "", number).replace(",", ".")
+        return number.replace(",", ".") if self.commas and _DECIMAL_COMMA.fullmatch(number) else number
+
+
+@dataclass(frozen=True)
 class ColumnSample:
     """A column with its name and its first cells.
 
@@ -56,13 +92,13 @@ class ColumnSample:
         name: name of the column.
         cells: its first cells.
         unit: unit after each of its numbers, "" if there is none.
-        cure: conversion of a cell from the form in the file to the usual form; None if none is needed.
+        cure: conversion of its cells, which has been applied to ``cells``; None if none is needed.
     """
 
     name: str
     cells: tuple[str, ...]
     unit: str = ""
-    cure: Callable[[str], str] | None = None
+    cure: Cure | None = None
 
     @cached_property
     def words(self) -> list[str]:
@@ -95,39 +131,29 @@ class ColumnSample:
     def num_distinct(self) -> int:
         return len(set(self.cells))
 
+    @cached_property
+    def names_photos(self) -> bool:
+        return bool(self.cells) and all(cell.lower().endswith(IMAGE_EXTENSIONS) for cell in self.cells)
+
     def cured(self) -> ColumnSample:
         """Return the column with numbers and dates in the usual form: decimal points, no units, 2026-01-31."""
-        cure: Callable[[str], str]
-        unit = ""
         if self.filled and all(map(spelt_date, self.filled)):
-            cure = _with_spelt_date
-        elif any(map(_DECIMAL_COMMA.fullmatch, self.filled)):
-            cure = _with_point
-        else:
-            units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
-            unit = units.pop() if len(units) == 1 else ""
-            if unit.lower() not in _UNITS:
-                return self
-            cure = _without(unit)
-        return replace(self, cells=tuple(map(cure, self.cells)), unit=unit, cure=cure)
+            return self._with(Cure(are_dates=True))
+        units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
+        unit = next(iter(units)) if len(units) == 1 else ""
+        cure = Cure(unit if unit.lower() in _UNITS else "")
+        cells = [*map(cure, self.filled)]
+        apart = (marks for marks, pattern in _THOUSANDS.items() if any(map(pattern.fullmatch, cells)))
+        cure = replace(cure, thousands=next(apart, ""), commas=any(map(_DECIMAL_COMMA.fullmatch, cells)))
+        return self if cure == Cure() else self._with(cure)
+
+    def _with(self, cure: Cure) -> ColumnSample:
+        return replace(self, cells=tuple(map(cure, self.cells)), unit=cure.unit, cure=cure)
 
     def __str__(self) -> str:
         if self.kind == "numbers" and len(self.numbers):
             return f"{self.name} ({self.numbers.min():.10g} to {self.numbers.max():.10g})"
         return f"{self.name} ({self.kind}{'' if self.kind == 'nothing' else f', {self.cells[0]!r}'})"
-
-
-def _with_spelt_date(cell: str) -> str:
-    return spelt_date(cell) or cell
-
-
-def _with_point(cell: str) -> str:
-    return cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
-
-
-def _without(unit: str) -> Callable[[str], str]:
-    ending = re.compile(rf"({_NUMBER.pattern}) ?{unit}", re.ASCII)
-    return lambda cell: match[1] if (match := ending.fullmatch(cell)) else cell
 
 
 @dataclass(frozen=True)
@@ -137,13 +163,14 @@ class Layout:
     Attributes:
         columns: the columns with the cells of the first rows.
         has_names: whether the file names its columns.
-        read_cells: reads all rows as they are in the file, with lines for the user about them.
+        read_cells: reads all rows as they are in the file, with lines for the user about them. The argument is that of
+            ``read``.
         are_records: whether the rows are records, in which values may be missing.
     """
 
     columns: tuple[ColumnSample, ...]
     has_names: bool
-    read_cells: Callable[[], tuple[TextTable, list[str]]]
+    read_cells: Callable[[bool], tuple[TextTable, list[str]]]
     are_records: bool = False
 
     @property
@@ -151,30 +178,33 @@ class Layout:
         """Unit after the numbers of each column, by the column's name."""
         return {column.name: column.unit for column in self.columns}
 
-    def read(self) -> tuple[TextTable, list[str]]:
+    def read(self, *, every_row: bool = False) -> tuple[TextTable, list[str]]:
         """Read all rows, with lines for the user about them.
 
+        Args:
+            every_row: whether a line that is not a row of the table is an error. Otherwise a few are left out.
+
         Raises:
-            InputError: too many lines are not rows of the table.
+            InputError: lines are not rows of the table.
         """
-        table, notes = self.read_cells()
+        table, notes = self.read_cells(every_row)
         cures = {column.name: column.cure for column in self.columns if column.cure}
         cured = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items()}
-        notes += ["numbers have decimal commas"] if _with_point in cures.values() else []
+        notes += ["numbers have decimal commas"] if any(cure.commas for cure in cures.values()) else []
         return replace(table, cells={**table.cells, **cured}), notes
 
 
 def layout_without_header(path: Path, header: Sequence[str], separator: str) -> Layout:
     """Return the layout of a file without a header row that is known to have these columns."""
     columns = tuple(ColumnSample(name, ()) for name in header)
-    return Layout(columns, True, lambda: _read_rows(path, header, separator, 0, ()))
+    return Layout(columns, True, lambda every_row: _read_rows(path, header, separator, 0, (), every_row))
 
 
 def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     """Find the layout of a file; None if it has no table."""
     if table := _read_records(path):
         first_rows = (ColumnSample(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
-        return Layout(tuple(column.cured() for column in first_rows), True, lambda: (table, []), True)
+        return Layout(tuple(column.cured() for column in first_rows), True, lambda _: (table, []), True)
     lines = read_head(path).split("\n")
     numbered = [(number, line) for number, line in enumerate(lines[:-1] or lines, 1) if line.strip()]
     content = [(number, line) for number, line in numbered if not _is_comment(line)][:_NUM_ROWS]
@@ -206,19 +236,23 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     return Layout(
         tuple(column if separator == "," and "," in "".join(column.cells) else column.cured() for column in columns),
         names is not None,
-        lambda: _read_rows(path, header, separator, num_skipped, header_row),
+        lambda every_row: _read_rows(path, header, separator, num_skipped, header_row, every_row),
     )
 
 
 def _read_rows(
-    path: Path, header: Sequence[str], separator: str, num_skipped: int, names: Sequence[str]
+    path: Path, header: Sequence[str], separator: str, num_skipped: int, names: Sequence[str], every_row: bool
 ) -> tuple[TextTable, list[str]]:
-    """Read all rows, and leave out a few other lines (text, a truncated line, a repeated header) with a note."""
+    """Read all rows without empty ones. A few other lines (text, a truncated line, a repeated header) are left out.
+
+    A note says how many, or the first of them is an error if ``every_row`` is true.
+    """
     numbered = enumerate(read_text(path).split("\n")[num_skipped:], num_skipped + 1)
     content = [(line, _cells(text, separator)) for line, text in numbered if text.strip() and not _is_comment(text)]
+    content = [(line, row) for line, row in content if any(row)]
     rows = [(line, row) for line, row in content if len(row) == len(header) and row != names]
     odd = [(line, row) for line, row in content if len(row) != len(header)]
-    if len(odd) > 1 + _MAX_SHARE_OF_WORDS * len(content):
+    if odd and (every_row or len(odd) > 1 + _MAX_SHARE_OF_WORDS * len(content)):
         line, row = odd[0]
         raise InputError(f"has {len(row)} cell{'s' * (len(row) != 1)}, the header row has {len(header)}", path, line)
     lost = f"{len(odd)} lines that are not rows of the table are left out, the first is line {odd[0][0]}" if odd else ""
@@ -272,7 +306,9 @@ def _read_records(path: Path) -> TextTable | None:
     A record that holds several ranges gives a row for each. A cell is empty if its record has no such value.
     """
     head = read_head(path).lstrip()
-    if head.startswith(("{", "[{")):
+    if is_gsi(head):
+        numbered = [*gsi_records(read_text(path, errors="replace"))]
+    elif head.startswith(("{", "[{")):
         numbered = list(_json_records(read_text(path)))
     elif _share_named(head) > _MIN_SHARE_NAMED:
         text = read_text(path, errors="replace")

@@ -29,6 +29,7 @@ _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct",
 _WITH_MONTH = re.compile(
     rf"(\d\d?)[- ]({'|'.join(_MONTHS)})[a-z]{{0,6}}[- ](\d{{4}})(?=$|[T _])", re.ASCII | re.IGNORECASE
 )
+_AS_EXIF = re.compile(r"(\d{4}):(\d\d):(\d\d)(?=[T ]\d\d?:)", re.ASCII)  # 2026:01:31 12:00:00
 _NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
 _DAY_S = 86400.0
 # The size of a time since 1970 tells its unit: 1e11 s are three thousand years, and 1e11 ms are three years.
@@ -41,10 +42,12 @@ def unit_by_digits(value: float) -> str | None:
 
 
 def spelt_date(text: str) -> str | None:
-    """Convert a date and time of digits alone, or with the month in words, to the form 2026-01-31; else None."""
+    """Convert a date of digits alone, with colons as in EXIF, or with the month in words to 2026-01-31; else None."""
     if compact := _COMPACT.fullmatch(text):
         year, month, day, hour, minute, second, fraction, zone = compact.groups()
         return f"{year}-{month}-{day}T{hour}:{minute}:{second}.{fraction or 0}{zone}"
+    if exif := _AS_EXIF.match(text):
+        return f"{exif[1]}-{exif[2]}-{exif[3]}{text[exif.end() :]}"
     if named := _WITH_MONTH.match(text):
         return f"{named[3]}-{_MONTHS.index(named[2].lower()) + 1:02}-{named[1]:>02}{text[named.end() :]}"
     return None

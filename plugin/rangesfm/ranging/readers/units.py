@@ -15,9 +15,11 @@ UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048}
 
 _MIN_NUM = 20  # number of values below which the values do not show their unit
 _SECONDS_SINCE_1970 = (1e9, 4e9)  # the years 2001 to 2096
-# Smallest and largest plausible median step between times, in seconds, by unit. In other units than seconds, a smaller
-# step means that the unit is wrong.
-_FASTEST_S, _SLOWEST_S = {"s": 0.0, "ms": 2e-3, "us": 2e-3, "ns": 2e-3}, 5.0
+# Smallest plausible median step between times, in seconds, by unit. In other units than seconds, a smaller step means
+# that the unit is wrong.
+_FASTEST_S = {"s": 0.0, "ms": 2e-3, "us": 2e-3, "ns": 2e-3}
+SLOWEST_S = 5.0
+"""Largest plausible median step between ranges, in seconds."""
 # Smallest mean step between times in seconds. With a smaller one the times are minutes, hours, or days like those of
 # Excel and MATLAB.
 _FASTEST_ON_AVERAGE_S = 1e-4
@@ -38,8 +40,11 @@ Ask = Callable[[Sequence[str], str], InputError]
 """Function that returns the error which asks for one of several units, given the units and what was found."""
 
 
-def time_unit(name: str, times: Array, notes: list[str], ask: Ask) -> str:
+def time_unit(name: str, times: Array, notes: list[str], ask: Ask, slowest_s: float = SLOWEST_S) -> str:
     """Return the unit of a column of times, and add a note if it is not from the name.
+
+    Args:
+        slowest_s: largest plausible median step between times.
 
     Raises:
         InputError: the unit is ambiguous.
@@ -47,7 +52,7 @@ def time_unit(name: str, times: Array, notes: list[str], ask: Ask) -> str:
     named, distinct = _named(name, TIMES), np.unique(times)
     by_digits = unit_by_digits(float(np.median(times))) if len(times) else None
     step = float(np.median(np.diff(distinct))) if len(distinct) > 1 else 0.0
-    is_so = by_digits is not None and step * SECONDS_PER_UNIT[by_digits] <= _SLOWEST_S
+    is_so = by_digits is not None and step * SECONDS_PER_UNIT[by_digits] <= slowest_s
     # A finer unit in the name is believed, because it may belong to a clock that started after 1970.
     if by_digits is not None and (is_so if named is None else SECONDS_PER_UNIT[named] > SECONDS_PER_UNIT[by_digits]):
         notes.append(f"{name} has as many digits as {by_digits} since 1970: taken as {by_digits}")
@@ -56,12 +61,12 @@ def time_unit(name: str, times: Array, notes: list[str], ask: Ask) -> str:
         return named or "s"
     mean_step = float(distinct[-1] - distinct[0]) / len(times)
     if mean_step < _FASTEST_ON_AVERAGE_S:
-        slow = [unit for unit in ("min", "h", "d") if mean_step * SECONDS_PER_UNIT[unit] <= _SLOWEST_S]
+        slow = [unit for unit in ("min", "h", "d") if mean_step * SECONDS_PER_UNIT[unit] <= slowest_s]
         if not days_before_1970(distinct):
             raise ask(slow, f"steps of {mean_step:.2g} between its numbers")
         notes.append(f"{name} looks like days (steps of {mean_step:.2g}): taken as such")
         return "d"
-    can_be = [unit for unit, least in _FASTEST_S.items() if least <= step * SECONDS_PER_UNIT[unit] <= _SLOWEST_S]
+    can_be = [unit for unit, least in _FASTEST_S.items() if least <= step * SECONDS_PER_UNIT[unit] <= slowest_s]
     if can_be == ["s"] or _SECONDS_SINCE_1970[0] <= distinct[0] < _SECONDS_SINCE_1970[1]:
         return "s"
     if len(can_be) != 1:
@@ -86,7 +91,7 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, not
     Raises:
         InputError: the unit is ambiguous.
     """
-    named = _named(name, LENGTHS)
+    named = named_length_unit(name)
     if named is not None or len(ranges) < _MIN_NUM:
         return named or "m"
     most, are_whole = float(np.percentile(ranges, 95)), bool(np.all(ranges == np.round(ranges)))
@@ -115,6 +120,11 @@ def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, noise_m
     same = np.diff(pair[order]) == 0
     moved, seconds = np.abs(np.diff(ranges_m[order]))[same], np.diff(times[order])[same]
     return float(np.mean(moved > noise_m + _FASTEST_M_PER_S * seconds)) if len(moved) else 0.0
+
+
+def named_length_unit(name: str) -> str | None:
+    """Return the unit of length in the words of a name, or None."""
+    return _named(name, LENGTHS)
 
 
 def _named(name: str, units: dict[str, str]) -> str | None:

@@ -56,7 +56,8 @@ NO_RANGE = _words(
 # Words in the names of processed ranges, which are used only if there is no other range.
 SECOND_RANGE = _words("calib calibrated corr corrected filtered filter smoothed smooth mean avg average median last")
 TIME = _words(
-    "time times timestamp timestamps timestep stamp datetime epoch elapsed clock zeit zeitstempel uhrzeit tiempo 时间"
+    "time times timestamp timestamps timestep stamp datetime epoch elapsed clock zeit zeitstempel uhrzeit aufnahmezeit "
+    "heure horodatage temps hora tiempo 时间"
 )
 TIME_IN_SHORT = frozenset({"t", "ts", *TIMES} - {"d", "h"})
 NANOSECONDS = _words("nsec nsecs nanosec nanosecs nanosecond nanoseconds")
@@ -65,7 +66,9 @@ SECOND_TIME = _words("device wearable sensor boot local received record rosbag b
 LENGTH_UNIT = frozenset(LENGTHS)
 ASKED = _words("responder rspdr resp rsp receiver to dest dst destination target peer remote neighbor neighbour")
 ASKING = _words("requester rqstr req sender initiator init from src source self")
-ANCHOR = _words("anchor anchors anc an beacon landmark station base basestation bs node anker ancla gateway 基站")
+ANCHOR = _words(
+    "anchor anchors anc an beacon landmark station base basestation bs node anker ancla ancre balise gateway 基站"
+)
 TAG = _words("tag tags mobile robot rover user wearable 标签")
 ANTENNA = _words("ant antenna")
 ANY_ID = _words("id uid bssid nodeid identifier address addr mac device dev serial")
@@ -80,3 +83,25 @@ ROLES = {
 }
 IN_WIDE = RANGE | RANGE_IN_SHORT | ANCHOR | TAG | LENGTH_UNIT | ASKED | ASKING | SECOND_RANGE | {"a", "b", "t", "raw"}
 PLAIN = _words("uwb field msg data header twr tof ranging meas measured measurement value vector arr array list")
+
+# Words in the names of columns of lists: anchors with positions, and photos with times.
+POINT = _words(
+    "point points pointid pointnumber ptid pt pts pnt punkt punkte punktnummer punktnr punktname pktnr pkt label nom "
+    "bezeichnung numéro numero punto"
+)
+COORDINATES = {
+    "x": _words("x e east easting eastings est este ost ostwert rechts rechtswert rw"),
+    "y": _words("y n north northing northings nord norte nordwert hoch hochwert hw"),
+    "z": _words("z h u up height hgt ht elevation elev alt altitude höhe hoehe hauteur cote cota quota altura"),
+}
+DEGREES = {
+    "x": _words("lon long lng longitude längengrad laengengrad"),
+    "y": _words("lat latitude breitengrad breite"),
+}
+BESIDE_COORDINATE = LENGTH_UNIT | _words("coord coords coordinate coordinates koordinate pos position value wert local")
+STDDEV = _words("stddev stdev std sigma sd uncertainty accuracy genauigkeit standardabweichung")
+BIAS = _words("bias offset")
+PHOTO = _words("image images img photo photos foto fotos picture pictures pic bild bilder bildname frame imagen")
+FILE = _words("file filename filenames name names path datei dateiname fichier nom source sourcefile archivo")
+# Words in the name of a file that is about anchors.
+ABOUT_ANCHORS = _words("anchor anchors anker beacon beacons ancla anclas ancre ancres balise balises")

@@ -1,0 +1,322 @@
+"""The anchor file: the canonical CSV, or any table of points whose columns are recognized by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import InputError, printable
+from rangesfm.files.text_tables import TextTable, has_columns, read_head, read_table, repeated, write_user_table
+from rangesfm.option_model import Bounds
+from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.readers import vocabulary as terms
+from rangesfm.ranging.readers.guess import by_id_rather_than_index, is_named_time, is_range
+from rangesfm.ranging.readers.layout import MISSING, ColumnSample, Layout, find_layout
+from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns, columns_flag, read_list
+from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
+
+WHAT = "anchors"
+QUANTITIES = ("anchor_id", "x", "y", "z", "position_stddev", "range_bias", "range_bias_stddev")
+_AXES = ("x", "y", "z")
+_CANONICAL = {
+    quantity: quantity if quantity == "anchor_id" else f"{quantity}_m" for quantity in QUANTITIES
+}  # names in the canonical CSV
+_REQUIRED = tuple(_CANONICAL[quantity] for quantity in ("anchor_id", *_AXES))
+_OPTIONAL = tuple(_CANONICAL[quantity] for quantity in QUANTITIES[4:])
+_ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
+_EXPECTED = f"expected a table with {','.join(_REQUIRED)}"
+# A table without names is taken for one of anchors only up to this number of rows.
+_MAX_NUM_UNNAMED = 64
+# Coordinates beyond this are those of a surveyed grid, in which north often comes before east.
+_LOCAL_M = 500.0
+_GEOGRAPHIC = "EPSG:4979"
+
+
+@dataclass(frozen=True)
+class AnchorList:
+    """Content of an anchor file.
+
+    Attributes:
+        anchors: in the order of the file.
+        notes: lines for the user about how the file was read.
+    """
+
+    anchors: tuple[Anchor, ...]
+    notes: tuple[str, ...] = ()
+
+
+def read_anchors(
+    path: str | Path, *, columns: Mapping[str, str] | None = None, unit: str | None = None
+) -> tuple[Anchor, ...]:
+    """Read the anchors in a file; see ``read_anchor_list``."""
+    return read_anchor_list(path, columns=columns, unit=unit).anchors
+
+
+def read_anchor_list(
+    path: str | Path, *, columns: Mapping[str, str] | None = None, unit: str | None = None
+) -> AnchorList:
+    """Read ``anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m]``, or another table of points.
+
+    Coordinates are empty for an anchor of unknown position. The optional cells may be empty as well. In other tables,
+    columns are recognized by their names, such as ``Point;East [m];North [m];Height [m]``; an instrument's GSI file
+    is such a table, too.
+
+    Args:
+        path: the file.
+        columns: name of the column of each quantity (QUANTITIES), or its number in a table without names; None:
+            recognized.
+        unit: unit of the coordinates, "m", "cm", "mm" or "ft"; None: that in the names of the columns, else metres.
+
+    Raises:
+        UnclearListError: the columns are not known for sure; the advice says what to type.
+        InputError: an anchor appears twice, a position is incomplete, or a cell is not a number. The error gives the
+            line.
+    """
+    path = Path(path)
+    head = read_head(path)
+    if not head.strip():
+        raise InputError(f"the file is empty, {_EXPECTED}", path)
+    if not columns and unit is None and is_canonical(head):
+        table = read_table(path, _REQUIRED, _OPTIONAL, aliases=_ALIASES, separator=None)
+        return AnchorList(_anchors(table, _CANONICAL, dict.fromkeys(QUANTITIES, "m"), ("",)))
+    layout = find_layout(path)
+    if layout is None:
+        raise InputError(f"no table, {_EXPECTED}", path)
+    taken = _columns_by_user(columns, layout, path) if columns else find_anchor_columns(path, layout)
+    if taken is None:
+        found = printable(", ".join(layout.units))
+        raise InputError(f"no columns of anchors; found {found}; {_EXPECTED}", path)
+    units, told = _units(layout, taken, unit)
+    table, notes = read_list(layout, taken)
+    by_order = [] if layout.has_names or columns else ["the table has no names: its numbers are taken as x, y, z"]
+    found_anchors = _anchors(table, taken, units, MISSING)
+    return AnchorList(found_anchors, tuple(f"{path.name}: {note}" for note in (*notes, *by_order, *told)))
+
+
+def is_canonical(head: str) -> bool:
+    """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
+    has_commas = "," in next((line for line in head.split("\n") if has_columns(line, _REQUIRED, _ALIASES)), "")
+    return has_columns(head, _REQUIRED, _ALIASES) and (has_commas or "," not in head)
+
+
+def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
+    """Write an anchor file that ``read_anchors`` reads, with empty cells for unknown values.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    rows = []
+    for anchor in anchors:
+        place = 4 * [None] if anchor.position_m is None else [*anchor.position_m, anchor.position_stddev_m]
+        bias = 2 * [None] if anchor.range_bias_stddev_m is None else [anchor.range_bias_m, anchor.range_bias_stddev_m]
+        rows.append([anchor.anchor_id, *("" if number is None else f"{number:.4f}" for number in (*place, *bias))])
+    write_user_table(Path(path), [*_REQUIRED, *_OPTIONAL], rows)
+
+
+def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
+    """Return the name of the column of each quantity; None if the table is not one of anchors.
+
+    Raises:
+        UnclearListError: it may be one, but the columns are not known for sure.
+    """
+    found = _by_name(layout) if layout.has_names else _by_values(layout)
+    ids, axes = found["anchor_id"], {axis: found[axis] for axis in _AXES}
+    degrees = {} if axes["x"] and axes["y"] else _degrees(layout)
+    is_about_anchors = not terms.ABOUT_ANCHORS.isdisjoint(terms.words_of(path.stem))
+    is_named = layout.has_names and any((terms.ANCHOR | terms.POINT) & {*column.words} for column in ids)
+    num_axes = sum(map(bool, axes.values()))
+    may_be = bool(ids) and (num_axes == 3 or (is_named and (num_axes == 2 or bool(degrees))))
+    if _is_of_times(layout, ids) or not (may_be or (is_about_anchors and _has_numbers(layout))):
+        return None
+    columns = {quantity: those[0].name for quantity, those in found.items() if those}
+    doubts, choices = [], list[Choice]()
+    for quantity, what in (("anchor_id", "the anchor's id"), ("x", "x"), ("y", "y"), ("z", "z (height)")):
+        several = found[quantity]
+        if len(several) > 1:
+            doubts.append(f"any of {_listed(several)} may be {what}")
+            choices += [_choice(f"if {one.name} is {what}", {**columns, quantity: one.name}) for one in several]
+        elif not several and not degrees:
+            doubts.append(f"no column seems to be {what}")
+    if not doubts and degrees:
+        named = columns | degrees
+        doubts.append(f"{degrees['y']} and {degrees['x']} are degrees, of no known coordinate system")
+        choices = [_choice("if that is WGS 84", named, "--anchor_crs", _GEOGRAPHIC)] if "z" in named else []
+    elif not doubts:
+        for doubt, those in _doubts_about_axes(layout, columns):
+            doubts.append(doubt)
+            choices += those
+    if not doubts:
+        return columns
+    unknown = {quantity: "NAME" for quantity in ("anchor_id", *_AXES) if quantity not in columns | degrees}
+    choices = choices or [_choice("with the names of the columns", columns | degrees | unknown)]
+    raise UnclearListError(WHAT, path, layout, doubts, choices)
+
+
+def _choice(when: str, columns: Mapping[str, str], *flags: str) -> Choice:
+    ordered = {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
+    return Choice(when, (*columns_flag("anchor_columns", ordered), *flags))
+
+
+def _listed(columns: Sequence[ColumnSample]) -> str:
+    return ", ".join(column.name for column in columns)
+
+
+def _by_name(layout: Layout) -> dict[str, list[ColumnSample]]:
+    """Return the columns that may hold each quantity by their names; an id also by its place and its cells."""
+    found: dict[str, list[ColumnSample]] = {quantity: [] for quantity in QUANTITIES}
+    others = list[ColumnSample]()
+    for column in layout.columns:
+        quantity = _named_quantity({*column.words})
+        (found[quantity] if quantity else others).append(column)
+    found["anchor_id"] = by_id_rather_than_index(found["anchor_id"])
+    if not found["anchor_id"] and all(found[axis] for axis in _AXES):
+        texts = [column for column in others if column.kind == "text" and column.num_distinct == len(column.cells)]
+        nameless = [column for column in layout.columns[:1] if column.name == "column 1"]
+        found["anchor_id"] = nameless or (texts if len(texts) == 1 else [])
+    return found
+
+
+def _named_quantity(words: set[str]) -> str | None:
+    """Return the quantity in a column with these words in its name, or None."""
+    about = words - terms.BESIDE_COORDINATE - terms.RANGE
+    if about and about <= terms.STDDEV | terms.BIAS:
+        if not about & terms.BIAS:
+            return "position_stddev"
+        return "range_bias_stddev" if about & terms.STDDEV else "range_bias"
+    own = about - terms.ANCHOR - terms.POINT
+    if axis := next((axis for axis in _AXES if own and own <= terms.COORDINATES[axis]), None):
+        return axis
+    return "anchor_id" if words and words <= terms.ANCHOR | terms.ID | terms.POINT else None
+
+
+def _by_values(layout: Layout) -> dict[str, list[ColumnSample]]:
+    """Return the columns of a table without names: an id with three numbers after it, and perhaps some text."""
+    found: dict[str, list[ColumnSample]] = {quantity: [] for quantity in QUANTITIES}
+    first, *others = layout.columns
+    numbers = [column for column in others if column.kind == "numbers"]
+    is_id = first.num_distinct == len(first.cells) and (first.kind == "text" or first.is_whole)
+    is_short = len(first.cells) <= _MAX_NUM_UNNAMED and len(layout.columns) <= 5
+    if is_id and is_short and len(numbers) == 3 and numbers == others[:3]:
+        found["anchor_id"] = [first]
+        found |= {axis: [column] for axis, column in zip(_AXES, numbers)}
+    return found
+
+
+def _degrees(layout: Layout) -> dict[str, str]:
+    """Return the columns of longitude and latitude as x and y; empty unless there are both."""
+    named = {
+        axis: [column.name for column in layout.columns if words & {*column.words}]
+        for axis, words in terms.DEGREES.items()
+    }
+    return {axis: names[0] for axis, names in named.items()} if all(named.values()) else {}
+
+
+def _is_of_times(layout: Layout, ids: Sequence[ColumnSample]) -> bool:
+    """Return whether a table holds ranges or positions over time; each anchor may have the time of its survey."""
+    has_times = layout.has_names and any(map(is_named_time, layout.columns))
+    is_of_ranges = any(map(is_range, layout.columns))
+    return has_times and (is_of_ranges or not ids or ids[0].num_distinct < len(ids[0].cells))
+
+
+def _has_numbers(layout: Layout) -> bool:
+    return any(column.kind == "numbers" for column in layout.columns)
+
+
+def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[tuple[str, list[Choice]]]:
+    """Yield what is not sure about the axes, with the choices there are: their order, and their units."""
+    by_name = {column.name: column for column in layout.columns}
+    order = [column.name for column in layout.columns]
+    x, y = columns["x"], columns["y"]
+    swapped = {**columns, "x": y, "y": x}
+    east_first, north_first = _choice("if x is east and y is north", columns), _choice("if x is north", swapped)
+    if not layout.has_names:
+        largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in _AXES), default=0.0)
+        if largest > _LOCAL_M or len(order) > 4:
+            first = _choice("if the numbers are x, y, z or east, north, height", columns)
+            second = _choice("if they are north, east, height (PNEZD)", swapped)
+            yield "a table without names, in which either east or north may come first", [first, second]
+    elif order.index(y) < order.index(x) and {"x", "y"} == {*by_name[x].words, *by_name[y].words} - terms.LENGTH_UNIT:
+        yield f"{y} comes before {x}, as where surveyors call north x", [north_first, east_first]
+    units = {axis: named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in _AXES}
+    if len({*units.values()}) > 1 and None in units.values():
+        told = sorted({unit for unit in units.values() if unit})
+        choices = [_choice(f"if all are in {unit}", columns, "--anchor_unit", unit) for unit in told]
+        yield f"some of the coordinates are in {' and '.join(told)}, others have no unit", choices
+
+
+def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
+    check_columns(columns, QUANTITIES, layout, path)
+    if missing := [quantity for quantity in ("anchor_id", *_AXES) if quantity not in columns]:
+        raise InputError(f"columns do not name {', '.join(missing)}, expected anchor_id, x, y and z", path)
+    return {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
+
+
+def _units(layout: Layout, columns: Mapping[str, str], unit: str | None) -> tuple[dict[str, str], list[str]]:
+    """Return the unit of each quantity, with a line for the user if it is not metres."""
+    by_name = {column.name: column.unit for column in layout.columns}
+    named = {quantity: named_length_unit(f"{name} {by_name[name]}") for quantity, name in columns.items()}
+    units = {quantity: (unit if quantity in _AXES else None) or own or "m" for quantity, own in named.items()}
+    units |= {quantity: units["x"] for quantity in QUANTITIES[4:] if quantity in columns and named[quantity] is None}
+    others = sorted({units[axis] for axis in _AXES} - {"m"})
+    return units, [f"coordinates are in {' and '.join(others)}"] if others else []
+
+
+def _anchors(
+    table: TextTable, names: Mapping[str, str], units: Mapping[str, str], missing: Sequence[str]
+) -> tuple[Anchor, ...]:
+    """Return the anchors of a table.
+
+    Args:
+        table: the rows.
+        names: name of the column of each quantity.
+        units: unit of each quantity.
+        missing: texts of a cell that counts as empty.
+    """
+    if not len(table):
+        raise InputError("names no anchor, expected one per line", table.path)
+    anchor_ids = table.text(names["anchor_id"])
+    if again := repeated(anchor_ids):
+        row, first = again
+        message = f"anchor {anchor_ids[row]} is in line {table.line[first]} already, expected each once"
+        raise InputError(message, table.path, int(table.line[row]))
+
+    def lengths_m(quantity: str, empty: float, bounds: Bounds) -> Array:
+        name, expected = names.get(quantity, ""), f"{bounds}, or nothing"
+        if name not in table:
+            return np.full(len(table), empty)
+        per_metre = UNITS_PER_METRE[units[quantity]]
+        expected += "" if per_metre == 1 else f" (here in {units[quantity]})"
+        metres = table.numbers(name, empty=np.nan, missing=missing, expected=expected) / per_metre
+        table.refuse(~(np.isnan(metres) | bounds.hold(metres)), name, expected)
+        return np.where(np.isnan(metres), empty, metres)
+
+    positions = np.column_stack([lengths_m(axis, np.nan, COORDINATE_M) for axis in _AXES])
+    _refuse_incomplete(table, names, positions)
+    position_stddevs = lengths_m("position_stddev", 0.0, STDDEV_OR_EXACT_M)
+    biases = lengths_m("range_bias", 0.0, BIAS_M)
+    bias_stddevs = lengths_m("range_bias_stddev", np.nan, STDDEV_OR_EXACT_M)
+    return tuple(
+        Anchor(
+            anchor_id=anchor_id,
+            position_m=None if np.isnan(positions[row, 0]) else positions[row],
+            position_stddev_m=float(position_stddevs[row]),
+            range_bias_m=float(biases[row]),
+            range_bias_stddev_m=None if np.isnan(bias_stddevs[row]) else float(bias_stddevs[row]),
+        )
+        for row, anchor_id in enumerate(anchor_ids)
+    )
+
+
+def _refuse_incomplete(table: TextTable, names: Mapping[str, str], positions: Array) -> None:
+    """Check that the positions (n, 3) are NaN, unknown, in all three coordinates or in none."""
+    unknown = np.isnan(positions)
+    incomplete = unknown.any(axis=1) & ~unknown.all(axis=1)
+    if np.any(incomplete):
+        row = int(np.argmax(incomplete))
+        axis = _AXES[int(np.argmax(unknown[row]))]
+        raise table.error(row, names[axis], "all three coordinates or none")

@@ -1,0 +1,159 @@
+"""The table of the photos' times: the canonical CSV, or any table with names of photos and times."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import InputError, printable
+from rangesfm.files.text_tables import TextTable, has_columns, read_head, read_table
+from rangesfm.options import TIME_S
+from rangesfm.ranging.readers import vocabulary as terms
+from rangesfm.ranging.readers.columns import read_timestamps
+from rangesfm.ranging.readers.guess import Guess, find_time, is_range, is_rising
+from rangesfm.ranging.readers.layout import ColumnSample, Layout, find_layout
+from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns, columns_flag, read_list
+from rangesfm.ranging.readers.times import SECONDS_PER_UNIT
+
+QUANTITIES = ("image_name", "timestamp", "date", "nanoseconds")
+_CANONICAL = {"image_name": "image_name", "timestamp": "timestamp_s"}
+_EXPECTED = f"expected a table with {','.join(_CANONICAL.values())}"
+# Largest plausible time between two photos; without a name, a time that may also be in a finer unit is asked for.
+_SLOWEST_S = 120.0
+_DECIMALS = re.compile(r"(?:^[-+]?\d*|:\d\d)[.,](\d+)", re.ASCII)
+
+
+@dataclass(frozen=True)
+class PhotoList:
+    """Content of a table of photo times, n rows.
+
+    Attributes:
+        table: the rows, for messages.
+        columns: name of the column of each quantity.
+        image_names: n names as written.
+        times_s: (n,) seconds.
+        resolution_s: (n,) value of one unit in the last place of each time as written.
+        notes: lines for the user about how the file was read.
+    """
+
+    table: TextTable
+    columns: Mapping[str, str]
+    image_names: list[str]
+    times_s: Array
+    resolution_s: Array
+    notes: tuple[str, ...] = ()
+
+
+def read_photo_list(
+    path: str | Path, *, columns: Mapping[str, str] | None = None, unit: str | None = None
+) -> PhotoList:
+    """Read ``image_name,timestamp_s``, or another table with names of photos and times.
+
+    Args:
+        path: the file; other columns are ignored.
+        columns: name of the column of each quantity (QUANTITIES), or its number in a table without names; None:
+            recognized.
+        unit: unit of the times as in [ranges] timestamp_unit; None: by the column's name or the values.
+
+    Raises:
+        UnclearListError: the columns or the unit are not known for sure; the advice says what to type.
+        InputError: a cell is not a time or a name. The error gives the line.
+    """
+    path = Path(path)
+    head = read_head(path)
+    if not head.strip():
+        raise InputError(f"the file is empty, {_EXPECTED}", path)
+    if not columns and unit is None and is_canonical(head):
+        table = read_table(path, [*_CANONICAL.values()], text=["image_name"], separator=None)
+        times_s = table.numbers("timestamp_s", bounds=TIME_S)
+        return _photo_list(table, _CANONICAL, times_s, "s", ())
+    layout = find_layout(path)
+    if layout is None:
+        raise InputError(f"no table of photos and times, {_EXPECTED}", path)
+    taken = _columns_by_user(columns, layout, path) if columns else find_photo_columns(path, layout)
+    if taken is None:
+        found = printable(", ".join(layout.units))
+        raise InputError(f"no columns with photos and times; found {found}; {_EXPECTED}", path)
+    table, notes = read_list(layout, taken)
+
+    def ask(units: Sequence[str], why: str) -> InputError:
+        choices = [Choice(f"if they are {one}", ("--image_times_unit", one)) for one in units]
+        return UnclearListError("photo times", path, layout, [f"the times have {why}"], choices)
+
+    times_s, unit = read_timestamps(table, taken, layout.units, unit, notes, ask, slowest_s=_SLOWEST_S)
+    return _photo_list(table, taken, times_s, unit, tuple(f"{path.name}: {note}" for note in notes))
+
+
+def is_canonical(head: str) -> bool:
+    """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
+    names = [*_CANONICAL.values()]
+    has_commas = "," in next((line for line in head.split("\n") if has_columns(line, names)), "")
+    return has_columns(head, names) and (has_commas or "," not in head)
+
+
+def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
+    """Return the name of the column of each quantity; None if the table is not one of photo times.
+
+    Raises:
+        UnclearListError: it may be one, but the columns are not known for sure.
+    """
+    photos = [column for column in layout.columns if column.names_photos] or _photos_by_name(layout)
+    others = [column for column in layout.columns if column not in photos and column.kind != "nothing"]
+    if not photos or any(map(is_range, others)):
+        return None
+    guess = Guess()
+    if layout.has_names:
+        find_time(others, guess)
+    doubts = []
+    if len({tuple(map(os.path.basename, column.cells)) for column in photos}) > 1:
+        doubts.append(f"any of {', '.join(column.name for column in photos)} may be the photo")
+    if "timestamp" not in guess.columns:
+        times = [column for column in others if column.kind == "times" or (len(others) == 1 and is_rising(column))]
+        if len(times) != 1:
+            return None
+        guess.columns["timestamp"] = times[0].name
+        doubts += [f"{times[0].name} may be the time"] * (layout.has_names and times[0].kind != "times")
+    if not doubts:
+        return {"image_name": photos[0].name, **guess.columns}
+    choices = []
+    for one in photos:
+        columns = {"image_name": one.name, **guess.columns}
+        choices.append(Choice(f"if {one.name} is the photo", columns_flag("image_times_columns", columns)))
+    raise UnclearListError("photo times", path, layout, doubts, choices)
+
+
+def _photos_by_name(layout: Layout) -> list[ColumnSample]:
+    """Return the columns that name photos without an ending by the names of the columns."""
+    return [
+        column
+        for column in layout.columns
+        if layout.has_names
+        and terms.PHOTO & {*column.words}
+        and {*column.words} <= terms.PHOTO | terms.FILE | terms.ID
+        and (column.kind == "text" or column.is_whole)
+    ]
+
+
+def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
+    check_columns(columns, QUANTITIES, layout, path)
+    if not {"image_name", "timestamp"} <= columns.keys():
+        raise InputError("columns do not name both image_name and timestamp", path)
+    return {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
+
+
+def _photo_list(
+    table: TextTable, columns: Mapping[str, str], times_s: Array, unit: str, notes: tuple[str, ...]
+) -> PhotoList:
+    if not len(table):
+        raise InputError("no rows below the header, expected one per photo", table.path)
+    places = [len(found[1]) if (found := _DECIMALS.search(text)) else 0 for text in table.text(columns["timestamp"])]
+    resolution_s = SECONDS_PER_UNIT[unit] * 10.0 ** -np.array(places, np.float64)
+    if "nanoseconds" in columns:
+        resolution_s[:] = SECONDS_PER_UNIT["ns"]
+    return PhotoList(table, columns, table.text(columns["image_name"]), times_s, resolution_s, notes)
