@@ -244,7 +244,9 @@ class _Round:
     num_left: int
 
 
-def _adjust(problem: RefinementProblem, bundle: BundleAdjustment, start: Presolved, learn: Learn | None) -> RefineSummary:
+def _adjust(
+    problem: RefinementProblem, bundle: BundleAdjustment, start: Presolved, learn: Learn | None
+) -> RefineSummary:
     """Alternate between solving the full problem and estimating the errors from its residuals."""
     added: AddedRadio
 

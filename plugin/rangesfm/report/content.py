@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.export.metric_map import points_of
+from rangesfm.export.metric_map import colored_points
 from rangesfm.files.folders import real_path
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.result.model_path import path_in_result
