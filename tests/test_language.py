@@ -16,9 +16,6 @@ FILES = sorted(path for name in ("plugin", "tests", "examples") for path in (ROO
 _WORDS = "and as at but by for from how if in none not of on or that to what when where whether which with without"
 FRAGMENT_WORDS = frozenset(_WORDS.split())
 
-# Folders of the package that still have such docstrings. A folder leaves the list when it has none, and none is added.
-NOT_YET_SWEPT = frozenset(("ceres",))
-
 
 def docstrings(source: str) -> list[tuple[int, str]]:
     """Return line and text of each docstring of a file: of modules, classes, functions and attributes."""
@@ -37,12 +34,6 @@ def fragments(source: str) -> list[tuple[int, str]]:
         for line, words in first_words
         if words and words[0].rstrip(",.:;").lower() in FRAGMENT_WORDS
     ]
-
-
-def folder_of(path: Path) -> str:
-    """Return the folder of a file, relative to the package if it is in that, with slashes."""
-    package = ROOT / "plugin" / "rangesfm"
-    return path.parent.relative_to(package if path.is_relative_to(package) else ROOT).as_posix()
 
 
 @pytest.mark.parametrize(
@@ -64,12 +55,6 @@ def test_docstrings_begin_with_no_fragment() -> None:
     found = [
         f"{path.relative_to(ROOT)}:{line}: {words}"
         for path in FILES
-        if folder_of(path) not in NOT_YET_SWEPT
         for line, words in fragments(path.read_text(encoding="utf-8"))
     ]
     assert found == []
-
-
-def test_folders_that_have_no_fragment_have_left_the_list() -> None:
-    with_fragments = {folder_of(path) for path in FILES if fragments(path.read_text(encoding="utf-8"))}
-    assert NOT_YET_SWEPT - with_fragments == set()

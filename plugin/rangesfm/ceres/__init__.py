@@ -1,4 +1,4 @@
-"""The compiled cost functions, and Ceres as pyceres shows it. No other package touches either.
+"""The compiled cost functions and pyceres. No other package imports either of them.
 
 A range residual goes into the problem of one of pycolmap's bundle adjusters::
 
@@ -8,12 +8,12 @@ A range residual goes into the problem of one of pycolmap's bundle adjusters::
     add_residual_block(adjuster, cost, None, [pose, anchor_in_world, range_bias])
     adjuster.solve()
 
-and a whole log of them in one call by ``add_ranges``. Poses are COLMAP's blocks: rig_from_world as
-[qx qy qz qw tx ty tz], and "cam" is the rig frame (the rig's reference camera). Metres throughout, residuals in
-stddevs; every value is checked where a cost is made.
+``add_ranges`` adds a whole log of ranges in one call. Poses are COLMAP's parameter blocks: rig_from_world as
+[qx qy qz qw tx ty tz]. "cam" is the rig frame (the frame of the rig's reference camera). Units are metres, residuals
+are in standard deviations, and every value is checked when a cost is created.
 
-pycolmap, pyceres and the compiled part exchange C++ objects, which works only between the versions that
-``pyproject.toml`` pins. Whatever is first used here checks it, by a residual whose cost is known.
+pycolmap, pyceres and the compiled part exchange C++ objects, which only works between the versions pinned in
+``pyproject.toml``. The first use of anything here checks this, with a residual whose cost is known.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -57,7 +57,7 @@ __all__ = [
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        """A compiled cost function, which is documented where it is bound, once its types are known to be shared.
+        """Return a compiled cost function, after checking that types are shared; it is documented where it is bound.
 
         Raises:
             SolverError: see ``check_compatibility``.

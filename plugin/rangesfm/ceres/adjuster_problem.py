@@ -1,4 +1,4 @@
-"""A bundle adjuster's problem: residuals into it, its solution, and its Jacobian as a sparse matrix."""
+"""A bundle adjuster's problem: adding residuals, solving, and its Jacobian as a sparse matrix."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _NUM_POSE_PARAMS = 7
 _NUM_POSE_COLUMNS = 6
-# What residuals refer to. The problem refers to its adjuster, so only a weak key lets the two go in the end.
+# Objects that residuals refer to. The problem refers to its adjuster, so only a weak key lets both be freed in the end.
 _used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()
 
 
@@ -32,22 +32,23 @@ def add_residual_block(
     loss: pyceres.LossFunction | None,
     blocks: Sequence[Array],
 ) -> None:
-    """Add a residual to a bundle adjuster's problem, so that nothing it needs can go missing or astray.
+    """Add a residual to a bundle adjuster's problem, with correct lifetimes and constant poses.
 
-    ``adjuster.problem.add_residual_block`` does the same for those who know its two traps. There, cost, loss
-    and blocks live only as long as the Python object ``problem``, and to solve without it reads freed memory;
-    here they live as long as the adjuster. And a pose that the adjuster holds constant is part of its
-    reprojection costs, not of the problem: there, a range makes it a new free block without a manifold, which
-    then wanders off alone; here it is held, as is the pose of a frame without observations.
+    ``adjuster.problem.add_residual_block`` has two traps. There, cost, loss and blocks live only as long as the Python
+    object ``problem``, and solving without it reads freed memory; here they live as long as the adjuster. And a pose
+    that
+    the adjuster holds constant is part of its reprojection costs, not of the problem: there, a range would add it as a
+    free block without a manifold, which then moves on its own; here it is held constant, as is the pose of a frame
+    without observations.
 
     Args:
         adjuster: from ``pycolmap.create_default_ceres_bundle_adjuster``.
-        cost: of which the blocks must have the sizes, in its order.
+        cost: its blocks must have the sizes and the order of ``blocks``.
         loss: None for least squares.
-        blocks: the arrays that the solver works on, in place: float64, contiguous, writeable.
+        blocks: float64, contiguous and writeable arrays, which the solver changes in place.
 
     Raises:
-        ValueError: a block is no such array, or given twice, or not of the cost's size.
+        ValueError: a block is not such an array, is given twice, or does not have the size that the cost expects.
     """
     for block in blocks:
         if block.dtype != np.float64 or not block.flags.carray:
@@ -65,16 +66,16 @@ def add_residual_block(
 def add_normal_prior(
     adjuster: pycolmap.CeresBundleAdjuster, block: Array, mean: npt.ArrayLike, stddev: npt.ArrayLike
 ) -> None:
-    """Add what was known of a block of n numbers beforehand, each for itself: ``(x - mean) / stddev``.
+    """Add a prior for each of the n numbers of a block, as the residual ``(x - mean) / stddev``.
 
     Args:
         adjuster: as in ``add_residual_block``.
         block: (n,) without a manifold, such as an anchor, a range bias or a lever arm.
         mean: (n,) in the block's unit.
-        stddev: of all, or (n,) likewise, positive.
+        stddev: one for all, or (n,), positive, in the block's unit.
 
     Raises:
-        ValueError: a value is not finite, or a stddev not positive, or not of its shape.
+        ValueError: a value is not finite, or a standard deviation is not positive, or a shape is wrong.
     """
     means, stddevs = np.asarray(mean, dtype=np.float64), np.broadcast_to(stddev, block.shape)
     variances = np.square(stddevs)
@@ -91,17 +92,18 @@ def add_normal_prior(
 
 
 def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, point: Array) -> None:
-    """Have Ceres eliminate the 3-D points alone, with its fastest kernels; for each free anchor, bias and the like.
+    """Make Ceres eliminate only the 3-D points, with its fastest kernels; to call for each free anchor, bias etc.
 
-    Ceres eliminates a set of blocks no two of which share a residual, first those of few neighbours, and has kernels
-    for blocks of one size that see blocks of one other size. Left alone, an anchor is taken for one of the points, and
-    eliminating it couples all poses that it was ranged from. So it is tied to a point by residuals that are always
-    zero; and takes as many columns as a pose, the last of them zero, since the kernels are for one size.
+    Ceres eliminates a set of blocks no two of which share a residual, first those with few neighbours. It has fast
+    kernels if all blocks of the set have one size and all others another size. Without this function it takes an anchor
+    for one of the points, and eliminating it couples all poses with ranges to it. So the block is tied to a point by
+    residuals that are always zero. It also gets as many columns as a pose, of which the last are zero, because of the
+    one size.
 
     Args:
         adjuster: as in ``add_residual_block``.
-        block: part of its problem, not constant, of 6 numbers at most.
-        point: a 3-D point's block that fewer images see than ``block`` has neighbours; it may hold several ties.
+        block: part of the problem, not constant, of at most 6 numbers.
+        point: block of a 3-D point seen by fewer images than ``block`` has neighbours; it may hold several ties.
     """
     check_compatibility()
     from rangesfm import _cpp
@@ -115,18 +117,18 @@ def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, 
 
 @dataclass(frozen=True)
 class PlacedRanges:
-    """n ranges, each at a keyframe (``before == after``) or between two.
+    """n ranges, each at one keyframe (``before == after``) or between two.
 
     Attributes:
-        range_m: (n,) measured, positive.
-        stddev_m: (n,) noise, positive.
-        before, after: (n,) keyframes by their index in ``RangeBlocks.poses``.
-        weight: (n,) from 0 (at ``before``) to 1 (at ``after``).
-        offset_in_world_m: (n, 3) what a curved path has beyond the straight line.
-        anchor_index: (n,) in ``RangeBlocks.anchors``.
-        tag_index: (n,) in ``RangeBlocks.tags_in_cam``.
+        range_m: (n,) measured ranges, positive.
+        stddev_m: (n,) standard deviation of the noise, positive.
+        before, after: (n,) indices of keyframes in ``RangeBlocks.poses``.
+        weight: (n,) interpolation fraction from 0 (at ``before``) to 1 (at ``after``).
+        offset_in_world_m: (n, 3) difference of a curved path from the straight line.
+        anchor_index: (n,) indices in ``RangeBlocks.anchors``.
+        tag_index: (n,) indices in ``RangeBlocks.tags_in_cam``.
         interval_s: (n,) time from ``before`` to ``after``; needed only for a time shift.
-        share: (n,) by how much each counts beside its noise, positive; None: 1.
+        share: (n,) weight besides the noise, positive; None: 1.
     """
 
     range_m: Array
@@ -143,17 +145,17 @@ class PlacedRanges:
 
 @dataclass(frozen=True)
 class RangeBlocks:
-    """The parameter blocks that ranges act on; the solver changes them in place.
+    """The parameter blocks of ranges; the solver changes them in place.
 
     Attributes:
         poses: rig_from_world (7,) of each keyframe.
-        anchors: (3,) each, in the world.
-        biases: (1,) of each anchor: what its ranges read too long.
-        tags_in_cam: (3,) of each tag: its antenna in the rig frame; blocks only if ``lever_arms_are_free``.
-        lever_arms_are_free: whether the tags' places are estimated.
-        time_shift: (1,) seconds that the ranges were taken later than thought; None: taken as they are. It
-            acts on ranges between two keyframes, also on those with a weight of 0 or 1.
-        amplitude: (1,) of what short ranges read too long; given exactly where ``short_range_length_m`` is.
+        anchors: (3,) position of each anchor in the world.
+        biases: (1,) of each anchor, by which its ranges are too long.
+        tags_in_cam: (3,) antenna of each tag in the rig frame; parameter blocks only if ``lever_arms_are_free``.
+        lever_arms_are_free: whether the tags' lever arms are estimated.
+        time_shift: (1,) seconds by which the ranges were taken later than assumed; None: not estimated. It affects
+            ranges between two keyframes, also those with a weight of 0 or 1.
+        amplitude: (1,) excess of short ranges at distance 0; given exactly if ``short_range_length_m`` is.
     """
 
     poses: Sequence[Array]
@@ -174,23 +176,24 @@ def add_ranges(
     loss_scale: float = math.inf,
     loss_is_bounded: bool = False,
 ) -> Indices:
-    """Add ranges to a bundle adjuster's problem: those of one place, anchor and tag as one residual block.
+    """Add ranges to a bundle adjuster's problem; ranges of one place, anchor and tag form one residual block.
 
-    The solver's work grows with the blocks and with the pairs of blocks that share a residual, much less with
-    the residuals in one; and each block takes some microseconds to add. A robust loss acts on each range all the same.
+    The solver's work grows with the number of blocks and of pairs of blocks that share a residual, and much less with
+    the number of residuals in a block. Adding a block takes some microseconds. A robust loss acts on each range
+    separately.
 
     Args:
-        adjuster: as in ``add_residual_block``, which says what is held and what lives how long.
+        adjuster: as in ``add_residual_block``, which describes lifetimes and constant poses.
         ranges: n, in any order.
-        blocks: of which those that no range refers to do not become part of the problem.
+        blocks: those without any range do not become part of the problem.
         short_range_length_m, loss_scale, loss_is_bounded: as in ``range_cost``.
 
     Returns:
-        (n,) where each range's residual is among the problem's.
+        (n,) index of each range's residual among the problem's.
 
     Raises:
-        ValueError: as ``range_cost`` and ``add_residual_block``; a time shift without intervals; an amplitude without
-            ``short_range_length_m``, or that without an amplitude.
+        ValueError: as in ``range_cost`` and ``add_residual_block``; or a time shift is given without intervals, or only
+            one of amplitude and ``short_range_length_m``.
         SolverError: see ``check_compatibility``.
     """
     if (blocks.amplitude is None) != (short_range_length_m is None):
@@ -212,7 +215,7 @@ def add_ranges(
 
 
 def _groups(ranges: PlacedRanges) -> list[Indices]:
-    """Rows of the ranges that share keyframes, anchor and tag."""
+    """Return the rows of the ranges that share keyframes, anchor and tag, group by group."""
     keys = np.stack([ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index])
     order = np.lexsort(keys[::-1])
     starts = np.flatnonzero(np.any(np.diff(keys[:, order]) != 0, axis=0)) + 1
@@ -240,7 +243,7 @@ def _cost(ranges: PlacedRanges, rows: Indices, blocks: RangeBlocks, model: Mappi
 
 
 def _blocks_of_group(ranges: PlacedRanges, row: int, blocks: RangeBlocks) -> list[Array]:
-    """In the order of the costs."""
+    """Return the parameter blocks of a group in the order of its cost."""
     before, after, anchor, tag = (
         int(index[row]) for index in (ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index)
     )
@@ -259,11 +262,11 @@ def _blocks_of_group(ranges: PlacedRanges, row: int, blocks: RangeBlocks) -> lis
 
 @dataclass(frozen=True)
 class Step:
-    """What the solver just did.
+    """One step of the solver.
 
     Attributes:
-        is_successful: whether the parameters moved. trust_region_radius: with which the step was found.
-        cost: after it. gain: by how much it fell. expected_gain: by how much it would have, were all residuals linear.
+        is_successful: whether the parameters changed. trust_region_radius: with which the step was computed.
+        cost: after the step. gain: decrease of the cost. expected_gain: decrease if all residuals were linear.
     """
 
     is_successful: bool
@@ -274,14 +277,14 @@ class Step:
 
 
 def solve_adjuster(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bool]) -> Any:
-    """Solve as ``adjuster.solve`` does, asking after each step whether that is enough.
+    """Solve like ``adjuster.solve``, and ask after each step whether to stop.
 
     Args:
-        is_enough: called with the parameters where the step left them; True ends the solve. What it raises ends it
-            too, and is raised here.
+        is_enough: called after each step, with the parameters updated; True ends the solution. Its exceptions end the
+            solution too and are raised here.
 
     Returns:
-        Ceres' summary, a ``pyceres.SolverSummary``.
+        the summary of Ceres, a ``pyceres.SolverSummary``.
     """
     check_compatibility()
     import pyceres
@@ -316,28 +319,28 @@ def solve_adjuster(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[
 
 
 def num_columns(problem: Any, block: Array) -> int:
-    """Of a block in ``tangent_jacobian``: its tangent size, without the padding of ``keep_from_elimination``."""
+    """Return a block's number of columns in ``tangent_jacobian``: its tangent size without padding."""
     return min(int(problem.parameter_block_tangent_size(block)), len(block))
 
 
 def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csc_array:
-    """(num_residuals, sum of ``num_columns``): robust losses applied, columns in the order of the blocks.
+    """Return the Jacobian, (num_residuals, sum of ``num_columns``), with robust losses, in the order of the blocks.
 
     Args:
-        problem: an adjuster's.
-        blocks: parts of the problem that are not constant; all others are taken as constant.
+        problem: of an adjuster.
+        blocks: non-constant blocks of the problem; all other blocks are taken as constant.
     """
     import pyceres
 
     options = pyceres.EvaluateOptions()
     options.set_parameter_blocks(list(blocks))
-    options.num_threads = num_threads()  # each entry is one thread's own: the same whatever their number
+    options.num_threads = num_threads()  # one thread computes an entry, so their number changes no result
     jacobian = problem.evaluate_jacobian(options)
     _, columns, values = jacobian.to_tuple()
     sizes = np.array([problem.parameter_block_tangent_size(block) for block in blocks], dtype=np.int64)
     wanted = np.minimum(sizes, [len(block) for block in blocks])
     is_padding = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes) >= np.repeat(wanted, sizes)
     place = np.empty(len(is_padding), dtype=columns.dtype)
-    place[np.argsort(is_padding, kind="stable")] = np.arange(len(place))  # padding goes last, where it is cut off
+    place[np.argsort(is_padding, kind="stable")] = np.arange(len(place))  # padding goes to the end, where it is cut off
     shape = jacobian.num_rows, jacobian.num_cols
     return csr_array((values, place[columns], jacobian.rows), shape=shape).tocsc()[:, : wanted.sum()]

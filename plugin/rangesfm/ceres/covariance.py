@@ -1,4 +1,4 @@
-"""How uncertain a bundle adjustment with ranges is: covariances of poses, anchors, biases, scale."""
+"""Covariances of a bundle adjustment with ranges: of poses, anchors, biases and scale."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from rangesfm.processes.threads import both
 
 _Product = Callable[[Array], Array]
 
-# A motion of the whole world that changes the residuals by less than this part of what its parts would do alone
-# changes nothing: rounding leaves some 1e-15, a single weak range some 1e-5.
+# A motion of the whole world changes no residual if its effect is below this share of the effects of its parts alone:
+# rounding leaves some 1e-15, a single weak range some 1e-5.
 _FREE_MOTION = 1e-9
-# Pivots of the normal equations, their diagonal scaled to 1, below which a direction is not determined.
+# Smallest pivot of the normal equations, with their diagonal scaled to 1, for a direction to count as determined.
 _MIN_PIVOT = 1e-13
 _BLOCKS_AT_ONCE = 64
-# Of the squared extent of a path, across which it is straight.
+# Share of the squared extent of a path below which it is straight: then the turn about it is not determined.
 _NO_TURN = 1e-10
 
 
 @dataclass(frozen=True)
 class ResidualErrors:
-    """How some residuals err otherwise than each on its own with the problem's residual stddev.
+    """Errors of residuals that are not independent with the problem's standard deviation.
 
     Attributes:
-        rows: (k,) which residuals, in the order of the problem; 3-D points have no part in them.
-        by_error: (k, m) sparse: how each of m errors changes them, in residual stddevs.
-        covariance: (m, m) of these errors: all that the residuals have.
-        variance_without_points: of the other residuals in which no 3-D point has a part, as priors are.
+        rows: (k,) indices of these residuals in the problem; they do not depend on 3-D points.
+        by_error: (k, m) sparse derivatives by m errors, in standard deviations of the residuals.
+        covariance: (m, m) of these errors, which replace those of the residuals.
+        variance_without_points: variance of all other residuals that do not depend on 3-D points, such as priors.
     """
 
     rows: Indices
@@ -54,20 +54,20 @@ class ResidualErrors:
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Covariances from the joint normal equations, of everything that the problem estimates at once.
+    """Covariances of everything that a problem estimates, from its joint normal equations.
 
     Attributes:
         frame_ids: (n,) registered frames, ascending.
         rig_from_world: (n, 6, 6) of a rotation from the left (rotation vector, rad) and the translation (metres).
         centers: (n, 3, 3) of the rig frames' origins in the world, square metres.
         anchors: (num_anchors, 3, 3) square metres.
-        others: of each other block, (k, k) in its unit.
-        similarity: (7, 7) of the map as a whole: of the logarithm of the scale, the turn (rad) and the shift (m) about
-            the middle of the centres, in the best similarity between true and estimated centres.
-        num_free_directions: how many motions of the whole map nothing holds (7 without ranges and gauge); along
-            these, covariances are those of the map that moves least (inner constraints). Blocks that are held
-            constant have covariance 0.
-        errors: how frames, cameras, sensors of rigs and anchors err together.
+        others: (k, k) of each other block, in its unit.
+        similarity: (7, 7) of the map as a whole: logarithm of the scale, turn (rad) and shift (m) about the middle of
+            the centres, for the best similarity between true and estimated centres.
+        num_free_directions: number of motions of the whole map that change no residual (7 without ranges and gauge).
+            Along these, covariances are those of the map that moves least (inner constraints). Constant blocks have
+            covariance 0.
+        errors: joint errors of frames, cameras, sensors of rigs and anchors.
     """
 
     frame_ids: Indices
@@ -81,7 +81,7 @@ class JointCovariance:
 
     @property
     def relative_scale_stddev(self) -> float:
-        """Of every length in the map, by the scale alone."""
+        """Relative standard deviation of every length in the map that is due to the scale."""
         return float(np.sqrt(self.similarity[0, 0]))
 
 
@@ -96,25 +96,25 @@ def joint_covariance(
     anchor_ids: Sequence[str] | None = None,
     refined_params: Mapping[int, Sequence[int]] | None = None,
 ) -> JointCovariance:
-    """Covariances at a problem's present parameters, by first order: the inverse of J^T J.
+    """Compute covariances at a problem's current parameters, to first order: the inverse of J^T J.
 
-    Where errors S of the residuals are not independent of stddev 1 it is (J^T J)^-1 J^T S J (J^T J)^-1.
+    If the covariance S of the residuals is not the identity, the result is (J^T J)^-1 J^T S J (J^T J)^-1.
 
-    3-D points are eliminated first (Schur complement), but for those that share a residual with another.
+    3-D points are eliminated first (Schur complement), except those that share a residual with another point.
 
     Args:
-        problem: of an adjuster over ``reconstruction``, with whatever residuals were added.
-        anchors: (3,) blocks that are points of the world.
+        problem: of an adjuster of ``reconstruction``, with any further residuals.
+        anchors: (3,) blocks of points in the world.
         others: further blocks: biases, lever arms, a time shift.
-        residual_stddev: of the residuals, which the covariances scale with: 1 if they are in stddevs.
-        errors: of residuals that err otherwise; None: none does.
-        anchor_ids: names of the anchors in the map's errors; None: their numbers.
-        refined_params: which parameters of each camera the problem adjusts, by the camera's id; cameras that are
-            missing there are adjusted whole or not at all.
+        residual_stddev: standard deviation of the residuals: 1 if they are in standard deviations.
+        errors: of residuals that are not independent; None: all are.
+        anchor_ids: names of the anchors in the map's errors; None: their indices.
+        refined_params: indices of the adjusted parameters of each camera, by the camera's id; cameras that are missing
+            here are adjusted as a whole or not at all.
 
     Raises:
-        ValueError: the problem has blocks that are neither the reconstruction's nor given.
-        GeometryError: residuals do not determine some block.
+        ValueError: the problem has blocks that are neither of the reconstruction nor given.
+        GeometryError: a block is not determined by the residuals.
     """
     columns = _Columns.of(problem, reconstruction, anchors, others)
     jacobian = tangent_jacobian(problem, columns.variable)
@@ -151,16 +151,16 @@ def joint_covariance(
 
 
 class PhotosAlone:
-    """What the photos of a map say of its poses, by first order: how far they would move, and what is left open."""
+    """First-order errors of poses from the photos alone: their covariance, and their distance from the minimum."""
 
     def __init__(self, problem: Any, reconstruction: pycolmap.Reconstruction, residual_stddev: float) -> None:
-        """Of a problem without anything but photos, at its present parameters.
+        """Linearise a problem of photos alone at its current parameters.
 
         Args:
-            residual_stddev: of its residuals.
+            residual_stddev: standard deviation of its residuals.
 
         Raises:
-            GeometryError: they leave more open than where the map is and how large.
+            GeometryError: the residuals do not determine the map up to a similarity.
         """
         self._columns = _Columns.of(problem, reconstruction, (), ())
         jacobian, residuals = tangent_jacobian(problem, self._columns.variable), problem.evaluate_residuals()
@@ -170,19 +170,21 @@ class PhotosAlone:
         self._size, self._stddev = len(kept), residual_stddev
 
     def of_functions(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
-        """Covariance (c, c) of functions that do not see where the map is, nor how large; and (c,) how much they grow
-        as the map goes to where the photos alone would have it.
+        """Return the errors of functions that do not depend on the place and the size of the map.
 
         Args:
-            frame_ids: (k,). by_turn, by_center: (c, k, 3) by a turn of each frame's rig in its own frame, and by a
-                shift of the rig's origin.
+            frame_ids: (k,). by_turn, by_center: (c, k, 3) derivatives by a turn of each frame's rig in its own frame,
+                and by a shift of the rig's origin.
+
+        Returns:
+            (c, c) covariance, and (c,) change of the functions if the map moves to the minimum of the photos alone.
         """
         columns, gradients = self._columns, np.zeros((self._size, len(by_turn)))
         pose_of_frame = dict(zip(columns.frames.tolist(), columns.poses, strict=True))
         for k, frame_id in enumerate(frame_ids.tolist()):
             pose = pose_of_frame[frame_id]
             if (index := columns.index_of.get(_address(pose))) is not None:
-                # Ceres turns the world's side of the camera, by twice its step.
+                # Ceres turns on the left of the rotation, and by twice its step.
                 by_step = by_center[:, k] @ _center_from_step(pose)
                 by_step[:, :3] -= 2.0 * by_turn[:, k]
                 gradients[columns.span(index)] = by_step.T
@@ -192,14 +194,14 @@ class PhotosAlone:
 
 @dataclass(frozen=True)
 class _Columns:
-    """The variable blocks in the order of the Jacobian's columns: poses, rigs, cameras, anchors, others, points.
+    """Variable blocks in the order of the Jacobian's columns: poses, rigs, cameras, anchors, others, points.
 
     Attributes:
-        frames: ids of registered frames; ``poses`` are their blocks, constant ones too.
+        frames: ids of registered frames. poses: their blocks, including constant ones.
         variable: all blocks that are estimated.
-        kinds: of these: "pose", "sensor", "anchor", "point" or "other".
-        starts: first column of each, and the number of columns.
-        index_of: place in ``variable`` by address.
+        kinds: of these blocks: "pose", "sensor", "anchor", "point" or "other".
+        starts: first column of each block, and the number of columns at the end.
+        index_of: index in ``variable`` by address.
     """
 
     frames: Indices
@@ -217,7 +219,7 @@ class _Columns:
         poses = [pose_of(reconstruction.frame(frame)).params for frame in frames]
         blocks = [("pose", pose) for pose in poses]
         for rig in reconstruction.rigs.values():
-            # Not by sensor_from_rig(), which hands out copies.
+            # The poses themselves are needed as blocks: sensor_from_rig() returns copies.
             blocks += [("sensor", pose.params) for pose in rig.non_ref_sensors.values() if pose is not None]
         blocks += [("other", camera.params) for camera in reconstruction.cameras.values()]
         blocks += [("anchor", anchor) for anchor in anchors]
@@ -242,7 +244,7 @@ class _Columns:
 
     @property
     def num_kept_blocks(self) -> int:
-        """All but the points, which come last."""
+        """Number of blocks without the points, which come last."""
         return self.kinds.index("point") if "point" in self.kinds else len(self.kinds)
 
     @property
@@ -253,24 +255,24 @@ class _Columns:
         return slice(int(self.starts[index]), int(self.starts[index + 1]))
 
     def covariance(self, block: Array, inverse_blocks: list[Array]) -> Array:
-        """Its part of the inverse; 0 where it is constant or no part of the problem."""
+        """Return a block's part of the inverse; 0 if the block is constant or not in the problem."""
         index = self.index_of.get(_address(block))
         size = 6 if len(block) == 7 else len(block)
         return np.zeros((size, size)) if index is None else inverse_blocks[index]
 
     def index_at(self, start: int) -> int:
-        """Return the place in ``variable`` of the block that begins at a column."""
+        """Return the index in ``variable`` of the block that begins at a column."""
         return int(np.searchsorted(self.starts, start))
 
     def name(self, column: int) -> str:
-        """What a column belongs to, for messages."""
+        """Return a name for the block of a column, for messages."""
         index = int(np.searchsorted(self.starts, column, side="right")) - 1
         kind = self.kinds[index]
         return f"{kind} number {self.kinds[:index].count(kind)}"
 
 
 def _excess(jacobian: csc_array, kept: Indices, columns: _Columns, errors: ResidualErrors | None) -> _Product:
-    """J^T (S - 1) J times (size, k), in the columns that are kept."""
+    """Return the product of J^T (S - 1) J, in the columns that are kept, with a matrix (size, k)."""
     if errors is None:
         return np.zeros_like
     has_point = np.diff(csr_array(jacobian[:, columns.num_kept_columns :]).indptr) > 0
@@ -289,7 +291,7 @@ def _address(block: Array) -> int:
 def _schur_complement(
     jacobian: csc_array, columns: _Columns, residuals: Array
 ) -> tuple[Array | csr_array, Indices, Array]:
-    """Normal equations of what is kept once the points are eliminated, which columns are kept, and the gradient."""
+    """Eliminate the points; return the normal equations of the other columns, these columns, and the gradient."""
     first = columns.num_kept_columns
     stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
     kept_columns = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
@@ -302,12 +304,12 @@ def _schur_complement(
 
 
 def _whitener(points: csc_array) -> bsr_array:
-    """Square, in blocks of 3: times its transpose the inverse of the points' own normal equations."""
+    """Return W, square in blocks of 3, so that W @ W.T is the inverse of the points' own normal equations."""
     num_points = points.shape[1] // 3
     squares = (points.T @ points.tocsr()).tocoo()
     blocks = np.zeros((num_points, 3, 3))
     blocks[squares.row // 3, squares.row % 3, squares.col % 3] = squares.data
-    # A point on the horizon has no depth to speak of; so little holds it without being felt elsewhere.
+    # A point near the horizon has no determined depth; this holds it without any noticeable effect elsewhere.
     blocks += 1e-12 * np.maximum(np.trace(blocks, axis1=1, axis2=2), 1e-300)[:, None, None] * np.eye(3)
     whitener = np.swapaxes(np.linalg.inv(np.linalg.cholesky(blocks)), 1, 2)
     indices = np.arange(num_points)
@@ -315,7 +317,7 @@ def _whitener(points: csc_array) -> bsr_array:
 
 
 def _explained_by(points: csc_array, kept: csr_array, whitener: bsr_array) -> Array | csr_array:
-    """What the points take from the normal equations of what is kept."""
+    """Return the part of the kept normal equations that the elimination of the points subtracts."""
     coupling = csr_array(points.T @ kept)
     coupling.resize(points.shape[1], -(-kept.shape[1] // 6) * 6)
     coupling = whitener.T @ coupling.tobsr((3, 6))  # blocks of poses and points multiply faster than numbers
@@ -323,7 +325,7 @@ def _explained_by(points: csc_array, kept: csr_array, whitener: bsr_array) -> Ar
 
 
 def _tied_points(points: csc_array) -> Mask:
-    """(num_points,) which share a residual with another, as two markers with a taped distance do."""
+    """Return a (num_points,) mask of points that share a residual with another point, as marks of a length do."""
     entries = points.tocoo()
     shape = points.shape[0], points.shape[1] // 3
     meets = csr_array((np.ones(entries.nnz), (entries.row, entries.col // 3)), shape=shape)
@@ -334,7 +336,7 @@ def _tied_points(points: csc_array) -> Mask:
 
 
 def _world_motions(columns: _Columns) -> Array:
-    """(num_columns, 7) how small turns, shifts and a change of scale of the world move everything in it."""
+    """Return (num_columns, 7) motions of everything by small turns, shifts and a change of scale of the world."""
     motions = np.zeros((int(columns.starts[-1]), 7))
     num = columns.num_kept_blocks
     for i, (kind, block) in enumerate(zip(columns.kinds[:num], columns.variable[:num], strict=True)):
@@ -354,7 +356,7 @@ def _world_motions(columns: _Columns) -> Array:
 
 
 def _free_motions(jacobian: csc_array, motions: Array) -> Array:
-    """(num_columns, k) a basis of the motions of the world that change no residual."""
+    """Return a basis (num_columns, k) of the motions of the world that change no residual."""
     alone = np.sqrt(np.square(abs(jacobian) @ np.abs(motions)).sum(axis=0))
     moves = alone > _FREE_MOTION * alone.max()
     scaled = motions[:, moves] / alone[moves]
@@ -363,13 +365,13 @@ def _free_motions(jacobian: csc_array, motions: Array) -> Array:
 
 
 class _Inverse:
-    """The pseudo-inverse of the normal equations, orthogonal to the free motions."""
+    """Pseudo-inverse of the normal equations, orthogonal to the free motions."""
 
     def __init__(self, normal: Array | csr_array, free: Array, columns: _Columns, excess: _Product) -> None:
         self._excess = excess
         self._free = linalg.orth(free) if free.shape[1] else free
         scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
-        # Holding as many coordinates as there are free motions makes the rest regular; which ones makes no difference.
+        # Fixing as many coordinates as there are free motions makes the matrix regular; any suitable choice will do.
         held = np.zeros(len(scale))
         held[linalg.qr(self._free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
         scaled = diags_array(scale) @ normal @ diags_array(scale) + diags_array(held)
@@ -377,13 +379,13 @@ class _Inverse:
         self._solve_scaled = _solver(scaled, columns)
 
     def solve(self, right: Array) -> Array:
-        """(size, k) for (size, k)."""
+        """Solve for a right side (size, k)."""
         right = right - self._free @ (self._free.T @ right)
         solution = self._scale * self._solve_scaled(self._scale * right)
         return np.asarray(solution - self._free @ (self._free.T @ solution))
 
     def diagonal_blocks(self, spans: Sequence[slice]) -> list[Array]:
-        """The blocks of the covariance at these rows and columns."""
+        """Return the blocks of the covariance at these rows and columns."""
         blocks: list[Array] = []
         for first in range(0, len(spans), _BLOCKS_AT_ONCE):
             some = spans[first : first + _BLOCKS_AT_ONCE]
@@ -403,7 +405,7 @@ class _Inverse:
         return solution + self.solve(self._excess(solution))
 
     def of_functions(self, gradients: Array) -> Array:
-        """(k, k) of the linear functions with these (size, k) gradients."""
+        """Return the (k, k) covariance of linear functions with (size, k) gradients."""
         solution = self.solve(gradients)
         return np.asarray(gradients.T @ solution + solution.T @ self._excess(solution))
 
@@ -424,10 +426,10 @@ def _not_determined(columns: _Columns, column: int) -> GeometryError:
 
 
 def _similarity_gradients(columns: _Columns, num_rows: int) -> Array:
-    """(num_rows, 7) of the similarity fitted, by least squares, to how the centres of all frames err."""
+    """Return (num_rows, 7) gradients of the similarity that fits the errors of all centres by least squares."""
     centers = np.array([-_matrix(pose).T @ pose[4:] for pose in columns.poses])
     motions = similarity_motions(centers - centers.mean(axis=0))
-    # Of lengths and angles alike: about a straight path no turn is seen, and none counts.
+    # Lengths and angles get one unit. The turn about a straight path is not determined and is left out.
     size = float(np.linalg.norm(centers - centers.mean(axis=0)) / np.sqrt(len(centers))) or 1.0
     unit = np.array([size] * 4 + [1.0] * 3)
     in_lengths = np.einsum("nik,nij->kj", motions, motions) / np.outer(unit, unit)
@@ -476,7 +478,7 @@ def _parts(
 
 
 def _size_m(columns: _Columns) -> float:
-    """Return the typical distance of what the photos show: of points, else of other frames, from the middle."""
+    """Return the median distance from the middle of the frames to the points, or to the frames without points."""
     centers = np.array([-_matrix(pose).T @ pose[4:] for pose in columns.poses])
     points = np.array(columns.variable[columns.num_kept_blocks :]).reshape(-1, 3)
     seen = points if len(points) else centers
@@ -484,11 +486,11 @@ def _size_m(columns: _Columns) -> float:
 
 
 def _center_from_step(pose: Array) -> Array:
-    """(3, 6) how the centre -R^T t moves with a step in the tangent space of Ceres, which turns by twice the step."""
+    """Return the (3, 6) derivative of the centre -R^T t by a step in Ceres' tangent space, which turns by twice it."""
     rotation = _matrix(pose)
     return -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])
 
 
 def _matrix(pose: Array) -> Array:
-    """(3, 3) rotation of [qx qy qz qw tx ty tz]."""
+    """Return the (3, 3) rotation of [qx qy qz qw tx ty tz]."""
     return np.asarray(Rotation.from_quat(pose[:4]).as_matrix())

@@ -1,4 +1,4 @@
-"""Is everything here that a run needs, and does it fit together?"""
+"""Checks that everything a run needs is installed and fits together."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ _KNOWN_COST = 2.0
 
 @dataclass(frozen=True)
 class InstallationCheck:
-    """One thing looked at.
+    """One check of the installation.
 
     Attributes:
-        name: what.
-        found: as it is here.
-        expected: as it should be.
+        name: of what is checked.
+        found: what is installed.
+        expected: what is needed.
         ok: whether rangesfm works with it.
-        remedy: what to do where it does not; empty where it does.
+        remedy: what to do if not; empty if ok.
     """
 
     name: str
@@ -49,17 +49,17 @@ class InstallationCheck:
 
 
 def diagnose() -> list[InstallationCheck]:
-    """Look at everything a run depends on. Nothing is raised or printed: what fails is in the list."""
+    """Check everything a run depends on. Nothing is raised or printed; failures are in the list."""
     checks = [_check_python(), _check_package("rangesfm"), *map(_check_package, needed_packages())]
     checks.append(_check_compiled_part())
-    # The rest asks pycolmap and pyceres themselves.
+    # The other checks ask pycolmap and pyceres themselves, so these must work.
     if all(check.ok for check in checks):
         checks += [_check_ceres(), _check_threads(), _check_cuda()]
     return checks
 
 
 def recorded_versions() -> dict[str, str]:
-    """Versions that a result depends on, for the record; "not installed" where one is missing."""
+    """Return the versions that a result depends on, for the record; "not installed" where one is missing."""
     return {
         "python": platform.python_version(),
         **{package: _found(package) for package in ("rangesfm", *needed_packages())},
@@ -69,7 +69,7 @@ def recorded_versions() -> dict[str, str]:
 
 
 def _found(package: str) -> str:
-    """The installed version in words, with the name of the build where it is another one."""
+    """Return the installed version in words, with the name of the build if it is another one."""
     builds = installed_builds(package)
     said = [version if name == package else f"{version} ({name})" for name, version in builds.items()]
     return " and ".join(said) or "not installed"
@@ -82,12 +82,12 @@ def _check_python() -> InstallationCheck:
 
 
 def _check_package(package: str) -> InstallationCheck:
-    """Whether a package is there, once, and in the version needed."""
+    """Check that a package is installed once, and in the version needed."""
     needed, builds = NEEDED_VERSIONS.get(package), installed_builds(package)
     expected, remedy = needed or "any", ""
     if not builds or not all(needed is None or is_version(version, needed) for version in builds.values()):
         remedy = f"run: {install_command() if needed else f'python -m pip install {package}'}"
-    elif len(builds) > 1:  # the files of one lie over those of the other
+    elif len(builds) > 1:  # both builds have written their files into the same folder
         expected = f"one of {' and '.join(builds)}, as both are the module {package}"
         remedy = f"run: python -m pip uninstall -y {' '.join(builds)}, then {install_command()}"
     return InstallationCheck(package, _found(package), expected, not remedy, remedy)
@@ -104,14 +104,14 @@ def _check_compiled_part() -> InstallationCheck:
 
 
 def _check_ceres() -> InstallationCheck:
-    # The compiled part has passed with them: what does not fit is in its own check.
+    # If the versions did not fit, the check of the compiled part would have failed.
     found = ", ".join(f"{version} in {where}" for where, version in _ceres_versions().items())
     return InstallationCheck("Ceres", found, f"{CERES} in both", ok=True)
 
 
 def _check_threads() -> InstallationCheck:
     num_cores = os.cpu_count() or 1
-    # A container or a batch queue may allow fewer than there are.
+    # A container or a batch queue may allow fewer cores than there are.
     num_usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else num_cores
     return InstallationCheck("threads", f"{num_usable} of {num_cores} cores", "1 or more", ok=True)
 
@@ -130,10 +130,10 @@ def _check_cuda() -> InstallationCheck:
 
 @functools.cache
 def check_compatibility() -> None:
-    """Check, once in a process, that pycolmap, pyceres and the compiled part really share their types.
+    """Check, once per process, that pycolmap, pyceres and the compiled part share their types.
 
     Raises:
-        SolverError: they do not; it names what is installed, what is needed and what to run.
+        SolverError: they do not; the message names what is installed, what is needed and what to run.
     """
     check_versions()
     try:
@@ -149,7 +149,7 @@ def check_compatibility() -> None:
 
 
 def _ceres_versions() -> dict[str, str]:
-    """The versions of Ceres that meet here, by where they are."""
+    """Return the versions of Ceres in use, by where they are."""
     import pyceres
     import pycolmap
 
@@ -163,7 +163,7 @@ def _ceres_versions() -> dict[str, str]:
 
 
 def _compare_ceres_versions() -> None:
-    """Raises SolverError for objects of a Ceres other than those that are known to be the same in memory."""
+    """Raise SolverError for versions of Ceres other than those known to have the same memory layout."""
     found = _ceres_versions()
     *libraries, headers = found.values()
     fits = all(is_version(version, CERES) for version in libraries) and len(set(libraries)) == 1
@@ -173,10 +173,10 @@ def _compare_ceres_versions() -> None:
 
 
 def _costs_of_known_residual() -> dict[str, float]:
-    """What one range residual costs in either package's problem, and as pycolmap's solver finds and leaves it.
+    """Return the cost of one range residual in both packages' problems, and before and after pycolmap's solver.
 
-    The tag is 5 m from the anchor; with 0.5 m of bias that is 2 stddevs of 0.25 m more than the range of 5 m,
-    and half its square is the cost.
+    The tag is 5 m from the anchor, the bias is 0.5 m and the range is 5 m. So the residual is 2 standard deviations of
+    0.25 m, and the cost is half its square.
     """
     import pyceres
     import pycolmap
@@ -197,13 +197,13 @@ def _costs_of_known_residual() -> dict[str, float]:
         costs[name] = sum(0.5 * residual**2 for residual in problem.evaluate_residuals())
     summary = cast(pycolmap.CeresBundleAdjustmentSummary, adjuster.solve()).ceres_summary
     costs["in pycolmap's solver"] = summary.initial_cost
-    # Anchor and bias are free, so that a right Jacobian leaves nothing over.
+    # Anchor and bias are free, so a correct Jacobian reduces the cost to zero.
     costs["less after pycolmap's solver"] = summary.initial_cost - summary.final_cost
     return costs
 
 
 def compiled_part_version() -> str:
-    """What the compiled part was built with, in words."""
+    """Describe what the compiled part was built with."""
     try:
         from rangesfm import _cpp
     except ImportError:

@@ -1,6 +1,6 @@
-"""Normal equations, factored dense or sparse; and what solving for all photos at once costs.
+"""Factorisation of normal equations, dense or sparse, and the cost of solving for all photos at once.
 
-It is cheap wherever each photo sees what few others see.
+The cost is low if each photo shares points with few others.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from scipy.sparse.linalg import splu
 from rangesfm.arrays import Array, Indices
 from rangesfm.processes.threads import side_by_side
 
-# Of an entry of a sparse factor, in time, against one of a dense factor.
+# Time for an entry of a sparse factor, relative to an entry of a dense factor.
 _SPARSE_SLOWDOWN = 8
-# Of a multiplication, where whole blocks of photos are eliminated at once.
+# The same per multiplication, where whole blocks of photos are eliminated at once.
 _BLOCKWISE_SLOWDOWN = 2
 # From this share of nonzeros on, a dense factor is faster than a sparse one.
 _DENSE_FROM = 0.15
-# Of normal equations, so that their sums are the same on all machines.
+# Number of strips in which normal equations are summed; it is fixed so that the sums are the same on all machines.
 _NUM_STRIPS = 4
 
 
 def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
-    """How many photos COLMAP's direct solver may take: ``limit``, or all where it costs no more than at the limit.
+    """Return the largest number of photos for COLMAP's direct solver: ``limit``, or all if they cost no more than that.
 
-    COLMAP takes an iterative solver beyond a number of photos, whatever they see. Along a path, where each photo sees
-    what few others see, it creeps, and the direct one takes time as the number of photos. What that costs at most, the
-    envelope tells: a row of the Cholesky factor reaches no further to the left than its matrix (George and Liu,
-    "Computer Solution of Large Sparse Positive Definite Systems", 1981). It is compared with that of ``limit`` photos
-    that all see the same.
+    COLMAP uses an iterative solver beyond a number of photos, whatever they see. Along a path, where each photo shares
+    points with few others, that converges slowly, while the time of the direct solver is proportional to the number of
+    photos. The envelope gives an upper bound of its cost, because a row of the Cholesky factor begins no further left
+    than that of its matrix (George and Liu, "Computer Solution of Large Sparse Positive Definite Systems", 1981). The
+    bound is compared with the cost of ``limit`` photos that all share points.
 
     Args:
-        overlaps: (n, n), symmetric; not zero where two photos see a common point.
+        overlaps: (n, n), symmetric; nonzero where two photos share a point.
         limit: COLMAP's ``max_num_images_direct_sparse_cpu_solver``.
     """
     num = overlaps.shape[0]
@@ -48,14 +48,18 @@ def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
 
 
 def dense_is_faster(overlaps: csr_array) -> bool:
-    """Whether photos see so much of what the others see that a sparse factor only costs more; as above."""
+    """Return True if so many photos share points that a dense factor is faster than a sparse one.
+
+    Args:
+        overlaps: as for ``max_num_images_direct``.
+    """
     return _cost(np.arange(overlaps.shape[0])) < _BLOCKWISE_SLOWDOWN * _cost(_envelope_widths(overlaps))
 
 
 def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:
-    """Whether each photo's columns of the inverse take no longer than those of ``limit`` photos that all see the same.
+    """Return True if the photos' columns of the inverse take no longer than those of ``limit`` photos that all overlap.
 
-    A column takes as long as the factor has entries.
+    The time for a column is proportional to the number of entries of the factor.
 
     Args:
         overlaps: as for ``max_num_images_direct``.
@@ -66,7 +70,7 @@ def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:
 
 
 def _envelope_widths(overlaps: csr_array) -> Indices:
-    """(n,) how far each row reaches to the left of its diagonal, in an order that keeps neighbours together."""
+    """Return (n,) distances from each row's first entry to the diagonal, in an order that keeps neighbours together."""
     order = reverse_cuthill_mckee(overlaps, symmetric_mode=True)
     ordered = overlaps[order][:, order].tocoo()
     leftmost = np.arange(overlaps.shape[0])
@@ -75,12 +79,12 @@ def _envelope_widths(overlaps: csr_array) -> Indices:
 
 
 def _cost(widths: Indices) -> float:
-    """Multiplications of a Cholesky factorisation, but for a factor."""
+    """Return the number of multiplications of a Cholesky factorisation, up to a constant factor."""
     return float(np.sum(widths.astype(np.float64) ** 2))
 
 
 def normal_matrix(rows: bsr_array, information: bsr_array | None = None) -> bsr_array:
-    """``rows.T @ information @ rows``, strips of rows side by side; None: of residuals in stddevs."""
+    """Return ``rows.T @ information @ rows``, computed in parallel strips; information None: the identity."""
 
     def strip(ends: tuple[int, int]) -> bsr_array:
         part = _strip(rows, *ends)
@@ -93,7 +97,7 @@ def normal_matrix(rows: bsr_array, information: bsr_array | None = None) -> bsr_
 
 
 def resized(normal: bsr_array, size: int) -> Array | csr_array:
-    """(size, size), new columns empty; dense where it is so full that adding to it and factoring it is faster so."""
+    """Return the matrix with another size (empty new columns); dense if it is full enough for that to be faster."""
     if not _is_full(normal):
         rows = normal.tocsr()
         rows.resize(size, size)
@@ -108,7 +112,7 @@ def _is_full(normal: bsr_array | csc_array | csr_array) -> bool:
 
 
 def _strip(rows: bsr_array, first: int, last: int) -> bsr_array:
-    """From one row of blocks up to another."""
+    """Return the rows of blocks from ``first`` up to ``last``."""
     starts = rows.indptr[first : last + 1]
     entries = slice(starts[0], starts[-1])
     shape = (rows.blocksize[0] * (last - first), rows.shape[1])
@@ -116,10 +120,10 @@ def _strip(rows: bsr_array, first: int, last: int) -> bsr_array:
 
 
 class SingularError(Exception):
-    """A column depends on others.
+    """A matrix is singular: a column depends on others.
 
     Attributes:
-        column: which one, as far as it shows.
+        column: the one at which this shows.
     """
 
     def __init__(self, column: int) -> None:
@@ -132,8 +136,8 @@ class Factored:
     """A factor of a symmetric positive definite matrix.
 
     Attributes:
-        solve: gives (size, k) for a right side of (size, k), or (size,) for (size,).
-        pivots: (size,) by column.
+        solve: solves for a right side of shape (size, k) or (size,).
+        pivots: (size,) of the columns.
     """
 
     solve: Callable[[Array], Array]
@@ -148,12 +152,12 @@ def factor(normal: Array | csr_array) -> Factored:
     """
     if isinstance(normal, np.ndarray):
         return _dense(normal)
-    return _dense(normal.toarray()) if _is_full(normal) else _sparse(normal.T)  # by columns, as it is symmetric
+    return _dense(normal.toarray()) if _is_full(normal) else _sparse(normal.T)  # in columns; it is symmetric
 
 
 def _dense(normal: Array) -> Factored:
-    # Symmetric: transposed, columns lie as LAPACK wants them, and nothing is copied. What SciPy makes of a failure in
-    # words, from which the column would have to be read, differs from version to version.
+    # The matrix is symmetric, so its transpose has the memory order of LAPACK and nothing is copied. SciPy's own
+    # function reports the failing column only in a text that differs between versions.
     lower, info = linalg.lapack.dpotrf(normal.T, lower=True, overwrite_a=True, clean=False)
     if info > 0:
         raise SingularError(info - 1)
