@@ -52,7 +52,7 @@ class MapPoints:
         model: in metres.
         anchors_m: (3,) positions of anchors by id, in the world of the model.
         markers: marks in photos by name.
-        pixel_stddev: standard deviation of a coordinate of a feature; infinite if it is not known.
+        pixel_stddev: standard deviation of a coordinate of a feature; NaN if it is not known.
         markers_path: file of the markers, for messages.
     """
 

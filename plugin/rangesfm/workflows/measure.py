@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,19 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.distances.map_points import MapPoint, MapPoints
+from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows, read_table, write_table
 from rangesfm.geometry.gravity import UP_IN_SITE, gravity_of
-from rangesfm.geometry.map_errors import MapErrors
+from rangesfm.result.measurements import Interval, MeasuredMap, Measurement
 from rangesfm.result.places import input_beside
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import TagCorners
-from rangesfm.scale.scale_estimate import NORMAL_95
 
 PAIR_COLUMNS = ("from", "to")
-Interval = tuple[float, float]
 _MEASURES = ("distance", "height_difference")
 _COLUMNS = (*PAIR_COLUMNS, *(f"{name}{end}_m" for name in _MEASURES for end in ("", "_low", "_high")))
 _SCALE_ALONE = (
@@ -33,25 +30,6 @@ _NO_HEIGHTS = (
     "no height differences: the map is in the first camera's frame, and nobody said which way is up (surveyed anchors, "
     "or [scale] up_in_first_camera)"
 )
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """The distance of two points of a map, and how much higher the second one is.
-
-    Attributes:
-        ends: names of both points.
-        distance_m: length of the straight line between them.
-        distance_interval_m: 95 % interval of the distance.
-        height_difference_m: height of the second minus height of the first; None if the map does not know what is up.
-        height_interval_m: its 95 % interval; None without a height difference or without a joint covariance.
-    """
-
-    ends: tuple[str, str]
-    distance_m: float
-    distance_interval_m: Interval
-    height_difference_m: float | None
-    height_interval_m: Interval | None
 
 
 @dataclass(frozen=True)
@@ -103,11 +81,13 @@ def measure(
         InputError: the folder is not a result with a metric model, a file cannot be read, or an end is not in the map.
     """
     result = read_result_folder(Path(result_folder))
-    points, errors = _points_of(result, None if markers is None else Path(markers)), result.read_map_errors()
-    up = _up_of(result)
-    measured = _Measuring(points, errors, *_stated_scale(result), up)
-    rows = tuple(measured.between(first, second) for first, second in pairs)
-    return Measurements(rows, tuple(_notes(result, errors, knows_up=up is not None)))
+    map_ = MeasuredMap(
+        _points_of(result, None if markers is None else Path(markers)),
+        result.read_map_errors(),
+        result.summary.scale.relative_stddev,
+        _up_of(result),
+    )
+    return Measurements(map_.measure(pairs), tuple(_notes(result, map_)))
 
 
 def read_pairs(path: Path) -> list[tuple[str, str]]:
@@ -126,55 +106,6 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
     return pairs
 
 
-@dataclass(frozen=True)
-class _Measuring:
-    """Points of a map and their joint errors.
-
-    Attributes:
-        points: of the map.
-        errors: of the map; None if they are not known.
-        scale_stddev, scale_lean: standard deviation, and shift of the middle, of the interval of the scale's logarithm.
-        up: upward unit vector (3,) in the map and the standard deviation of its direction in radians; None if unknown.
-    """
-
-    points: MapPoints
-    errors: MapErrors | None
-    scale_stddev: float
-    scale_lean: float
-    up: tuple[Array, float] | None
-
-    def between(self, first_name: str, second_name: str) -> Measurement:
-        first, second = (self.points.find(name) for name in (first_name, second_name))
-        apart = second.position_m - first.position_m
-        distance_m = float(np.linalg.norm(apart))
-        covariance, by_scale = self._relative(first, second)
-        along = apart / distance_m if distance_m > 0 else np.zeros(3)
-        low, high = self._interval(distance_m, along, covariance, by_scale)
-        height = interval = None
-        if self.up is not None:
-            up, tilt_stddev = self.up
-            height = float(up @ apart)
-            if self.errors is not None:
-                level_m = float(np.linalg.norm(apart - height * up))
-                interval = self._interval(height, up, covariance, by_scale, tilt_stddev * level_m)
-        return Measurement((first_name, second_name), distance_m, (max(low, 0.0), high), height, interval)
-
-    def _relative(self, first: MapPoint, second: MapPoint) -> tuple[Array, Array]:
-        """Return the covariance (3, 3) of second minus first, and its change (3,) by the logarithm of the scale."""
-        apart = second.position_m - first.position_m
-        if self.errors is None:
-            return self.scale_stddev**2 * np.outer(apart, apart), apart
-        return self.errors.relative(first.errors, second.errors, self.scale_stddev)
-
-    def _interval(
-        self, value: float, along: Array, covariance: Array, by_scale: Array, more_stddev: float = 0.0
-    ) -> Interval:
-        middle = value + self.scale_lean * float(along @ by_scale)
-        variance = max(float(along @ covariance @ along), 0.0) + more_stddev**2
-        half = NORMAL_95 * math.sqrt(variance)
-        return middle - half, middle + half
-
-
 def _points_of(result: ResultFolder, markers_path: Path | None) -> MapPoints:
     model = result.read_metric_model()
     if model is None:
@@ -183,7 +114,7 @@ def _points_of(result: ResultFolder, markers_path: Path | None) -> MapPoints:
     pixel_stddev = None if refine is None else refine.pixel_stddev
     markers = _markers_of(result) | ({} if markers_path is None else read_markers(markers_path))
     anchors_m = result.anchor_positions_m
-    return MapPoints(model, anchors_m, markers, np.inf if pixel_stddev is None else pixel_stddev, markers_path)
+    return MapPoints(model, anchors_m, markers, np.nan if pixel_stddev is None else pixel_stddev, markers_path)
 
 
 def _markers_of(result: ResultFolder) -> dict[str, Marker]:
@@ -196,11 +127,6 @@ def _markers_of(result: ResultFolder) -> dict[str, Marker]:
     return found | (read_markers(given) if given is not None and given.is_file() else {})
 
 
-def _stated_scale(result: ResultFolder) -> tuple[float, float]:
-    stated = result.summary.scale.relative_stddev
-    return stated.empirical, stated.lean
-
-
 def _up_of(result: ResultFolder) -> tuple[Array, float] | None:
     if result.summary.frame == "site":
         return UP_IN_SITE, 0.0
@@ -208,10 +134,10 @@ def _up_of(result: ResultFolder) -> tuple[Array, float] | None:
     return None if gravity is None else (gravity.up_in_first_camera, gravity.stddev_rad)
 
 
-def _notes(result: ResultFolder, errors: MapErrors | None, *, knows_up: bool) -> Iterator[str]:
-    if errors is None:
+def _notes(result: ResultFolder, map_: MeasuredMap) -> Iterator[str]:
+    if map_.errors is None:
         yield _SCALE_ALONE
-    if not knows_up:
+    if map_.up is None:
         yield _NO_HEIGHTS
     for what, verdict in (("scale", result.summary.scale), ("place", result.summary.place)):
         if verdict is not None and verdict.verdict != "good":

@@ -1,0 +1,260 @@
+"""Check whether true distances and height differences are in their stated intervals, on simulated surveys of ten kinds.
+
+Run: python -m tests.studies.measured_distances [--kinds yard hall ...] [--num_seeds 20] [--seed 0] [--out FILE]
+
+Each survey is mapped from noisy features by COLMAP's bundle adjustment, then scaled and refined with all defaults. Its
+radio is drawn from the population of real ones, one range in 25 is obstructed. Measured are pairs of marks, which
+somebody clicked in up to four photos with an error of one pixel, and pairs of photos, of map points, and of a mark and
+an anchor. The truth is that of the simulation.
+
+Prints for each kind of survey the shares of distances and of height differences in their 95 % intervals, with the
+standard error of the share over surveys (distances of one survey share the error of its scale), the median half width
+of the intervals as a share of the distance, and the root mean square of the errors in stated standard deviations. Exit
+status 1 if the share of distances between marks, over all surveys, is not within 93 to 97 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rangesfm.demo.ranges import CameraPath
+from tests.simulated.path import lap_path, loop_path, orbit_path, sequence_path
+from tests.studies.drifting_maps import MAST_M, Made, made, run, truth_of
+from tests.studies.erring_surveys import SITES
+from tests.studies.simulated_survey import SITE_ANCHORS_M
+from tests.studies.simulated_survey import Survey as Truth
+
+from rangesfm.distances.map_points import MapPoints
+from rangesfm.distances.tape import Marker
+from rangesfm.errors import GeometryError, SolverError
+from rangesfm.geometry.gravity import UP_IN_SITE
+from rangesfm.result.measurements import MeasuredMap, Measurement
+from rangesfm.result.metric_result import MetricResult
+
+Array = npt.NDArray[np.float64]
+Line = dict[str, Any]
+
+NUM_MARKS, MAX_NUM_PHOTOS, MARK_STDDEV_PX = 16, 4, 1.0
+NUM_PAIRS = {"marks": 30, "photos": 15, "points": 15, "mark and anchor": 8}
+MIN_DISTANCE_M = 0.3
+WANTED = (0.93, 0.97)
+Z_95 = 1.96
+
+ROOM_M = {f"R{k}": (x, y, z) for k, (x, y, z) in enumerate(
+    [(2.4, 2.9, 2.2), (-2.4, 2.8, 0.4), (-2.3, -2.9, 2.3), (2.5, -2.7, 0.3), (0.1, 3.0, 1.3), (0.0, -3.0, 0.8)], 1
+)}  # fmt: skip
+ALONG_M = {"B1": (-5.0, 8.0, 3.0), "B2": (15.0, -9.0, 1.0), "B3": (35.0, 9.0, 4.0), "B4": (55.0, -8.0, 0.5)}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of survey.
+
+    Attributes:
+        path: of the camera, by seed.
+        interval_s: between two photos.
+        anchors_m: positions in the site.
+        frame: of the anchors.
+        num_observations, depth_range_m: of the photos, as in ``synthetic_model``.
+        pixel_stddev: noise of features.
+        rate_hz: of the ranges to each anchor.
+    """
+
+    path: Callable[[int], CameraPath]
+    interval_s: float
+    anchors_m: dict[str, tuple[float, float, float]]
+    frame: str
+    num_observations: int = 100
+    depth_range_m: tuple[float, float] = (2.0, 20.0)
+    pixel_stddev: float = 0.5
+    rate_hz: float = 4.0
+
+
+def _yard(seed: int) -> CameraPath:
+    return loop_path(40.0, height_amplitude_m=0.8, unsteadiness_m=0.1, seed=seed)
+
+
+def _room(seed: int) -> CameraPath:
+    return loop_path(
+        60.0, center_m=(0, 0, 1.4), semi_axes_m=(1.3, 1.6), height_amplitude_m=0.5, num_turns=2.3,
+        unsteadiness_m=0.1, seed=seed,
+    )  # fmt: skip
+
+
+KINDS = {
+    "yard": Kind(_yard, 0.7, SITE_ANCHORS_M, "site"),
+    "yard, one anchor in the first camera's frame": Kind(_yard, 0.7, {"A1": SITE_ANCHORS_M["A1"]}, "first_camera"),
+    "yard, four unknown anchors": Kind(_yard, 0.7, SITE_ANCHORS_M, "unknown"),
+    "yard, one unknown anchor": Kind(_yard, 0.7, {"A3": SITE_ANCHORS_M["A3"]}, "unknown", rate_hz=10.0),
+    "room": Kind(_room, 1.0, ROOM_M, "site", 120, (0.8, 4.0)),
+    "room, six unknown anchors": Kind(_room, 1.0, ROOM_M, "unknown", 120, (0.8, 4.0)),
+    "hall": Kind(SITES[0].path, 1.5, SITES[0].anchors_m, "site", 100, (1.5, 9.0), 0.7, 1.5),
+    "orbit of a drone": Kind(
+        lambda seed: orbit_path(60.0 + seed % 3, radius_m=15.0, height_amplitude_m=3.0), 1.0, SITE_ANCHORS_M, "site",
+        80, (6.0, 40.0),
+    ),
+    "way that never returns": Kind(lambda seed: sequence_path(60.0, seed=seed), 0.8, ALONG_M, "site", 80, (3.0, 25.0)),
+    "part of a lap, one anchor on a mast": Kind(
+        lambda _: lap_path(40.0, share=0.13), 0.6, MAST_M, "first_camera", 120, (6.0, 40.0), 0.3, 8.0
+    ),
+}  # fmt: skip
+
+
+def simulated(kind: Kind, seed: int) -> tuple[Truth, Made]:
+    """Simulate a survey, and map it."""
+    path = kind.path(seed)
+    times = np.arange(path.start_s, path.end_s - 1e-6, kind.interval_s)
+    truth = truth_of(path, times, kind.anchors_m, kind.frame, kind.num_observations, kind.depth_range_m)
+    step_s = 1 / (kind.rate_hz * len(kind.anchors_m))
+    at_s = np.arange(times[0] + step_s / 2, times[-1], step_s)
+    return truth, made(truth, path, at_s, kind.pixel_stddev, seed, 0.1, with_radio=True)
+
+
+def marks_in(truth: Truth, rng: np.random.Generator) -> tuple[dict[str, Marker], dict[str, Array]]:
+    """Return marks in photos at points of the scene, and their true positions."""
+    model = truth.model.reconstruction
+    ids = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= 3]
+    markers, true_m = {}, {}
+    for k, point_id in enumerate(rng.choice(ids, min(NUM_MARKS, len(ids)), replace=False).tolist()):
+        point = model.point3D(point_id)
+        images = [model.image(element.image_id) for element in point.track.elements]
+        chosen = [images[i] for i in np.unique(np.linspace(0, len(images) - 1, MAX_NUM_PHOTOS).astype(int))]
+        pixels = np.array([np.ravel(image.project_point(point.xyz)) for image in chosen])
+        pixels += MARK_STDDEV_PX * rng.standard_normal(pixels.shape)
+        names = tuple(image.name for image in chosen)
+        markers[f"mark{k}"] = Marker(names, pixels, (0,) * len(names), MARK_STDDEV_PX)
+        true_m[f"mark{k}"] = point.xyz
+    return markers, true_m
+
+
+def pairs_of(names: dict[str, list[str]], true_m: dict[str, Array], rng: np.random.Generator) -> Iterator[list[str]]:
+    """Yield pairs with the kind of their ends."""
+    for what, num in NUM_PAIRS.items():
+        first, second = (names["marks"], names["anchors"]) if what == "mark and anchor" else (names[what], names[what])
+        for _ in range(num):
+            a, b = rng.choice(first), rng.choice(second)
+            if np.linalg.norm(true_m[b] - true_m[a]) >= MIN_DISTANCE_M:
+                yield [what, str(a), str(b)]
+
+
+def measured_map(metric: MetricResult, markers: dict[str, Marker]) -> MeasuredMap:
+    summary = metric.kept_refinement
+    assert summary is not None
+    anchors_m = {anchor.anchor_id: anchor.position_m for anchor in metric.anchors}
+    points = MapPoints(metric.final, anchors_m, markers, summary.pixel_stddev)
+    up = (UP_IN_SITE, 0.0) if metric.estimate.frame == "site" else None
+    return MeasuredMap(points, metric.map_errors, metric.estimate.uncertainty, up)
+
+
+def told(name: str, seed: int) -> Line:
+    """Run a survey, and return what was measured: errors and half widths, metres."""
+    line: Line = {"kind": name, "seed": seed}
+    truth, survey = simulated(KINDS[name], seed)
+    rng = np.random.default_rng([seed, 21])
+    try:
+        metric = run(survey, seed)
+    except (GeometryError, SolverError) as error:
+        return {**line, "refused": str(error)}
+    if metric.kept_refinement is None or metric.map_errors is None:
+        return {**line, "refused": "no refined map with a covariance"}
+    model = truth.model
+    markers, true_m = marks_in(truth, rng)
+    names = {"marks": list(markers), "photos": list(model.timestamps_s), "anchors": list(truth.anchors_m)}
+    seen = [i for i in metric.final.point3D_ids() if metric.final.point3D(i).track.length() >= 3]
+    names["points"] = [f"point:{i}" for i in rng.choice(sorted(seen), 30, replace=False).tolist()]
+    true_m |= dict(zip(model.timestamps_s, model.centers_m, strict=True)) | truth.anchors_m
+    true_m |= {name: model.reconstruction.point3D(int(name[6:])).xyz for name in names["points"]}
+    pairs = [*pairs_of(names, true_m, rng)]
+    found = measured_map(metric, markers).measure((a, b) for _, a, b in pairs)
+    rows = [_row(what, each, true_m) for (what, _, _), each in zip(pairs, found, strict=True)]
+    return {**line, "refused": "", "verdict": metric.estimate.verdict, "rows": rows}
+
+
+def _row(what: str, found: Measurement, true_m: dict[str, Array]) -> Line:
+    apart = true_m[found.ends[1]] - true_m[found.ends[0]]
+    row: Line = {"what": what, **_off("distance", found.distance_interval_m, float(np.linalg.norm(apart)))}
+    row["distance_m"] = float(np.linalg.norm(apart))
+    if found.height_interval_m is not None:
+        row |= _off("height", found.height_interval_m, float(apart[2]))
+    return row
+
+
+def _off(name: str, interval: tuple[float, float], truth: float) -> Line:
+    half = (interval[1] - interval[0]) / 2
+    return {f"{name}_off_m": (interval[0] + interval[1]) / 2 - truth, f"{name}_half_m": half}
+
+
+def share_covered(lines: list[Line], what: str, measure: str = "distance") -> tuple[float, float, int]:
+    """Return the share of measurements in their intervals, its standard error over surveys, and their number."""
+    shares, sizes = [], []
+    for line in lines:
+        rows = [row for row in line["rows"] if row["what"] == what and f"{measure}_half_m" in row]
+        rows = [row for row in rows if row[f"{measure}_half_m"] > 1e-9]
+        if rows:
+            shares.append(np.mean([abs(row[f"{measure}_off_m"]) <= row[f"{measure}_half_m"] for row in rows]))
+            sizes.append(len(rows))
+    if not shares:
+        return np.nan, np.nan, 0
+    spread = float(np.std(shares, ddof=1) / np.sqrt(len(shares))) if len(shares) > 1 else np.nan
+    return float(np.average(shares, weights=sizes)), spread, sum(sizes)
+
+
+def report(lines: list[Line]) -> Iterator[str]:
+    """Yield a row for each kind of survey and of ends, and for all surveys together."""
+    judged = [line for line in lines if not line["refused"]]
+    for kind in [*dict.fromkeys(line["kind"] for line in lines), "all"]:
+        own = [line for line in judged if kind in ("all", line["kind"])]
+        num = sum(kind in ("all", line["kind"]) for line in lines)
+        yield f"{kind}: {num} surveys, {num - len(own)} refused or without a refined map"
+        for what in NUM_PAIRS:
+            rows = [
+                row for line in own for row in line["rows"] if row["what"] == what and row["distance_half_m"] > 1e-9
+            ]
+            if not rows:
+                continue
+            texts = []
+            for measure in ("distance", "height"):
+                share, error, size = share_covered(own, what, measure)
+                if size:
+                    texts.append(f"{measure}s {100 * share:.1f} % +- {100 * error:.1f} ({size})")
+            width = np.median([row["distance_half_m"] / row["distance_m"] for row in rows])
+            in_stddevs = np.sqrt(
+                np.mean([(Z_95 * row["distance_off_m"] / row["distance_half_m"]) ** 2 for row in rows])
+            )
+            yield f"  {what:16} {'; '.join(texts)}; half width {100 * width:.2f} %, errors {in_stddevs:.2f} stddevs"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kinds", nargs="*")
+    parser.add_argument("--num_seeds", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0, help="the first")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    known = args.out.read_text(encoding="utf-8").splitlines() if args.out is not None and args.out.exists() else []
+    done = {(line["kind"], line["seed"]): line for line in map(json.loads, known)}
+    for seed in range(args.seed, args.seed + args.num_seeds):
+        for kind in args.kinds or KINDS:
+            if (kind, seed) in done:
+                continue
+            line = done[kind, seed] = told(kind, seed)
+            if args.out is not None:
+                with args.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(line) + "\n")
+    lines = list(done.values())
+    for text in report(lines):
+        print(text)
+    share, _, _ = share_covered([line for line in lines if not line["refused"]], "marks")
+    return 0 if WANTED[0] <= share <= WANTED[1] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
