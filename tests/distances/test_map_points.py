@@ -10,7 +10,16 @@ import pycolmap
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from tests.ceres.test_covariance import covariance_of_all, joint, model, variable
+from tests.ceres.test_covariance import (
+    ANCHORS_M,
+    BIAS_STDDEV_M,
+    NUM_FRAMES,
+    RANGE_STDDEV_M,
+    covariance_of_all,
+    joint,
+    model,
+    variable,
+)
 from tests.known import known
 
 from rangesfm.ceres.covariance import joint_covariance
@@ -18,6 +27,8 @@ from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import InputError
 from rangesfm.geometry.map_errors import Part
+from rangesfm.result.measurements import MeasuredMap
+from rangesfm.scale.estimate import ScaleUncertainty
 
 Array = npt.NDArray[np.float64]
 STEP = 1e-6
@@ -184,3 +195,35 @@ def test_what_is_no_point_of_the_map_is_refused_by_name(name: str, message: str)
     points = points_in(reconstruction, {"tag7.0": whole, "tag7.1": whole, "lonely": lonely})
     with pytest.raises(InputError, match=message):
         points.find(name)
+
+
+def test_distances_of_solved_surveys_are_in_their_intervals() -> None:
+    """Monte Carlo: of the true distances between points, photos and anchors 95 % are in their 95 % intervals."""
+    rng = np.random.default_rng(11)
+    inside = []
+    for seed in range(60):
+        noise = RANGE_STDDEV_M * rng.standard_normal((len(ANCHORS_M), NUM_FRAMES))
+        biases = BIAS_STDDEV_M * rng.standard_normal((len(ANCHORS_M), 1))
+        survey = joint(model(seed), hold_first=True, range_errors_m=noise + biases)
+        reconstruction = survey.reconstruction
+        names = [f"point:{i}" for i in sorted(reconstruction.point3D_ids())[::8]]
+        names += [image.name for image in reconstruction.images.values()]
+        true_m = {name: MapPoints(reconstruction, {}, {}, 1.0).find(name).position_m.copy() for name in names}
+        assert survey.adjuster.solve().is_solution_usable()
+        found = joint_covariance(
+            survey.problem,
+            reconstruction,
+            anchors=survey.anchors,
+            others=survey.biases,
+            anchor_ids=[f"A{k}" for k in range(len(ANCHORS_M))],
+        )
+        anchors_m = {f"A{k}": at for k, at in enumerate(survey.anchors)}
+        true_m |= {f"A{k}": at for k, at in enumerate(ANCHORS_M)}
+        uncertainty = ScaleUncertainty(found.relative_scale_stddev, {})
+        map_ = MeasuredMap(MapPoints(reconstruction, anchors_m, {}, 1.0), found.errors, uncertainty, None)
+        pairs = [tuple(rng.choice([*true_m], 2, replace=False).tolist()) for _ in range(30)]
+        for row in map_.measure(pairs):
+            low, high = row.distance_interval_m
+            inside.append(low <= np.linalg.norm(true_m[row.ends[0]] - true_m[row.ends[1]]) <= high)
+    # The standard error of the share is 0.7 %, as about half of a survey's distances are independent.
+    assert 0.93 <= np.mean(inside) <= 0.97
