@@ -16,8 +16,9 @@ from PIL import Image
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import make_output_folder, new_file
+from rangesfm.report.packing import pack
 from rangesfm.report.plot import Figure, Mark, Panel, Range, Series
-from rangesfm.report.scene import data_uri, pack
+from rangesfm.report.scene import data_uri
 
 ASSETS = Path(__file__).with_name("assets")
 Spec: TypeAlias = dict[str, Any]

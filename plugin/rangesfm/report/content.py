@@ -54,6 +54,7 @@ class Content:
         reference_m: (k, 3) true positions in the frame of the map; ``reference_by_photo`` has the same by photo, each
             of shape (3,).
         points_m, points_rgb: (m, 3) positions and colours of the points of the final map.
+        point_ids: (m,) their ids.
         cameras: intrinsics in the scaled and in the refined model.
     """
 
@@ -77,7 +78,9 @@ class Content:
         scaled, refined = models = [result.read_model(stage) for stage in ("sparse_scaled", "sparse_metric")]
         self.scaled, self.refined = (None if model is None else path_in_result(model, result) for model in models)
         self.final = self.refined or self.scaled
-        self.points_m, self.points_rgb = colored_points(refined or scaled or pycolmap.Reconstruction())
+        final = refined or scaled or pycolmap.Reconstruction()
+        self.points_m, self.points_rgb = colored_points(final)
+        self.point_ids = np.array(sorted(final.point3D_ids()), dtype=np.int64)
         self.cameras = tuple(_cameras(scaled, refined))
         reference = result.read_reference()
         self.reference_m = None if reference is None else reference.positions_m

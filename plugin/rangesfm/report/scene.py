@@ -18,7 +18,9 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.report.content import Content
+from rangesfm.report.packing import pack
 from rangesfm.report.plot import every_nth
+from rangesfm.report.scene_errors import errors_of_scene
 from rangesfm.report.text import count
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.places import is_within
@@ -75,6 +77,7 @@ class Scene:
         points_m, points_rgb: (m, 3) positions and colours of the map's points.
         anchors: by id. Ranges are drawn to those that have a position.
         content: result whose ranges and photos are shown, too; None: only the map is shown.
+        point_ids: (m,) ids of the points in the model; None if they are not known.
     """
 
     frame: str
@@ -83,6 +86,7 @@ class Scene:
     points_rgb: npt.NDArray[np.uint8]
     anchors: Mapping[str, AnchorEntry]
     content: Content | None = None
+    point_ids: npt.NDArray[np.int64] | None = None
 
     @property
     def result(self) -> Trajectory:
@@ -104,7 +108,15 @@ def scene_of(content: Content) -> Scene | None:
     if content.refined:
         paths.append(ScenePath("refined", "Cameras, refined", "after", content.refined))
     summary = content.summary
-    return Scene(summary.frame, tuple(paths), content.points_m, content.points_rgb, summary.anchors, content)
+    return Scene(
+        summary.frame,
+        tuple(paths),
+        content.points_m,
+        content.points_rgb,
+        summary.anchors,
+        content,
+        content.point_ids,
+    )
 
 
 def view_of(scene: Scene) -> dict[str, Any]:
@@ -143,11 +155,16 @@ def view_of(scene: Scene) -> dict[str, Any]:
         "frustum_size": _frustum_size(scene.result, box["radius"]),
         "frustum_shape": cameras[0].half_angles if cameras else _FRUSTUM_SHAPE,
         "thumbnails": pictures,
+        "errors": None if content is None else _errors(content, scene, [anchor["id"] for anchor in anchors]),
         "scale_interval": [end / scale.value for end in scale.interval_95] if scale and scale.interval_95 else None,
         "layers": [*layers, ("grid", "Grid", "muted", "box")],
         "num_photos": len(photos) if scene.paths[-1].has_orientations else 0,
         "note": " ".join(filter(None, note)),
     }
+
+
+def _errors(content: Content, scene: Scene, anchor_ids: Sequence[str]) -> dict[str, Any] | None:
+    return errors_of_scene(content.result.read_map_errors(), content.summary, scene.result, anchor_ids)
 
 
 def _path(path: ScenePath, origin_m: Array) -> dict[str, Any]:
@@ -176,6 +193,7 @@ def _points(scene: Scene, origin_m: Array) -> dict[str, Any] | None:
         "extent": extent,
         "steps": pack(np.round((points - origin) / extent * NUM_STEPS), "uint16"),
         "colors": pack(scene.points_rgb[chosen], "uint8"),
+        "ids": None if scene.point_ids is None else pack(scene.point_ids[chosen], "int32"),
     }
 
 
@@ -294,17 +312,6 @@ def _residual_limit(residuals: Array) -> float:
     """Return the residual in metres that is drawn in full colour: 95 % of the used ranges have smaller ones."""
     known = np.abs(residuals[np.isfinite(residuals)])
     return max(float(np.quantile(known, 0.95)), 1e-3) if len(known) else 1.0
-
-
-def pack(values: npt.ArrayLike, kind: str) -> dict[str, str]:
-    """Return an array, row by row, as base64 in the form that the script of the page reads.
-
-    Args:
-        values: numbers of any shape.
-        kind: "uint8", "uint16", "int32" or "float32".
-    """
-    array = np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<"))
-    return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
 
 
 def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str]:

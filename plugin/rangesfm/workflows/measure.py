@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.arrays import Array
 from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows, read_table, write_table
-from rangesfm.geometry.gravity import UP_IN_SITE, gravity_of
-from rangesfm.result.measurements import Interval, MeasuredMap, Measurement
-from rangesfm.result.places import input_beside
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.measurements import Interval, MeasuredMap, Measurement, up_in_map
+from rangesfm.result.places import input_beside
 from rangesfm.result.result_tables import TagCorners
 
 PAIR_COLUMNS = ("from", "to")
@@ -85,7 +83,7 @@ def measure(
         _points_of(result, None if markers is None else Path(markers)),
         result.read_map_errors(),
         result.summary.scale.relative_stddev,
-        _up_of(result),
+        up_in_map(result.summary),
     )
     return Measurements(map_.measure(pairs), tuple(_notes(result, map_)))
 
@@ -125,13 +123,6 @@ def _markers_of(result: ResultFolder) -> dict[str, Marker]:
     recorded = result.summary.settings.to_json().get("scale", {}).get("markers")
     given = None if recorded is None else input_beside(result.path, recorded)
     return found | (read_markers(given) if given is not None and given.is_file() else {})
-
-
-def _up_of(result: ResultFolder) -> tuple[Array, float] | None:
-    if result.summary.frame == "site":
-        return UP_IN_SITE, 0.0
-    gravity = gravity_of(result.summary.settings.to_json().get("scale", {}).get("up_in_first_camera"))
-    return None if gravity is None else (gravity.up_in_first_camera, gravity.stddev_rad)
 
 
 def _notes(result: ResultFolder, map_: MeasuredMap) -> Iterator[str]:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pycolmap
 import pytest
+from tests.known import known
 from tests.report.conftest import ANCHORS
 from tests.report.in_browser.conftest import downloaded
 
+import rangesfm
+from rangesfm.geometry.map_errors import MapErrors, PartErrors
 from rangesfm.report import write_report
+from rangesfm.result.joint_covariance import write_map_errors
 
 if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser, Pixels
@@ -154,6 +158,58 @@ def test_two_clicks_measure_a_distance_with_its_interval(opened: Browser) -> Non
     assert [float(value) for value in said.groups()] == pytest.approx(expected, abs=6e-4)
     opened.wait_for("document.querySelector('.label.distance')")  # with the next frame
     assert text_of(opened, ".label.distance") == f"{distance:.3f} m"
+
+
+@pytest.fixture(scope="module")
+def page_with_errors(tmp_path_factory: pytest.TempPathFactory, make_shared_result: MakeResult) -> Path:
+    """A page of a result that holds how its parts err together: by some modes at random, and by rests."""
+    folder = make_shared_result(tmp_path_factory.mktemp("errors") / "survey", num_keyframes=12, num_points=500)
+    rng = np.random.default_rng(4)
+
+    def parts(ids: tuple[Any, ...], size: int) -> PartErrors:
+        rest = 1e-5 * np.eye(size)
+        shape = len(ids), size
+        return PartErrors(
+            ids, 0.02 * rng.normal(size=(*shape, 9)), np.tile(rest, (len(ids), 1, 1)), rng.normal(size=shape)
+        )
+
+    frame_ids = tuple(range(1, 13))
+    anchor_ids = tuple(str(k) for k in range(1, 9))
+    write_map_errors(MapErrors({"frame": parts(frame_ids, 6), "anchor": parts(anchor_ids, 3)}, 0.004), folder)
+    return write_report(folder)
+
+
+def test_the_page_measures_as_the_command_does(browser: Browser, page_with_errors: Path) -> None:
+    browser.open(page_with_errors)
+    for first, second in ((0, 11), (3, 12), (14, 19)):
+        names = browser.run(
+            "const { measuring, path, scene } = rangesfmView; measuring.clear();"
+            "const center = row => Array.from(path.centers.subarray(3 * row, 3 * row + 3));"
+            "const ends = arguments[0].map(row => row < 12"
+            " ? {kind: 'camera', name: path.names[row], position: center(row), row}"
+            " : {kind: 'anchor', name: scene.anchors[row - 12].id, position: scene.anchors[row - 12].position, row});"
+            "ends.forEach(end => measuring.add(end)); return ends.map(end => end.name);",
+            [first, second],
+        )
+        (expected,) = rangesfm.measure(page_with_errors.parent, [tuple(names)]).rows
+        said = re.findall(r"[+-]?\d+\.\d{3}", text_of(browser, ".measured").replace("−", "-"))
+        heights = known(expected.height_difference_m), *known(expected.height_interval_m)
+        wanted = [expected.distance_m, *expected.distance_interval_m, *heights]
+        assert [float(number) for number in said] == pytest.approx(wanted, abs=6e-4)
+
+
+def test_a_point_of_the_map_is_measured_by_the_command(browser: Browser, page_with_errors: Path) -> None:
+    browser.open(page_with_errors)
+    point = browser.run(
+        "const { measuring, scene, path } = rangesfmView; measuring.clear();"
+        "measuring.add({kind: 'point', name: scene.points.ids[5], position: rangesfmView.pointAt(5), row: null});"
+        "measuring.add({kind: 'camera', name: path.names[2], position: [0, 0, 0], row: 2}); return scene.points.ids[5]"
+    )
+    command = f"rangesfm measure RESULT point:{point} image00002.jpg"
+    assert f"(its 95 % interval: {command})" in text_of(browser, ".measured")
+    model = pycolmap.Reconstruction(page_with_errors.parent / "sparse_metric" / "0")
+    at = np.add(browser.run("return rangesfmView.pointAt(5)"), browser.run("return rangesfmView.scene.origin"))
+    assert np.linalg.norm(model.point3D(point).xyz - at) < 1e-3
 
 
 def test_a_drag_turns_the_view_and_chooses_nothing(opened: Browser) -> None:

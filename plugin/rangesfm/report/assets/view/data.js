@@ -1,6 +1,6 @@
 // The data of the page (JSON that holds typed arrays as base64), and its colours.
 
-const ARRAY_TYPES = { uint8: Uint8Array, uint16: Uint16Array, int32: Int32Array, float32: Float32Array };
+const ARRAY_TYPES = { uint8: Uint8Array, int16: Int16Array, uint16: Uint16Array, int32: Int32Array, float32: Float32Array };
 
 /** Returns a block of data by its id, with each {type, data} in it as a typed array; null where there is none. */
 function readBlock(id) {

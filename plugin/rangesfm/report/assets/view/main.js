@@ -6,7 +6,7 @@ class View {
     this.stage = Stage.on(this.canvas, root.querySelector(".labels"), scene.up, scene.box);
     root.classList.toggle("no-webgl", this.stage === null);
     if (this.stage === null) return;
-    this.measuring = new Measuring(this.stage, root.querySelector(".measured"), scene.scale_interval);
+    this.measuring = new Measuring(this.stage, root.querySelector(".measured"), scene);
     this.#fillStage();
     this.#attachControls();
     onClick(this.canvas, (pixel) => this.click(pixel));
@@ -28,23 +28,27 @@ class View {
 
   click(pixel) {
     const { points, anchors } = this.scene;
-    const nearest = (num, positionOf, nameOf) => {
+    const nearest = (num, positionOf, endOf) => {
       const found = nearestTo(this.stage, pixel, num, positionOf);
-      return found === null ? [] : [{ ...found, name: nameOf(found.index) }];
+      return found === null ? [] : [{ ...found, ...endOf(found.index) }];
     };
     const { names, centers } = this.path;
-    const cameras = nearest(names.length, (i) => row3(centers, i), (i) => `camera ${names[i]}`);
+    const cameras = nearest(names.length, (i) => row3(centers, i), (i) => ({ kind: "camera", name: names[i], row: i }));
     if (!this.root.querySelector("[name=measure]").checked) {
       for (const { index } of cameras) this.choose(index);
       return;
     }
     const numPoints = this.layers.points?.visible ? points.num : 0;
     const [found] = [
-      ...nearest(anchors.length, (i) => anchors[i].position, (i) => `anchor ${anchors[i].id}`),
+      ...nearest(anchors.length, (i) => anchors[i].position, (i) => ({
+        kind: "anchor",
+        name: anchors[i].id,
+        row: names.length + i,
+      })),
       ...cameras,
-      ...nearest(numPoints, (i) => this.pointAt(i), (i) => `point ${i + 1}`),
+      ...nearest(numPoints, (i) => this.pointAt(i), (i) => ({ kind: "point", name: points.ids?.[i] ?? i + 1, row: null })),
     ].sort((a, b) => a.pixels - b.pixels);
-    if (found !== undefined) this.measuring.add(found.name, found.position);
+    if (found !== undefined) this.measuring.add(found);
   }
 
   look(name) {

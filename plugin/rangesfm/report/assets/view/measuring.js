@@ -1,9 +1,41 @@
-// The distance between two clicked positions, with the interval that follows from the scale.
+// Distance and height difference of two clicked positions, with their 95 % intervals.
+
+const NORMAL_95 = 1.96;
+const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+const metres = (value, sign = "") => (value < 0 ? "−" : sign) + Math.abs(value).toFixed(3);
+
+/** How cameras and anchors err together: the precision of one relative to another. See MapErrors of the package. */
+class RelativeErrors {
+  constructor(errors) {
+    Object.assign(this, errors);
+  }
+
+  /** Returns the interval of a value that changes with the shift of the second point against the first along a direction.
+   * more: a further standard deviation of the value. */
+  interval(first, second, value, direction, more = 0) {
+    const change = (rows) => dot(direction, [0, 1, 2].map((axis) => rows[3 * second + axis] - rows[3 * first + axis]));
+    const byScale = change(this.by_scale);
+    let variance = this.scale_variance_change * byScale ** 2 + more ** 2;
+    for (const row of [first, second]) {
+      const rest = this.rests.subarray(9 * row, 9 * row + 9);
+      variance += dot(direction, [0, 1, 2].map((axis) => dot(direction, rest.subarray(3 * axis, 3 * axis + 3))));
+    }
+    const width = this.num_modes;
+    for (let mode = 0; mode < width; mode++) {
+      const at = (row, axis) => this.modes[(3 * row + axis) * width + mode];
+      const shift = dot(direction, [0, 1, 2].map((axis) => at(second, axis) - at(first, axis)));
+      variance += (shift * this.steps[mode]) ** 2;
+    }
+    const half = NORMAL_95 * Math.sqrt(Math.max(variance, 0));
+    const middle = value + this.scale_lean * byScale;
+    return [middle - half, middle + half];
+  }
+}
 
 class Measuring {
-  /** interval: 95 % interval of the scale relative to its value, [low, high], or null. */
-  constructor(stage, output, interval) {
-    Object.assign(this, { stage, output, interval });
+  /** scene: has errors of cameras and anchors, or null, and the 95 % interval of the scale relative to its value. */
+  constructor(stage, output, { errors, scale_interval }) {
+    Object.assign(this, { stage, output, errors: errors && new RelativeErrors(errors), scaleInterval: scale_interval });
     this.line = themed(THREE.Line, [], new THREE.LineBasicMaterial({ depthTest: false }), "chosen");
     this.line.renderOrder = 1;
     this.label = makeLabel("distance", "");
@@ -20,22 +52,47 @@ class Measuring {
   }
 
   /** Adds an end of the distance; a third end begins a new distance. */
-  add(name, position) {
+  add(end) {
     if (this.ends.length === 2) this.clear();
-    this.ends.push({ name, position });
-    if (this.ends.length === 1) this.output.textContent = `From ${name}: now click the other end.`;
+    this.ends.push(end);
+    if (this.ends.length === 1) this.output.textContent = `From ${end.kind} ${end.name}: now click the other end.`;
     else this.#show(...this.ends);
   }
 
   #show(a, b) {
-    const distance = Math.hypot(...a.position.map((value, axis) => value - b.position[axis]));
+    const apart = b.position.map((value, axis) => value - a.position[axis]);
+    const distance = Math.hypot(...apart);
     moveTo(this.line, [a.position, b.position]);
     this.line.visible = true;
     this.label.position.set(...a.position.map((value, axis) => (value + b.position[axis]) / 2));
     this.label.element.textContent = `${distance.toFixed(3)} m`;
-    const [low, high] = (this.interval ?? []).map((share) => (share * distance).toFixed(3));
-    const interval = low && ` (95 % interval, from the scale alone: ${low} to ${high} m)`;
-    this.output.textContent = `${a.name} to ${b.name}: ${distance.toFixed(3)} m${interval ?? ""}`;
+    const ends = `${a.kind} ${a.name} to ${b.kind} ${b.name}`;
+    this.output.textContent = `${ends}: ${distance.toFixed(3)} m${this.#precision(a, b, apart, distance)}`;
     this.stage.requestFrame();
+  }
+
+  #precision(a, b, apart, distance) {
+    const { errors, scaleInterval } = this;
+    if (errors === null || distance === 0) {
+      const [low, high] = (scaleInterval ?? []).map((share) => metres(share * distance));
+      return low ? ` (95 % interval, from the scale alone: ${low} to ${high} m)` : "";
+    }
+    if (a.row === null || b.row === null) {
+      const names = [a, b].map((end) => (end.kind === "point" ? `point:${end.name}` : end.name));
+      return ` (its 95 % interval: rangesfm measure RESULT ${names.join(" ")})`;
+    }
+    const along = apart.map((value) => value / distance);
+    const [low, high] = errors.interval(a.row, b.row, distance, along);
+    return ` (95 % interval ${metres(Math.max(low, 0))} to ${metres(high)} m)${this.#height(a, b, apart)}`;
+  }
+
+  #height(a, b, apart) {
+    const { errors } = this;
+    if (errors.up === null) return "";
+    const height = dot(errors.up, apart);
+    const level = Math.hypot(...apart.map((value, axis) => value - height * errors.up[axis]));
+    const ends = errors.interval(a.row, b.row, height, errors.up, errors.tilt_stddev * level);
+    const [low, high] = ends.map((end) => metres(end, "+"));
+    return `; height difference ${metres(height, "+")} m (${low} to ${high} m)`;
   }
 }
