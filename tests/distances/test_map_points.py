@@ -28,7 +28,7 @@ from rangesfm.distances.tape import Marker
 from rangesfm.errors import InputError
 from rangesfm.geometry.map_errors import Part
 from rangesfm.result.measurements import MeasuredMap
-from rangesfm.scale.estimate import ScaleUncertainty
+from rangesfm.scale.scale_estimate import ScaleUncertainty
 
 Array = npt.NDArray[np.float64]
 STEP = 1e-6

@@ -25,13 +25,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from rangesfm.demo.ranges import CameraPath
 from tests.simulated.path import lap_path, loop_path, orbit_path, sequence_path
 from tests.studies.drifting_maps import MAST_M, Made, made, run, truth_of
 from tests.studies.erring_surveys import SITES
 from tests.studies.simulated_survey import SITE_ANCHORS_M
 from tests.studies.simulated_survey import Survey as Truth
 
+from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError, SolverError

@@ -12,9 +12,9 @@ from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows, read_table, write_table
-from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.measurements import Interval, MeasuredMap, Measurement, up_in_map
 from rangesfm.result.places import input_beside
+from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import TagCorners
 
 PAIR_COLUMNS = ("from", "to")
