@@ -17,6 +17,7 @@ import pycolmap
 
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
+from rangesfm.files.contents import open_regular
 from rangesfm.files.text_tables import read_text
 
 MAX_COORDINATE = 1e12
@@ -83,7 +84,8 @@ def read_records(path: Path) -> Records:
             a damaged count run for minutes and fill the memory.
     """
     try:
-        cursor = _Cursor(path.read_bytes())
+        with open_regular(path) as file:
+            cursor = _Cursor(file.read())
         start, groups_start = [], []
         for _ in range(cursor.number("Q")):
             start.append(cursor.place)

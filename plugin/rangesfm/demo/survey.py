@@ -136,8 +136,10 @@ def _plan(folder: Path, num_photos: int, seed: int) -> DemoSurvey:
 
 def _is_there(survey: DemoSurvey, text: str) -> bool:
     try:
-        return survey.survey_path.read_text(encoding="utf-8") == text and all(
-            (survey.folder / "images" / name).is_file() for name in survey.image_names
+        return (
+            survey.survey_path.is_file()
+            and survey.survey_path.read_text(encoding="utf-8") == text
+            and all((survey.folder / "images" / name).is_file() for name in survey.image_names)
         )
     except (OSError, UnicodeDecodeError):
         return False

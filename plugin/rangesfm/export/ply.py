@@ -16,6 +16,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import colored_points
 from rangesfm.files.atomic import new_file
+from rangesfm.files.contents import open_regular
 from rangesfm.geometry.similarity import Similarity, overflow_raised
 from rangesfm.geometry.trajectory import Trajectory
 
@@ -100,7 +101,8 @@ def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
         InputError: it is not a PLY file that begins with vertices, or it has Gaussian splats, whose colours depend on
             direction and would have to be turned, too.
     """
-    content = path.read_bytes()
+    with open_regular(path) as file:
+        content = file.read()
     header = _read_header(path, content)
     if "rot_0" in header.columns:
         raise InputError("Gaussian splats cannot be transformed: train them again on the metric model", path)

@@ -1,18 +1,35 @@
-"""Hashes of files, which tell whether their content has changed."""
+"""Contents of regular files, and their hashes, which tell whether a content has changed."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
+import stat
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 CHUNK_BYTES = 1 << 20
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a file to be read, if it is a regular one. A device or a pipe may never end, or never begin.
+
+    Raises:
+        OSError: it is something else, or cannot be opened.
+    """
+    mode = os.stat(path).st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
+    return open(path, "rb")
 
 
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file's content, in hexadecimal."""
     digest = hashlib.sha256()
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         while chunk := file.read(CHUNK_BYTES):
             digest.update(chunk)
     return digest.hexdigest()

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rangesfm.errors import InputError
-from rangesfm.files.contents import CHUNK_BYTES
+from rangesfm.files.contents import CHUNK_BYTES, open_regular
 from rangesfm.files.folders import stays_inside
 
 _NAME = "manifest.json"
@@ -113,7 +113,8 @@ class Manifest:
 
     def _read(self) -> None:
         try:
-            record = json.loads(self._path.read_text(encoding="utf-8", errors="surrogateescape"))
+            with open_regular(self._path) as file:
+                record = json.loads(file.read().decode("utf-8", errors="surrogateescape"))
             if record["version"] != _VERSION:
                 raise ValueError(f"version {record['version']}")
             self.token = _word(record["token"])
@@ -149,7 +150,7 @@ class Manifest:
 def content_hash(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; the counters in the header of an SQLite database are ignored."""
     digest = hashlib.sha256()
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         head = bytearray(file.read(CHUNK_BYTES))
         if head.startswith(_SQLITE_MAGIC):
             for first, end in _SQLITE_COUNTERS:

@@ -15,7 +15,6 @@ import gzip
 import io
 import os
 import re
-import stat
 import zlib
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ import numpy.typing as npt
 
 from rangesfm.errors import InputError, printable
 from rangesfm.files.atomic import new_file
+from rangesfm.files.contents import open_regular
 from rangesfm.option_model import Bounds
 
 MAX_NUMBER = 1e100
@@ -348,12 +348,9 @@ def guess_separator(row: str) -> str:
 
 def _read_bytes(path: str | Path, num: int = -1) -> bytes:
     try:
-        status = os.stat(path)
-        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):  # reading a device or pipe may never end
-            raise InputError("is not a regular file", path)
-        if stat.S_ISREG(status.st_mode) and status.st_size == 0:  # like the kernel's own files, some of which never end
-            return b""
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
+            if os.fstat(file.fileno()).st_size == 0:  # like the kernel's own files, some of which never end
+                return b""
             packed = file.read(len(_GZIP_MARK)) == _GZIP_MARK
             file.seek(0)
             if not packed:

@@ -48,7 +48,10 @@ def read_map_errors(folder: Path) -> MapErrors | None:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             scale_stddev = float(arrays[_SCALE_STDDEV])
             parts = {kind: _part_errors(arrays, kind) for kind in _KINDS if f"{kind}_ids" in arrays}
-    except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+    except (
+        *(ArithmeticError, EOFError, LookupError, MemoryError, NotImplementedError, OSError, RuntimeError, TypeError),
+        *(ValueError, zipfile.BadZipFile, zlib.error),
+    ) as error:
         raise InputError("is damaged, expected the file as a run wrote it", path) from error
     if not parts or len({of.modes.shape[2] for of in parts.values()}) > 1:
         raise InputError("is damaged, expected the file as a run wrote it", path)

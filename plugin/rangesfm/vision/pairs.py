@@ -11,6 +11,7 @@ import pycolmap
 
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError, ReconstructionError
+from rangesfm.files.tables import read_text
 from rangesfm.options import MapperOptions
 from rangesfm.vision.database import named_by_place
 from rangesfm.vision.photo_files import Photos
@@ -56,10 +57,7 @@ def read_pairs(path: Path) -> NamedPairs:
     Raises:
         InputError: a line does not hold two different names (the error gives the line), or the file cannot be read.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("cannot be read, expected a text file of pairs of photos", path) from error
+    lines = read_text(path).split("\n")
     pairs = []
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):

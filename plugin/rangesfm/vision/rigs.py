@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +13,8 @@ import pycolmap
 
 from rangesfm.distances.tape import CONTROL, TapedDistance
 from rangesfm.errors import InputError
+from rangesfm.files.records import read_json
+from rangesfm.options import COORDINATE_M
 
 # Cameras nearer to each other than this share a centre, like those of a panorama, and give no length.
 _MIN_BASELINE_M = 1e-4
@@ -167,23 +168,30 @@ def read_rigs(path: Path | None) -> Rigs:
     """
     if path is None:
         return NO_RIGS
+    content = read_json(path)
     try:
         configs = pycolmap.read_rig_config(path)
-        places = [camera for rig in json.loads(path.read_text(encoding="utf-8")) for camera in rig["cameras"]]
-    except (RuntimeError, ValueError, LookupError, TypeError) as error:
+        for camera in (camera for rig in content for camera in rig["cameras"]):
+            _check_pose(camera, path)
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split()).removesuffix(".")
         raise InputError(f"is not a rig configuration of COLMAP's ({reason})", path) from None
     if not configs:
         raise InputError("holds no rig, expected COLMAP's rig configuration", path)
-    for camera in places:  # COLMAP does not check the number of values, and has arbitrary ones where some are missing
-        for key, num in (("cam_from_rig_rotation", 4), ("cam_from_rig_translation", 3)):
-            if len(found := camera.get(key, [0.0] * num)) != num:
-                raise InputError(f"{key} of '{camera['image_prefix']}' has {len(found)} numbers, expected {num}", path)
-        turn = camera.get("cam_from_rig_rotation", [1.0, 0.0, 0.0, 0.0])
-        if not abs(np.linalg.norm(np.array(turn, dtype=float)) - 1) < _MAX_OFF_UNIT:
-            message = f"cam_from_rig_rotation of '{camera['image_prefix']}' is {turn}, expected w, x, y, z of length 1"
-            raise InputError(message, path)
     return Rigs(tuple(configs), path)
+
+
+def _check_pose(camera: Mapping[str, Any], path: Path) -> None:
+    """Check what COLMAP does not: it has arbitrary numbers where some are missing, and takes any that are there."""
+    name = camera["image_prefix"]
+    for key, num in (("cam_from_rig_rotation", 4), ("cam_from_rig_translation", 3)):
+        if len(found := camera.get(key, [0.0] * num)) != num:
+            raise InputError(f"{key} of '{name}' has {len(found)} numbers, expected {num}", path)
+    turn, shift = camera.get("cam_from_rig_rotation", [1, 0, 0, 0]), camera.get("cam_from_rig_translation", [0, 0, 0])
+    if not abs(np.linalg.norm(np.array(turn, dtype=float)) - 1) < _MAX_OFF_UNIT:
+        raise InputError(f"cam_from_rig_rotation of '{name}' is {turn}, expected w, x, y, z of length 1", path)
+    if not COORDINATE_M.hold(np.array(shift, dtype=float)).all():
+        raise InputError(f"cam_from_rig_translation of '{name}' is {shift}, expected three times {COORDINATE_M}", path)
 
 
 def _baseline_m(camera: pycolmap.RigConfigCamera) -> float:

@@ -13,6 +13,7 @@ from typing import Any
 
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import ReconstructionError
+from rangesfm.files.contents import open_regular
 from rangesfm.files.records import write_json
 from rangesfm.progress import Progress
 
@@ -194,7 +195,8 @@ class Workspace:
 
 def _read(path: Path, part: str) -> dict[str, dict[str, Any]]:
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))[part]
+        with open_regular(path) as file:
+            entries = json.loads(file.read())[part]
         return {str(name): dict(entry) for name, entry in entries.items()}
     except (OSError, ValueError, AttributeError, TypeError, LookupError, RecursionError):
         return {}  # there is no record yet, or the file is not one of ours
