@@ -43,7 +43,7 @@ from tests.studies.foreign_files import FORMATS, MODEL_FLAGS, RUN, content_of, m
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.files.output_folder import LOCK_NAME, PRIVATE_NAME
-from rangesfm.survey.settings import TABLES
+from rangesfm.survey.settings import SURVEY_TABLES
 
 STATUSES = (0, 2, 3, 4)
 MAX_SECONDS = 300.0
@@ -350,7 +350,7 @@ def _bounds(hint: Any) -> list[float]:
 
 def _keys_at_bounds() -> list[tuple[str, str]]:
     found = []
-    for model in TABLES.values():
+    for model in SURVEY_TABLES.values():
         hints = get_type_hints(model, include_extras=True)
         for key in model.keys().values():
             num = 3 if key.name in ("tag_in_cam_m", "up_in_first_camera", "origin_lat_lon_height") else 1
