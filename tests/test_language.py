@@ -1,14 +1,16 @@
-"""Docstrings begin with an imperative sentence or a noun phrase, so that a stranger understands their first words."""
+"""Docstrings begin with an imperative sentence or a noun phrase, and public names of the package stand once."""
 
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted(path for name in ("plugin", "tests", "examples") for path in (ROOT / name).rglob("*.py"))
+PACKAGE_FILES = sorted((ROOT / "plugin").rglob("*.py"))
 
 # A docstring that begins with one of these is a fragment ("Of features whose ...", "As they are", "Whether it is") or
 # hides what comes out. All of them can be avoided: "Photos by name" in place of "By name, the photos". Articles,
@@ -58,3 +60,18 @@ def test_docstrings_begin_with_no_fragment() -> None:
         for line, words in fragments(path.read_text(encoding="utf-8"))
     ]
     assert found == []
+
+
+def test_no_two_files_of_the_package_share_a_name() -> None:
+    names = Counter(path.name for path in PACKAGE_FILES if path.name != "__init__.py")
+    assert [name for name, num in names.items() if num > 1] == []
+
+
+def test_no_two_public_functions_or_classes_share_a_name() -> None:
+    names = Counter(
+        node.name
+        for path in PACKAGE_FILES
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
+    )
+    assert [name for name, num in names.items() if num > 1] == []

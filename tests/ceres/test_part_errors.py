@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.ceres.test_covariance import Joint, covariance_of_all, joint, model, variable
 
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
-from rangesfm.geometry.map_errors import MapErrors, PointErrors
+from rangesfm.geometry.map_errors import MapErrors, MapPointErrors
 
 Array = npt.NDArray[np.float64]
 
@@ -24,15 +24,15 @@ def found_in(survey: Joint) -> JointCovariance:
     )
 
 
-def center_of(frame_id: int) -> PointErrors:
-    return PointErrors({("frame", frame_id): np.hstack([np.zeros((3, 3)), np.eye(3)])}, np.zeros((3, 3)))
+def center_of(frame_id: int) -> MapPointErrors:
+    return MapPointErrors({("frame", frame_id): np.hstack([np.zeros((3, 3)), np.eye(3)])}, np.zeros((3, 3)))
 
 
-def anchor(anchor_id: str) -> PointErrors:
-    return PointErrors({("anchor", anchor_id): np.eye(3)}, np.zeros((3, 3)))
+def anchor(anchor_id: str) -> MapPointErrors:
+    return MapPointErrors({("anchor", anchor_id): np.eye(3)}, np.zeros((3, 3)))
 
 
-def relative(errors: MapErrors, first: PointErrors, second: PointErrors) -> Array:
+def relative(errors: MapErrors, first: MapPointErrors, second: MapPointErrors) -> Array:
     """Return the relative covariance as the problem has it, with its own uncertainty of the scale."""
     return errors.relative(first, second, errors.scale_stddev)[0]
 

@@ -112,7 +112,7 @@ def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generat
 def test_with_the_tag_on_the_anchor_all_numbers_are_finite(rng: np.random.Generator) -> None:
     start = random_state(rng)
     problem = random_problem(rng, start)
-    tag = range_equation.tag_positions(problem, start.metric_from_model)[0]
+    tag = range_equation.antenna_positions(problem, start.metric_from_model)[0]
     anchors = start.anchors_m.copy()
     anchors[problem.anchor_index[0]] = tag
     state = replace(start, anchors_m=anchors)

@@ -96,14 +96,14 @@ def _measure(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm measure out IMG_0001.jpg IMG_0020.jpg A1
       rangesfm measure out --pairs pairs.csv --markers marks.csv --output_path measured.csv
     """
-    from rangesfm.workflows.measure import measure, read_pairs
+    from rangesfm.workflows.measure import measure, read_point_pairs
 
     if again := {name for name in args.points if args.points.count(name) > 1}:
         raise InputError(f"{min(again)} is given twice, expected different points")
     if len(args.points) == 1 or not (args.points or args.pairs):
         given = f"one point, {args.points[0]}" if args.points else "no point"
         raise InputError(f"{given} is given, expected two or more (or --pairs FILE)")
-    pairs = [*itertools.combinations(args.points, 2), *(read_pairs(args.pairs) if args.pairs else ())]
+    pairs = [*itertools.combinations(args.points, 2), *(read_point_pairs(args.pairs) if args.pairs else ())]
     found = measure(Path(args.result), pairs, markers=args.markers)
     if args.output_path is None:
         return Outcome([str(found)])

@@ -22,11 +22,11 @@ from rangesfm.scale.range_equation import (
     Columns,
     RangeProblem,
     RangeState,
+    antenna_positions,
     columns_of,
     prior_jacobian,
     prior_residuals,
     range_jacobian,
-    tag_positions,
 )
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
@@ -101,7 +101,7 @@ class RangesOnMap:
     @property
     def from_anchor_m(self) -> Array:
         """(n, 3) vectors from each range's anchor to its tag, in the metric world."""
-        tags_m = tag_positions(self.problem, self.state.metric_from_model)
+        tags_m = antenna_positions(self.problem, self.state.metric_from_model)
         return np.asarray(tags_m - self.state.anchors_m[self.problem.anchor_index])
 
 
@@ -232,7 +232,7 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
     place = np.zeros((len(expected.cells), 3, columns.num))
     place[:, :, columns.scale] = mean(placed.scale * problem.centers @ placed.rotation.T)
     if columns.frame >= 0:
-        arms_m = mean(tag_positions(problem, placed) - placed.translation)
+        arms_m = mean(antenna_positions(problem, placed) - placed.translation)
         place[:, :, columns.frame : columns.frame + 6] = similarity_motions(arms_m)[:, :, 1:]
     return Linearized(
         residual_m=mean(on_map.residual_m) + expected.shift_m,

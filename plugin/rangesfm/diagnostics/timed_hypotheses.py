@@ -20,7 +20,7 @@ from rangesfm.diagnostics.hypothesis import (
     too_long,
 )
 from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.scale.range_equation import tag_positions
+from rangesfm.scale.range_equation import antenna_positions
 
 # Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.
 _NUM_TIMES = 32
@@ -70,7 +70,7 @@ def anchors_moved(problem: Linearized) -> Iterator[Hypothesis]:
 def map_breaks(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: after some time the map is elsewhere, as after a wrong match."""
     # Two parts of a map cannot be farther apart than the map is large.
-    tags_m = tag_positions(problem.on_map.problem, problem.on_map.state.metric_from_model)
+    tags_m = antenna_positions(problem.on_map.problem, problem.on_map.state.metric_from_model)
     extent_m = float(np.linalg.norm(np.ptp(tags_m, axis=0)))
     return _elsewhere(problem, None, "map break", extent_m, lambda: np.eye(3), problem.gradient.by_tag)
 

@@ -15,7 +15,7 @@ from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import images_by_name, triangulate_marker
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import InputError
-from rangesfm.geometry.map_errors import Part, PointErrors
+from rangesfm.geometry.map_errors import MapPointErrors, Part
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
 
@@ -41,7 +41,7 @@ class MapPoint:
 
     name: str
     position_m: Array
-    errors: PointErrors
+    errors: MapPointErrors
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class MapPoints:
             return self._middle(name, corners)
         if name in self.anchors_m:
             shift: Mapping[Part, Array] = {("anchor", name): np.eye(3)}
-            return MapPoint(name, self.anchors_m[name], PointErrors(shift, np.zeros((3, 3))))
+            return MapPoint(name, self.anchors_m[name], MapPointErrors(shift, np.zeros((3, 3))))
         if name.startswith(POINT_PREFIX):
             return self._point(name)
         known = [*self._images, *self.markers, *self.anchors_m]
@@ -88,7 +88,7 @@ class MapPoints:
     def _images(self) -> dict[str, pycolmap.Image]:
         return images_by_name(self.model)
 
-    def _errors_of_photo(self, image: pycolmap.Image) -> PointErrors:
+    def _errors_of_photo(self, image: pycolmap.Image) -> MapPointErrors:
         view = _View(self.model, image)
         from_rig_m = image.projection_center() - view.rig_center_m
         by_part: dict[Part, Array] = {view.frame: np.hstack([-cross_matrices(from_rig_m), np.eye(3)])}
@@ -96,7 +96,7 @@ class MapPoints:
             world_from_cam = view.world_from_rig @ view.cam_from_rig.rotation.matrix().T
             by_sensor = np.hstack([cross_matrices(view.cam_from_rig.translation), np.eye(3)])
             by_part[view.sensor] = -world_from_cam @ by_sensor
-        return PointErrors(by_part, np.zeros((3, 3)))
+        return MapPointErrors(by_part, np.zeros((3, 3)))
 
     def _marked(self, name: str) -> MapPoint:
         marker = self.markers[name]
@@ -116,7 +116,7 @@ class MapPoints:
             for part in parts
         }
         own_m2 = np.sum([of.errors.own_m2 for of in found], axis=0) / NUM_CORNERS**2
-        return MapPoint(name, np.mean([of.position_m for of in found], axis=0), PointErrors(by_part, own_m2))
+        return MapPoint(name, np.mean([of.position_m for of in found], axis=0), MapPointErrors(by_part, own_m2))
 
     def _point(self, name: str) -> MapPoint:
         number = name.removeprefix(POINT_PREFIX)
@@ -169,7 +169,7 @@ def _errors_of_seen(
     pixel_stddev: float,
     *,
     by_distance: bool = False,
-) -> PointErrors:
+) -> MapPointErrors:
     """Return how a point that is found from photos errs.
 
     Args:
@@ -192,7 +192,7 @@ def _errors_of_seen(
             pulls[part] = pulls.get(part, 0.0) + weighted @ slope
     inverse = np.linalg.pinv(information, hermitian=True)
     own_m2 = pixel_stddev**2 * inverse @ noise @ inverse
-    return PointErrors({part: -inverse @ pull for part, pull in pulls.items()}, own_m2)
+    return MapPointErrors({part: -inverse @ pull for part, pull in pulls.items()}, own_m2)
 
 
 def _by_point(camera: pycolmap.Camera, in_cam: Array) -> Array:

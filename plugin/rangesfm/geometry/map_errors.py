@@ -44,7 +44,7 @@ class PartErrors:
 
 
 @dataclass(frozen=True)
-class PointErrors:
+class MapPointErrors:
     """Errors of one point of a map.
 
     Attributes:
@@ -71,7 +71,7 @@ class MapErrors:
     parts: Mapping[Kind, PartErrors]
     scale_stddev: float
 
-    def relative(self, first: PointErrors, second: PointErrors, scale_stddev: float) -> tuple[Array, Array]:
+    def relative(self, first: MapPointErrors, second: MapPointErrors, scale_stddev: float) -> tuple[Array, Array]:
         """Return how a point errs relative to another one.
 
         Args:

@@ -24,7 +24,7 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
 from rangesfm.scale.initialize import model_from_cam, placement_covariance
-from rangesfm.scale.range_equation import RangeFit, RangeState, fit_at, range_jacobian, tag_positions
+from rangesfm.scale.range_equation import RangeFit, RangeState, antenna_positions, fit_at, range_jacobian
 from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
@@ -156,7 +156,7 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
     path, observations = planned.trajectory, planned.observations()
     posed = planned.posed(observations)
     state = planned.state(posed, observations.log.anchor_ids)
-    tags, scale = tag_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
+    tags, scale = antenna_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
     errors = posed.errors.at(tags, posed.placing_stddev_m(scale))
     solution = _at_the_truth(posed, errors, state, planned.num_alike)
     rotations, made = model_from_cam(observations, path, posed), None

@@ -221,7 +221,7 @@ def columns_of(parts: Sequence[RangeProblem]) -> tuple[Columns, ...]:
     return tuple(Columns(scale, frame, anchor, bias, next_column) for scale, frame in of_own)
 
 
-def tag_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array:
+def antenna_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array:
     """Return the (n, 3) antenna positions in the metric world."""
     turned: Array = problem.tag_from_center @ metric_from_model.rotation.T
     return metric_from_model.apply(problem.centers) + turned
@@ -229,7 +229,7 @@ def tag_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array
 
 def range_gradient(problem: RangeProblem, state: RangeState) -> RangeGradient:
     """Return the n distances between antenna and anchor, with their derivatives."""
-    tags = tag_positions(problem, state.metric_from_model)
+    tags = antenna_positions(problem, state.metric_from_model)
     return RangeGradient.of(tags - state.anchors_m[problem.anchor_index])
 
 

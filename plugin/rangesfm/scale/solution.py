@@ -17,10 +17,10 @@ from rangesfm.scale.range_equation import (
     RangeFit,
     RangeProblem,
     RangeState,
+    antenna_positions,
     predicted_ranges,
     prior_cost,
     solve,
-    tag_positions,
 )
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.starts import (
@@ -201,7 +201,7 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
 
     def seen(errors: RangeErrors, state: RangeState) -> RangeErrors:
         placed = state.metric_from_model
-        errors = errors.at(tag_positions(given, placed), posed.placing_stddev_m(placed.scale))
+        errors = errors.at(antenna_positions(given, placed), posed.placing_stddev_m(placed.scale))
         return errors.seen_by_rigid_map(residuals_m(state), prior_cost(given, state))
 
     def shown(errors: RangeErrors, fitted: RangeFit) -> RangeErrors:

@@ -21,7 +21,7 @@ from rangesfm.processes.threads import side_by_side
 from rangesfm.ranging.anchors.point_fit import multilaterate
 from rangesfm.ranging.errors.noise import robust_stddevs
 from rangesfm.ranging.errors.robust_loss import SAME_COST
-from rangesfm.scale.range_equation import RangeProblem, RangeState, solve, tag_positions
+from rangesfm.scale.range_equation import RangeProblem, RangeState, antenna_positions, solve
 
 _T = TypeVar("_T")
 
@@ -223,7 +223,7 @@ def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeS
 def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -> RangeProblem:
     """Return the problem of one anchor with the path given: centres are already metric, and the scale has no effect."""
     part = problem.of_anchor(k)
-    tags = tag_positions(part, metric_from_model)
+    tags = antenna_positions(part, metric_from_model)
     return replace(
         part,
         centers=np.zeros_like(tags),

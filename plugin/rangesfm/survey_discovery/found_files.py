@@ -57,8 +57,8 @@ _TABLES: dict[str, Callable[[str], bool]] = {
     "scale.distances": partial(has_columns, required=DISTANCE_COLUMNS),
     "ranges.error_curve": is_error_curve_file,
     "report.reference": is_reference_file,
-    ANCHORS: anchor_file.is_canonical,
-    TIMES: photo_list.is_canonical,
+    ANCHORS: anchor_file.is_canonical_anchor_file,
+    TIMES: photo_list.is_canonical_photo_list,
 }
 # Lists in tables of any layout: how their columns are found, and how they are read.
 _LISTS: dict[str, tuple[Callable[[Path, Layout], object], Callable[[Path], object]]] = {
@@ -138,14 +138,14 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
     return Found(found, calibrations, tuple(models), unclear, tuple(notes))
 
 
-def shown(path: Path, folders: Sequence[Path]) -> str:
+def short_path(path: Path, folders: Sequence[Path]) -> str:
     """Return a path as it is from the one of the folders that it is in."""
     inside = [os.path.relpath(path, folder) for folder in folders if path.is_relative_to(folder)]
     return inside[0] if inside else str(path)
 
 
 def _listed(paths: Sequence[Path], folders: Sequence[Path]) -> str:
-    names = [shown(path, folders) for path in paths]
+    names = [short_path(path, folders) for path in paths]
     if len(names) <= _MAX_NUM_NAMED + 1:
         return ", ".join(names)
     endings = ", ".join(sorted({path.suffix.lower() or path.name for path in paths[_MAX_NUM_NAMED:]}))

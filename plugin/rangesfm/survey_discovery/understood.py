@@ -17,7 +17,7 @@ from rangesfm.ranging.readers import read_ranges
 from rangesfm.ranging.readers.lists import UnclearListError
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
-from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, Found, look_into, shown
+from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, Found, look_into, short_path
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.photo_files import usable_photos
 
@@ -80,17 +80,17 @@ def understand(
             continue
         if key in values or (key == "scale.markers" and "scale.distances" not in values):
             why = f"--{item.flag} names another" if key in values else "marks are the ends of taped distances"
-            notes.append(f"not used: {', '.join(shown(path, folders) for path in paths)} ({why})")
+            notes.append(f"not used: {', '.join(short_path(path, folders) for path in paths)} ({why})")
             continue
         paths = _tops(paths, folders) if key == PHOTOS else paths
         chosen = _chosen(key, paths)
         if chosen is None:
-            names = ", ".join(shown(path, folders) for path in paths)
+            names = ", ".join(short_path(path, folders) for path in paths)
             questions.append(f"{names}: any of them may be [{item.table}] {item.name}; say which by --{item.flag} PATH")
             continue
         values[key] = chosen
         if chosen in paths and len(paths) > 1:
-            others = ", ".join(shown(path, folders) for path in paths if path != chosen)
+            others = ", ".join(short_path(path, folders) for path in paths if path != chosen)
             notes.append(f"{chosen.name} is used; left out: {others}")
     unclear = {key: those for key, those in found.unclear.items() if key not in values}
     questions += [line for key, those in unclear.items() for line in _questions(key, those, folders, command)]
@@ -99,7 +99,7 @@ def understand(
         first = next((those[0] for those in unclear.values()), None)
         raise first.asking(questions) if first else InputError(several, folders[0], advice=questions)
     notes += [
-        f"not used: {shown(error.path or Path(), folders)} ({error.message})"
+        f"not used: {short_path(error.path or Path(), folders)} ({error.message})"
         for key, those in found.unclear.items()
         for error in those
     ]
@@ -123,7 +123,7 @@ def _questions(
     flag = next(item.flag for item in KEYS if item.dotted == key)
     for error in unclear:
         path = Path(error.path or "")
-        yield from (f"{shown(path, folders)}: {line}" for line in error.about)
+        yield from (f"{short_path(path, folders)}: {line}" for line in error.about)
         for choice in error.choices:
             yield f"{choice.when}: {shlex.join([*command, f'--{flag}', _typed(path), *choice.flags])}"
     what = unclear[0].what

@@ -69,7 +69,7 @@ def read_photo_list(
     head = read_head(path)
     if not head.strip():
         raise InputError(f"the file is empty, {_EXPECTED}", path)
-    if not columns and unit is None and is_canonical(head):
+    if not columns and unit is None and is_canonical_photo_list(head):
         table = read_table(path, [*_CANONICAL.values()], text=["image_name"], separator=None)
         times_s = table.numbers("timestamp_s", bounds=TIME_S)
         return _photo_list(table, _CANONICAL, times_s, "s", ())
@@ -90,7 +90,7 @@ def read_photo_list(
     return _photo_list(table, taken, times_s, unit, tuple(f"{path.name}: {note}" for note in notes))
 
 
-def is_canonical(head: str) -> bool:
+def is_canonical_photo_list(head: str) -> bool:
     """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
     names = [*_CANONICAL.values()]
     has_commas = "," in next((line for line in head.split("\n") if has_columns(line, names)), "")

@@ -88,7 +88,7 @@ def measure(
     return Measurements(map_.measure(pairs), tuple(_notes(result, map_)))
 
 
-def read_pairs(path: Path) -> list[tuple[str, str]]:
+def read_point_pairs(path: Path) -> list[tuple[str, str]]:
     """Read the pairs of a CSV ``from,to``; a file of taped distances has these columns, too.
 
     Raises:

@@ -81,7 +81,7 @@ def read_anchor_list(
     head = read_head(path)
     if not head.strip():
         raise InputError(f"the file is empty, {_EXPECTED}", path)
-    if not columns and unit is None and is_canonical(head):
+    if not columns and unit is None and is_canonical_anchor_file(head):
         table = read_table(path, _REQUIRED, _OPTIONAL, aliases=_ALIASES, separator=None)
         return AnchorList(_anchors(table, _CANONICAL, dict.fromkeys(QUANTITIES, "m"), ("",)))
     layout = find_layout(path)
@@ -98,7 +98,7 @@ def read_anchor_list(
     return AnchorList(found_anchors, tuple(f"{path.name}: {note}" for note in (*notes, *by_order, *told)))
 
 
-def is_canonical(head: str) -> bool:
+def is_canonical_anchor_file(head: str) -> bool:
     """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
     has_commas = "," in next((line for line in head.split("\n") if has_columns(line, _REQUIRED, _ALIASES)), "")
     return has_columns(head, _REQUIRED, _ALIASES) and (has_commas or "," not in head)

@@ -84,7 +84,7 @@ def read_list(layout: Layout, columns: Mapping[str, str]) -> tuple[TextTable, li
     """
     table, notes = layout.read(every_row=True)
     # The layout leaves commas in a table with commas as they are, because such a cell may be a list of numbers.
-    cured = {column.name: column.cured() for column in columns_of(layout, columns.values()) if column.cure is None}
+    cured = {column.name: column.cured() for column in column_samples(layout, columns.values()) if column.cure is None}
     cells = {name: [*map(one.cure, table.text(name, empty=""))] for name, one in cured.items() if one.cure}
     taken = ", ".join(f"{quantity} = {name}" for quantity, name in columns.items())
     unused = [name for name in layout.units if name not in columns.values()]
@@ -92,7 +92,7 @@ def read_list(layout: Layout, columns: Mapping[str, str]) -> tuple[TextTable, li
     return replace(table, cells={**table.cells, **cells}), notes
 
 
-def columns_of(layout: Layout, names: Iterable[str]) -> list[ColumnSample]:
+def column_samples(layout: Layout, names: Iterable[str]) -> list[ColumnSample]:
     """Return the columns with these names, in the order of the file."""
     wanted = {*names}
     return [column for column in layout.columns if column.name in wanted]
