@@ -96,6 +96,7 @@ REFINED_FILES = {
     "sparse_scaled/0",
     "sparse_metric/0",
     "pose_covariance.csv",
+    "joint_covariance.npz",
     "result.json",
     "ranges.csv",
     "images.csv",

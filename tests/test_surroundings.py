@@ -245,7 +245,7 @@ def test_what_is_no_regular_file_is_not_read(
     monkeypatch.chdir(tmp_path)
     os.mkfifo("fifo")
     assert main(["ranges", path]) == 2
-    assert capfd.readouterr().err == f"rangesfm: error: {path}: is not a regular file\n"
+    assert capfd.readouterr().err == f"rangesfm: error: {path}: cannot be read (is not a regular file)\n"
 
 
 def test_clock_that_jumps_changes_nothing(

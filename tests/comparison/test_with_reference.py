@@ -171,7 +171,7 @@ def test_a_camera_that_stands_still_has_no_scale() -> None:
     [
         (
             Reference(np.zeros((1, 3)), image_names=("other.jpg",)),
-            "is of photo 'other.jpg', the first of the keyframes of '000.jpg'",
+            "is of photo 'other.jpg', the first of the keyframes of photo '000.jpg'",
         ),
         (
             Reference(np.zeros((2, 3)), timestamps_s=np.array([90.0, 90.5])),

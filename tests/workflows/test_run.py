@@ -263,8 +263,8 @@ class TestSeveralTags:
         with (survey.output.path / "ranges.csv").open(newline="") as file:
             rows = [row for row in csv.DictReader(file) if row["status"] in ("anchor-anchor", "tag-tag")]
         assert [(row["tag_id"], row["anchor_id"], row["range_m"], row["residual_m"]) for row in rows] == [
-            ("A2", "A1", "12.0", ""),
             ("right", "left", "0.8", ""),
+            ("A2", "A1", "12.0", ""),
         ]
 
 

@@ -12,6 +12,7 @@ from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows, read_table, write_table
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.measurements import Interval, MeasuredMap, Measurement, up_in_map
 from rangesfm.result.places import input_beside
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
@@ -61,6 +62,7 @@ class Measurements:
         write_table(path, list(_COLUMNS), map(_cells, self.rows))
 
 
+@with_one_blas_thread
 def measure(
     result_folder: Path | str, pairs: Iterable[tuple[str, str]], *, markers: Path | str | None = None
 ) -> Measurements:
