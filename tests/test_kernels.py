@@ -44,6 +44,8 @@ TESTS = (
 # change.
 SLOW = (
     "tests/ceres/test_covariance.py::test_surveys_err_as_the_covariance_says",
+    "tests/distances/test_map_points.py::test_a_marker_errs_by_its_marks_as_much_as_it_moves_with_them",
+    "tests/distances/test_map_points.py::test_distances_of_solved_surveys_are_in_their_intervals",
     "tests/ranging/anchors/test_trilateration.py::TestCovariance",
     "tests/ranging/anchors/test_trilateration.py::test_ranges_that_say_how_noisy_they_are_weigh_accordingly",
     "tests/ranging/anchors/test_trilateration.py::test_study_in_small",
