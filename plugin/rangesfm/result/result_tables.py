@@ -116,7 +116,7 @@ class RangesAsUsed(TableFile):
         status: n labels of RangeStatus.
     """
 
-    NAME: ClassVar = "ranges.csv"
+    NAME: ClassVar[str] = "ranges.csv"
     timestamp_s: NumbersOrEmpty
     image_name: TextsOrEmpty
     anchor_id: Texts
@@ -193,7 +193,7 @@ class RangesAsUsed(TableFile):
 class PhotoTimes(TableFile):
     """Content of ``images.csv``: time of each photo on the camera's clock. There is none for photos without times."""
 
-    NAME: ClassVar = "images.csv"
+    NAME: ClassVar[str] = "images.csv"
     image_name: Texts
     timestamp_s: Numbers
 
@@ -211,7 +211,7 @@ class PhotoTimes(TableFile):
 class CenterCovariances(TableFile):
     """Content of ``pose_covariance.csv``: covariance of each keyframe's projection centre, m^2, in the final frame."""
 
-    NAME: ClassVar = "pose_covariance.csv"
+    NAME: ClassVar[str] = "pose_covariance.csv"
     image_name: Texts
     cov_xx_m2: _Covariance
     cov_xy_m2: _Covariance
@@ -241,7 +241,7 @@ class CenterCovariances(TableFile):
 class TagCorners(TableFile):
     """Content of ``markers.csv``: pixels at which corners of printed tags were found; it can be a survey's markers."""
 
-    NAME: ClassVar = "markers.csv"
+    NAME: ClassVar[str] = "markers.csv"
     marker: Texts
     image_name: Texts
     x_px: Rounded
@@ -262,7 +262,7 @@ class TagCorners(TableFile):
 class ScaleCandidates(TableFile):
     """Content of ``scale_candidates.csv``: the paper's two candidates of each range, metres per SfM unit."""
 
-    NAME: ClassVar = "scale_candidates.csv"
+    NAME: ClassVar[str] = "scale_candidates.csv"
     timestamp_s: NumbersOrEmpty
     anchor_id: Texts
     alpha0: Rounded
@@ -282,7 +282,7 @@ class ScaleCandidates(TableFile):
 class ScaleConsensus(TableFile):
     """Content of ``scale_consensus.csv``: number of ranges that agree with each scale, metres per SfM unit."""
 
-    NAME: ClassVar = "scale_consensus.csv"
+    NAME: ClassVar[str] = "scale_consensus.csv"
     scale: Rounded
     num_agreeing: Annotated[Array, ColumnFormat(".0f")]
 
@@ -297,7 +297,7 @@ class ScaleConsensus(TableFile):
 class TimeOffsetCurve(TableFile):
     """Content of ``time_offset_curve.csv``: cost in metres of each time offset that was tried; see CostCurve."""
 
-    NAME: ClassVar = "time_offset_curve.csv"
+    NAME: ClassVar[str] = "time_offset_curve.csv"
     time_offset_s: Numbers
     cost: RoundedOrEmpty
 

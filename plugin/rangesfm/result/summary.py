@@ -41,7 +41,7 @@ class ResultSummary(Record):
         seconds: by stage, and in total ("total").
     """
 
-    NAME: ClassVar = "result.json"
+    NAME: ClassVar[str] = "result.json"
 
     scale: entries.ScaleEntry
     place: entries.PlaceEntry | None
