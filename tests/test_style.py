@@ -69,7 +69,7 @@ def test_python_types_are_right() -> None:
 
 
 def test_class_variables_have_a_type() -> None:
-    """On Python 3.10, pydantic refuses a plain ``ClassVar`` in a model when its module is imported."""
+    """Pydantic refuses a plain ``ClassVar`` on Python 3.10 in a model when its module is imported."""
     texts = {path.name: path.read_text(encoding="utf-8") for path in sorted((ROOT / "plugin").rglob("*.py"))}
     assert [name for name, text in texts.items() if re.search(r": ClassVar(?!\[)\b", text)] == []
 
