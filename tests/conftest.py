@@ -64,7 +64,7 @@ def blas_kernels() -> list[str]:
 # Test files that take a quarter of a minute or more.
 LONG_FILES = (
     *(
-        "test_style.py",
+        "test_cpp_part.py",
         "test_kernels.py",
         "test_same_everywhere.py",
         "test_commands.py",

@@ -1,8 +1,9 @@
-"""Docstrings begin with an imperative sentence or a noun phrase, and public names of the package stand once."""
+"""Docstrings begin with a sentence or a noun phrase, public names stand once, and class variables have a type."""
 
 from __future__ import annotations
 
 import ast
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -75,3 +76,9 @@ def test_no_two_public_functions_or_classes_share_a_name() -> None:
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
     )
     assert [name for name, num in names.items() if num > 1] == []
+
+
+def test_class_variables_have_a_type() -> None:
+    """Pydantic refuses a plain ``ClassVar`` on Python 3.10 in a model when its module is imported."""
+    texts = {path.name: path.read_text(encoding="utf-8") for path in PACKAGE_FILES}
+    assert [name for name, text in texts.items() if re.search(r": ClassVar(?!\[)\b", text)] == []

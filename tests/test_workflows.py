@@ -1,18 +1,16 @@
-"""The CI workflows are valid, and what they say about the project is true."""
+"""Claims of the CI workflows about the project are true."""
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from ruamel.yaml import YAML
-from tests.test_style import tool
+from tests.checkers import WORKFLOWS
 
 from rangesfm.installed_versions import PYTHONS
 
@@ -25,7 +23,6 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).parents[1]
-WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -49,21 +46,6 @@ def test_there_is_one_for_every_pull_request_one_a_week_and_the_release() -> Non
     assert "push" in starts["release"]
 
 
-@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda workflow: workflow.stem)
-def test_a_workflow_has_the_keys_that_github_knows(workflow: Path) -> None:
-    command = [tool("check-jsonschema"), "--builtin-schema", "vendor.github-workflows", str(workflow)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert done.returncode == 0, done.stdout
-
-
-def test_the_linter_of_workflows_finds_nothing() -> None:
-    command = [tool("zizmor"), "--offline", "--no-progress", "--format", "json", str(ROOT / ".github")]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == []
-    assert all(workflow.name in done.stderr for workflow in WORKFLOWS), "one was not looked at"
-
-
 @pytest.mark.parametrize(("workflow", "name"), jobs())
 def test_a_job_waits_for_jobs_that_are_there_and_runs_what_is_there(workflow: Path, name: str) -> None:
     all_jobs = read(workflow)["jobs"]
@@ -72,6 +54,8 @@ def test_a_job_waits_for_jobs_that_are_there_and_runs_what_is_there(workflow: Pa
     for step in all_jobs[name]["steps"]:
         for path in re.findall(r"(?:tests|\.ci|examples)/[\w./]+", step.get("run", "")):
             assert (ROOT / path).is_file(), path
+        for module in re.findall(r"-m (tests[.\w]+)", step.get("run", "")):
+            assert (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
 
 
 def test_pull_requests_are_tried_on_the_oldest_a_middle_and_the_newest_python() -> None:
