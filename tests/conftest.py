@@ -71,7 +71,7 @@ LONG_FILES = (
         "test_batch.py",
         "test_initialize.py",
     ),
-    *("test_trilateration.py", "test_run.py", "test_ranges_in_mapping.py", "test_kills.py", "test_bad_input.py"),
+    *("test_trilateration.py", "test_run.py", "test_kills.py", "test_bad_input.py"),
     *("test_mistakes.py", "test_with_ranges.py", "test_reconstruct.py", "test_estimate.py", "test_report.py"),
     *("test_site_anchors.py", "test_broken_refinement.py", "test_interrupt.py", "test_lengths_alone.py"),
 )

@@ -602,6 +602,7 @@ def test_option_that_the_adjustment_does_not_take_is_named_with_its_line(
     ("content", "said"),
     [
         ("[mapper]\n\nmin_num_machtes = 3", r"^survey.toml:3: unknown key 'min_num_machtes'"),
+        ("[mapper]\nranges_in_mapping = true", r"^survey.toml:2: unknown key 'ranges_in_mapping' in \[mapper"),
         (
             "[mapper.pipeline]\nmin_num_matches = 'x'",
             r"^survey.toml:2: .* min_num_matches is 'x', expected a whole numb",

@@ -691,14 +691,3 @@ def test_photos_and_a_log_that_names_them_need_no_times(
     errors = [np.linalg.norm(center - true[name]) for name, center in zip(centers.image_names, centers.centers)]
     assert len(errors) > 10
     assert np.median(errors) < 0.1
-
-
-def test_a_run_can_be_watched_and_ends_as_its_report(rangesfm_command: Command, own_survey: WalkedSurvey) -> None:
-    flags = (*own_survey.flags, "--anchors", "anchors.csv", "--anchor_frame", "site")
-    done = rangesfm_command("run", *flags, "--live", "--output_path", "out", cwd=own_survey.folder)
-    assert f"this run can be watched in {own_survey.folder / 'out' / 'live.html'}" in done.stderr
-    page = (own_survey.folder / "out" / "live.html").read_text(encoding="utf-8")
-    assert 'content="0; url=report.html"' in page
-    assert (own_survey.folder / "out" / "report.html").is_file()
-    for stage in ("scale", "refinement", "results"):
-        assert f'<th scope="row">{stage}</th>' in page

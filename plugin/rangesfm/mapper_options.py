@@ -47,9 +47,6 @@ class MapperOptions(Options, table="mapper"):
     pipeline: dict[str, Any] = Field(default_factory=dict)
     """Passed through to the options of pycolmap's mapper: IncrementalPipelineOptions, GlobalPipelineOptions or
     HierarchicalPipelineOptions."""
-    ranges_in_mapping: bool = False
-    """Use the ranges in each global bundle adjustment during mapping, once they determine the scale. This takes much
-    longer, and the refinement at the end usually finds the same map without it."""
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)],
         KeyMeta(expected="1 or more up to 4096, or -1 for all cores"),

@@ -33,8 +33,8 @@ def test_nothing_is_changed_after_two_dashes() -> None:
 
 
 def test_a_switch_takes_no_value() -> None:
-    assert survey_of("run", "--ranges-in-mapping").mapper.ranges_in_mapping
-    assert not survey_of("run").mapper.ranges_in_mapping
+    assert survey_of("run", "--adopt").scale.adopt
+    assert not survey_of("run").scale.adopt
 
 
 @pytest.mark.parametrize("spelling", ["--tag_in_cam", "--tag-in-cam"])

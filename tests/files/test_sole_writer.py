@@ -73,7 +73,7 @@ def test_what_is_written_into_a_result_waits_for_its_run(
     assert names_in(tmp_path / "out") == ["result.json"]
 
 
-@pytest.mark.parametrize("command", ["refine", "scale", "run", "run --live"])
+@pytest.mark.parametrize("command", ["refine", "scale", "run"])
 def test_a_second_run_is_refused_and_told_of_the_first(
     command: str,
     hold: Callable[[Path], subprocess.Popen[str]],

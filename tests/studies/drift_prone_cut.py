@@ -1,7 +1,7 @@
 """Cut a survey with true positions into one that drifts, in which photos share points with their neighbours only.
 
 Run: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT [--first 0]
-     [--num_photos 120] [--overlap 2] [--max_num_features 1000] [--ranges_in_mapping]
+     [--num_photos 120] [--overlap 2] [--max_num_features 1000]
  or: python -m tests.studies.drift_prone_cut SURVEY.toml --base_path DATA --output_path OUT --input_path sparse/0
      [--max_track_length 3] [--share_of_points 0.15] [--num_seeds 3]
 
@@ -36,7 +36,6 @@ from rangesfm.survey.inputs import read_ranging_inputs, times_of_model
 from rangesfm.survey.settings import Survey, read_survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.reconstruct import reconstruct
-from rangesfm.workflows.map_photos import AdjustmentWithRanges
 from rangesfm.workflows.run import refine_model
 
 # A tolerance small enough that the solver runs to convergence.
@@ -57,7 +56,6 @@ def main() -> None:
     parser.add_argument("--num_photos", type=int, default=120)
     parser.add_argument("--overlap", type=int, default=2)
     parser.add_argument("--max_num_features", type=int, default=1000)
-    parser.add_argument("--ranges_in_mapping", action="store_true")
     parser.add_argument("--input_path", type=Path, help="a model, instead of mapping")
     parser.add_argument("--max_track_length", type=int, default=3, help="photos in a piece of a track of that model")
     parser.add_argument("--share_of_points", type=float, default=0.15, help="of that model")
@@ -67,7 +65,7 @@ def main() -> None:
     args.output_path.mkdir(parents=True, exist_ok=True)
     if args.input_path is None:
         times = times_of_stretch(survey, args.first, args.num_photos)
-        sfm = mapped(survey, times, args.overlap, args.max_num_features, ranges_in_mapping=args.ranges_in_mapping)
+        sfm = mapped(survey, times, args.overlap, args.max_num_features)
         print_row(survey, sfm)
     else:
         whole = pycolmap.Reconstruction(args.input_path)
@@ -81,16 +79,13 @@ def times_of_stretch(survey: Survey, first: int, num_photos: int) -> ImageTimes:
     return times.of(times.image_names[first : first + num_photos])
 
 
-def mapped(
-    survey: Survey, times: ImageTimes, overlap: int, max_num_features: int, *, ranges_in_mapping: bool
-) -> pycolmap.Reconstruction:
+def mapped(survey: Survey, times: ImageTimes, overlap: int, max_num_features: int) -> pycolmap.Reconstruction:
     """Return the largest model of the stretch."""
     mapper = survey.mapper.changed(
         matching="sequential",
         pairing={"overlap": overlap, "quadratic_overlap": False},
         features={"sift": {"max_num_features": max_num_features}},
     )
-    adjustment = AdjustmentWithRanges(survey, read_ranging_inputs(survey), times.image_names[0], times)
     assert survey.images.path is not None
     summary = reconstruct(
         survey.images.path,
@@ -99,10 +94,7 @@ def mapped(
         camera=survey.camera,
         mapper=mapper,
         seed=survey.output.seed,
-        adjustment=adjustment if ranges_in_mapping else None,
     )
-    if note := adjustment.note():
-        print(note)
     return summary.models[0]
 
 

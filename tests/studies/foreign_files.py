@@ -46,7 +46,7 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
     (*RUN, "--camera_params", "281,180,120,-0.04"),
     (*RUN, "--restart", "--formats", "tum,ply,colmap"),
     (*RUN, "--output_path", "."),
-    (*RUN, "--live", "--check_share", "0.1"),
+    (*RUN, "--check_share", "0.1"),
     ("reconstruct", "--images", "images", "--output_path", "out", "--num_threads", "1"),
     ("reconstruct", "--images", "project/images", "--output_path", "project", "--num_threads", "1"),
     ("scale", "--input_path", "out/sparse/0", *MODEL_FLAGS, "--output_path", "out"),
@@ -76,7 +76,7 @@ NAMES = (
     *RECONSTRUCTION_NAMES,
     *PHOTOS_NAMES,
     *(name for names in EXPORTED_NAMES.values() for name in names),
-    *("live.html", "comparison.html", "plan.json", "plan.html", "figures", "applied", "batch.csv", "survey.toml"),
+    *("comparison.html", "plan.json", "plan.html", "figures", "applied", "batch.csv", "survey.toml"),
     *("database.db-wal", "database.db-shm", "mapping_snapshot", "given_database", "matching", "rigs"),
     *(".bashrc.20240101.old", ".mozilla.20210101.old", ".ranges.123.part.csv", ".result.unfinished", ".rangesfm.lock"),
 )

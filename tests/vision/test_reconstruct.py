@@ -4,7 +4,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -222,26 +222,6 @@ class TestEarlierRun:
         summary = reconstruct(room.folder, room.names, output, **arguments)
         assert list(summary.seconds) == steps
         assert summary.num_registered == 6
-
-    def test_with_an_adjustment_of_ones_own_is_taken_over_while_that_is_the_same(
-        self, room: Room, output: Path
-    ) -> None:
-        asked: list[int] = []
-
-        @dataclass(frozen=True)
-        class LeftToColmap:
-            inputs: str
-
-            def adjust(self, model: pycolmap.Reconstruction) -> bool:
-                asked.append(model.num_reg_images())
-                return False
-
-        steps = []
-        for adjustment in (LeftToColmap("a"), LeftToColmap("a"), LeftToColmap("b"), None):
-            arguments: dict[str, Any] = {"camera": room.camera, "mapper": MAPPER, "adjustment": adjustment}
-            steps.append(list(reconstruct(room.folder, room.names, output, **arguments).seconds))
-        assert steps == [["mapping"], [], ["mapping"], ["mapping"]]
-        assert asked.count(6) >= 2
 
     def test_is_taken_over_while_the_photos_are_the_same_whatever_the_times_of_their_files(
         self, room: Room, output: Path, tmp_path: Path, listener: Listener

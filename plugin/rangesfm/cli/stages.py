@@ -32,9 +32,6 @@ def add_stages_commands(commands: Commands) -> None:
     run = commands.add("run", _run, "make a metric model from photos and ranges: the whole pipeline")
     add_survey_arguments(run)
     add_restart_argument(run)
-    run.add_argument(
-        "--live", action="store_true", help="write live.html, a page to watch the run, to the output folder"
-    )
     demo = commands.add("demo", _demo, "make a small survey and run the pipeline on it: no data needed")
     demo.add_argument(
         "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"folder to write to (default: {_DEMO_FOLDER})"
@@ -79,16 +76,7 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
         _require_model_and_metres(survey)
     from rangesfm.workflows.run import metric_map_of
 
-    if not args.live:
-        return Outcome(metric_map_of(survey, progress=progress, restart=args.restart).lines)
-    from rangesfm.files.atomic import sole_writer
-    from rangesfm.report.live import live_page
-
-    with sole_writer(survey.output.path), live_page(progress, survey.output.path) as page:
-        page.message(f"this run can be watched in {page.path}")
-        result = metric_map_of(survey, progress=page, restart=args.restart)
-        page.finish(survey.output.path / "report.html" if survey.report.enabled else None)
-    return Outcome(result.lines)
+    return Outcome(metric_map_of(survey, progress=progress, restart=args.restart).lines)
 
 
 def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:

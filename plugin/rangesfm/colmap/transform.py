@@ -29,16 +29,6 @@ def transform(reconstruction: pycolmap.Reconstruction, new_from_old: Similarity)
     reconstruction.transform(pycolmap.Sim3d(new_from_old.scale, rotation, new_from_old.translation))
 
 
-def take_over(reconstruction: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction) -> None:
-    """Copy poses, points and intrinsics from an adjusted copy of a model into the model, in place."""
-    for frame_id in reconstruction.reg_frame_ids():
-        pose_of(reconstruction.frame(frame_id)).params[:] = pose_of(adjusted.frame(frame_id)).params
-    for point_id, point in reconstruction.points3D.items():
-        point.xyz[:] = adjusted.point3D(point_id).xyz
-    for camera_id, camera in reconstruction.cameras.items():
-        camera.params[:] = adjusted.camera(camera_id).params
-
-
 def joined_model(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
     """Return one model with the registered photos and the points of several models.
 

@@ -15,14 +15,14 @@ from rangesfm.colmap.calibrated_cameras import cameras_as_given
 from rangesfm.colmap.colmap_log import append_log
 from rangesfm.colmap.model_files import read_model, write_binary_model
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.errors import OptionError, ReconstructionError
+from rangesfm.errors import ReconstructionError
 from rangesfm.files.atomic import new_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.processes.supervision import run_children
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.device import uses_gpu
-from rangesfm.vision.mapping_loop import GlobalAdjustment, adjust_whole, incremental_mapping
+from rangesfm.vision.incremental_mapping import adjust_whole, incremental_mapping
 from rangesfm.vision.own_process import MODULE, WholeMapping, WholePipelineOptions
 from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import Rigs
@@ -54,11 +54,8 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
     """Return the options of the chosen mapper.
 
     Raises:
-        InputError: a key or value that COLMAP does not have, or that only the incremental mapper has.
+        InputError: a key or value that COLMAP does not have.
     """
-    if mapper.ranges_in_mapping and mapper.method != "incremental":
-        message = f"[mapper] ranges_in_mapping is true, expected false with method '{mapper.method}'"
-        raise OptionError(message, "mapper", "ranges_in_mapping")
     options: PipelineOptions
     if mapper.method == "global":
         options = pycolmap.GlobalPipelineOptions(num_threads=_NUM_THREADS, random_seed=seed)
@@ -126,9 +123,7 @@ def _held_cameras(
     return held["kept"], held["refined last"]
 
 
-def map_photos(
-    space: Workspace, photos: Photos, options: MappingOptions, adjustment: GlobalAdjustment | None = None
-) -> None:
+def map_photos(space: Workspace, photos: Photos, options: MappingOptions) -> None:
     """Map the photos of the database and write all models, the one with the most photos first.
 
     The incremental mapper continues from the newest snapshot, if there is one, and writes snapshots until it is done.
@@ -138,12 +133,12 @@ def map_photos(
     """
     growing, whole = options.growing, options.whole
     if isinstance(growing, pycolmap.IncrementalPipelineOptions):
-        models = _map_incrementally(space, photos, growing, adjustment)
+        models = _map_incrementally(space, photos, growing)
     else:
         models = _map_at_once(space, photos.folder, growing)
     if whole is not None:
         for model in models:
-            adjust_whole(space.database, model, options=whole, adjustment=adjustment)
+            adjust_whole(space.database, model, options=whole)
     if not models:
         with pycolmap.Database.open(space.database) as database:
             num_matching = num_matching_pairs(database)
@@ -159,10 +154,7 @@ def map_photos(
 
 
 def _map_incrementally(
-    space: Workspace,
-    photos: Photos,
-    options: pycolmap.IncrementalPipelineOptions,
-    adjustment: GlobalAdjustment | None,
+    space: Workspace, photos: Photos, options: pycolmap.IncrementalPipelineOptions
 ) -> list[pycolmap.Reconstruction]:
     """Return all models that COLMAP's incremental mapper makes; there may be none."""
     begun = newest_snapshot(space.snapshots)
@@ -187,7 +179,6 @@ def _map_incrementally(
                 space.database,
                 photos.folder,
                 options=options,
-                adjustment=adjustment,
                 input_path=begun,
                 initial_image_pair_callback=begin_model,
                 next_image_callback=add_photo,

@@ -17,7 +17,6 @@ from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_mapped_models
-from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase
@@ -56,7 +55,6 @@ def reconstruct(
     seed: int = 0,
     progress: Progress | None = None,
     restart: bool = False,
-    adjustment: GlobalAdjustment | None = None,
     superseded: Sequence[str] = (),
     deferred: bool = False,
 ) -> ReconstructionSummary:
@@ -77,7 +75,6 @@ def reconstruct(
         rigs: the rigs that cameras are mounted on.
         seed: the same seed gives the same models.
         restart: take nothing over.
-        adjustment: takes the place of COLMAP's global bundle adjustment while the map grows, photo by photo.
         superseded: names in the output folder of files made from the earlier models; they are removed with them.
         deferred: leave the earlier reconstruction in its place until a result is published (``OutputFolder.defer``).
 
@@ -95,7 +92,7 @@ def reconstruct(
     ):
         space = unpublished.space
         photos, inputs = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space)
-        _map(space, photos, inputs, camera, mapper, rigs, seed, adjustment)
+        _map(space, photos, inputs, camera, mapper, rigs, seed)
         found, log_path = read_mapped_models(unpublished.models_path), output.path / LOG_NAME
         files = unpublished.files()
         if files and deferred:
@@ -119,7 +116,6 @@ def _map(
     mapper: MapperOptions,
     rigs: Rigs,
     seed: int,
-    adjustment: GlobalAdjustment | None,
 ) -> None:
     """Map the photos in the workspace's database into models.
 
@@ -127,8 +123,7 @@ def _map(
         of_matches: fingerprint of the matches.
     """
     intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
-    of_adjustment = [] if adjustment is None else [adjustment.inputs]
-    inputs = fingerprint(of_matches, mapper.method, mapper.pipeline, *intrinsics, *of_adjustment)
+    inputs = fingerprint(of_matches, mapper.method, mapper.pipeline, *intrinsics)
     with space.logged():
         if not all(rigs.are_known):
             space.steps.run(
@@ -145,7 +140,7 @@ def _map(
             inputs,
             space.models / "0",
             space.remove_old_models,
-            lambda: map_photos(space, photos, mapping_options(camera, mapper, rigs, seed, space.database), adjustment),
+            lambda: map_photos(space, photos, mapping_options(camera, mapper, rigs, seed, space.database)),
             unfinished=space.snapshots,
         )
 

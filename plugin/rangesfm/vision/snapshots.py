@@ -36,7 +36,7 @@ class Snapshots:
     def add_photo(self, model: pycolmap.Reconstruction) -> None:
         """Take a snapshot if one is due; to be called when COLMAP has added a photo to the first model."""
         if self._is_just_refined(model):
-            _keep(write_snapshot(model, self._scratch), self._path)
+            _keep(_write(model, self._scratch), self._path)
 
     def _is_just_refined(self, model: pycolmap.Reconstruction) -> bool:
         """Return whether the whole model was refined, that is, all poses have changed since the last photo."""
@@ -45,7 +45,7 @@ class Snapshots:
         return bool(before) and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
 
 
-def write_snapshot(model: pycolmap.Reconstruction, path: Path) -> Path:
+def _write(model: pycolmap.Reconstruction, path: Path) -> Path:
     """Write a model into a new folder in ``path``, named by the time in milliseconds as COLMAP does; return it."""
     folder = path / f"{time.time_ns() // 1_000_000:013d}"
     folder.mkdir()

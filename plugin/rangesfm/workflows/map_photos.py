@@ -1,11 +1,10 @@
-"""Mapping of photos to unscaled models by the options of a survey: checks before the long work, mapping with ranges."""
+"""Mapping of photos to unscaled models by the options of a survey, with checks before the long work."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +13,12 @@ import pycolmap
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.colmap.transform import rescale, take_over
 from rangesfm.diagnostics.preflight import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
 from rangesfm.distances.tape import Tape
-from rangesfm.errors import GeometryError, InputError, SolverError
+from rangesfm.errors import InputError
 from rangesfm.export import check_formats
-from rangesfm.files.contents import sha256_of
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.join.join_models import PathOfModel, estimate_scale
 from rangesfm.progress import Journal
-from rangesfm.ranging.clock.time_offset import estimate_time_offset
-from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.result.result_folder import RESULT_NAMES, places_for_photos, refuse_to_overwrite
 from rangesfm.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.sources.source import is_source
@@ -32,16 +26,10 @@ from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
-from rangesfm.vision.mapping_loop import GlobalAdjustment
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
-from rangesfm.workflows.make_metric_map import path_of_model, ranges_on_path, refine_by_survey
-
-# A path of fewer keyframes has too little shape for ranges to determine its scale.
-_MIN_NUM_KEYFRAMES = 5
-# Factor by which the path must have grown before the time offset is searched for again.
-_GROWTH = 1.5
+from rangesfm.workflows.make_metric_map import ranges_on_path
 
 
 def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
@@ -207,7 +195,6 @@ def map_keyframes(
     keyframes: tuple[str, ...],
     journal: Journal,
     restart: bool,
-    adjustment: GlobalAdjustment | None = None,
     *,
     deferred: bool,
 ) -> tuple[pycolmap.Reconstruction, ...]:
@@ -218,7 +205,6 @@ def map_keyframes(
         keyframes: names of the photos.
         journal: for stages, times and warnings.
         restart: whether to do all steps again.
-        adjustment: global bundle adjustment in place of COLMAP's own; None: COLMAP's.
         deferred: whether to keep an earlier reconstruction in its place until the new result is complete.
     """
     rigs = read_rigs(survey.images.rig_config)
@@ -234,7 +220,6 @@ def map_keyframes(
             seed=survey.output.seed,
             progress=journal.progress,
             restart=restart,
-            adjustment=adjustment,
             superseded=RESULT_NAMES,
             deferred=deferred,
         )
@@ -243,92 +228,3 @@ def map_keyframes(
         which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
         journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
     return summary.models
-
-
-@dataclass
-class AdjustmentWithRanges:
-    """Global bundle adjustment with ranges of a map that is still growing, by the options of a survey.
-
-    Each time, time offset, scale and refinement are estimated for the present map. Only the time offset is kept for
-    some time; anchors, scale and weights of a growing map are not worth keeping. Taped distances are not used, because
-    their ends may not be in the map yet.
-
-    Attributes:
-        survey: options.
-        measured: inputs measured in metres.
-        first_keyframe: photo that defines the frame "first_camera" of anchors.
-        times: of the photos; None where the log names photos.
-        num_with_ranges: number of adjustments with ranges so far.
-        num_without: number of adjustments that were left to COLMAP.
-        found_offset_s: time offset of the last search, if it is searched for.
-        num_with_offset: number of keyframes at the last search.
-    """
-
-    survey: Survey
-    measured: RangingInputs
-    first_keyframe: str
-    times: ImageTimes | None
-    num_with_ranges: int = 0
-    num_without: int = 0
-    found_offset_s: float = 0.0
-    num_with_offset: int = 0
-
-    @property
-    def inputs(self) -> list[Any]:
-        """Return everything that the adjustment depends on: settings, and hashes of files."""
-        survey = self.survey
-        settings = survey.model_dump(
-            mode="json",
-            include={"camera", "ranges", "anchors", "tag", "scale", "refine"},
-            exclude={"ranges": {"path", "error_curve"}, "anchors": {"path"}, "scale": {"distances", "markers"}},
-        )
-        files = (survey.ranges.error_curve, survey.anchors.path, survey.images.times)
-        logs = [item.path for item in survey.input_paths() if item.key == "ranges.path" and item.role == "file"]
-        contents = [None if path is None else sha256_of(path) for path in (*logs, *files)]
-        return [settings, self.measured.anchor_frame, self.first_keyframe, contents]
-
-    def adjust(self, model: pycolmap.Reconstruction) -> bool:
-        """Adjust a model in place. Return false and leave it unchanged while the ranges do not determine its scale."""
-        path = path_of_model(model, self.times)
-        try:
-            if len(path) < _MIN_NUM_KEYFRAMES:
-                raise GeometryError(f"{_MIN_NUM_KEYFRAMES} or more are needed")
-            take_over(model, self._adjusted(model, path))
-        except (GeometryError, InputError, SolverError) as error:
-            logging.getLogger(__name__).info("%d keyframes are adjusted without ranges: %s", len(path), error)
-            self.num_without += 1
-            return False
-        self.num_with_ranges += 1
-        return True
-
-    def note(self) -> str | None:
-        """Return a line for the user that says how often ranges were used; None if there was nothing to adjust."""
-        num = self.num_with_ranges + self.num_without
-        if not num:
-            return None
-        return f"ranges were used in {self.num_with_ranges} of {num} global adjustments of the map while it grew"
-
-    def _adjusted(self, model: pycolmap.Reconstruction, path: Trajectory) -> pycolmap.Reconstruction:
-        survey, inputs = self.survey, replace(self.measured, tape=None)
-        # Anchor positions in the frame of the first camera cannot be used before that photo is part of the map.
-        if inputs.anchor_frame == "first_camera" and path.image_names[0] != self.first_keyframe:
-            inputs = replace(inputs, anchor_frame="unknown")
-        estimate = estimate_scale(survey, inputs, PathOfModel("", model, path, self._observations(path)))
-        refine_intrinsics = survey.camera.intrinsics_in_mapping != "kept"
-        asked = survey.changed({"camera.refine_intrinsics": refine_intrinsics, "refine.covariance": False})
-        scaled = rescale(model, estimate.metric_from_sfm)
-        refined, _ = refine_by_survey(asked, inputs, scaled, path, estimate, tape=None)
-        return refined
-
-    def _observations(self, path: Trajectory) -> RangeObservations:
-        survey, inputs, offset_s = self.survey, self.measured, self.survey.ranges.time_offset_s
-        if inputs.log.timestamp_s is None or offset_s is not None:
-            return ranges_on_path(survey, inputs, path, offset_s or 0.0)
-        if len(path) >= _GROWTH * self.num_with_offset:
-            found = estimate_time_offset(
-                inputs.log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
-            )
-            if found.rivals or not found.is_certain:
-                raise GeometryError("more than one time offset is likely")
-            self.found_offset_s, self.num_with_offset = found.value_s, len(path)
-        return ranges_on_path(survey, inputs, path, self.found_offset_s)

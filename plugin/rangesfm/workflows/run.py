@@ -34,7 +34,6 @@ from rangesfm.workflows.make_metric_map import (
     ranges_on_paths,
 )
 from rangesfm.workflows.map_photos import (
-    AdjustmentWithRanges,
     check_times,
     checked_keyframes,
     find_keyframes,
@@ -78,23 +77,15 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         survey = with_photos_in_folder(survey, journal, restart=restart)
         keyframes, times = checked_keyframes(survey, inputs, journal)
         inputs = with_tags(survey, inputs, keyframes, journal)
-        adjustment = AdjustmentWithRanges(survey, inputs, keyframes[0], times)
-        with_ranges = survey.mapper.ranges_in_mapping and len(inputs.log) > 0
         # An earlier result keeps its reconstruction until the new result is complete.
         deferred = (output.path / ResultSummary.NAME).exists()
-        models = map_keyframes(
-            survey, keyframes, journal, restart, adjustment if with_ranges else None, deferred=deferred
-        )
-        if note := adjustment.note():
-            journal.warn(note)
+        models = map_keyframes(survey, keyframes, journal, restart, deferred=deferred)
         return to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
     """Make an unscaled model from photos, and return a summary for the user."""
     journal = Journal(progress)
-    if survey.mapper.ranges_in_mapping:
-        journal.warn("ranges_in_mapping has no effect here: ranges are used in a whole run only")
     refuse_to_overwrite(survey)
     with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         survey = with_photos_in_folder(survey, journal, restart=restart)

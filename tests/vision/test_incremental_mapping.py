@@ -1,11 +1,9 @@
-"""The mapper's loop with another global adjustment; with COLMAP's own, it gives the same as COLMAP."""
+"""The incremental mapping gives COLMAP's models, the same in every run, and can be ended and continued."""
 
 from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +18,8 @@ from tests.studies.simulated_database import write_database
 
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.vision.incremental_mapping import adjust_whole, incremental_mapping
 from rangesfm.vision.mapping import pipeline_options
-from rangesfm.vision.mapping_loop import adjust_whole, incremental_mapping
 
 
 def walk(num_photos: int, max_track_length: int) -> pycolmap.Reconstruction:
@@ -61,26 +59,10 @@ def options() -> pycolmap.IncrementalPipelineOptions:
     return options
 
 
-@dataclass(frozen=True)
-class Adjustment:
-    adjust: Callable[[pycolmap.Reconstruction], bool]
-    inputs: str = ""
-
-
 def mapped(
-    database: Path,
-    options: pycolmap.IncrementalPipelineOptions,
-    adjust: Callable[[pycolmap.Reconstruction], bool] | None,
-    **arguments: Any,
+    database: Path, options: pycolmap.IncrementalPipelineOptions, **arguments: Any
 ) -> list[pycolmap.Reconstruction]:
-    adjustment = None if adjust is None else Adjustment(adjust)
-    return incremental_mapping(database, database.parent, options=options, adjustment=adjustment, **arguments)
-
-
-@pytest.fixture(params=["colmaps loop", "own loop"])
-def adjust(request: pytest.FixtureRequest) -> Callable[[pycolmap.Reconstruction], bool] | None:
-    """The adjustment of the loop: None for COLMAP's loop, or one that leaves everything to COLMAP."""
-    return None if request.param == "colmaps loop" else lambda model: False
+    return incremental_mapping(database, database.parent, options=options, **arguments)
 
 
 def centers(model: pycolmap.Reconstruction) -> npt.NDArray[np.float64]:
@@ -92,10 +74,8 @@ def off_by(model: pycolmap.Reconstruction, true: pycolmap.Reconstruction) -> flo
     return rmse(align_points(centers(model), centers(true)).apply(centers(model)) - centers(true))
 
 
-def assert_they_are_colmaps_models(
-    found: list[pycolmap.Reconstruction], database: Path, options: pycolmap.IncrementalPipelineOptions
-) -> None:
-    output = database.with_name("expected")
+def test_it_gives_colmaps_models(database: Path, options: pycolmap.IncrementalPipelineOptions) -> None:
+    found, output = mapped(database, options), database.with_name("expected")
     expected = pycolmap.incremental_mapping(database, database.parent, output, options=options)
     assert [model.num_reg_images() for model in expected.values()] == [10, 6]
     for theirs, ours in zip(expected.values(), found, strict=True):
@@ -104,61 +84,15 @@ def assert_they_are_colmaps_models(
         assert np.abs(centers(ours) - centers(theirs)).max() < 1e-8
 
 
-def test_without_an_adjustment_it_gives_colmaps_models(
-    database: Path, options: pycolmap.IncrementalPipelineOptions
-) -> None:
-    assert_they_are_colmaps_models(mapped(database, options, None), database, options)
-
-
-def test_what_an_adjustment_leaves_to_colmap_gives_colmaps_models(
-    database: Path, options: pycolmap.IncrementalPipelineOptions
-) -> None:
-    sizes: list[int] = []
-
-    def leave_it(model: pycolmap.Reconstruction) -> bool:
-        sizes.append(model.num_reg_images())
-        return False
-
-    assert_they_are_colmaps_models(mapped(database, options, leave_it), database, options)
-    assert len(set(sizes)) > 3
-    assert max(sizes) == 10
-
-
 def test_threads_do_not_change_the_map(tmp_path: Path, options: pycolmap.IncrementalPipelineOptions) -> None:
     """The mapping of pycolmap itself, with several threads, begins with one of seven pairs of photos."""
     database = write_matches(tmp_path / "database.db", walk(28, max_track_length=7))
-    (expected,) = mapped(database, options, None)
+    (expected,) = mapped(database, options)
     assert expected.num_reg_images() == 28
     options.num_threads = 8
     for _ in range(4):
-        (found,) = mapped(database, options, None)
+        (found,) = mapped(database, options)
         assert np.abs(centers(found) - centers(expected)).max() < 1e-9
-
-
-def test_the_adjustment_is_the_last_to_move_the_map(
-    database: Path, options: pycolmap.IncrementalPipelineOptions
-) -> None:
-    """The adjustment bends the map away from the optimum of COLMAP's own adjustment, which would undo that."""
-    stretch = np.diag([1.0, 1.0, 1.02])
-
-    def bend(model: pycolmap.Reconstruction) -> bool:
-        assert model.num_reg_images() > 2
-        for frame_id in model.reg_frame_ids():
-            pose = model.frame(frame_id).rig_from_world
-            assert pose is not None
-            rotation = pose.rotation.matrix()
-            pose.params[4:] = rotation @ stretch @ rotation.T @ pose.translation
-        bent.append(centers(model))
-        return True
-
-    bent: list[npt.NDArray[np.float64]] = []
-    options.multiple_models = False
-    (model,) = mapped(database, options, bend)
-    last = centers(model)
-    assert len(bent) > 3
-    # COLMAP normalizes the map in between, by a similarity without rotation.
-    ratio = np.ptp(last, axis=0) / np.ptp(bent[-1], axis=0)
-    assert ratio == pytest.approx(np.full(3, ratio.mean()), rel=1e-9)
 
 
 def test_a_whole_map_finds_out_a_calibration_that_it_grew_with(
@@ -171,7 +105,7 @@ def test_a_whole_map_finds_out_a_calibration_that_it_grew_with(
         focal_length_px, camera.params = camera.params[0], [*(1.03 * camera.params[:2]), *camera.params[2:]]
         opened.update_camera(camera)
     whole, options.constant_cameras = copy.deepcopy(options), {camera.camera_id}
-    (model,) = mapped(database, options, None)
+    (model,) = mapped(database, options)
     errors_m = [off_by(model, true)]
     assert model.camera(camera.camera_id).params[0] == pytest.approx(1.03 * focal_length_px, rel=1e-12)
     adjust_whole(database, model, options=whole)
@@ -180,24 +114,8 @@ def test_a_whole_map_finds_out_a_calibration_that_it_grew_with(
     assert errors_m[1] < 0.5 * errors_m[0]
 
 
-def test_the_adjustment_of_a_whole_map_may_be_ones_own(
-    database: Path, options: pycolmap.IncrementalPipelineOptions
-) -> None:
-    taken: list[pycolmap.Reconstruction] = []
-
-    def take(found: pycolmap.Reconstruction) -> bool:
-        taken.append(found)
-        return True
-
-    model, _ = mapped(database, options, None)
-    adjust_whole(database, model, options=options, adjustment=Adjustment(take))
-    assert taken
-
-
 def test_cancelled_mapping_ends_with_the_photo_at_hand(
-    database: Path,
-    options: pycolmap.IncrementalPipelineOptions,
-    adjust: Callable[[pycolmap.Reconstruction], bool] | None,
+    database: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> None:
     token, registered = pycolmap.CancellationToken(), list[str]()
 
@@ -206,33 +124,28 @@ def test_cancelled_mapping_ends_with_the_photo_at_hand(
         if len(registered) == 2:
             token.cancel()
 
-    (model,) = mapped(database, options, adjust, next_image_callback=cancel_the_second_time, cancellation_token=token)
+    (model,) = mapped(database, options, next_image_callback=cancel_the_second_time, cancellation_token=token)
     assert model.num_reg_images() == 4
 
 
-def test_a_mapping_ends_when_its_time_is_over(
-    database: Path,
-    options: pycolmap.IncrementalPipelineOptions,
-    adjust: Callable[[pycolmap.Reconstruction], bool] | None,
-) -> None:
+def test_a_mapping_ends_when_its_time_is_over(database: Path, options: pycolmap.IncrementalPipelineOptions) -> None:
     options.max_runtime_seconds = 1
-    (model,) = mapped(database, options, adjust, next_image_callback=lambda model: time.sleep(0.6))
+    (model,) = mapped(database, options, next_image_callback=lambda model: time.sleep(0.6))
     assert 2 <= model.num_reg_images() <= 4
     assert all(point.error >= 0 for point in model.points3D.values())
 
 
-def test_a_mapping_goes_on_from_a_snapshot_of_its_own(
+def test_a_mapping_goes_on_from_a_snapshot(
     database: Path, options: pycolmap.IncrementalPipelineOptions, tmp_path: Path
 ) -> None:
     options.snapshot_path, options.snapshot_frames_freq, options.multiple_models = tmp_path, 2, False
-    (whole,) = mapped(database, options, lambda model: False)
+    (whole,) = mapped(database, options)
     snapshots = [pycolmap.Reconstruction(folder) for folder in sorted(tmp_path.iterdir())]
     assert [model.num_reg_images() for model in snapshots] == [4, 6, 8, 10]
     options.snapshot_frames_freq, registered = 0, list[str]()
     (continued,) = mapped(
         database,
         options,
-        lambda model: False,
         input_path=sorted(tmp_path.iterdir())[1],
         next_image_callback=lambda model: registered.append(""),
     )
