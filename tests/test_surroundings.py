@@ -218,6 +218,21 @@ def test_too_little_memory_to_begin_with_is_one_line(
     assert (done.returncode, done.stderr) == (4, b"rangesfm: error: out of memory\n")
 
 
+def test_too_little_address_space_to_draw_pictures_is_one_line(
+    command: Callable[..., subprocess.CompletedProcess[bytes]], own_survey: WalkedSurvey
+) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
+
+    before = contents(own_survey.folder)
+    done = command("ranges", "uwb.csv", "--plot", "ranges.png", preexec_fn=limit)
+    lines = done.stderr.decode().splitlines()
+    assert (done.returncode, len(lines)) == (4, 1)
+    assert lines[0].startswith("rangesfm: error: the engine that draws pictures failed: its process was ended (SIG")
+    assert lines[0].endswith("(it reserves 64 GB of address space; `ulimit -v` may allow less)")
+    assert contents(own_survey.folder) == before
+
+
 def test_root_of_the_file_system_is_no_output_folder(
     own_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -51,9 +51,14 @@ def test_one_that_needs_too_much_memory_is_killed() -> None:
     assert ended.last == {"n": 1}
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGABRT])
-def test_a_crash_is_named(number: signal.Signals) -> None:
-    trace = "why it crashed\\n*** stack trace ***\\n    @ 0x5 f()"
+OF_GLOG = "why it crashed\\n*** stack trace ***\\n    @ 0x5 f()"
+OF_V8 = "#\\n# why it crashed\\n#\\n==== C stack trace ====\\n\\n    lib.so(+0x3a) [0x7f0b]"
+
+
+@pytest.mark.parametrize(
+    ("number", "trace"), [(signal.SIGKILL, OF_GLOG), (signal.SIGABRT, OF_GLOG), (signal.SIGTRAP, OF_V8)]
+)
+def test_a_crash_is_named(number: signal.Signals, trace: str) -> None:
     code = f"print('{trace}', file=sys.stderr)\nos.kill(os.getpid(), {number.value})"
     ended = run(code)
     assert (ended.signal, ended.errors, ended.last) == (number, "why it crashed", None)
@@ -88,7 +93,10 @@ def test_nothing_is_left_running_where_the_listener_fails() -> None:
     assert not psutil.pid_exists(heard[0]["pid"])
 
 
-@pytest.mark.parametrize("module", ["rangesfm.vision.own_process", "rangesfm.batch.survey_process"])
+@pytest.mark.parametrize(
+    "module",
+    ["rangesfm.vision.own_process", "rangesfm.batch.survey_process", "rangesfm.processes.draw_pictures"],
+)
 def test_a_child_imports_nothing_from_the_working_folder(
     module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,7 @@ import json
 import os
 import pickle
 import queue
+import re
 import signal
 import subprocess
 import sys
@@ -40,7 +41,8 @@ _RUN_MODULE = (
     "import sys; sys.path[:1] == [''] and sys.path.pop(0); "
     "import runpy; runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
 )
-_STACK_TRACE = ("***", "@", "PC:")  # beginnings of the lines of a stack trace by glog
+# A line of a stack trace by glog or V8, after leading marks.
+_STACK_TRACE = re.compile(r"\*\*\*|@|PC:|=+ |.*\[0x[0-9a-f]+\]$")
 
 
 class MessagesToParent:
@@ -298,5 +300,5 @@ def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> No
 
 def _last_line(errors: IO[bytes]) -> str:
     errors.seek(0)
-    lines = [line.strip() for line in errors.read().decode(errors="replace").split("\n")]
-    return next((line[:_MAX_LINE] for line in reversed(lines) if line and not line.startswith(_STACK_TRACE)), "")
+    lines = [line.strip().lstrip("# ") for line in errors.read().decode(errors="replace").split("\n")]
+    return next((line[:_MAX_LINE] for line in reversed(lines) if line and not _STACK_TRACE.match(line)), "")

@@ -16,6 +16,7 @@ from PIL import Image
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import make_output_folder, new_file
+from rangesfm.processes.draw_pictures import draw_pictures
 from rangesfm.report.packing import pack
 from rangesfm.report.plot import Figure, Mark, Panel, Range, Series
 from rangesfm.report.scene import data_uri
@@ -31,9 +32,7 @@ ZOOM: Spec = {
     "select": {"type": "interval", "zoom": "wheel![event.ctrlKey || event.metaKey]"},
 }
 
-# For picture files: pixels of a PNG per pixel of the page, and the largest width of a panel, with which text has the
-# size that is usual in papers.
-PNG_SCALE, MAX_WIDTH_PX = 2.5, 660.0
+MAX_WIDTH_PX = 660.0  # of a panel in a picture file, with which text has the size that is usual in papers
 FORMATS = ("png", "svg")
 _NUM_COLUMNS = {"single": 1, "views": 2, "panels": 3}
 _SYMBOLS = {"dots": "circle", "disc": "circle", "triangle": "triangle-up"}
@@ -236,13 +235,14 @@ def write_pictures(figures: list[Figure], folder: Path) -> list[Path]:
 
     Raises:
         InputError: the folder cannot be written to.
+        SolverError: the engine that draws them failed.
     """
+    drawings = {f"{figure.name}.{format}": (figure_spec(figure), format) for figure in figures for format in FORMATS}
+    contents = draw_pictures([*drawings.values()])
     make_output_folder(folder)
-    paths = []
-    for figure in figures:
-        for format in FORMATS:
-            paths.append(folder / f"{figure.name}.{format}")
-            write_picture(figure, paths[-1])
+    paths = [folder / name for name in drawings]
+    for path, content in zip(paths, contents, strict=True):
+        _write_picture_file(content, path)
     return paths
 
 
@@ -251,20 +251,19 @@ def write_picture(figure: Figure, path: Path) -> None:
 
     Raises:
         InputError: the file cannot be written, or its ending is not one of ``FORMATS``.
+        SolverError: the engine that draws it failed.
     """
     format = path.suffix[1:].lower()
     if format not in FORMATS:
         raise InputError(f"no figure format is named '{format}', expected one of {', '.join(FORMATS)}", path)
-    import vl_convert  # it loads 90 MB with a script engine, so it is imported only where a picture is drawn
+    (content,) = draw_pictures([(figure_spec(figure), format)])
+    _write_picture_file(content, path)
 
-    spec = figure_spec(figure)
-    if format == "png":
-        data = vl_convert.vegalite_to_png(spec, scale=PNG_SCALE)
-    else:
-        data = vl_convert.vegalite_to_svg(spec).encode("utf-8")
+
+def _write_picture_file(content: bytes, path: Path) -> None:
     try:
         with new_file(path) as temporary:
-            temporary.write_bytes(data)
+            temporary.write_bytes(content)
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", path) from error
 

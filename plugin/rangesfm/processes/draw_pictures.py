@@ -1,0 +1,61 @@
+"""Drawing of pictures by the engine of Vega-Lite, in a process of its own.
+
+The engine is written in C++ and ends the whole process where it fails. Here that is a child process, whose end is
+noticed. ``rangesfm.processes.supervision`` runs this file as a module.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import pickle
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+from rangesfm.errors import SolverError
+from rangesfm.processes.supervision import MessagesToParent, child_command, supervise, work_for_parent
+
+_MODULE = "rangesfm.processes.draw_pictures"
+# Pixels of a PNG per pixel of the page, with which text has the size that is usual in papers.
+_PNG_SCALE = 2.5
+# Vega-Lite specification of a picture, and its format: "png" or "svg".
+Drawing: TypeAlias = tuple[dict[str, Any], str]
+
+
+def draw_pictures(drawings: Sequence[Drawing]) -> list[bytes]:
+    """Return the contents of picture files.
+
+    Raises:
+        SolverError: the engine fails, for example because it may not reserve the address space that it wants.
+    """
+    ended = supervise(
+        child_command(_MODULE),
+        pickle.dumps(drawings),
+        lambda _: None,
+        environment=os.environ,
+        memory_limit_bytes=None,
+        is_stopped=lambda: False,
+    )
+    last = ended.last or {}
+    if "done" not in last:
+        why = last["failed"]["message"] if "failed" in last else ended.how
+        hint = " (it reserves 64 GB of address space; `ulimit -v` may allow less)" if ended.signal is not None else ""
+        raise SolverError(f"the engine that draws pictures failed: {why}{hint}")
+    return [base64.b64decode(content) for content in last["done"]]
+
+
+def _draw(drawings: Sequence[Drawing], _: MessagesToParent) -> list[str]:
+    """Draw the pictures and return their contents as text for a message."""
+    import vl_convert  # it loads 90 MB with a script engine, so it is imported only where a picture is drawn
+
+    contents = [
+        vl_convert.vegalite_to_png(spec, scale=_PNG_SCALE)
+        if format == "png"
+        else vl_convert.vegalite_to_svg(spec).encode("utf-8")
+        for spec, format in drawings
+    ]
+    return [base64.b64encode(content).decode("ascii") for content in contents]
+
+
+if __name__ == "__main__":
+    work_for_parent(_draw)
