@@ -59,6 +59,19 @@ while (walker.nextNode()) {
 return poor;
 """
 
+# Moves the pointer over a place in the data of each figure, and counts how often values are shown.
+POINT_AT_FIGURES = """
+let told = 0;
+for (const chart of Object.values(rangesfmFigures).flat()) {
+  const {node, view, spec} = chart, box = node.getBoundingClientRect(), {left, top} = spec.padding;
+  const rows = [...chart.rows()], row = rows[Math.floor(rows.length / 2)];
+  const [clientX, clientY] = [box.x + left + view.scale("x")(row.x), box.y + top + view.scale("y")(row.y)];
+  node.dispatchEvent(new PointerEvent("pointermove", {clientX, clientY}));
+  told += !chart.tip.hidden;
+}
+return told;
+"""
+
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory, make_shared_result: MakeResult) -> Path:
@@ -84,6 +97,24 @@ def test_it_opens_with_all_figures_a_silent_console_and_no_request(browser: Brow
     assert {url for url in browser.requests() if not url.startswith("data:")} == {page.as_uri()}
     assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
     assert browser.run("return document.title").startswith("a survey & more")
+
+
+def test_whatever_is_pointed_at_or_clicked_the_console_stays_silent(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    browser.draw_figures()
+    browser.run("for (const details of document.querySelectorAll('details')) details.open = true")
+    assert browser.run(POINT_AT_FIGURES) == NUM_CHARTS
+    num_clicked = browser.run(
+        "window.files = []; HTMLAnchorElement.prototype.click = function () { files.push(this.download); };"
+        "const controls = document.querySelectorAll('button, input, summary, a[href^=\"#\"]');"
+        "for (const control of controls) control.dispatchEvent(new MouseEvent('click', {bubbles: true}));"
+        "return controls.length"
+    )
+    browser.draw_frame()
+    buttons = browser.run("return [...document.querySelectorAll('button.csv')].map(x => `${x.dataset.figure}.csv`)")
+    assert num_clicked > len(buttons) > 10
+    assert browser.run("return files") == buttons
+    assert browser.console() == []
 
 
 def test_it_draws_in_the_readers_theme(browser: Browser, page: Path) -> None:

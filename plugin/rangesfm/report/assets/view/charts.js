@@ -35,7 +35,7 @@ class Chart {
   /** Rounds a value to numDigits digits, and to more where the axis is short and far from 0. */
   number(value, axis, numDigits) {
     const [low, high] = this.spec.encoding[axis].scale.domain;
-    const share = Math.max(Math.abs(low), Math.abs(high)) / (high - low);
+    const share = Math.max(Math.abs(low), Math.abs(high)) / Math.abs(high - low); // the numbers of rows run downwards
     return Number(value.toPrecision(Math.min(numDigits + Math.max(0, Math.ceil(Math.log10(share))), 17)));
   }
 
