@@ -47,7 +47,9 @@ from rangesfm.survey.settings import SURVEY_TABLES
 
 STATUSES = (0, 2, 3, 4)
 MAX_SECONDS = 300.0
-MAX_BYTES = 8 << 30  # of address space, of which a command takes some gigabytes; what reads for ever ends there
+# Of memory that can be written to, so that what reads for ever ends. The engine that draws pictures reserves far more
+# address space than it uses.
+MAX_BYTES = 8 << 30
 OWN_WORDS = (
     "Traceback",
     "internal error",
@@ -220,9 +222,11 @@ def damage_a_file(probe: Probe, names: tuple[str, ...]) -> None:
         kind = probe.choose(kinds)
         change(probe, path, kind)
     probe.said.append(f"{path.relative_to(probe.folder)} {kind}")
-    # What rangesfm keeps to itself it may repair.
-    if os.path.lexists(path) and kind != "locked" and PRIVATE_NAME not in path.parts:
-        probe.protect(path)
+    if kind != "locked":
+        probe.protected.pop(path, None)
+        # What rangesfm keeps to itself it may repair, and a file that is not there it may write.
+        if os.path.lexists(path) and PRIVATE_NAME not in path.parts:
+            probe.protect(path)
 
 
 def change(probe: Probe, path: Path, kind: str) -> None:
@@ -460,15 +464,15 @@ def prepared(template: Path, folder: Path, rng: np.random.Generator) -> tuple[Pr
     return probe, (*command, *probe.flags)
 
 
-def start(command: tuple[str, ...], probe: Probe) -> tuple[int | None, str]:
-    """Run a command; return its exit status, None if it does not end, and its error output."""
+def start(command: tuple[str, ...], probe: Probe) -> tuple[int | None, str, str]:
+    """Run a command; return its exit status, None if it does not end, its output, and its error output."""
 
     def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (MAX_BYTES, MAX_BYTES))
+        resource.setrlimit(resource.RLIMIT_DATA, (MAX_BYTES, MAX_BYTES))
         for one in probe.limits:
             one()
 
-    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, **probe.streams}
+    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **probe.streams}
     process = subprocess.Popen(
         [Path(sys.executable).with_name("rangesfm"), *command],
         cwd=probe.folder,
@@ -479,23 +483,25 @@ def start(command: tuple[str, ...], probe: Probe) -> tuple[int | None, str]:
         **streams,
     )
     try:
-        _, errors = process.communicate(timeout=MAX_SECONDS)
+        output, errors = process.communicate(timeout=MAX_SECONDS)
     except subprocess.TimeoutExpired:
         process.kill()
         process.communicate()
-        return None, ""
-    return process.returncode, errors or ""
+        return None, "", ""
+    return process.returncode, output or "", errors or ""
 
 
-def what_is_wrong(status: int | None, errors: str, probe: Probe) -> str | None:
+def what_is_wrong(status: int | None, output: str, errors: str, probe: Probe) -> str | None:
     """Say what is wrong with how a command ended, or None."""
     if status is None:
         return "does not end"
     if status not in STATUSES:
         return f"status {status}"
-    if said := [words for words in OWN_WORDS if words in errors]:
+    if said := [words for words in OWN_WORDS if words in output + errors]:
         return f"says {said[0]!r}"
     num_errors = len(re.findall("^rangesfm: error: ", errors, re.MULTILINE))
+    # What `check` finds wrong is its output, and may be several lines.
+    num_errors += bool(re.search("^error: ", output, re.MULTILINE))
     if "stderr" not in probe.streams and num_errors != (status != 0):
         return f"{num_errors} lines of errors"
     changed = probe.changed()
@@ -516,8 +522,8 @@ def main() -> int:
             rng, folder = np.random.default_rng([arguments.seed, number]), Path(name) / "probe"
             probe, command = prepared(Path(name) / "template" / "survey", folder, rng)
             with probe.held:
-                status, errors = start(command, probe)
-                wrong = what_is_wrong(status, errors, probe)
+                status, output, errors = start(command, probe)
+                wrong = what_is_wrong(status, output, errors, probe)
             ended[f"{command[0]} {status}"] += 1
             num_wrong += wrong is not None
             if wrong is not None or arguments.verbose:
