@@ -78,6 +78,7 @@ class KeyMeta:
         expected: description of valid values, for messages; None: made from type and bounds.
         role: of a path, what kind of file or folder it leads to.
         is_key: whether users may write it into the survey file.
+        is_common: whether most people need it, so that the short help of a command has its flag.
     """
 
     flag: str | None = None
@@ -85,6 +86,7 @@ class KeyMeta:
     expected: str | None = None
     role: PathRole | None = None
     is_key: bool = True
+    is_common: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,7 @@ class Key:
         expected: as in ``KeyMeta``, never None.
         meaning: the docstring on one line without its full stop, followed by the default.
         role: as in ``KeyMeta``.
+        is_common: as in ``KeyMeta``.
     """
 
     table: str
@@ -110,6 +113,7 @@ class Key:
     expected: str
     meaning: str
     role: PathRole | None
+    is_common: bool
 
     @property
     def dotted(self) -> str:
@@ -168,7 +172,17 @@ class Options(BaseModel):
             meaning = " ".join((field.description or "").split()).removesuffix(".")
             meaning += _default(field.get_default(call_default_factory=True))
             type_ = _without_none(bare[name])
-            keys[name] = Key(cls.table, name, meta.flag or name, meta.metavar, type_, expected, meaning, meta.role)
+            keys[name] = Key(
+                cls.table,
+                name,
+                meta.flag or name,
+                meta.metavar,
+                type_,
+                expected,
+                meaning,
+                meta.role,
+                meta.is_common,
+            )
         return keys
 
     @classmethod

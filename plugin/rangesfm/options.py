@@ -91,7 +91,7 @@ _LengthUnit = Literal["m", "cm", "mm", "ft"]
 class KeyframeOptions(Options, table="images"):
     """Choice of the photos that become keyframes. All keys that are given apply together."""
 
-    every_nth: _Count = 1
+    every_nth: Annotated[_Count, KeyMeta(is_common=True)] = 1
     """Use every n-th photo, in order of time."""
     min_interval_s: _Duration = 0.0
     """Shortest time between two keyframes."""
@@ -102,12 +102,12 @@ class KeyframeOptions(Options, table="images"):
 class ImageOptions(KeyframeOptions):
     """The photos."""
 
-    path: Annotated[Path | None, KeyMeta(flag="images", metavar="PATH", role="photos")] = None
+    path: Annotated[Path | None, KeyMeta(flag="images", metavar="PATH", role="photos", is_common=True)] = None
     """Folder of the photos (subfolders included), a video, or a ROS bag with images. The flag also takes the CSV with
     the photos' times."""
-    model: Annotated[Path | None, KeyMeta(flag="input_path", metavar="MODEL", role="model")] = None
+    model: Annotated[Path | None, KeyMeta(flag="input_path", metavar="MODEL", role="model", is_common=True)] = None
     """Folder of a COLMAP model, such as sparse/0, to start from; no photos are needed then."""
-    times: Annotated[Path | None, KeyMeta(flag="image_times", role="file")] = None
+    times: Annotated[Path | None, KeyMeta(flag="image_times", role="file", is_common=True)] = None
     """CSV image_name,timestamp_s with the times of the photos, or another table of photos and times (default: by
     rate_hz if given, else EXIF, else file names)."""
     times_columns: Annotated[dict[str, str], KeyMeta(flag="image_times_columns", metavar="QUANTITY=NAME,..")] = Field(
@@ -203,7 +203,7 @@ class CameraOptions(Options, table="camera"):
 class LogOptions(Options, table="ranges"):
     """The radio's log and how it is read."""
 
-    path: Annotated[Path | None, KeyMeta(flag="ranges", metavar="LOG", role="log")] = None
+    path: Annotated[Path | None, KeyMeta(flag="ranges", metavar="LOG", role="log", is_common=True)] = None
     """The radio's log: a file, a folder of files, or a pattern such as uwb_*.csv."""
     format: Annotated[str | None, KeyMeta(flag="ranges_format")] = None
     """Format of the log (default: recognised by content)."""
@@ -290,9 +290,10 @@ class RangesOptions(RangeModelOptions, CheckOptions, AssociationOptions, LogOpti
 class AnchorOptions(Options, table="anchors"):
     """The anchors."""
 
-    path: Annotated[Path | None, KeyMeta(flag="anchors", role="file")] = None
-    """CSV anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], or another table of points or a
-    GSI file; empty coordinates mean an unknown position (default: the anchors in the log, all unknown)."""
+    path: Annotated[Path | None, KeyMeta(flag="anchors", role="file", is_common=True)] = None
+    """CSV anchor_id,x_m,y_m,z_m, possibly with position_stddev_m, range_bias_m and range_bias_stddev_m, or another
+    table of points or a GSI file; empty coordinates mean an unknown position (default: the anchors in the log, all
+    unknown)."""
     columns: Annotated[dict[str, str], KeyMeta(flag="anchor_columns", metavar="QUANTITY=NAME,..")] = Field(
         default_factory=dict
     )
@@ -311,7 +312,11 @@ class AnchorOptions(Options, table="anchors"):
 class TagOptions(Options, table="tag"):
     """The radio tag on the camera, or several tags."""
 
-    tag_in_cam_m: Annotated[_LeverArm, KeyMeta(flag="tag_in_cam", metavar="[ID:]X,Y,Z")] = (0.0, 0.0, 0.0)
+    tag_in_cam_m: Annotated[_LeverArm, KeyMeta(flag="tag_in_cam", metavar="[ID:]X,Y,Z", is_common=True)] = (
+        0.0,
+        0.0,
+        0.0,
+    )
     """Lever arm: position of the tag's antenna in the camera frame (right, down, forward), metres; with a rig, in the
     frame of its reference camera. With several tags, give the flag once for each, with the tag's ID."""
     lever_arms_m: Annotated[dict[str, _LeverArm], KeyMeta(flag="tag_in_cam", metavar="ID:X,Y,Z")] = Field(
@@ -347,7 +352,7 @@ class ScaleOptions(Options, table="scale"):
     adopt: bool = False
     """Run again with the likeliest mistake corrected, where the tests find one: an anchor taken as unknown, the lever
     arm that fits, labels swapped, some of the ranges left out. The result says what was changed."""
-    distances: Annotated[Path | None, KeyMeta(role="file")] = None
+    distances: Annotated[Path | None, KeyMeta(role="file", is_common=True)] = None
     """CSV from,to,distance_m[,stddev_m,kind] with taped distances."""
     markers: Annotated[Path | None, KeyMeta(role="file")] = None
     """CSV marker,image_name,x_px,y_px with the places in photos of the marks between which distances were taped."""
@@ -363,7 +368,7 @@ class ScaleOptions(Options, table="scale"):
 class MarkerOptions(Options, table="markers"):
     """Printed tags of known size in the photos."""
 
-    dictionary: Annotated[TagDictionary | None, KeyMeta(flag="marker_dictionary")] = None
+    dictionary: Annotated[TagDictionary | None, KeyMeta(flag="marker_dictionary", metavar="NAME")] = None
     """Dictionary of the printed tags, by OpenCV's name. The corners of tag 7 are the markers tag7.0 (upper left of the
     upright tag) to tag7.3, clockwise (default: no tags are looked for)."""
     side_m: Annotated[_Positive | None, KeyMeta(flag="marker_side_m")] = None
@@ -406,7 +411,7 @@ class RefineOptions(Options, table="refine"):
 class ExportOptions(Options, table="export"):
     """The metric model in other formats, and the frame of the exported files."""
 
-    formats: _Texts = DEFAULT_FORMATS
+    formats: Annotated[_Texts, KeyMeta(is_common=True)] = DEFAULT_FORMATS
     """Names of export formats; the message about an unknown name lists them all."""
     frame: Annotated[Literal["result", "level", "enu"], KeyMeta(flag="export_frame")] = "result"
     """Frame of the exported files. result: that of the result (site or first camera); level: z up, y along the first
@@ -434,7 +439,7 @@ class ExportOptions(Options, table="export"):
 class ReportOptions(Options, table="report"):
     """The report, and true positions to compare the result with."""
 
-    reference: Annotated[Path | None, KeyMeta(metavar="FILE", role="file")] = None
+    reference: Annotated[Path | None, KeyMeta(metavar="FILE", role="file", is_common=True)] = None
     """File with true positions of the camera, for comparison: CSV or TUM."""
     enabled: Annotated[bool, KeyMeta(flag="report")] = True
     """Write report.html."""
@@ -443,7 +448,7 @@ class ReportOptions(Options, table="report"):
 class OutputOptions(Options, table="output"):
     """The folder of the results, and the seed."""
 
-    path: Annotated[Path, KeyMeta(flag="output_path", role="output")] = Path("out")
+    path: Annotated[Path, KeyMeta(flag="output_path", role="output", is_common=True)] = Path("out")
     """Folder of the results."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
     """Seed of everything random: same input and seed, same result."""

@@ -93,4 +93,4 @@ def test_wrong_arguments_are_named(argv: list[str], said: str) -> None:
     with pytest.raises(InputError) as caught:
         parse(normalize(argv))
     assert said in str(caught.value)
-    assert "--help" in str(caught.value)
+    assert " -h)" in str(caught.value)

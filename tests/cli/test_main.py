@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -57,6 +58,44 @@ def test_help_of_each_command_shows_an_example(command: str, capsys: pytest.Capt
     assert main([*command.split(), "--help"]) == 0
     text = capsys.readouterr().out
     assert f"example:\n  rangesfm {command}" in text
+    assert main([*command.split(), "-h"]) == 0
+    short = capsys.readouterr().out
+    assert f"example:\n  rangesfm {command}" in short
+    assert f"everything:\n  rangesfm {command} --help" in short
+    assert set(re.findall(r"--\w+", short)) <= set(re.findall(r"--\w+", text))
+
+
+@pytest.mark.parametrize("num_columns", [80, 100])
+def test_help_is_wrapped_to_the_width_of_the_terminal(
+    num_columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(num_columns))
+    for command in ("", *Commands().by_name):
+        for flag in ("-h", "--help"):
+            assert main([*command.split(), flag]) == 0
+    widths = [len(line) for line in capsys.readouterr().out.splitlines()]
+    assert num_columns - 5 < max(widths) <= num_columns
+
+
+def test_short_help_is_a_page_of_what_most_people_need(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "-h"]) == 0
+    short = capsys.readouterr().out
+    assert main(["run", "--help"]) == 0
+    full = capsys.readouterr().out
+    assert len(short.splitlines()) < 60 < len(full.splitlines())
+    for flag, is_common in {"--images": True, "--ranges": True, "--tag_in_cam": True, "--stamp_bits": False}.items():
+        assert f"\n  {flag} " in full
+        assert (f"\n  {flag} " in short) == is_common
+
+
+def test_first_list_has_the_commands_most_people_need_and_the_full_help_all(capsys: pytest.CaptureFixture[str]) -> None:
+    listed = []
+    for flag in ("-h", "--help"):
+        assert main([flag]) == 0
+        text = capsys.readouterr().out.partition("example:")[0]
+        listed.append([name for name in Commands().by_name if re.search(f"\n  {name}  ", text)])
+    assert listed[0] == ["init", "check", "run", "demo", "plan", "measure", "export", "report"]
+    assert listed[1] == list(Commands().by_name)
 
 
 @pytest.mark.parametrize(

@@ -39,8 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         settle_num_threads()
         try:
             args = parse(normalize(sys.argv[1:] if argv is None else argv))
-        except SystemExit as ended:  # by --help, which has printed its text, or by --version, which has not
-            _print([ended.code] if isinstance(ended.code, str) else [])
+        except SystemExit as ended:  # by -h, --help or --version, with the text to print
+            _print([str(ended.code)])
             return 0
         if args.command != "doctor":  # doctor reports on the versions in more detail
             from rangesfm.installed_versions import check_versions

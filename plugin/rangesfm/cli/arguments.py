@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, NoReturn
 
+from rangesfm.cli.help_pages import HelpParser, HelpSection
 from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
@@ -29,7 +30,7 @@ class Outcome:
 Execute = Callable[[argparse.Namespace, Progress], Outcome]
 
 
-class Parser(argparse.ArgumentParser):
+class Parser(HelpParser):
     """Parser that raises InputError where argparse would print its usage and exit.
 
     Attributes:
@@ -38,7 +39,7 @@ class Parser(argparse.ArgumentParser):
     """
 
     def __init__(self, **options: Any):
-        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options)
+        super().__init__(**options)
         self.later: list[Callable[[Parser], None]] = []
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
@@ -47,11 +48,40 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see {self.prog} --help)")
+        raise InputError(f"{message} (see {self.prog} -h)")
 
     def nearest_option(self, name: str) -> str | None:
         """Return the known long option that is spelt most like ``name``; None if none is similar."""
         return next(iter(difflib.get_close_matches(name, self._option_string_actions, 1)), None)
+
+
+class ProgramParser(Parser):
+    """Parser of the whole command line; its help lists the commands.
+
+    Attributes:
+        commands: all commands with their lines of help, by whether the short help lists them too.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(
+            prog="rangesfm",
+            usage="rangesfm COMMAND [options]",
+            description="Metric COLMAP models from photos and ultra-wideband ranges.",
+            epilog="example:\n  rangesfm demo\n\nmore:\n"
+            "  rangesfm --help          all commands\n"
+            "  rangesfm COMMAND -h      what most people need of a command\n"
+            "  rangesfm COMMAND --help  everything about it; options may be spelt with _ or -",
+        )
+        self.more = None
+        self.commands: dict[bool, list[argparse.Action]] = {True: [], False: []}
+        self.general.add_argument("--version", action=_PrintVersion)
+
+    def help_sections(self, *, is_full: bool) -> Sequence[HelpSection]:
+        common = HelpSection("commands", self.commands[True])
+        if not is_full:
+            return [common]
+        more = HelpSection("more commands", self.commands[False])
+        return [common, more, HelpSection("options", self.general._group_actions)]
 
 
 class Commands:
@@ -63,35 +93,26 @@ class Commands:
     """
 
     def __init__(self) -> None:
-        self.parser = Parser(
-            prog="rangesfm",
-            description="Metric COLMAP models from photos and ultra-wideband ranges.",
-            epilog="example:\n  rangesfm demo\n\n"
-            "rangesfm COMMAND --help explains a command. Options may be spelt with _ or -.",
-        )
-        self.parser.add_argument("--version", action=_PrintVersion)
-        self._subparsers = self.parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
+        self.parser = ProgramParser()
+        self._subparsers = self.parser.add_subparsers(prog="rangesfm", metavar="COMMAND", parser_class=Parser)
         self.by_name: dict[str, Parser] = {}
         for module in _MODULES:
             getattr(import_module(f"rangesfm.cli.{module}"), f"add_{module}_commands")(self)
 
-    def add(self, name: str, execute: Execute, help: str) -> Parser:
+    def add(self, name: str, execute: Execute, help: str, *, is_common: bool = False) -> Parser:
         """Add a command and return its parser, with the options that all commands have.
 
         Args:
             name: of the command; it may have two words.
             execute: function that runs it. Its docstring is the description and the example in the help.
             help: one line for the list of commands.
+            is_common: whether most people need it; the others are in a list of their own, in the full help only.
         """
         description, _, example = inspect.cleandoc(execute.__doc__ or "").partition("\n\nexample:")
-        parser: Parser = self._subparsers.add_parser(
-            name,
-            help=help,
-            description=description,
-            epilog=f"example:{example}",
-        )
-        parser.add_argument("--quiet", action="store_true", help="print results and errors only")
+        parser: Parser = self._subparsers.add_parser(name, description=description, epilog=f"example:{example}")
+        parser.general.add_argument("--quiet", action="store_true", help="print results and errors only")
         parser.set_defaults(execute=execute, command=name)
+        self.parser.commands[is_common].append(argparse.Action([], name, help=help))
         self.by_name[name] = parser
         return parser
 
@@ -120,7 +141,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 
     Raises:
         InputError: an unknown command or option (the text names the nearest known one), or a bad value.
-        SystemExit: after ``--help``, which has printed its text; for ``--version``, with the text to print.
+        SystemExit: with the text to print, for ``-h``, ``--help`` and ``--version``.
     """
     commands = Commands()
     args: argparse.Namespace

@@ -54,14 +54,14 @@ def add_batch_commands(commands: Commands) -> None:
 
 
 def _batch(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Run many surveys, each as rangesfm run does. A survey that fails does not stop the others. The outcome of
+    r"""Run many surveys, each as rangesfm run does. A survey that fails does not stop the others. The outcome of
     each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.
 
     Without --scheduler, the workers are processes of this machine, which share its cores and memory. With it,
     they are the workers of a Dask scheduler. These must have this version of rangesfm installed, and find the
     files of the surveys under the same paths. Each worker should run one survey at a time:
       dask scheduler --host HEAD
-      dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard       # on each machine
+      dask worker tcp://HEAD:8786 --nthreads 1 --no-dashboard  # on each machine
     dask-jobqueue starts workers on Slurm, PBS and similar, dask-kubernetes on Kubernetes: see
     examples/many_surveys.md.
 
@@ -69,7 +69,8 @@ def _batch(args: argparse.Namespace, progress: Progress) -> Outcome:
 
     example:
       rangesfm batch surveys/*.toml --output_path batch
-      rangesfm batch surveys/*.toml --num_workers 2 --num_threads 4 --memory_limit 8GB
+      rangesfm batch surveys/*.toml --num_workers 2 --num_threads 4 \
+        --memory_limit 8GB
       rangesfm batch surveys/*.toml --scheduler tcp://head:8786 --num_threads 8
     """
     if args.scheduler is not None and args.num_workers is not None:

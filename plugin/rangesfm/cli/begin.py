@@ -23,12 +23,14 @@ if TYPE_CHECKING:
 
 
 def add_begin_commands(commands: Commands) -> None:
-    init = commands.add("init", _init, "write a survey file from folders of photos and logs")
+    init = commands.add("init", _init, "write a survey file from folders of photos and logs", is_common=True)
     init.add_argument("folders", nargs="+", metavar="FOLDER", help="folders with photos, log, anchors, ...")
     init.add_argument("--output_path", metavar="PATH", help="survey file, or its folder (default: the first FOLDER)")
     init.add_argument("--force", action="store_true", help="write a survey file anew that is there already")
     add_flags(init, without=("output.path",))
-    check = commands.add("check", _check, "say in seconds what a run would read, and what is wrong with it")
+    check = commands.add(
+        "check", _check, "say in seconds what a run would read, and what is wrong with it", is_common=True
+    )
     add_survey_arguments(check)
 
 

@@ -11,7 +11,9 @@ from rangesfm.progress import Progress
 
 
 def add_planning_commands(commands: Commands) -> None:
-    plan = commands.add("plan", _plan, "say before a survey how accurate it will be, and what to change")
+    plan = commands.add(
+        "plan", _plan, "say before a survey how accurate it will be, and what to change", is_common=True
+    )
     plan.add_argument("plan", nargs="?", metavar="PLAN.toml", help="file with anchors, path and radio")
     plan.add_argument("--from", dest="result", metavar="RESULT", help="plan another survey like this finished one")
     plan.add_argument("--output_path", metavar="FOLDER", help="write plan.json and plan.html into this folder")

@@ -234,8 +234,8 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
     curve through their neighbours in time.
 
     example:
-      rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d --timestamp_unit ms \
-        --output_path ranges.csv
+      rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d \
+        --timestamp_unit ms --output_path ranges.csv
     """
     from rangesfm.ranging.range_summary import summarize_ranges
     from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
@@ -325,8 +325,8 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
     compare take the file that this writes as --error_curve; in a survey file it is error_curve in [ranges].
 
     example:
-      rangesfm ranges calibrate log.csv --anchors anchors.csv --positions truth.csv \
-        --output_path curve.csv
+      rangesfm ranges calibrate log.csv --anchors anchors.csv \
+        --positions truth.csv --output_path curve.csv
     """
     from rangesfm.ranging.errors.error_curve import write_error_curve
     from rangesfm.ranging.errors.radio_calibration import calibrate_ranges
@@ -366,12 +366,13 @@ def _calibrated(calibration: RadioCalibration, num_in_log: int) -> list[str]:
 
 
 def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Estimate the positions of anchors robustly, from ranges taken at known positions of the tag. If these positions
+    r"""Estimate the positions of anchors robustly, from ranges taken at known positions of the tag. If these positions
     are in a plane, an anchor has two possible places, one on each side of the plane; --side says which one is right.
     If --height gives the height of an anchor, only x and y are estimated, and positions in a level plane are enough.
 
     example:
-      rangesfm trilaterate uwb.csv --positions total_station.csv --side above --output_path anchors.csv
+      rangesfm trilaterate uwb.csv --positions total_station.csv --side above \
+        --output_path anchors.csv
       rangesfm run survey.toml --anchors anchors.csv --anchor_frame site
     """
     from rangesfm.ranging.anchors.anchor_file import write_anchors

@@ -22,7 +22,7 @@ _WITHOUT_LOG = ("--distances", "--markers")
 
 
 def add_results_commands(commands: Commands) -> None:
-    measure = commands.add("measure", _measure, "measure distances and height differences in a map")
+    measure = commands.add("measure", _measure, "measure distances and height differences in a map", is_common=True)
     measure.add_argument("result", metavar="RESULT", help="output folder of a run")
     measure.add_argument(
         "points",
@@ -39,7 +39,7 @@ def add_results_commands(commands: Commands) -> None:
         help="CSV marker,image_name,x_px,y_px with marks in photos (default: the tags and markers of the run)",
     )
     measure.add_argument("--output_path", type=Path, metavar="FILE", help="also write the measurements as CSV")
-    export = commands.add("export", _export, "write the metric model in other formats")
+    export = commands.add("export", _export, "write the metric model in other formats", is_common=True)
     _add_result_argument(export)
     add_flags(export, "export", by_own_names=True)
     export.add_argument(
@@ -64,7 +64,7 @@ def add_results_commands(commands: Commands) -> None:
         "--output_path", metavar="FOLDER", help="for two models or more: also write comparison.html to this folder"
     )
     add_flags(compare, *_COMPARE_KEYS, without=_OF_A_RUN)
-    report = commands.add("report", _report, "write a result folder as one self-contained HTML page")
+    report = commands.add("report", _report, "write a result folder as one self-contained HTML page", is_common=True)
     _add_result_argument(report)
     report.add_argument(
         "--images",
@@ -88,13 +88,14 @@ def _result_path(args: argparse.Namespace) -> Path:
 
 
 def _measure(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Measure distances and height differences between points of a map. Their 95 % intervals count how the two points
+    r"""Measure distances and height differences between points of a map. Their 95 % intervals count how the two points
     err together: by the scale, by the map's bending, and by the photos that show them. Height differences need a site
     frame, or a given upward direction.
 
     example:
       rangesfm measure out IMG_0001.jpg IMG_0020.jpg A1
-      rangesfm measure out --pairs pairs.csv --markers marks.csv --output_path measured.csv
+      rangesfm measure out --pairs pairs.csv --markers marks.csv \
+        --output_path measured.csv
     """
     from rangesfm.workflows.measure import measure, read_point_pairs
 
@@ -113,10 +114,11 @@ def _measure(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Write the metric model of a result folder in other formats. An unknown format prints the list of all.
+    r"""Write the metric model of a result folder in other formats. An unknown format prints the list of all.
 
     example:
-      rangesfm export out --formats tum,ply,nerfstudio --frame level --output_path exported
+      rangesfm export out --formats tum,ply,nerfstudio --frame level \
+        --output_path exported
     """
     from rangesfm.workflows.export_result import apply_result, export_result
 
@@ -159,8 +161,9 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
     example:
       rangesfm compare out --reference reference.csv
       rangesfm compare out other_tool/sparse/0 --output_path comparison
-      rangesfm compare one/sparse/0 other/sparse/0 --ranges uwb.csv --anchors anchors.csv \
-          --images images.csv --tag_in_cam -0.0012,-0.09,-0.0663 --distances taped.csv
+      rangesfm compare one/sparse/0 other/sparse/0 --ranges uwb.csv \
+        --anchors anchors.csv --images images.csv \
+        --tag_in_cam -0.0012,-0.09,-0.0663 --distances taped.csv
     """
     given = [*([] if args.input_path is None else [args.input_path]), *args.models]
     paths = [Path(path) for path in given] or [Path("out")]

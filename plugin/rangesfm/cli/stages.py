@@ -29,10 +29,10 @@ _JOIN_KEYS = (
 
 
 def add_stages_commands(commands: Commands) -> None:
-    run = commands.add("run", _run, "make a metric model from photos and ranges: the whole pipeline")
+    run = commands.add("run", _run, "make a metric model from photos and ranges: the whole pipeline", is_common=True)
     add_survey_arguments(run)
     add_restart_argument(run)
-    demo = commands.add("demo", _demo, "make a small survey and run the pipeline on it: no data needed")
+    demo = commands.add("demo", _demo, "make a small survey and run the pipeline on it: no data needed", is_common=True)
     demo.add_argument(
         "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"folder to write to (default: {_DEMO_FOLDER})"
     )
@@ -61,6 +61,7 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
     of a survey file, a folder is enough if its files can be recognised (see rangesfm init).
 
     example:
+      rangesfm run my_survey
       rangesfm run survey.toml --every_nth 3 --output_path out
     """
     survey = survey_from_arguments(args, progress)
@@ -106,7 +107,7 @@ def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Make an unscaled COLMAP model from photos: keyframes, features, matching, mapping.
 
     example:
-      rangesfm reconstruct --images photos --image_times images.csv --output_path out
+      rangesfm reconstruct --images photos --image_times images.csv
     """
     survey = survey_from_arguments(args)
     _require_images(survey)
@@ -116,10 +117,11 @@ def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Estimate the scale of a COLMAP model from ranges, and write the rescaled model. The model needs no points.
+    r"""Estimate the scale of a COLMAP model from ranges, and write the rescaled model. The model needs no points.
 
     example:
-      rangesfm scale --input_path sparse/0 --ranges uwb.csv --images images.csv --output_path out
+      rangesfm scale --input_path sparse/0 --ranges uwb.csv --images images.csv \
+        --output_path out
     """
     survey = survey_from_arguments(args)
     _require_model_and_metres(survey)

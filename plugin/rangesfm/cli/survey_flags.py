@@ -62,6 +62,7 @@ def _add_flags(parser: Parser, *, keys: tuple[str, ...], without: tuple[str, ...
             group = parser.add_argument_group(f"[{table}] in a survey file", model.__doc__)
             for item in chosen:
                 _add_flag(group, item, item.name if by_own_names else item.flag)
+            parser.common |= {item.dotted for item in chosen if item.is_common}
 
 
 def _add_flag(group: argparse._ArgumentGroup, item: Key, flag: str) -> None:
@@ -70,6 +71,8 @@ def _add_flag(group: argparse._ArgumentGroup, item: Key, flag: str) -> None:
         group.add_argument(f"--{flag}", f"--no_{flag}", dest=item.dotted, action=_Switch, help=meaning)
         return
     choices = get_args(item.type) if get_origin(item.type) is Literal else None
+    if choices and item.metavar:  # they are too many for the place of a value
+        meaning += f". One of {', '.join(map(str, choices))}"
     is_lever_arm = item.dotted == "tag.tag_in_cam_m"
     group.add_argument(
         f"--{flag}",
@@ -78,7 +81,7 @@ def _add_flag(group: argparse._ArgumentGroup, item: Key, flag: str) -> None:
         type=_lever_arm if is_lever_arm else _converter(item.type),
         choices=choices,
         help=meaning,
-        metavar=None if choices else item.metavar or _metavar(item),
+        metavar=item.metavar or (None if choices else _metavar(item)),
     )
 
 

@@ -1,0 +1,87 @@
+"""The two pages of help of a command: a short one for ``-h``, and everything for ``--help``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+_OPTIONS = argparse.Action([], "options", metavar="[options]")  # stands for them all in the usage
+
+
+@dataclass(frozen=True)
+class HelpSection:
+    """A list of arguments or commands under a title, with a text below the title if there is one."""
+
+    title: str | None
+    actions: Sequence[argparse.Action]
+    text: str | None = None
+
+
+class HelpFormatter(argparse.HelpFormatter):
+    """Formatter that wraps texts to the width of the terminal. Indented lines, such as commands, stay as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines: list[str] = []
+        for is_prose, group in groupby(text.splitlines(), lambda line: bool(line[:1].strip())):
+            block = list(group)
+            lines += [super()._fill_text(" ".join(block), width, indent)] if is_prose else block
+        return "\n".join(lines)
+
+
+class PrintHelp(argparse.Action):
+    """Flag ``-h`` or ``--help``, which ends the reading of arguments with the text to print."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str):
+        super().__init__(option_strings, dest, nargs=0, help="-h: what most people need; --help: everything")
+
+    def __call__(self, parser: object, namespace: object, values: object, name: str | None = None) -> None:
+        assert isinstance(parser, HelpParser)
+        raise SystemExit(parser.help_page(is_full=name == "--help").rstrip("\n"))
+
+
+class HelpParser(argparse.ArgumentParser):
+    """Parser with two pages of help. The short one has the arguments that are in no group, and the common ones.
+
+    Attributes:
+        common: attributes of the parsed arguments that hold the common ones of the groups.
+        general: group of the options that all commands have.
+        more: last lines of the short page.
+    """
+
+    def __init__(self, **options: Any):
+        super().__init__(formatter_class=HelpFormatter, allow_abbrev=False, add_help=False, **options)
+        self.color = False  # with colours, those of Python 3.14, the text would contain control characters
+        self.common: set[str] = set()
+        self.more: str | None = f"everything:\n  {self.prog} --help"
+        self.general = self.add_argument_group("general")
+        self.general.add_argument("-h", "--help", action=PrintHelp)
+
+    def help_page(self, *, is_full: bool) -> str:
+        """Return the text of ``--help`` (everything) or of ``-h``."""
+        formatter = self.formatter_class(prog=self.prog)
+        required = [action for action in self._actions if action.required or not action.option_strings]
+        formatter.add_usage(self.usage, [_OPTIONS, *required], [])
+        description = self.description or ""
+        formatter.add_text(description if is_full else description.partition("\n\n")[0])
+        for section in self.help_sections(is_full=is_full):
+            formatter.start_section(section.title)
+            formatter.add_text(section.text)
+            formatter.add_arguments(section.actions)
+            formatter.end_section()
+        formatter.add_text(self.epilog)
+        formatter.add_text(None if is_full else self.more)
+        return formatter.format_help()
+
+    def help_sections(self, *, is_full: bool) -> Sequence[HelpSection]:
+        """Return the lists of a page: all groups, or what is common of them in two lists."""
+        if is_full:
+            return [HelpSection(group.title, group._group_actions, group.description) for group in self._action_groups]
+        ungrouped = {action for group in self._action_groups[:2] for action in group._group_actions}
+        shown = [action for action in self._actions if action in ungrouped or action.dest in self.common]
+        return [
+            HelpSection("arguments", [action for action in shown if not action.option_strings]),
+            HelpSection("options", [action for action in shown if action.option_strings]),
+        ]
