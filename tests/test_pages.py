@@ -28,7 +28,9 @@ from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 from tests.simulated.path import loop_path
 
 from rangesfm.cli.arguments import Commands, normalize, parse
+from rangesfm.export import EXPORTERS
 from rangesfm.planning.plan_file import PLAN_TABLES as PLAN_TABLES
+from rangesfm.ranging.readers import reader_names
 from rangesfm.survey.settings import KEYS, read_survey
 
 if TYPE_CHECKING:
@@ -156,6 +158,31 @@ def test_every_command_is_on_a_page() -> None:
     assert [command for command in Commands().by_name if f"rangesfm {command}" not in text] == []
 
 
+def test_every_log_format_and_every_export_format_is_on_a_page() -> None:
+    logs, exports = ((ROOT / "examples" / name).read_text(encoding="utf-8") for name in ("log_formats.md", "export.md"))
+    assert [name for name in EXPORTERS if f"`{name}`" not in exports] == []
+    assert [name for name in reader_names() if PAGE_NAMES.get(name, f"`{name}`").lower() not in logs.lower()] == []
+
+
+# Names in log_formats.md of readers that are known to users by another name.
+PAGE_NAMES = {
+    "ros": "ROS 1 and 2 bags",
+    "canonical": "canonical CSV",
+    "mapped": "--columns",
+    "table": "any table of text",
+    "librsf": "libRSF",
+    "pyfg": "PyFactorGraph",
+    "leaps_meas": "LEAPS",
+    "leaps_lea": "LEAPS",
+    "qorvo": "Qorvo",
+    "dwm1001_lec": "DWM1001 `lec`",
+    "dwm1001_les": "and `les`",
+    "mauwb": "MaUWB",
+    "arduino": "Arduino",
+    "makerfabs_json": "Makerfabs",
+}
+
+
 def test_the_readme_is_read_in_one_go() -> None:
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
 
@@ -195,8 +222,12 @@ def test_flags_in_the_text_exist() -> None:
     )
     named = {flag.replace("-", "_").replace("__", "--", 1) for flag in re.findall(r"(?<=[` ])--\w[\w-]*", text)}
     assert named - known == OF_OTHER_PROGRAMS | OF_STUDIES
+    everything = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert {flag for flag in known if flag not in everything} == OF_THE_HELP
 
 
+# These need no page: the help says all.
+OF_THE_HELP = {"--num_photos", "--quiet"}
 OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--csv", "--ref_images_path", "--transform_path"}
 OF_STUDIES = {"--by_photo", "--calibrated", "--data", "--leave_radio_out"}
 
