@@ -16,7 +16,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from rangesfm.survey.settings import parse_toml, read_survey
+from rangesfm.survey.survey_reader import parse_toml, read_survey
 
 if TYPE_CHECKING:
     from tests.conftest import PhotoRun, WalkedSurvey

@@ -89,6 +89,12 @@ def test_what_stands_at_the_root_imports_no_folder() -> None:
     assert not [(module, name) for module in at_root for name in own_imports(module) if layer(name) != ROOT]
 
 
+def test_settings_are_values_that_need_no_reader_and_no_disk() -> None:
+    imported = own_imports("survey.settings")
+    assert imported
+    assert [name for name in imported if layer(name) != ROOT] == []
+
+
 def test_the_root_holds_few_files_and_every_folder_has_its_layer() -> None:
     assert len(list(PACKAGE.glob("*.py"))) <= MAX_NUM_FILES_AT_ROOT
     folders = {folder_of(module) for module, path in MODULES.items() if path.parent != PACKAGE}

@@ -31,7 +31,8 @@ from rangesfm.cli.arguments import Commands, normalize, parse
 from rangesfm.export import EXPORTERS
 from rangesfm.planning.plan_file import PLAN_TABLES as PLAN_TABLES
 from rangesfm.ranging.readers import reader_names
-from rangesfm.survey.settings import KEYS, read_survey
+from rangesfm.survey.settings import KEYS
+from rangesfm.survey.survey_reader import read_survey
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey

@@ -47,7 +47,7 @@ _HOME = {
     "read_plan": "rangesfm.planning.plan_file",
     "read_ranges": "rangesfm.ranging.readers",
     "read_reference": "rangesfm.geometry.reference",
-    "read_survey": "rangesfm.survey.settings",
+    "read_survey": "rangesfm.survey.survey_reader",
     "reconstruct": "rangesfm.vision.reconstruct",
     "refine_with_ranges": "rangesfm.refine.with_ranges",
     "rescale": "rangesfm.colmap.transform",

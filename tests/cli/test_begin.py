@@ -12,7 +12,8 @@ from tests.conftest import TAG_IN_CAM_M
 from tests.simulated.phone_survey import write_anchors, write_log, write_photos
 
 from rangesfm.cli import main
-from rangesfm.survey.settings import Survey, read_survey
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import read_survey
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey

@@ -27,7 +27,7 @@ from rangesfm.files.atomic import sole_writer, write_text
 from rangesfm.geometry.reference import read_reference
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.readers import read_ranges
-from rangesfm.survey.settings import read_survey
+from rangesfm.survey.survey_reader import read_survey
 
 NUM_PHOTOS = 4
 

@@ -25,7 +25,8 @@ from rangesfm.ranging.range_summary import summarize_ranges
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, write_ranges_csv
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
-from rangesfm.survey.settings import Survey, read_survey
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import read_survey
 from rangesfm.vision.image_times import ImageTimes, read_image_times_csv
 
 CORPUS = Path(__file__).parent / "corpus"

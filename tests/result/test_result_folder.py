@@ -20,7 +20,8 @@ from rangesfm.result.result_folder import (
     refuse_to_overwrite,
 )
 from rangesfm.result.result_tables import RESULT_TABLES, RangesAsUsed
-from rangesfm.survey.settings import Survey, survey_from_tables
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import survey_from_tables
 
 PAGE = (Path(__file__).parents[2] / "examples" / "results.md").read_text(encoding="utf-8")
 

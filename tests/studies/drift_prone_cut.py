@@ -33,7 +33,8 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
 from rangesfm.survey.inputs import read_ranging_inputs, times_of_model
-from rangesfm.survey.settings import Survey, read_survey
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import read_survey
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.workflows.run import refine_model

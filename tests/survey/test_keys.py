@@ -14,7 +14,8 @@ from rangesfm.cli.survey_flags import survey_from_arguments
 from rangesfm.errors import InputError
 from rangesfm.option_model import Key
 from rangesfm.options import CameraOptions, OutputOptions, ScaleOptions
-from rangesfm.survey.settings import KEYS, Survey, read_survey
+from rangesfm.survey.settings import KEYS, Survey
+from rangesfm.survey.survey_reader import input_paths, read_survey
 
 EXTREMES = ("1e308", "-1e308", "1e-320", "9223372036854775807", "-9223372036854775808", "-1", "0", "nan", "inf", "-inf")
 
@@ -153,5 +154,5 @@ def test_every_path_that_is_read_is_in_one_list(tmp_path: Path) -> None:
     assert all(item.role for item in KEYS if item.type is Path)
     read = {**{item.dotted: item.dotted for item in files}, "images.model": "sparse", "images.path": "photos"}
     survey = Survey().changed({key: tmp_path / name for key, name in {**read, "output.path": "out"}.items()})
-    listed = {item.path.name: item.role for item in survey.input_paths()}
+    listed = {item.path.name: item.role for item in input_paths(survey)}
     assert listed == {"sparse": "model", "photos": "photos", **{item.dotted: "file" for item in files}}

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from rangesfm.errors import InputError
 from rangesfm.options import MapperOptions, OutputOptions
 from rangesfm.ranging.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
-from rangesfm.survey.settings import Survey, read_survey, survey_from_tables
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import input_paths, read_survey, survey_from_tables
 
 WHOLE = """
 [images]
@@ -302,7 +303,7 @@ def test_log_may_be_files_in_a_folder_and_an_empty_one_is_refused(folder: Path) 
         (folder / "logs" / f"anchor_{anchor_id}.csv").touch()
     for path in ("logs", "logs/anchor_*.csv"):
         survey = read_survey(write(folder, f"[ranges]\npath = '{path}'\n"))
-        assert [item.path.name for item in survey.input_paths()] == ["anchor_1.csv", "anchor_2.csv"]
+        assert [item.path.name for item in input_paths(survey)] == ["anchor_1.csv", "anchor_2.csv"]
 
 
 def test_folder_in_place_of_a_file_is_named_as_one(folder: Path) -> None:

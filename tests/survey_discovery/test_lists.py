@@ -14,7 +14,8 @@ from rangesfm.cli import main
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.survey.inputs import read_ranging_inputs
-from rangesfm.survey.settings import Survey, read_survey
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import read_survey
 from rangesfm.vision.image_times import find_image_times, list_images
 
 Place = tuple[float, float, float]

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from rangesfm.errors import InputError
-from rangesfm.survey.settings import SURVEY_TABLES, read_survey, survey_from_tables
+from rangesfm.survey.settings import SURVEY_TABLES
+from rangesfm.survey.survey_reader import read_survey, survey_from_tables
 from rangesfm.survey_discovery.survey_file import survey_text
 
 

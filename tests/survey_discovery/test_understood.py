@@ -10,7 +10,7 @@ from tests.simulated.phone_survey import write_anchors, write_log, write_photos
 from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.errors import InputError
-from rangesfm.survey.settings import read_survey
+from rangesfm.survey.survey_reader import read_survey
 from rangesfm.survey_discovery.understood import understand
 
 CAMERA = {"camera_model": "PINHOLE", "width": 96, "height": 64, "params": [90, 90, 48, 32], "tag_in_cam_m": [0, 0.1, 0]}

@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 from tests.simulated.phone_survey import write_anchors, write_log, write_photos
 
-from rangesfm.survey.settings import Survey, survey_from_tables
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.workflows.check import check_survey
 
 PHONE_START_S = 1777888800.0  # 2026-05-04 10:00:00 UTC

@@ -20,7 +20,8 @@ from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.options import CameraOptions
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.result.result_folder import read_result_folder
-from rangesfm.survey.settings import Survey, survey_from_tables
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.workflows.check import check_survey
 from rangesfm.workflows.map_photos import with_photos_in_folder
 

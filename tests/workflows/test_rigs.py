@@ -17,7 +17,8 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.result.summary import ResultSummary
-from rangesfm.survey.settings import Survey, survey_from_tables
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.workflows import map_photos
 from rangesfm.workflows.map_photos import find_keyframes, map_keyframes
 from rangesfm.workflows.run import refine_model

@@ -28,7 +28,8 @@ from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.places import path_in, recorded_path
 from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus
 from rangesfm.result.summary import ResultSummary
-from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
+from rangesfm.survey.settings import KEYS, Survey
+from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.workflows import run
 from rangesfm.workflows.export_result import export_result
 from rangesfm.workflows.run import refine_model, scale_model

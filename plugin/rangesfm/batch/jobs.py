@@ -8,7 +8,8 @@ from pathlib import Path
 
 from rangesfm.errors import Failure, InputError, failure_of, one_line
 from rangesfm.files.folders import real_path
-from rangesfm.survey.settings import Survey, read_survey
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import read_survey
 
 _USUAL_BYTES = 2 * 10**9  # a reconstruction of some hundred photos needs less memory than this
 

@@ -45,7 +45,7 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     from rangesfm.files.atomic import write_text
     from rangesfm.files.output_folder import free_output
-    from rangesfm.survey.settings import read_survey
+    from rangesfm.survey.survey_reader import read_survey
     from rangesfm.survey_discovery.found_files import SURVEY_NAME
     from rangesfm.survey_discovery.survey_file import survey_text
     from rangesfm.survey_discovery.understood import understand

@@ -91,7 +91,7 @@ def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
     if args.seed < 0:
         raise InputError(f"--seed is {args.seed}, expected 0 or more")
     from rangesfm.demo.survey import make_demo_survey
-    from rangesfm.survey.settings import read_survey
+    from rangesfm.survey.survey_reader import read_survey
     from rangesfm.workflows.run import run_survey
 
     folder = Path(args.folder)

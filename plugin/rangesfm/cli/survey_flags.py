@@ -176,7 +176,7 @@ def _columns(text: str) -> dict[str, str]:
 
 
 def _options(text: str) -> dict[str, Any]:
-    from rangesfm.survey.settings import parse_inline_table
+    from rangesfm.survey.survey_reader import parse_inline_table
 
     try:
         return parse_inline_table(text)
@@ -224,7 +224,7 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
     Raises:
         InputError: the file cannot be read, or a key or a flag is wrong.
     """
-    from rangesfm.survey.settings import read_survey, survey_from_tables
+    from rangesfm.survey.survey_reader import read_survey, survey_from_tables
     from rangesfm.survey_discovery.found_files import SURVEY_NAME
 
     overrides = overrides_from_arguments(args)

@@ -20,7 +20,7 @@ from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, asce
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
-from rangesfm.survey.settings import absolute_value, parse_toml, refuse_unknown_tables
+from rangesfm.survey.survey_reader import absolute_value, parse_toml, refuse_unknown_tables
 
 _Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 _Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]

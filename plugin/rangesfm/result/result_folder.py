@@ -27,6 +27,7 @@ from rangesfm.result.places import input_beside, path_in
 from rangesfm.result.result_tables import RESULT_TABLES, PhotoTimes, TableFile
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import input_paths
 from rangesfm.vision.steps import RECONSTRUCTION_NAMES
 
 _Table = TypeVar("_Table", bound=TableFile)
@@ -60,7 +61,7 @@ def refuse_to_overwrite(survey: Survey) -> None:
     maps = survey.images.model is None
     places = {folder / name for name in result_names(survey)}
     places.update(folder / name for name in (*RECONSTRUCTION_NAMES, *PHOTOS_NAMES) if maps)
-    for item in survey.input_paths():
+    for item in input_paths(survey):
         path = real_path(item.path)
         if not places.isdisjoint((path, *path.parents)):
             raise InputError("the results would overwrite this input, expected another output path", item.path)

@@ -25,6 +25,7 @@ from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import input_paths
 from rangesfm.vision.image_times import (
     ImageTimes,
     find_image_times,
@@ -350,7 +351,7 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
     For a folder of photos, only names and sizes are hashed: reading gigabytes again would take too long.
     """
     entries: list[dict[str, Any]] = []
-    for item in survey.input_paths():
+    for item in input_paths(survey):
         if item.role == "photos":
             entries += [_folder(item.path)] if item.path.is_dir() else []
         else:

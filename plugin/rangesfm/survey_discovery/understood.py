@@ -16,7 +16,8 @@ from rangesfm.errors import InputError
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.ranging.readers.lists import UnclearListError
 from rangesfm.sources.source import is_source, open_source
-from rangesfm.survey.settings import KEYS, Survey, survey_from_tables
+from rangesfm.survey.settings import KEYS, Survey
+from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, Found, look_into, short_path
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.photo_files import usable_photos

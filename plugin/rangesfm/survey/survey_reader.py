@@ -1,0 +1,188 @@
+"""Reading of surveys: from a TOML file, from flags or from both, and the files that a survey names."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rangesfm.errors import InputError, OptionError, nearest_known, printable, shown
+from rangesfm.files.atomic import path_of
+from rangesfm.files.text_tables import read_text
+from rangesfm.option_model import PathRole
+from rangesfm.options import CameraOptions
+from rangesfm.ranging.readers import files_of_log
+from rangesfm.survey.settings import ROLE_OF_PATH, SURVEY_TABLES, OptionsOrigin, Survey
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+# A flag for the first key replaces the second key in the file, because both give lever arms.
+_INSTEAD_OF = {"tag.tag_in_cam_m": "lever_arms_m", "tag.lever_arms_m": "tag_in_cam_m"}
+
+
+def parse_toml(path: Path) -> tuple[dict[str, Any], OptionsOrigin]:
+    """Read a TOML file.
+
+    Raises:
+        InputError: it cannot be read or is not TOML; the text names the line.
+    """
+    text = read_text(path)
+    try:
+        return tomllib.loads(text), OptionsOrigin(path, text)
+    except RecursionError:
+        raise InputError("not a TOML file (nested too deeply)", path) from None
+    except ValueError as error:  # a TOMLDecodeError, or a number that Python refuses to read
+        where = re.search(r" \(at (?:line (\d+), column \d+|end of document)\)$", str(error))
+        message = str(error)[: where.start()] if where else str(error)
+        line = None if where is None else int(where[1] or text.rstrip().count("\n") + 1)
+        raise InputError(f"not a TOML file ({printable(message)})", path, line) from None
+
+
+def parse_inline_table(text: str) -> dict[str, Any]:
+    """Read text such as ``a = 1, b.c = "x"`` as the inside of an inline table of TOML.
+
+    Raises:
+        ValueError: it is not TOML.
+    """
+    table: dict[str, Any] = tomllib.loads(f"table = {{{text}}}")["table"]
+    return table
+
+
+def read_survey(
+    path: str | Path, overrides: Mapping[str, object] | None = None, base_folder: str | Path | None = None
+) -> Survey:
+    """Read a survey file.
+
+    Args:
+        path: of the TOML file.
+        overrides: values by dotted key (``{"ranges.path": "uwb.csv"}``) that replace those of the file. Their paths are
+            relative to the working directory.
+        base_folder: folder to which paths in the file are relative; None: the folder of the file.
+
+    Raises:
+        InputError: an unknown table or key, a value of the wrong type or out of bounds, or a file that does not exist.
+            The text names the line where possible.
+    """
+    tables, source = parse_toml(Path(path))
+    folder = Path(path).absolute().parent if base_folder is None else base_folder
+    return survey_from_tables(tables, folder, overrides, source)
+
+
+def survey_from_tables(
+    tables: Mapping[str, Any],
+    base_folder: str | Path,
+    overrides: Mapping[str, object] | None = None,
+    source: OptionsOrigin | None = None,
+) -> Survey:
+    """Make a survey from tables in memory, otherwise as ``read_survey``; ``source`` names the file for messages."""
+    folder, overrides = Path(base_folder).absolute(), overrides or {}
+    source = replace(source or OptionsOrigin(), overridden=tuple(overrides))
+    with source.naming_lines():
+        tables, other_cameras = _with_one_camera(tables)
+        refuse_unknown_tables(tables, SURVEY_TABLES)
+        given: dict[str, dict[Any, Any]] = {name: dict(tables.get(name, {})) for name in SURVEY_TABLES}
+        given["output"].setdefault("path", "out")
+        for dotted_key in ROLE_OF_PATH:
+            table, _, name = dotted_key.partition(".")
+            if name in given[table]:
+                given[table][name] = absolute_value(given[table][name], folder)
+        for dotted_key, value in overrides.items():
+            table, _, name = dotted_key.partition(".")
+            given[table].pop(_INSTEAD_OF.get(dotted_key), None)
+            given[table][name] = absolute_value(value, Path.cwd()) if dotted_key in ROLE_OF_PATH else value
+        given["camera"] |= {"others": other_cameras} if other_cameras else {}
+        options: dict[str, Any] = {name: model(**given[name]) for name, model in SURVEY_TABLES.items()}
+        survey = Survey(**options, source=source)
+        _require_files(survey)
+    return survey
+
+
+def _with_one_camera(tables: Mapping[str, Any]) -> tuple[Mapping[str, Any], tuple[CameraOptions, ...]]:
+    """Return the tables with a single [camera], and the options of the other [[camera]] tables, which have a pattern.
+
+    Raises:
+        OptionError: a camera's options are not valid, or two have no pattern.
+    """
+    cameras = tables.get("camera")
+    if not isinstance(cameras, list):
+        return tables, ()
+    others, rest = [], []
+    for number, table in enumerate(cameras, 1):
+        if "images" not in table:
+            rest.append(table)
+            continue
+        try:
+            others.append(CameraOptions(**table))
+        except OptionError as error:
+            raise OptionError(str(error), f"camera {number}", error.key) from None
+    if len(rest) > 1:
+        message = f"{len(rest)} [[camera]] tables have no key images, expected at most one: that for all other photos"
+        raise OptionError(message, "camera")
+    return {**tables, "camera": rest[0] if rest else {}}, tuple(others)
+
+
+def refuse_unknown_tables(tables: Mapping[str, Any], known: Collection[str]) -> None:
+    """Check that all tables are known and are tables.
+
+    Raises:
+        OptionError: one is not; the text names the nearest known table.
+    """
+    for name, table in tables.items():
+        if name not in known:
+            message = f"unknown table [{printable(name)}]; the nearest known one is '{nearest_known(name, known)}'"
+            raise OptionError(message, "", name)
+        if not isinstance(table, Mapping):
+            raise OptionError(f"{name} is {shown(table)}, expected a table [{name}]", "", name)
+
+
+def absolute_value(value: object, folder: Path) -> object:
+    """Return text or a path as an absolute path, and any other value unchanged."""
+    # What can be the name of no file stays as it is, and is refused as no path.
+    is_name = isinstance(value, (str, Path)) and str(value) and "\0" not in str(value)
+    return folder / path_of(str(value)) if is_name else value
+
+
+def _require_files(survey: Survey) -> None:
+    try:
+        paths = [*input_paths(survey)]
+    except InputError as error:
+        raise OptionError(f"[ranges] path: {error}", "ranges", "path") from None
+    for item in paths:
+        if item.role == "file" and not os.path.isfile(item.path):
+            is_folder = os.path.isdir(item.path)
+            found = f"{item.path} is a folder, expected a file" if is_folder else f"there is no file {item.path}"
+            table, _, name = item.key.partition(".")
+            raise OptionError(f"[{table}] {name}: {found}", table, name)
+
+
+@dataclass(frozen=True)
+class InputPath:
+    """A path that a survey reads.
+
+    Attributes:
+        key: dotted key of the survey file.
+        role: kind of file or folder.
+        path: absolute.
+    """
+
+    key: str
+    role: PathRole
+    path: Path
+
+
+def input_paths(survey: Survey) -> Iterator[InputPath]:
+    """Yield every path that a survey reads. It must exist, it is hashed, and no result may overwrite it."""
+    for dotted_key, role in ROLE_OF_PATH.items():
+        table, _, name = dotted_key.partition(".")
+        path = getattr(getattr(survey, table), name)
+        if path is not None and role == "log":
+            yield from (InputPath(dotted_key, "log" if file.is_dir() else "file", file) for file in files_of_log(path))
+        elif path is not None and role != "output":
+            yield InputPath(dotted_key, role, path)
