@@ -534,7 +534,8 @@ class TestResultFolder:
         flags = ("--formats", "laz,geojson,nerfstudio", "--frame", "enu", *place, "--output_path", "exported")
         done = rangesfm_command("export", out, *flags, cwd=out)
         names = ("points.laz", "survey.geojson", "transforms.json")
-        lines = [*(f"exported/{name}" for name in names), "up is z of the site"]
+        lost = "the photos are not there: give --images, or copy them to exported/images"
+        lines = [*(f"exported/{name}" for name in names), "up is z of the site", lost]
         assert done.stdout.splitlines() == lines
         features = json.loads((out / "exported" / "survey.geojson").read_text())["features"]
         (anchor,) = (f for f in features if f["properties"]["name"] == "A1")

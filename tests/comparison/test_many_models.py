@@ -183,7 +183,6 @@ def test_the_command_takes_the_log_and_the_tape(
     ("arguments", "said"),
     [
         (("--anchors", "anchors.csv"), "--anchors given without a log to use it for, expected --ranges LOG"),
-        (("--images", "images.csv"), "expected --ranges LOG"),
         (("--markers", "marks.csv"), "expected distances beside it"),
         (("--ranges", "gone.csv"), "gone.csv"),
     ],
@@ -208,8 +207,65 @@ def test_a_file_of_positions_is_a_model_too(models: tuple[Path, Path, Path], wal
     assert row.base_from_model is not None
     assert row.reprojection_rms_px is None
     assert row.base_from_model.scale == pytest.approx(1 / walked_survey.site_from_sfm.scale, rel=1e-6)
-    with pytest.raises(InputError, match="the first must be a model or a result folder"):
-        read_named_models([reference, models[0]])
+    base, row = compared(reference, models[0]).rows
+    assert row.scale_ratio == pytest.approx(1 / walked_survey.site_from_sfm.scale, rel=1e-6)
+    assert base.is_metric
+    assert not row.is_metric
+    with pytest.raises(InputError, match="only files of positions are given"):
+        read_named_models([reference])
+
+
+def test_truth_by_time_needs_no_times_of_its_own(
+    rangesfm_command: Command,
+    result: Path,
+    models: tuple[Path, Path, Path],
+    walked_survey: WalkedSurvey,
+    tmp_path: Path,
+) -> None:
+    """The times are those of a result folder or of a table; the truth may stand anywhere."""
+    files = walked_survey.folder
+    time_of = dict(line.split(",") for line in (files / "images.csv").read_text().splitlines()[1:])
+    rows = [line.split(",") for line in (files / "reference.csv").read_text().splitlines()]
+    (tmp_path / "truth.csv").write_text(
+        "timestamp_s,x_m,y_m,z_m\n" + "".join(f"{time_of[row[0]]},{','.join(row[1:4])}\n" for row in rows[1:])
+    )
+    scale = walked_survey.site_from_sfm.scale
+
+    def printed(*arguments: str | Path) -> list[list[str]]:
+        done = rangesfm_command("compare", *arguments, cwd=tmp_path)
+        return [line.split() for line in done.stdout.splitlines()]
+
+    by_result = printed("truth.csv", models[0], result)
+    ratios = [float(row[4]) for row in by_result[1:4]]
+    assert ratios == pytest.approx([1.0, 1 / scale, 1.0], rel=0.02)
+    by_table = printed(models[0], "--reference", "truth.csv", "--images", files / "images.csv")
+    assert by_table[-1] == [str(models[0]), "40", "-", "-", by_table[-1][4], f"{1 / scale:.6g}"]
+    assert float(by_table[-1][4]) < 0.001
+    done = rangesfm_command("compare", models[0], "--reference", "truth.csv", cwd=tmp_path, status=2)
+    assert "the photos have no times" in done.stderr
+
+
+def test_only_models_that_are_known_to_be_metric_have_lengths_in_metres(
+    rangesfm_command: Command,
+    result: Path,
+    models: tuple[Path, Path, Path],
+    walked_survey: WalkedSurvey,
+    tmp_path: Path,
+) -> None:
+    scaled, reference = result / "sparse_scaled" / "0", walked_survey.folder / "reference.csv"
+    text = rangesfm_command("compare", result, scaled, models[1], "--reference", reference, cwd=tmp_path).stdout
+    first, distances, against_truth = (block.splitlines() for block in text.split("\n\n"))
+    assert [float(row.split()[4]) for row in first[1:]] == pytest.approx(
+        [1.0, 1.0, 0.5 / walked_survey.site_from_sfm.scale], rel=0.01
+    )
+    assert [row.split()[10] == "-" for row in first[1:]] == [False, False, True]  # ranges, by the cameras as they are
+    assert f"{scaled} m" in distances[0]
+    assert f"{models[1]} m" not in distances[0]
+    cells = {row.split()[0]: row.split()[2:] for row in against_truth[1:]}
+    assert cells[str(models[1])][:2] == ["-", "-"]
+    for metric in (result, scaled):
+        rmse_m, after_se3_m = map(float, cells[str(metric)][:2])
+        assert after_se3_m <= rmse_m < 0.5
 
 
 def test_models_of_other_photos_are_refused(models: tuple[Path, Path, Path], tmp_path: Path) -> None:
@@ -233,8 +289,7 @@ def test_the_command_prints_tables_and_writes_the_page(
     page = (tmp_path / "page" / "comparison.html").read_text(encoding="utf-8")
     assert "2 models of 40 photos" in page
     for row in compared(*models[:2]).rows:
-        assert row.base_from_model is not None
-        assert f"<td>{row.base_from_model.scale:.6g}</td>" in page
+        assert f"<td>{row.scale_ratio:.6g}</td>" in page
 
 
 def test_one_model_alone_has_no_page(

@@ -137,6 +137,36 @@ def test_nerfstudio_projects_points_where_colmap_does(camera_model: str, tmp_pat
                 np.testing.assert_allclose(at, expected, atol=1e-6)
 
 
+def test_nerfstudio_gets_copies_of_the_photos_that_it_names(tmp_path: Path) -> None:
+    model, photos = made(), tmp_path / "photos"
+    for image in model.images.values():
+        image.name = f"left/{image.name}"
+        (photos / image.name).parent.mkdir(parents=True, exist_ok=True)
+        (photos / image.name).write_text(image.name)
+    for _ in range(2):  # the second export replaces the first
+        path = export(model, "nerfstudio", tmp_path / "out", photos)
+    for frame in load(path)["frames"]:
+        copied = path.parent / frame["file_path"]
+        assert copied.read_text() == frame["file_path"].removeprefix("images/")
+        assert copied.stat().st_nlink == 1
+    (path.parent / "images" / "left" / "own.jpg").touch()
+    with pytest.raises(InputError, match=r"own\.jpg: is not a file that rangesfm wrote"):
+        export(model, "nerfstudio", tmp_path / "out", photos)
+    next((photos / "left").iterdir()).unlink()
+    with pytest.raises(InputError, match="is not in this folder"):
+        export(model, "nerfstudio", tmp_path / "elsewhere", photos)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_nerfstudio_export_beside_the_photos_leaves_them_as_they_are(tmp_path: Path) -> None:
+    model = made()
+    (tmp_path / "images").mkdir()
+    for image in model.images.values():
+        (tmp_path / "images" / image.name).write_text(image.name)
+    path = export(model, "nerfstudio", tmp_path, tmp_path / "images")
+    assert all((tmp_path / frame["file_path"]).is_file() for frame in load(path)["frames"])
+
+
 def of_two_cameras(first: str, second: str) -> pycolmap.Reconstruction:
     """Twelve photos, six of each camera."""
     model = synthesized(6, 60, seed=3, num_rigs=2)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _COMPARE_KEYS = ("images.path", "ranges", "anchors", "tag", "scale")
 _OF_A_RUN = ("ranges.check_share", "ranges.check_anchors", "ranges.check_times_s", "scale.method")
-_WITHOUT_LOG = ("--distances", "--markers")
+_WITHOUT_LOG = ("--images", "--distances", "--markers")
 
 
 def add_results_commands(commands: Commands) -> None:
@@ -120,6 +120,7 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm export out --formats tum,ply,nerfstudio --frame level \
         --output_path exported
     """
+    from rangesfm.export import NERFSTUDIO_IMAGES
     from rangesfm.workflows.export_result import apply_result, export_result
 
     source = _result_path(args)
@@ -127,6 +128,8 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
     if args.apply_to is None:
         destination, notes = Path(args.output_path or source), []
         written = export_result(source, options.formats, destination, options=options, images_path=args.images)
+        if "nerfstudio" in options.formats and not (destination / NERFSTUDIO_IMAGES).is_dir():
+            notes = [f"the photos are not there: give --images, or copy them to {destination / NERFSTUDIO_IMAGES}"]
     else:
         if "formats" in options.model_fields_set:
             raise InputError("--apply_to writes files in their own formats: leave out --formats")
@@ -154,9 +157,10 @@ def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
 
 def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
     r"""Compare models. One result folder: its models with each other, and with a reference if there is one. Two or
-    more models, result folders or files of camera positions: each of them with the first. --ranges compares them
-    with a radio log, placed on the first model (default: the ranges that the first result folder used), and
-    --distances with taped distances.
+    more models, result folders or files of camera positions by photo or time, in any order: each of them with the
+    first. --ranges compares them with a radio log, placed on the first model (default: the ranges that the first
+    result folder used), and --distances with taped distances. The photos' times are those of --images, of the result
+    folders, or in the photos' names.
 
     example:
       rangesfm compare out --reference reference.csv
@@ -167,7 +171,9 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     given = [*([] if args.input_path is None else [args.input_path]), *args.models]
     paths = [Path(path) for path in given] or [Path("out")]
-    if len(paths) > 1:
+    from rangesfm.result.summary import ResultSummary
+
+    if len(paths) > 1 or (args.reference is not None and not (paths[0] / ResultSummary.NAME).is_file()):
         return _compare_many(args, paths)
     if args.output_path is not None:
         raise InputError(f"one model is given, {paths[0]}; a page of comparison needs two (see rangesfm report)")
@@ -179,9 +185,8 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
-    from rangesfm.comparison.many_models import compare_many, read_named_models
+    from rangesfm.comparison.many_models import against_reference, compare_many, read_named_models
     from rangesfm.comparison.model_ranges import ranges_of_survey
-    from rangesfm.comparison.with_reference import compare, format_table
     from rangesfm.distances.tape import read_tape
     from rangesfm.geometry.reference import read_reference
     from rangesfm.survey.inputs import read_ranging_inputs
@@ -191,16 +196,16 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     if of_log and "--ranges" not in given:
         raise InputError(f"{', '.join(of_log)} given without a log to use it for, expected --ranges LOG as well")
     survey = survey_from_arguments(args)
-    models, ranges, tape = read_named_models(paths), None, None
-    if survey.ranges.path is not None and models[0].model is not None:
-        ranges = ranges_of_survey(survey, read_ranging_inputs(survey), models[0].model, paths[0])
+    models, ranges, tape = read_named_models(paths, survey), None, None
+    if survey.ranges.path is not None:
+        model, path = next((one.model, path) for one, path in zip(models, paths, strict=True) if one.model is not None)
+        ranges = ranges_of_survey(survey, read_ranging_inputs(survey), model, path)
     if survey.scale.distances is not None:
         tape = read_tape(survey.scale.distances, survey.scale.markers)
     comparison = compare_many(models, ranges, tape)
     lines = [str(comparison)]
     if args.reference is not None:
-        trajectories = {model.name: model.path for model in comparison.models}
-        lines += ["", format_table(compare(trajectories, read_reference(args.reference), frame=None))]
+        lines += ["", against_reference(models, read_reference(args.reference))]
     if args.output_path is not None:
         from rangesfm.comparison.comparison_page import write_comparison
 

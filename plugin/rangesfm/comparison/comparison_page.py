@@ -28,7 +28,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
     base, path = comparison.models[0], folder / "comparison.html"
     aligned = [carried_by(row.base_from_model, model.path) for model, row in zip(comparison.models, comparison.rows)]
     title = f"{len(comparison.models)} models of {len(base.path)} photos"
-    frame = "first_camera" if base.result is None else base.result.summary.frame
+    frame = base.frame or "first_camera"
     similarity, *lengths = comparison.tables
     figures = [*_moved_figure(comparison), _path_figure(comparison, aligned, frame)]
     with sole_writer(folder):
@@ -52,10 +52,12 @@ def _color(index: int) -> str:
 
 
 def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> Scene:
-    """Return the scene with the first model's map and all paths. Its own path is last: on that, cameras are chosen."""
+    """Return the scene with a model's map and all paths. The first model's is last: on that, cameras are chosen."""
     base = comparison.models[0]
-    assert base.model is not None
-    points_m, points_rgb = colored_points(base.model)
+    mapped = [(row.base_from_model, one.model) for row, one in zip(comparison.rows, comparison.models) if one.model]
+    base_from_map, map_ = mapped[0]
+    points_m, points_rgb = colored_points(map_)
+    points_m = points_m if base_from_map is None else base_from_map.apply(points_m)
     paths = [
         ScenePath(f"model-{i}", model.name, _color(i), path, has_orientations=model.model is not None)
         for i, (model, path) in enumerate(zip(comparison.models, aligned))

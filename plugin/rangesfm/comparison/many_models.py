@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.model_ranges import ModelRanges, ranges_of_result
-from rangesfm.comparison.with_reference import known_keyframes, similarity_onto, text_or_dash
+from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto, text_or_dash
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows
-from rangesfm.geometry.reference import read_reference
+from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.similarity import Similarity, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.report.report_tables import ReportTable
@@ -26,6 +27,8 @@ from rangesfm.result.entries import rms
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
+from rangesfm.survey.inputs import times_of_model
+from rangesfm.survey.settings import Survey
 
 Length = tuple[str, str, tuple[float, ...]]
 """A distance between two photos: their names, and the length in each model, in the unit of that model."""
@@ -39,7 +42,8 @@ class NamedModel:
         name: path from which it was read.
         path: keyframes in the world of the model.
         model: None where only positions are known.
-        result: result folder from which the model comes; None where it does not come from one.
+        result: result folder whose final model this is; None for other models.
+        frame: world of a model in metres, as in ``compare``; None where the unit of the model is not known.
         has_orientations: whether the rotations of the path are known; otherwise they are the identity.
     """
 
@@ -47,7 +51,12 @@ class NamedModel:
     path: Trajectory
     model: pycolmap.Reconstruction | None
     result: ResultFolder | None
+    frame: str | None = None
     has_orientations: bool = True
+
+    def heading(self, of_column: str) -> str:
+        """Return the heading of a column with lengths in the unit of the model."""
+        return of_column if self.frame is None else f"{of_column} m"
 
 
 @dataclass(frozen=True)
@@ -56,6 +65,7 @@ class ModelRow:
 
     Attributes:
         name: of the model.
+        is_metric: whether the model is known to be in metres.
         num_photos: number of its photos.
         base_from_model: best similarity from this model to the first; None with fewer than three common photos.
         common_names: names of the photos in both, in the order of the first model.
@@ -67,6 +77,7 @@ class ModelRow:
     """
 
     name: str
+    is_metric: bool
     num_photos: int
     base_from_model: Similarity | None
     common_names: tuple[str, ...]
@@ -74,6 +85,11 @@ class ModelRow:
     moved_aligned: Array | None
     reprojection_rms_px: float | None
     range_rms_m: tuple[float, float] | None
+
+    @property
+    def scale_ratio(self) -> float | None:
+        """Return the lengths in the model divided by those in the first model; None without a similarity."""
+        return None if self.base_from_model is None else 1.0 / self.base_from_model.scale
 
     @property
     def rotation_deg(self) -> float | None:
@@ -119,8 +135,10 @@ class ModelsComparison:
     @property
     def tables(self) -> tuple[ReportTable, ...]:
         """Return the tables of the comparison. A table without data has no rows."""
-        cells, names = [_cells(row) for row in self.rows], [model.name for model in self.models]
-        of_row = [f"{name} after Sim(3)" for name in names] if self.taped and self.taped[0].lengths_m else []
+        cells = [_cells(row, self.models[0]) for row in self.rows]
+        names = [model.heading(model.name) for model in self.models]
+        of_row = [f"{model.name} after Sim(3) m" for model in self.models]
+        of_row = of_row if self.taped and self.taped[0].lengths_m else []
         distances = [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in self.distances]
         return (
             ReportTable(
@@ -129,7 +147,7 @@ class ModelsComparison:
                 [[text for _, text in row] for row in cells],
                 _NOTE,
             ),
-            ReportTable("Distances between photos, in each model's unit", ["distance", *names], distances),
+            ReportTable("Distances between photos", ["distance", *names], distances, _UNIT_NOTE),
             ReportTable(
                 "Taped distances",
                 ["taped distance", "tape m", *names, *of_row],
@@ -142,18 +160,49 @@ class ModelsComparison:
         return "\n\n".join(align_rows([table.header, *table.rows]) for table in self.tables if table.rows)
 
 
-def read_named_models(paths: Sequence[Path]) -> tuple[NamedModel, ...]:
-    """Read COLMAP models, final models of result folders, and files of camera positions (CSV or TUM).
+def read_named_models(paths: Sequence[Path], survey: Survey | None = None) -> tuple[NamedModel, ...]:
+    """Read COLMAP models, final models of result folders, and files of camera positions (CSV or TUM), in any order.
+
+    Args:
+        paths: of models and files.
+        survey: settings that may say when the photos were taken. Where they do not, the times are those of the result
+            folders that the models come from, or those in the photos' names.
 
     Raises:
-        InputError: one of them is none of these, or the first is a file of positions.
+        InputError: one of the paths is none of these, or none of them is a model.
     """
-    if paths[0].is_file():
-        raise InputError("the first must be a model or a result folder, the others may be files of positions", paths[0])
-    models: list[NamedModel] = []
-    for path in paths:
-        models.append(_read_positions(path, models[0].path) if path.is_file() else _read_model(path))
-    return tuple(models)
+    folders = [path for path in paths if not path.is_file()]
+    if not folders:
+        raise InputError("only files of positions are given, expected a model or a result folder too", paths[0])
+    models = {path: _read_model(path) for path in folders}
+    times_s = _photo_times(models, survey or Survey())
+    timed = {path: replace(model, path=_timed(model.path, times_s)) for path, model in models.items()}
+    return tuple(timed[path] if path in timed else _read_positions(path, timed[folders[0]].path) for path in paths)
+
+
+def _photo_times(models: Mapping[Path, NamedModel], survey: Survey) -> dict[str, float]:
+    """Return the times of the models' photos by name; empty where they are not known."""
+    path, first = next(iter(models.items()))
+    times_s: dict[str, float] = {}
+    if first.model is not None and survey.images.times is not None:
+        return dict(times_of_model(survey, first.model, path).by_name())
+    with suppress(InputError):  # the names of the photos are no times
+        times_s.update(times_of_model(survey, first.model, path).by_name() if first.model is not None else {})
+    for result in filter(None, map(_result_around, models)):
+        times_s.update(result.timestamps_s or {})
+    return times_s
+
+
+def _timed(path: Trajectory, times_s: Mapping[str, float]) -> Trajectory:
+    """Return a path with the times of its photos, if it has none and all are known."""
+    has_times = path.timestamps_s is not None or not all(name in times_s for name in path.image_names)
+    return path if has_times else path.timed(times_s)
+
+
+def _result_around(path: Path) -> ResultFolder | None:
+    """Return the result that is in this folder, or that has this model as its sparse/0, sparse_scaled/0, ..."""
+    folders = (path, path.absolute().parent.parent)
+    return next((read_result_folder(folder) for folder in folders if (folder / ResultSummary.NAME).is_file()), None)
 
 
 def compare_many(
@@ -179,14 +228,15 @@ def compare_many(
 
 
 def _read_model(path: Path) -> NamedModel:
-    if (path / ResultSummary.NAME).is_file():
-        result = read_result_folder(path)
-        model = result.read_metric_model()
-        if model is None:
+    result = _result_around(path)
+    if result is not None and (path / ResultSummary.NAME).is_file():
+        metric = result.read_metric_model()
+        if metric is None:
             raise InputError("the result holds no metric model", path)
-        return NamedModel(str(path), path_in_result(model, result), model, result)
-    model = read_model(path)
-    return NamedModel(str(path), trajectory_from_reconstruction(model), model, None)
+        return NamedModel(str(path), path_in_result(metric, result), metric, result, result.summary.frame)
+    model, kind = read_model(path), path.absolute().parent.name
+    frame = result.summary.frame if result is not None and kind in ("sparse_scaled", "sparse_metric") else None
+    return NamedModel(str(path), trajectory_from_reconstruction(model), model, None, frame)
 
 
 def _read_positions(path: Path, base: Trajectory) -> NamedModel:
@@ -201,7 +251,7 @@ def _read_positions(path: Path, base: Trajectory) -> NamedModel:
         centers=positions,
         world_from_cam=np.tile(np.eye(3), (len(known), 1, 1)) if rotations is None else rotations,
     )
-    return NamedModel(str(path), trajectory, None, None, has_orientations=rotations is not None)
+    return NamedModel(str(path), trajectory, None, None, "site", has_orientations=rotations is not None)
 
 
 def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None, onto_ranges: Similarity | None) -> ModelRow:
@@ -211,6 +261,7 @@ def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None, onto_r
     similarity = similarity_onto(theirs, ours)
     return ModelRow(
         name=other.name,
+        is_metric=other.frame is not None,
         num_photos=len(other.path),
         base_from_model=similarity,
         common_names=names,
@@ -305,32 +356,54 @@ def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
     return rmse(np.concatenate(errors))
 
 
+_UNIT_NOTE = "Lengths of a model whose unit is not known to be the metre are in its own units."
 _NOTE = (
-    "Scale and turn: the best similarity from the model to the first model. Moved: RMS distance of the cameras from "
-    "their positions in the first model, before and after that similarity, in the unit of the first model. Range RMS: "
-    "of the residuals of the ranges used, with the cameras as they are, and after the best similarity onto the path "
-    "that the ranges were placed on."
+    "Scale / first: lengths in the model divided by those in the first model. Turn: rotation of the best similarity "
+    "from the model to the first model. Moved: RMS distance of the cameras from their positions in the first model, "
+    "before and after that similarity, where both are in metres or neither is known to be. Range RMS: of the residuals "
+    "of the ranges used, with the cameras as they are (for models in metres), and after the best similarity onto the "
+    "path that the ranges were placed on."
 )
 _TAPED_NOTE = (
-    "Lengths are in the unit of each model. After Sim(3): in metres, with the scale that brings the cameras of the "
-    "model onto the path that the ranges were placed on."
+    f"{_UNIT_NOTE} After Sim(3): with the scale that brings the cameras of the model onto the path that the ranges "
+    "were placed on."
 )
 
 
-def _cells(row: ModelRow) -> list[tuple[str, str]]:
-    """Return name and text of each cell of a row; the name is that of the column."""
-    similarity, aligned, range_rms_m = row.base_from_model, row.moved_aligned, row.range_rms_m or (None, None)
+def against_reference(models: Sequence[NamedModel], reference: Reference) -> str:
+    """Return the table of the models' differences from a reference, as plain text.
+
+    Of a model that is not known to be in metres, only the scale and what remains after Sim(3) are compared.
+
+    Raises:
+        InputError: the reference has no keyframe of a model, or is by time and the times of its photos are not known.
+    """
+    header = ("model", "keyframes", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale / truth")
+    rows: list[Sequence[str]] = []
+    for model in models:
+        (row,) = compare({model.name: model.path}, reference, frame=model.frame)
+        unaligned_m = (row.rmse_m, None if model.frame is None else row.rmse_se3_m)
+        ratio = None if row.scale_error_percent is None else 1.0 + row.scale_error_percent / 100.0
+        lengths = [text_or_dash(length_m, ".4f") for length_m in (*unaligned_m, row.rmse_sim3_m)]
+        rows.append((model.name, str(row.num_keyframes), *lengths, text_or_dash(ratio, ".6g")))
+    return align_rows([header, *rows])
+
+
+def _cells(row: ModelRow, first: NamedModel) -> list[tuple[str, str]]:
+    """Return name and text of each cell of a row about a model and the first; the name is that of the column."""
+    aligned, range_rms_m = row.moved_aligned, row.range_rms_m or (None, None)
+    moved = rmse(row.moved[:, None]) if row.is_metric == (first.frame is not None) else None
     return [
         ("model", row.name),
         ("photos in common", f"{len(row.common_names)} of {row.num_photos}"),
-        ("scale", text_or_dash(None if similarity is None else similarity.scale, ".6g")),
+        ("scale / first", text_or_dash(row.scale_ratio, ".6g")),
         ("turn deg", text_or_dash(row.rotation_deg, ".3f")),
-        ("moved", text_or_dash(rmse(row.moved[:, None]), ".4f")),
-        ("after Sim(3)", text_or_dash(None if aligned is None else rmse(aligned[:, None]), ".4f")),
-        ("most", text_or_dash(None if aligned is None else float(aligned.max()), ".4f")),
+        (first.heading("moved"), text_or_dash(moved, ".4f")),
+        (first.heading("after Sim(3)"), text_or_dash(None if aligned is None else rmse(aligned[:, None]), ".4f")),
+        (first.heading("most"), text_or_dash(None if aligned is None else float(aligned.max()), ".4f")),
         ("reproj. px", text_or_dash(row.reprojection_rms_px, ".4f")),
-        ("range RMS m", text_or_dash(range_rms_m[0], ".4f")),
-        ("after Sim(3)", text_or_dash(range_rms_m[1], ".4f")),
+        ("range RMS m", text_or_dash(range_rms_m[0] if row.is_metric else None, ".4f")),
+        ("after Sim(3) m", text_or_dash(range_rms_m[1], ".4f")),
     ]
 
 

@@ -19,7 +19,7 @@ from rangesfm.export.colmap import (
 )
 from rangesfm.export.gis import write_features, write_laz
 from rangesfm.export.metric_map import MetricMap, in_frame
-from rangesfm.export.photogrammetry import write_nerfstudio, write_opensfm, write_opf
+from rangesfm.export.photogrammetry import NERFSTUDIO_IMAGES, write_nerfstudio, write_opensfm, write_opf
 from rangesfm.export.ply import write_anchor_vertices, write_cameras, write_points
 from rangesfm.export.trajectories import COVARIANCE_FORMATS, write_covariances, write_kitti, write_trajectory
 from rangesfm.files.atomic import make_output_folder
@@ -30,6 +30,7 @@ __all__ = [
     "COVARIANCE_FORMATS",
     "EXPORTED_NAMES",
     "EXPORTERS",
+    "NERFSTUDIO_IMAGES",
     "MetricMap",
     "apply_to",
     "best_similarity",
@@ -89,7 +90,7 @@ EXPORTED_NAMES: dict[str, tuple[str, ...]] = {
     "kml": ("survey.kml",),
     "transform": ("transform_colmap_4.txt", "transform_colmap_3.8.txt"),
     "model_aligner": ("positions.txt",),
-    "nerfstudio": ("transforms.json", "transforms_points.ply"),
+    "nerfstudio": ("transforms.json", "transforms_points.ply", NERFSTUDIO_IMAGES),
     "opensfm": ("reconstruction.json",),
     "opf": ("opf",),
 }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -15,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap, registered_images
+from rangesfm.export.metric_map import MetricMap, photo_files, registered_images, require_space
 from rangesfm.files.atomic import new_folder, write_text
-from rangesfm.files.folders import real_path, stays_inside
+from rangesfm.files.folders import real_path
 from rangesfm.geometry.similarity import Similarity
 
 
@@ -104,17 +102,11 @@ def write_undistorted(map_: MetricMap, folder: Path) -> Path:
     images_path = map_.images_path
     if images_path is None:
         raise InputError("the format 'undistorted' needs the photos: give their folder (--images)")
-    names = [image.name for image in registered_images(map_.reconstruction)]
-    for name in names:
-        if not stays_inside(name):
-            raise InputError(f"the photo {name} would be written outside of it, expected a name inside it", folder)
-        if not os.path.isfile(images_path / name):
-            raise InputError(f"the photo {name} of the map is not in this folder", images_path)
+    files = photo_files(map_, images_path)
     with new_folder(folder) as temporary, tempfile.TemporaryDirectory() as model_path:
         write_binary_model(map_.reconstruction, Path(model_path))
         # On a full disk, the library that writes the photos ends the whole process without an error message.
-        if shutil.disk_usage(temporary).free < sum(os.path.getsize(images_path / name) for name in names):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(temporary))
+        require_space(temporary, files.values())
         with colmap_log(temporary / "undistortion.log"):
             pycolmap.undistort_images(temporary, model_path, images_path)
         _into_sparse_0(temporary)

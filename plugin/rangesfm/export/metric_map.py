@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import errno
+import os
+import shutil
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +17,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
+from rangesfm.files.folders import stays_inside
 from rangesfm.geometry.georeference import Georeference, check_crs, georeference_of_anchor
 from rangesfm.geometry.similarity import Similarity, path_shape
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
@@ -79,6 +83,31 @@ class MetricMap:
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """Return the images of a model that have a pose, in order of their names."""
     return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+
+
+def photo_files(map_: MetricMap, images_path: Path) -> dict[str, Path]:
+    """Return the files of the photos of a map by their names, in order of the names.
+
+    Raises:
+        InputError: a photo is not in the folder ``images_path``, or its name leads out of a folder.
+    """
+    names = [image.name for image in registered_images(map_.reconstruction)]
+    for name in names:
+        if not stays_inside(name):
+            raise InputError(f"the photo {name} would be written outside of its folder, expected a name inside it")
+        if not os.path.isfile(images_path / name):
+            raise InputError(f"the photo {name} of the map is not in this folder", images_path)
+    return {name: images_path / name for name in names}
+
+
+def require_space(folder: Path, files: Iterable[Path]) -> None:
+    """Check that copies of some files fit on the disk of a folder.
+
+    Raises:
+        OSError: they do not.
+    """
+    if shutil.disk_usage(folder).free < sum(map(os.path.getsize, files)):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
 def colored_points(model: pycolmap.Reconstruction) -> tuple[Array, npt.NDArray[np.uint8]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,11 +15,14 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
-from rangesfm.export.metric_map import MetricMap, colored_points, registered_images
+from rangesfm.export.metric_map import MetricMap, colored_points, photo_files, registered_images, require_space
 from rangesfm.export.ply import write_points
 from rangesfm.files.atomic import new_folder
+from rangesfm.files.folders import real_path
 from rangesfm.files.records import write_json
 
+NERFSTUDIO_IMAGES = "images"
+"""Folder of the photos beside transforms.json."""
 _POINTS_NAME = "transforms_points.ply"
 _FLIP_Y_AND_Z = np.diag([1.0, -1.0, -1.0, 1.0])
 # The camera models of COLMAP that each program supports, with the program's own name for each.
@@ -49,7 +53,7 @@ def _distortion(camera: pycolmap.Camera, program: str, known: Mapping[str, str])
 
 
 def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
-    """Write ``transforms.json`` and its points. Photos are referred to as ``images/NAME``.
+    """Write ``transforms.json``, its points and, where their folder is known, copies of the photos in ``images``.
 
     nerfstudio reads the camera model at the top level only, and takes a missing one for perspective. Other camera
     parameters at the top level hold for all photos; so with several cameras, each photo has its own parameters.
@@ -58,7 +62,9 @@ def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
     the poses unless it is told not to (``--auto-scale-poses False --center-method none --orientation-method none``).
 
     Raises:
-        InputError: nerfstudio does not support a camera model, or some photos are from fisheye cameras and some not.
+        InputError: nerfstudio does not support a camera model, or some photos are from fisheye cameras and some not, or
+            a photo is missing.
+        OSError: the disk is too full for the photos.
     """
     model, images = map_.reconstruction, registered_images(map_.reconstruction)
     cameras = {i: _intrinsics(model.cameras[i]) for i in sorted({image.camera_id for image in images})}
@@ -66,6 +72,8 @@ def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
     if len(kinds) > 1:
         raise InputError("nerfstudio has one camera model for all photos, but only some of these are fisheye photos")
     common = next(iter(cameras.values())) if len(cameras) == 1 else {}
+    if map_.images_path is not None and real_path(map_.images_path) != real_path(folder / NERFSTUDIO_IMAGES):
+        _copy_photos(photo_files(map_, map_.images_path), folder / NERFSTUDIO_IMAGES)
     content = {
         **({"camera_model": kinds.pop()} if kinds else {}),
         **common,
@@ -77,9 +85,21 @@ def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
     return folder / "transforms.json"
 
 
+def _copy_photos(files: Mapping[str, Path], path: Path) -> None:
+    """Copy photos into the folder ``path``. They are no links, so that editing a copy cannot change a photo."""
+    with new_folder(path) as folder:
+        require_space(folder, files.values())
+        for name, file in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, folder / name)
+
+
 def _frame(image: pycolmap.Image) -> dict[str, Any]:
     world_from_cam = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
-    return {"file_path": f"images/{image.name}", "transform_matrix": (world_from_cam @ _FLIP_Y_AND_Z).tolist()}
+    return {
+        "file_path": f"{NERFSTUDIO_IMAGES}/{image.name}",
+        "transform_matrix": (world_from_cam @ _FLIP_Y_AND_Z).tolist(),
+    }
 
 
 def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
