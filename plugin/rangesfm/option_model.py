@@ -33,7 +33,13 @@ Same = TypeVar("Same", bound="Options")
 PathRole = Literal["file", "log", "photos", "model", "output"]
 _NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path", dict: "a table"}
 _TABLE_OF = "a table in which each value is "
-_UNITS = {"m_per_s": "metres a second", "m": "metres", "s": "seconds", "deg": "degrees"}
+_UNITS = {
+    "deg_per_s": "degrees a second",
+    "m_per_s": "metres a second",
+    "m": "metres",
+    "s": "seconds",
+    "deg": "degrees",
+}
 
 
 @dataclass(frozen=True)

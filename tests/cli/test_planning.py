@@ -33,15 +33,17 @@ def test_the_example_is_planned_and_written(tmp_path: Path, capsys: pytest.Captu
     assert any("mirror image" in reason for reason in content["reasons"])
 
 
-def test_a_scale_that_a_run_would_refuse_is_refused_in_one_line(
+def test_a_scale_that_a_run_would_refuse_has_a_page_and_advice_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "plan.toml").write_text(STRAIGHT)
-    assert main(["plan", str(tmp_path / "plan.toml")]) == 3
+    assert main(["plan", str(tmp_path / "plan.toml"), "--output_path", str(tmp_path / "plan")]) == 3
     printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.startswith("rangesfm: error: the scale is only known to")
-    assert printed.err.count("\n") == 1
+    assert printed.err == ""
+    assert "% (95 %); refused\n  the scale is only known to" in printed.out
+    assert "what would gain most for the scale:\n  1. " in printed.out
+    assert json.loads((tmp_path / "plan" / "plan.json").read_text())["verdict"] == "refused"
+    assert "<h2>Refused</h2>" in (tmp_path / "plan" / "plan.html").read_text()
 
 
 def test_a_key_that_is_not_known_is_named_with_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

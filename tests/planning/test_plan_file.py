@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.planning.paths import path_through
 from rangesfm.planning.plan_file import read_plan
 
 ANCHORS = "[anchors.places]\nA = [0, 0, 2]\nB = [6.0, 0, 2.5]\nC = [3, 5, 1]\n"
@@ -25,11 +27,31 @@ def test_waypoints_are_walked_at_their_speed(tmp_path: Path) -> None:
     assert [anchor.anchor_id for anchor in plan.anchors] == ["A", "B", "C"]
     assert plan.duration_s == pytest.approx((4 + np.hypot(2, 2)) / 0.5, abs=0.5)
     steps = np.linalg.norm(np.diff(plan.trajectory.centers, axis=0), axis=1)
-    assert np.median(steps) == pytest.approx(0.25)
+    assert steps.max() == pytest.approx(0.25)  # it is slower in the corner
     # The camera is level and looks along its way, which is x: its z axis is the way, and its y axis points down.
     np.testing.assert_allclose(plan.trajectory.world_from_cam[0] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(plan.trajectory.world_from_cam[0] @ [0, 1, 0], [0, 0, -1], atol=1e-12)
     assert np.linalg.det(plan.trajectory.world_from_cam) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("corner_deg", [90.0, 180.0])
+def test_corners_are_rounded_off_as_fast_as_the_camera_may_turn(corner_deg: float) -> None:
+    around = np.deg2rad(corner_deg)
+    waypoints = np.array([[0, 0, 1.6], [8, 0, 1.6], [8 + 8 * np.cos(around), 8 * np.sin(around), 1.6]])
+    path = path_through(waypoints.tolist(), speed_m_per_s=0.5, photo_rate_hz=2.0, turn_deg_per_s=30.0)
+    turns = Rotation.from_matrix(path.world_from_cam)
+    turned_deg = np.rad2deg((turns[:-1].inv() * turns[1:]).magnitude())
+    assert turned_deg.max() == pytest.approx(15.0, abs=1.0)  # half a second
+    assert turned_deg.sum() == pytest.approx(corner_deg)
+    assert np.linalg.norm(path.centers - waypoints[1], axis=1).min() < 0.8
+    steps = np.linalg.norm(np.diff(path.centers, axis=0), axis=1)
+    assert steps.max() < 0.25 + 1e-9
+    np.testing.assert_allclose(path.centers[10:20, 1], 0.0, atol=1e-12)  # lines stay lines
+
+
+def test_a_vertical_line_is_walked_with_the_heading_before_it() -> None:
+    path = path_through([(0, 0, 0), (0, 0, 2), (0, 4, 2), (0, 4, 0)], speed_m_per_s=0.5, photo_rate_hz=2.0)
+    np.testing.assert_allclose(path.world_from_cam[:, :, 2], np.tile([0.0, 1.0, 0.0], (len(path), 1)), atol=1e-12)
 
 
 def test_a_trajectory_and_anchors_may_stand_in_files(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 from tests.planning.surveys import FIVE_ANCHORS_M, loop, planned
 
 from rangesfm.planning.expected import Expected, expect
+from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.ranging.errors.components import BENDS
 
@@ -46,6 +47,15 @@ def test_the_bend_grows_with_the_noise_of_features_and_with_fewer_points() -> No
     sharp, blurred = seen_by(OPEN.changed(feature_stddev=0.01)), seen_by(OPEN.changed(feature_stddev=0.02))
     assert free_bend_m(blurred) == pytest.approx(2 * free_bend_m(sharp), rel=0.05)
     assert free_bend_m(seen_by(OPEN.changed(feature_stddev=0.01, num_points=15))) > 1.5 * free_bend_m(sharp)
+
+
+def test_a_walk_around_corners_is_photographed_without_a_break() -> None:
+    square = [(3.0, 3.0, 1.4), (-3.0, 3.0, 1.9), (-3.0, -3.0, 1.4), (3.0, -3.0, 1.9), (3.0, 3.0, 1.4)]
+    walk = path_through(square, speed_m_per_s=0.6, photo_rate_hz=2.0)
+    rigid = planned(FIVE_ANCHORS_M, "site", walk)
+    bending, stiff = expect(replace(rigid, photos=PlannedPhotos())), expect(rigid)
+    assert bending.uncertainty.empirical < 1.2 * stiff.uncertainty.empirical
+    assert bending.verdict.verdict == "good"
 
 
 def test_ranges_straighten_a_map_that_bends() -> None:

@@ -69,6 +69,21 @@ def test_anchors_stay_within_the_heights_that_are_allowed() -> None:
     assert all(0.0 <= height <= 2.0 for height in heights)
 
 
+def test_advice_stays_within_the_walls() -> None:
+    """The path is 8 m wide: 1.5 times as wide it leads through walls that are 10 m apart, and not 1.25 times."""
+    survey = planned(FIVE_ANCHORS_M, "site", loop(30.0, 60))
+    half_m = np.abs(survey.trajectory.centers[:, :2]).max(axis=0)
+
+    def widths(share: float) -> set[str]:
+        corners = share * half_m * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+        advice = plan_survey(replace(survey, walls_m=(corners,))).advice
+        return {each.words for each in advice if each.kind == "wider path"}
+
+    assert widths(3.0) == {"walk 1.5 times as wide", "walk 1.25 times as wide"}
+    assert widths(1.4) == {"walk 1.25 times as wide"}
+    assert widths(1.1) == set()
+
+
 def test_mistakes_that_would_be_found_have_a_size_and_an_effect(plan: SurveyPlan) -> None:
     places = [mistake for mistake in plan.mistakes if mistake.name == "anchor place"]
     assert {mistake.subject for mistake in places} == {

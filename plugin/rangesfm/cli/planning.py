@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from rangesfm.cli.arguments import Commands, Outcome
-from rangesfm.errors import InputError
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.progress import Progress
 
 
@@ -22,7 +22,7 @@ def add_planning_commands(commands: Commands) -> None:
 def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
     """Compute what a run of a survey would say, before any range is measured: how accurately the scale and the place
     of the map will be known, which mistakes would be found, and which change of anchors, path or radio would help
-    most.
+    most. If a run would refuse the scale, the exit status is 3; all is printed and written nevertheless.
 
     example:
       rangesfm plan plan.toml --output_path plan
@@ -33,7 +33,7 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
     from rangesfm.files.atomic import require_apart
     from rangesfm.planning.placement import place_anchors
     from rangesfm.planning.plan_file import read_plan
-    from rangesfm.planning.survey_plan import plan_survey
+    from rangesfm.planning.survey_plan import REFUSED, plan_survey
     from rangesfm.report.plan_page import write_plan
 
     if args.output_path is not None:
@@ -46,4 +46,4 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
         planned = plan_of_result(args.result)
     plan = plan_survey(planned)
     written = [] if args.output_path is None else map(str, write_plan(plan, Path(args.output_path)))
-    return Outcome([*plan.lines, *written])
+    return Outcome([*plan.lines, *written], GeometryError.exit_status if plan.verdict == REFUSED else 0)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
 import numpy as np
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Mask
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.expected import Expected, expect_roughly
@@ -31,6 +32,8 @@ _LEARNT_CURVE_M = 0.02
 _TAPED_M = (5.0, 0.005)
 # Standard deviation of the coordinates of surveyed anchors, metres.
 _SURVEYED_M = 0.02
+# Smallest distance between a wall and the camera of somebody who walks along it, metres.
+_CLEARANCE_M = 0.3
 # Smallest distance of a new anchor from the others, metres; a nearer one adds almost no information.
 _NEAR_M = 1.0
 # Number of changes that a result recommends.
@@ -79,7 +82,10 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
     """
     bending = {name: stddev for name, stddev in expected.learned.stddev_of_component.items() if name in BENDS}
     before = _compared(expected.planned, bending)
-    afters = ((change, _compared(change[3], bending)) for change in _changes(expected.planned))
+    possible = (
+        change for change in _changes(expected.planned) if not _leads_through_walls(expected.planned, change[3])
+    )
+    afters = ((change, _compared(change[3], bending)) for change in possible)
     found = (_advice(change, after, before, expected) for change, after in afters if before and after)
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
 
@@ -151,8 +157,8 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
     if path_shape(path.centers).stddevs[1] < NEARLY_STRAIGHT * path_shape(path.centers).stddevs[0]:
         bent, off_m = _bent(path)
         yield "bend", "", f"walk a bend, up to {off_m:.2g} m off the line", replace(planned, trajectory=bent)
-    wide = f"walk {_WIDER:g} times as wide"
-    yield "wider path", "", wide, replace(planned, trajectory=_wider(path))
+    for factor in (_WIDER, 1 + (_WIDER - 1) / 2):
+        yield "wider path", "", f"walk {factor:g} times as wide", replace(planned, trajectory=_wider(path, factor))
     yield "rate", "", "range twice as often", replace(planned, rate_hz=2 * planned.rate_hz)
     if planned.allowed_m is None:
         yield "wider anchors", "", f"put the anchors {_WIDER:g} times as far out", _with_wider_anchors(planned)
@@ -163,6 +169,25 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
     yield "tape", "", tape, replace(planned, taped=(*planned.taped, _TAPED_M))
 
 
+def _leads_through_walls(before: PlannedSurvey, after: PlannedSurvey) -> bool:
+    """Return whether a keyframe moves through a wall, or nearer to it than people walk."""
+    start, end = before.trajectory.centers[:, :2], after.trajectory.centers[:, :2]
+    moved_m = np.linalg.norm(end - start, axis=1, keepdims=True)
+    end = end + _CLEARANCE_M * (end - start) / np.maximum(moved_m, _CLEARANCE_M)
+    return any(np.any(_cross(start, end, *wall)) for line in before.walls_m for wall in itertools.pairwise(line))
+
+
+def _cross(start: Array, end: Array, from_: Array, to: Array) -> Mask:
+    """Return for each of n straight lines (n, 2) in a plane whether it crosses another one, with ends (2,) each."""
+
+    def side(a: Array, b: Array, point: Array) -> Array:
+        (x, y), (dx, dy) = (point - a).T, (b - a).T
+        return np.sign(dx * y - dy * x)
+
+    apart = side(start, end, from_) * side(start, end, to) < 0
+    return np.asarray(apart & (side(from_, to, start) * side(from_, to, end) < 0))
+
+
 def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
     """Return the plan with a calibrated radio, without the given values of error components that this changes."""
     taken = {component.name for component in COMPONENTS if component.calibrated_median is not None}
@@ -171,14 +196,14 @@ def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
 
 
 def _with_wider_anchors(planned: PlannedSurvey) -> PlannedSurvey:
-    moved = zip(planned.anchors, _farther_out(planned.trajectory, planned.anchors_m), strict=True)
+    moved = zip(planned.anchors, _farther_out(planned.trajectory, planned.anchors_m, _WIDER), strict=True)
     return replace(planned, anchors=tuple(replace(anchor, position_m=at) for anchor, at in moved))
 
 
-def _farther_out(path: Trajectory, places_m: Array) -> Array:
-    """Return places (n, 3) moved horizontally away from the mean of the path, by the factor _WIDER."""
+def _farther_out(path: Trajectory, places_m: Array, factor: float) -> Array:
+    """Return places (n, 3) moved horizontally away from the mean of the path, by a factor."""
     middle = path.centers.mean(axis=0)
-    return np.asarray(middle + (places_m - middle) * [_WIDER, _WIDER, 1.0])
+    return np.asarray(middle + (places_m - middle) * [factor, factor, 1.0])
 
 
 def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
@@ -247,9 +272,9 @@ def _bent(path: Trajectory) -> tuple[Trajectory, float]:
     return replace(path, centers=path.centers + length_m / 4 * arc[:, None] * aside), length_m / 4
 
 
-def _wider(path: Trajectory) -> Trajectory:
-    """Return a path spread out around its mean, walked at the same speed, with as many photos."""
+def _wider(path: Trajectory, factor: float) -> Trajectory:
+    """Return a path spread out around its mean by a factor, walked at the same speed, with as many photos."""
     times = path.timestamps_s
     assert times is not None
-    out = _farther_out(path, path.centers)
-    return replace(path, centers=out, timestamps_s=times[0] + _WIDER * (times - times[0]))
+    out = _farther_out(path, path.centers, factor)
+    return replace(path, centers=out, timestamps_s=times[0] + factor * (times - times[0]))

@@ -19,18 +19,28 @@ _LOOP_SHARE = 2 / 3
 _LOOP_STEP_M, _NUM_WAVES = 0.25, 3
 # Below this ratio of its horizontal part to its length a direction counts as vertical.
 _STEEP = 1e-6
+# Times at which a turn is sampled, relative to its middle and its duration.
+_DURING_TURN = (np.arange(128) + 0.5) / 128 - 0.5
 
 
 def path_through(
-    waypoints: Sequence[Sequence[float]], speed_m_per_s: float, photo_rate_hz: float, num_rounds: int = 1
+    waypoints: Sequence[Sequence[float]],
+    speed_m_per_s: float,
+    photo_rate_hz: float,
+    num_rounds: int = 1,
+    turn_deg_per_s: float = 30.0,
 ) -> Trajectory:
-    """Return a walk at constant speed along straight lines between waypoints, with an upright camera that looks ahead.
+    """Return a walk along straight lines between waypoints, with an upright camera that looks ahead.
+
+    Corners are walked as people walk them: place and heading are means over the time that the sharpest turn takes. So
+    corners are rounded off, and the camera turns evenly from one line to the next.
 
     Args:
         waypoints: points (3,), metres, z up.
-        speed_m_per_s: speed of the walk.
+        speed_m_per_s: speed of the walk; it is lower in corners.
         photo_rate_hz: keyframes per second.
         num_rounds: number of times that the waypoints are walked.
+        turn_deg_per_s: angular velocity in the sharpest turn.
     """
     corners = np.array(waypoints, dtype=np.float64).reshape(-1, 3)
     if len(corners):
@@ -43,10 +53,12 @@ def path_through(
     num = int(way[-1] / speed_m_per_s * photo_rate_hz) + 1
     _require_possible(num)
     times = np.arange(num) / photo_rate_hz
-    at = speed_m_per_s * times
-    centers = places_on_way(at, way, corners)
-    leg = np.clip(np.searchsorted(way, at, side="right") - 1, 0, len(corners) - 2)
-    return _trajectory(times, centers, _looking(np.diff(corners, axis=0)[leg]))
+    headings = _headings(np.diff(corners, axis=0))
+    turn_s = np.rad2deg(np.abs(np.diff(headings)).max(initial=0.0)) / turn_deg_per_s
+    during = speed_m_per_s * (times[:, None] + turn_s * _DURING_TURN)
+    leg = np.clip(np.searchsorted(way, during, side="right") - 1, 0, len(corners) - 2)
+    centers = places_on_way(during.ravel(), way, corners).reshape(num, -1, 3).mean(axis=1)
+    return _trajectory(times, centers, _looking(headings[leg].mean(axis=1)))
 
 
 def way_along(corners: Array) -> Array:
@@ -118,11 +130,18 @@ def _trajectory(times: Array, centers: Array, world_from_cam: Array) -> Trajecto
     return Trajectory(np.arange(1, num + 1), names, times, centers, world_from_cam)
 
 
-def _looking(ahead: Array) -> Array:
-    """Return world_from_cam (n, 3, 3) of level cameras that look along the horizontal parts of directions (n, 3)."""
-    forward = ahead * [1.0, 1.0, 0.0]
-    level = np.linalg.norm(forward, axis=1) > _STEEP * np.linalg.norm(ahead, axis=1)
-    forward = np.where(level[:, None], forward, [1.0, 0.0, 0.0])
-    forward = forward / np.linalg.norm(forward, axis=1)[:, None]
+def _headings(legs: Array) -> Array:
+    """Return the headings (n,) of straight lines (n, 3): radians from x towards y, from each to the next the short way.
+
+    A vertical line is walked with the heading of the line before it, or of the first that is not vertical.
+    """
+    is_level = np.linalg.norm(legs[:, :2], axis=1) > _STEEP * np.linalg.norm(legs, axis=1)
+    before = np.maximum.accumulate(np.where(is_level, np.arange(len(legs)), int(np.argmax(is_level))))
+    return np.asarray(np.unwrap(np.arctan2(legs[before, 1], legs[before, 0])))
+
+
+def _looking(headings: Array) -> Array:
+    """Return world_from_cam (n, 3, 3) of level cameras that look in these directions (n,), radians from x towards y."""
+    forward = np.column_stack([np.cos(headings), np.sin(headings), np.zeros(len(headings))])
     down = np.broadcast_to([0.0, 0.0, -1.0], forward.shape)
     return np.stack([np.cross(down, forward), down, forward], axis=2)

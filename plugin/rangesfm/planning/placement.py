@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.errors import GeometryError
 from rangesfm.planning.expected import expect_roughly
 from rangesfm.planning.paths import places_on_way, way_along
 from rangesfm.planning.planned import PlannedSurvey
@@ -72,9 +71,6 @@ def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> P
     One anchor after the other is tried at every allowed place (Fedorov's exchange). The product of the scale's relative
     standard deviation and the least certain keyframe's standard deviation is minimized, or the first alone if the map
     is not placed in the site.
-
-    Raises:
-        GeometryError: no choice of places determines the scale.
     """
     progress = progress or SilentProgress()
     if planned.is_placed or planned.allowed_m is None:
@@ -95,8 +91,6 @@ def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> P
                     planned, best = tried, badness
         if best == before:
             break
-    if np.isinf(best):
-        raise GeometryError("no allowed places of the anchors determine the scale with this path")
     return planned
 
 

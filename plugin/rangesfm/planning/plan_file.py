@@ -81,7 +81,7 @@ class PlannedPathOptions(Options, table="path"):
     waypoints: Annotated[
         Annotated[tuple[_Place, ...], Field(strict=False)] | None, KeyMeta(expected="a list of lists of 3 numbers")
     ] = None
-    """Points x, y, z in the site that the camera passes; it looks ahead."""
+    """Points x, y, z in the site that the camera passes; it looks ahead, and its path is rounded off at corners."""
     loop_inside_m: Annotated[
         Annotated[tuple[_Spot, ...], Field(strict=False, min_length=3)] | None,
         KeyMeta(expected="a list of 3 corners x, y or more"),
@@ -91,6 +91,8 @@ class PlannedPathOptions(Options, table="path"):
     """Lowest and highest height of the camera on that loop."""
     speed_m_per_s: Annotated[float, Field(ge=0.01, le=100)] = 0.8
     """Speed along the waypoints or the loop."""
+    turn_deg_per_s: Annotated[float, Field(ge=1, le=360)] = 30.0
+    """Angular velocity with which the camera turns in the sharpest corner."""
     num_rounds: Annotated[int, Field(ge=1, le=1000)] = 1
     """Number of times that they are walked; each further round starts by going back to the first waypoint."""
     file: Annotated[Path | None, KeyMeta(role="file")] = None
@@ -180,6 +182,7 @@ def _planned(
         heights_m=anchors.heights_m,
         path_is_level=path.is_level,
         allowed_m=allowed_m,
+        walls_m=_walls(anchors, path),
         is_placed=anchors.num_to_place is None,
     )
     if planned.duration_s > _MAX_DURATION_S:
@@ -205,7 +208,7 @@ def _path(path: PlannedPathOptions) -> Trajectory:
     if path.model is not None:
         return path_from_model(path.model, path.photo_rate_hz)
     waypoints = path.waypoints or loop_inside(path.loop_inside_m or (), path.heights_m)
-    return path_through(waypoints, path.speed_m_per_s, path.photo_rate_hz, path.num_rounds)
+    return path_through(waypoints, path.speed_m_per_s, path.photo_rate_hz, path.num_rounds, path.turn_deg_per_s)
 
 
 def _allowed(options: PlannedAnchorOptions) -> Array | None:
@@ -215,6 +218,12 @@ def _allowed(options: PlannedAnchorOptions) -> Array | None:
     if options.region_m is not None or options.heights_m is None:
         raise options.refused("walls_m", "goes with heights_m and without region_m")
     return places_on_walls(options.walls_m, options.heights_m)
+
+
+def _walls(anchors: PlannedAnchorOptions, path: PlannedPathOptions) -> tuple[Array, ...]:
+    """Return the walls, and the outline of the floor, as corners (k, 2)."""
+    floor = () if path.loop_inside_m is None else ((*path.loop_inside_m, path.loop_inside_m[0]),)
+    return tuple(np.array(corners, dtype=np.float64) for corners in (*(anchors.walls_m or ()), *floor))
 
 
 def _anchors(options: PlannedAnchorOptions, allowed_m: Array | None) -> tuple[Anchor, ...]:

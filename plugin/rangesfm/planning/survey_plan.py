@@ -12,12 +12,15 @@ import numpy as np
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.hypothesis_tests import Factorization, MistakeTest, row_of
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
+from rangesfm.errors import GeometryError
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import component_words
 
+REFUSED = "refused"
+"""Verdict of a plan whose scale a run will refuse."""
 _MAX_NUM_SHOWN = 5
 # Columns of a mistake's test that do not depend on the measured ranges.
 _SIZES = ("smallest_detectable", "effect_on_scale", "effect_on_place_m")
@@ -57,7 +60,8 @@ class SurveyPlan:
         components: relative standard deviation of the scale from each component of the range errors, by name.
         place: placement in the site; None if the frame is the first camera's.
         keyframe_stddevs_m: (n,) standard deviation of each keyframe's position in the result's frame.
-        verdict, reasons: the run's verdict on the scale; also "doubtful" if the run will leave the position open.
+        verdict, reasons: the run's verdict on the scale; also "doubtful" if the run will leave the position open, and
+            "refused" if it will refuse the scale.
         mistakes: for each possible mistake the smallest size that would be found, and its effect, the largest effect on
             the scale first; None means without limit.
         advice: changes that would gain something.
@@ -112,11 +116,11 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
     """Compute the expected result of a survey by the formulas of a run at the true map, and the changes that gain most.
 
     Raises:
-        GeometryError: a run will refuse the scale.
+        GeometryError: there is nothing to compute, because a run will find too few ranges on the path, or no two
+            photos that see the same point.
     """
     expected = expect(planned)
-    verdict = expected.verdict
-    open_place = expected.mirror_image()
+    verdict, reasons = _verdict(expected)
     half_width = expected.uncertainty.half_width_95
     return SurveyPlan(
         num_ranges=planned.num_ranges,
@@ -129,12 +133,24 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         components=expected.uncertainty.components,
         place=_place(expected),
         keyframe_stddevs_m=tuple(expected.keyframe_stddevs_m.tolist()),
-        verdict="doubtful" if open_place else verdict.verdict,
-        reasons=(*([f"a run will give the scale only: {open_place}"] if open_place else []), *verdict.reasons),
+        verdict=verdict,
+        reasons=reasons,
         mistakes=_mistakes(expected),
         advice=advise(expected),
         expected=expected,
     )
+
+
+def _verdict(expected: Expected) -> tuple[str, tuple[str, ...]]:
+    """Return the verdict of the run on scale and position, and its reasons."""
+    try:
+        verdict = expected.verdict
+    except GeometryError as error:
+        return REFUSED, (str(error), *error.advice)
+    open_place = expected.mirror_image()
+    if open_place is None:
+        return verdict.verdict, tuple(verdict.reasons)
+    return "doubtful", (f"a run will give the scale only: {open_place}", *verdict.reasons)
 
 
 def _place(expected: Expected) -> PlannedPlace | None:

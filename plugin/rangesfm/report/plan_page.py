@@ -24,8 +24,9 @@ from rangesfm.report.text import count, duration, fixed, percent, rough
 # From the smallest to the largest stddev; each colour is as visible on a light page as on a dark one.
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")
 _OPEN_COLOR = "#a3123a"
-# Fraction of the largest stddev below which all stddevs have the same colour.
-_LEAST_SHOWN = 0.1
+_WALL_COLOR = "#6b7280"
+# Ends of the bands of stddevs are numbers that begin with one of these. Three bands are a factor of 10.
+_STEPS = np.array([1.0, 2.0, 5.0])
 _AREA_OPACITY, _AREA_WIDTH_PX = 70, 160
 _MAX_NUM_MISTAKES = 12
 
@@ -80,7 +81,7 @@ def _tiles(plan: SurveyPlan) -> list[tuple[str, str, str]]:
 def accuracy_views(plan: SurveyPlan) -> Figure:
     """Return plan and elevation of the path; path and surroundings are coloured by their expected stddev."""
     centers = plan.expected.planned.trajectory.centers
-    edges = _edges(plan.expected.stddevs_at(plan.expected.planned.places_m))
+    edges = _edges(np.array(plan.keyframe_stddevs_m))
     # A plan is drawn in the site frame, z up, even where the result will be in another frame.
     views = tuple(_view(plan, view, centers, edges) for view in views_of(centers, "site"))
     whose = "in the site" if plan.place is not None else "against the first camera"
@@ -94,7 +95,8 @@ def accuracy_views(plan: SurveyPlan) -> Figure:
 def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
     places, marks = view.anchors(plan.anchors_m)
     line = view.seen(centers)
-    limits = equal_view(np.vstack([line, places]))
+    walls = [np.insert(wall, 2, centers[:, 2].mean(), axis=1) for wall in plan.expected.planned.walls_m]
+    limits = equal_view(np.vstack([line, places, *map(view.seen, walls)]))
     of_keyframe = np.digitize(plan.keyframe_stddevs_m, edges)
     names = _names(edges)
     shown = names if len(edges) in of_keyframe else names[:-1]
@@ -102,6 +104,9 @@ def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
         Series(name, _color(band, len(names)), _stretches(line, of_keyframe == band), "line")
         for band, name in enumerate(shown)
     ]
+    if walls and view.axes == (0, 1):
+        gaps = [np.vstack([view.seen(wall), [[np.nan, np.nan]]]) for wall in walls]
+        series.append(Series("walls", _WALL_COLOR, np.vstack(gaps), "line"))
     area = _area(plan, view, centers.mean(axis=0), edges, limits)
     return view.panel("the path and the anchors", " m", series, limits, marks=marks, picture=area)
 
@@ -122,15 +127,18 @@ def _area(plan: SurveyPlan, view: View, middle: Array, edges: Array, limits: Lim
 
 
 def _edges(stddevs_m: Array) -> Array:
-    """Return upper ends of bands of stddevs, metres with two digits, at about equal ratios; the last is infinite."""
+    """Return the upper ends of bands of stddevs, metres; the last is infinite.
+
+    The ends are 1, 2, 5, 10, ... and the median keyframe is in the band in the middle. So the colours differ where one
+    place is known at least twice as well as another, and a path that is known evenly has one colour.
+    """
     known = stddevs_m[np.isfinite(stddevs_m) & (stddevs_m > 0)]
     if len(known) == 0:
         return np.array([np.inf])
-    # In the frame of the first camera, stddevs near that camera are almost 0; bands of equal ratio cannot begin there.
-    least = max(known.min(), _LEAST_SHOWN * known.max())
-    inner = np.geomspace(least, known.max(), len(_COLORS) + 1)[1:-1]
-    edges = np.unique([float(f"{edge:.2g}") for edge in inner])
-    return np.append(edges, np.inf)
+    exponent = math.floor(math.log10(np.median(known)))
+    ladder = np.concatenate([_STEPS * 10.0 ** (exponent + by) for by in (-1, 0, 1)])
+    first = int(np.searchsorted(ladder, np.median(known), side="right")) - len(_COLORS) // 2
+    return np.append(ladder[first : first + len(_COLORS) - 1], np.inf)
 
 
 def _names(edges: Array) -> list[str]:
