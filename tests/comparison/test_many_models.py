@@ -15,12 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.comparison.comparison_page import write_comparison
 from rangesfm.comparison.many_models import ModelsComparison, compare_many, read_named_models
-from rangesfm.comparison.model_ranges import ranges_of_survey
 from rangesfm.distances.tape import read_tape
 from rangesfm.errors import InputError
 from rangesfm.progress import SilentProgress
-from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.settings import Survey
+from rangesfm.workflows.ranges_for_models import ranges_of_survey
 from rangesfm.workflows.run import scale_model
 
 if TYPE_CHECKING:
@@ -126,7 +125,7 @@ def test_a_log_is_held_against_models_that_no_run_has_made(
     survey = survey_of(files)
     named = read_named_models(models)
     assert named[0].model is not None
-    ranges = ranges_of_survey(survey, read_ranging_inputs(survey), named[0].model, models[0])
+    ranges = ranges_of_survey(survey, named[0].model, models[0])
     (first, similar, moved) = compare_many(named, ranges).rows
     rms = [row.range_rms_m for row in (first, similar, moved) if row.range_rms_m is not None]
     assert len(rms) == 3
@@ -167,7 +166,7 @@ def test_the_command_takes_the_log_and_the_tape(
 ) -> None:
     files = walked_survey.folder
     names = compared(*models[:2]).models[0].path.image_names
-    (tmp_path / "taped.csv").write_text(f"from,to,distance_m\n{names[0]},{names[9]},1.25\n")
+    (tmp_path / "taped.csv").write_text(f"from,to,distance_m,kind\n{names[0]},{names[9]},1.25,check\n")
     log = ("--ranges", files / "uwb.csv", "--anchors", files / "anchors.csv", "--images", files / "images.csv")
     tag = ("--tag-in-cam", ",".join(map(str, TAG_IN_CAM_M)), "--ranges_time_offset", "2")
     tape = ("--distances", "taped.csv", "--output_path", "page")

@@ -23,8 +23,8 @@ from rangesfm.demo.simulated_radio import CameraPath, Radio
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.join.join_models import JoinedModels, PathOfModel, join_models
-from rangesfm.progress import SilentProgress
+from rangesfm.join.join_models import JoinedModels, join_models
+from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
@@ -32,6 +32,7 @@ from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.vision.reconstruct import ReconstructionSummary
 from rangesfm.workflows.run import run_survey, scale_model
 
@@ -72,7 +73,8 @@ class Halves:
         anchors = [Anchor(name, None if frame == "unknown" else positions.get(name)) for name in self.log.anchor_ids]
         arms, (site, _) = np.array([TAG_IN_CAM_M]), local_site((), "unknown", None)
         inputs = RangingInputs(self.log, arms, tuple(anchors), frame, site, None, None, ())
-        return join_models(self.parts, Survey().changed({"scale.max_relative_stddev": 0.2}), inputs)
+        survey = Survey().changed({"scale.max_relative_stddev": 0.2})
+        return join_models(SurveyRun(survey, inputs, Journal(SilentProgress())), self.parts)
 
     def off_m(self, centers: Array, *, with_scale: bool = True) -> float:
         """Return the largest distance of a photo from the truth after the best similarity (or rigid motion) of all."""

@@ -30,7 +30,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
@@ -48,7 +47,6 @@ from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.join.join_models import PathOfModel
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
@@ -58,6 +56,7 @@ from rangesfm.ranging.range_log import RangeLog
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.workflows.run import map_in_metres
 
 Array = npt.NDArray[np.float64]
@@ -232,13 +231,8 @@ def run(survey: Made, seed: int) -> MetricResult:
     observations = associate(survey.log, survey.trajectory, survey.tag_in_cam_m)
     sfm = survey.sfm if survey.sfm.num_reg_images() else of_poses(survey.trajectory)
     path = PathOfModel("sparse/0", sfm, survey.trajectory, observations)
-    found: list[MetricResult] = []
-    with (
-        patch("rangesfm.workflows.run.write_results", lambda survey, inputs, metric, journal: found.append(metric)),
-        patch("rangesfm.workflows.run.with_advice", lambda metric, tag_in_cam_m: metric),
-    ):
-        map_in_metres(settings, inputs, [path], None, Journal(SilentProgress()), refine=survey.refine)
-    return found[0]
+    run = SurveyRun(settings, inputs, Journal(SilentProgress()))
+    return map_in_metres(run, [path], refine=survey.refine)[1]
 
 
 def of_poses(path: Trajectory) -> pycolmap.Reconstruction:

@@ -186,10 +186,9 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.comparison.many_models import against_reference, compare_many, read_named_models
-    from rangesfm.comparison.model_ranges import ranges_of_survey
     from rangesfm.distances.tape import read_tape
     from rangesfm.geometry.reference import read_reference
-    from rangesfm.survey.inputs import read_ranging_inputs
+    from rangesfm.workflows.ranges_for_models import ranges_of_survey
 
     given = flags_given(args, *_COMPARE_KEYS)
     of_log = [name for name in given if name not in _WITHOUT_LOG]
@@ -199,7 +198,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     models, ranges, tape = read_named_models(paths, survey), None, None
     if survey.ranges.path is not None:
         model, path = next((one.model, path) for one, path in zip(models, paths, strict=True) if one.model is not None)
-        ranges = ranges_of_survey(survey, read_ranging_inputs(survey), model, path)
+        ranges = ranges_of_survey(survey, model, path)
     if survey.scale.distances is not None:
         tape = read_tape(survey.scale.distances, survey.scale.markers)
     comparison = compare_many(models, ranges, tape)

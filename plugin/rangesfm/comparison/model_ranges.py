@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.clock.time_offset import estimate_time_offset
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.result.metric_result import USED
+from rangesfm.result.metric_result import USED, MetricResult
 from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
-from rangesfm.scale.initialize import initialize_scale
-from rangesfm.survey.inputs import RangingInputs, times_of_model
-from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_run import SurveyRun
 
 
 @dataclass(frozen=True)
@@ -99,53 +93,28 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
     )
 
 
-def ranges_of_survey(
-    survey: Survey, inputs: RangingInputs, model: pycolmap.Reconstruction, model_path: Path
-) -> ModelRanges:
-    """Return the ranges of a log, placed on a model: those that the estimate of its scale uses, and its anchors.
+def ranges_of_map(run: SurveyRun, metric: MetricResult, image_times_s: Mapping[str, float] | None) -> ModelRanges:
+    """Return the ranges that a map in metres uses, and its anchors.
 
     Args:
-        survey: settings of log, anchors, tag and photo times.
-        inputs: what was read from the files of the survey.
-        model: in any unit; it is scaled by the ranges in any case.
-        model_path: folder from which the model was read.
-
-    Raises:
-        InputError: the photos have no times, or no range has a place on the path.
-        GeometryError: the ranges do not determine the time offset or the scale of the model.
+        run: survey of the map.
+        metric: the map, scaled by its ranges.
+        image_times_s: as in ``ModelRanges``.
     """
-    times = None if inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
-    path = trajectory_from_reconstruction(model, times)
-    log = inputs.log
+    estimate, log, inputs = metric.estimate, metric.observations.log, run.inputs
     if log.timestamp_s is not None:
-        offset_s: float | Array | None = survey.ranges.time_offset_s
-        if offset_s is None:
-            found = estimate_time_offset(
-                log, path, inputs.tag_in_cam_m, association=survey.ranges, seed=survey.output.seed
-            )
-            offset_s = found.at(log.timestamp_s)
+        offset = metric.time_offset
+        offset_s = (metric.time_offset_s or 0.0) if offset is None else offset.at(log.timestamp_s)
         log = replace(log, timestamp_s=log.timestamp_s + offset_s)
-    observations = associate(log, path, inputs.tag_in_cam_m, options=survey.ranges)
-    if not observations.has_place.any():
-        raise InputError("no range was taken near a photo: are --images and the time offset of this model?", log.source)
-    estimate = initialize_scale(
-        observations,
-        path,
-        inputs.anchors,
-        anchor_frame=inputs.anchor_frame,
-        options=survey.scale,
-        range_model=survey.ranges,
-        seed=survey.output.seed,
-    )
-    metric = estimate.metric_from_sfm
     to_site = inputs.site.offset_m if estimate.frame == "site" else np.zeros(3)
-    anchors = {anchor.anchor_id: anchor for anchor in estimate.anchors if np.isfinite(anchor.position_m).all()}
+    anchors = {anchor.anchor_id: anchor for anchor in metric.anchors if np.isfinite(anchor.position_m).all()}
+    scaled = estimate.metric_from_sfm
     return ModelRanges(
-        log=estimate.observations.log.subset(np.isin(estimate.observations.status, USED)),
+        log=log.subset(np.isin(metric.observations.status, USED)),
         tags_in_cam_m=dict(zip(log.tag_ids, inputs.tag_in_cam_m, strict=True)),
         anchors_m={id_: anchor.position_m + to_site for id_, anchor in anchors.items()},
         biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
-        image_times_s=times,
-        metric_path=path.transformed(metric.scale, metric.rotation, metric.translation + to_site),
-        association=survey.ranges,
+        image_times_s=image_times_s,
+        metric_path=metric.trajectory.transformed(scaled.scale, scaled.rotation, scaled.translation + to_site),
+        association=run.survey.ranges,
     )

@@ -6,20 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 
 from rangesfm.colmap.transform import joined_model, rescale
-from rangesfm.distances.locate_lengths import distances_within, locatable, locate_distances
+from rangesfm.distances.locate_lengths import distances_within, locatable
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import Trajectory, joined_trajectory
-from rangesfm.ranging.errors.bending import MapBending
-from rangesfm.ranging.range_observations import RangeObservations, each_on_one_path, joined_observations
-from rangesfm.scale.initialize import initialize_scale
+from rangesfm.geometry.trajectory import joined_trajectory
+from rangesfm.ranging.range_observations import each_on_one_path, joined_observations
 from rangesfm.scale.model_placement import ScaledModel, place_models
 from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.survey.inputs import RangingInputs
-from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 
 
 @dataclass(frozen=True)
@@ -43,43 +39,6 @@ class ModelVerdict:
 
 
 @dataclass(frozen=True)
-class PathOfModel:
-    """A model with its path and the ranges on that path.
-
-    Attributes:
-        name: name for the user, such as "sparse/0".
-        sfm: the unscaled model.
-        trajectory: path of its photos that have a time.
-        observations: ranges on that path, from the log that all models share.
-    """
-
-    name: str
-    sfm: pycolmap.Reconstruction
-    trajectory: Trajectory
-    observations: RangeObservations
-
-
-def estimate_scale(
-    survey: Survey, inputs: RangingInputs, path: PathOfModel, bending: MapBending | None = None
-) -> ScaleEstimate:
-    """Estimate the scale of a model by ``initialize_scale``, with the options and measured lengths of a survey."""
-    distances = None
-    if inputs.tape is not None:
-        distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
-    return initialize_scale(
-        path.observations,
-        path.trajectory,
-        inputs.anchors,
-        anchor_frame=inputs.anchor_frame,
-        options=survey.scale,
-        range_model=survey.ranges,
-        distances=distances,
-        bending=bending,
-        seed=survey.output.seed,
-    )
-
-
-@dataclass(frozen=True)
 class JoinedModels:
     """Result of joining.
 
@@ -94,10 +53,11 @@ class JoinedModels:
     notes: tuple[str, ...]
 
 
-def join_models(parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInputs) -> JoinedModels:
+def join_models(run: SurveyRun, parts: Sequence[PathOfModel]) -> JoinedModels:
     """Scale each model on its own, then place all in one world by all their ranges, with one set of anchors.
 
     Args:
+        run: survey of the models.
         parts: models without common photos. The others are joined to the first one.
 
     Raises:
@@ -106,10 +66,10 @@ def join_models(parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInp
     exclusive = each_on_one_path([part.observations for part in parts])
     parts = [replace(part, observations=of) for part, of in zip(parts, exclusive, strict=True)]
     first = _first_in_time(parts)
-    scaled, reasons = _scaled_alone(parts, survey, inputs, first)
+    scaled, reasons = _scaled_alone(run, parts, first)
     placements = place_models(list(scaled.values()))
     reasons |= {k: reason for k, reason in zip(scaled, placements.reasons, strict=True) if reason}
-    if first in reasons and inputs.anchor_frame == "first_camera":
+    if first in reasons and run.inputs.anchor_frame == "first_camera":
         why = f"the anchors are given in the frame of the first photo, and {parts[first].name}, which has that photo, "
         reasons = {k: reasons.get(k, f"{why}cannot be placed") for k in range(1, len(parts))}
     first_from_sfm = dict(zip(scaled, placements.first_from_sfm, strict=True))
@@ -138,7 +98,7 @@ def _first_in_time(parts: Sequence[PathOfModel]) -> int:
 
 
 def _scaled_alone(
-    parts: Sequence[PathOfModel], survey: Survey, inputs: RangingInputs, first: int
+    run: SurveyRun, parts: Sequence[PathOfModel], first: int
 ) -> tuple[dict[int, ScaledModel], dict[int, str]]:
     """Return the models whose scale their own ranges determine, and for the other models the reason.
 
@@ -149,7 +109,7 @@ def _scaled_alone(
     reasons: dict[int, str] = {}
     for k, part in enumerate(parts):
         try:
-            scaled[k] = _alone(part, survey, inputs, has_first_camera=k == first)
+            scaled[k] = _alone(run, part, has_first_camera=k == first)
         except GeometryError as error:
             if k == 0:
                 raise
@@ -157,18 +117,19 @@ def _scaled_alone(
     return scaled, reasons
 
 
-def _alone(part: PathOfModel, survey: Survey, inputs: RangingInputs, *, has_first_camera: bool) -> ScaledModel:
+def _alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -> ScaledModel:
     """Scale a model by its own ranges.
 
     For a model without the first photo, anchors in that photo's frame are like anchors in a site frame.
     """
-    frame, tape = inputs.anchor_frame, inputs.tape
+    frame, tape = run.inputs.anchor_frame, run.inputs.tape
     if not has_first_camera:
         frame = "site" if frame == "first_camera" else frame
-        survey = survey.changed({"scale.up_in_first_camera": None})
+        run = run.changed({"scale.up_in_first_camera": None})
     if tape is not None:
         tape = distances_within(locatable(tape, part.sfm), part.sfm, part.observations.log.anchor_ids)
-    estimate = estimate_scale(survey, replace(inputs, anchor_frame=frame, tape=tape), part)
+    run = replace(run, inputs=replace(run.inputs, anchor_frame=frame, tape=tape))
+    estimate = run.estimate_scale(part)
     is_given = frame == "first_camera"
     return ScaledModel(
         part.trajectory, estimate, is_in_anchor_frame=is_given or estimate.frame == "site", frame_is_given=is_given
@@ -188,4 +149,5 @@ def _assembled(parts: Sequence[PathOfModel], first_from_sfm: Sequence[Similarity
     model = joined_model([rescale(part.sfm, motion) for part, motion in zip(parts, first_from_sfm, strict=True)])
     frame_of = {image.name: image.frame_id for image in model.images.values()}
     frame_ids = np.array([frame_of[name] for name in trajectory.image_names], dtype=np.int64)
-    return PathOfModel(parts[0].name, model, replace(trajectory, frame_ids=frame_ids), observations)
+    path = replace(trajectory, frame_ids=frame_ids)
+    return PathOfModel(parts[0].name, model, path, observations, parts[0].time_offset)

@@ -10,40 +10,36 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import Correction
 from rangesfm.errors import GeometryError
-from rangesfm.join.join_models import PathOfModel
-from rangesfm.progress import Journal
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
-from rangesfm.survey.settings import Survey
-from rangesfm.workflows.make_metric_map import metric_map, ranges_on_path
+from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.workflows.make_metric_map import metric_map
 
 
-def with_likeliest_cause(
-    survey: Survey, inputs: RangingInputs, path: PathOfModel, metric: MetricResult, journal: Journal
-) -> tuple[RangingInputs, MetricResult]:
-    """Correct the likeliest mistake and make the map again; return the inputs and the map unchanged if none was found.
+def with_likeliest_cause(run: SurveyRun, path: PathOfModel, metric: MetricResult) -> tuple[SurveyRun, MetricResult]:
+    """Correct the likeliest mistake and make the map again; return the run and the map unchanged if none was found.
 
     The verdict on the new map is doubtful, with the change as a reason. Of two mistakes that the ranges hardly tell
     apart the likelier one is corrected, too; the user has asked for it and is told.
     """
     if metric.diagnosis is None or not metric.diagnosis.causes:
-        return inputs, metric
+        return run, metric
     if metric.models:
-        journal.warn("no mistake is corrected: the map is joined from several models")
-        return inputs, metric
+        run.journal.warn("no mistake is corrected: the map is joined from several models")
+        return run, metric
     cause = metric.diagnosis.causes[0]
-    corrected = _corrected_inputs(inputs, cause.correction, metric.diagnosis.rows)
+    corrected = replace(run, inputs=_corrected_inputs(run.inputs, cause.correction, metric.diagnosis.rows))
     try:
-        moved = replace(path, observations=_observations(survey, corrected, path, metric, metric.diagnosis))
+        moved = replace(path, observations=_observations(corrected, path, metric, metric.diagnosis))
         is_refined = metric.refined is not None
-        adopted = metric_map(survey, corrected, moved, metric.time_offset, journal, refine=is_refined)
+        adopted = metric_map(corrected, moved, refine=is_refined)
     except GeometryError as error:
-        journal.warn(f"no mistake is corrected, because the corrected survey fails: {error}")
-        return inputs, metric
+        run.journal.warn(f"no mistake is corrected, because the corrected survey fails: {error}")
+        return run, metric
     change = 100 * (adopted.estimate.value / metric.estimate.value - 1)
     said = f"adopted: {cause.words}; the scale changed by {change:+.2f} %, from {metric.estimate.value:.6g}"
-    journal.warn(said)
+    run.journal.warn(said)
     return corrected, adopted.doubted((said,))
 
 
@@ -64,15 +60,13 @@ def _corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indic
     return replace(inputs, anchors=anchors, tag_in_cam_m=inputs.tag_in_cam_m + moves, log=log)
 
 
-def _observations(
-    survey: Survey, inputs: RangingInputs, path: PathOfModel, metric: MetricResult, diagnosis: Diagnosis
-) -> RangeObservations:
+def _observations(run: SurveyRun, path: PathOfModel, metric: MetricResult, diagnosis: Diagnosis) -> RangeObservations:
     """Return the corrected ranges on the path. Ranges that the correction leaves out get the status of check ranges."""
     correction, rows = diagnosis.causes[0].correction, diagnosis.rows
-    offset, times, known_s = metric.time_offset, inputs.log.timestamp_s, metric.time_offset_s or 0.0
-    shift_s = _spread(np.broadcast_to(correction.time_shift_s, len(rows)), rows, len(inputs.log))
-    offset_s = shift_s + (known_s if offset is None or times is None else offset.at(times))
-    observations = ranges_on_path(survey, inputs, path.trajectory, offset_s)
+    log, offset, known_s = run.inputs.log, metric.time_offset, metric.time_offset_s or 0.0
+    shift_s = _spread(np.broadcast_to(correction.time_shift_s, len(rows)), rows, len(log))
+    offset_s = shift_s + (known_s if offset is None or log.timestamp_s is None else offset.at(log.timestamp_s))
+    observations = run.ranges_on(path.trajectory, offset_s)
     if correction.left_out is None:
         return observations
     status = observations.status.copy()

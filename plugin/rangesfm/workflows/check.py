@@ -24,7 +24,7 @@ from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.rigs import read_rigs
-from rangesfm.workflows.map_photos import checked_keyframes, read_inputs, read_registered
+from rangesfm.workflows.map_photos import begin_run, checked_keyframes, read_registered
 
 # Largest number of photo sizes and of cameras that are listed.
 _MAX_NUM_SIZES = 4
@@ -73,7 +73,8 @@ def check_survey(survey: Survey) -> CheckedSurvey:
         if model is None:
             photos = _check_photos(survey, checked)
     with checked.finding_faults():
-        inputs = read_inputs(survey, journal)
+        run = begin_run(survey, journal)
+        inputs = run.inputs
         checked.assumed += inputs.assumed
         checked.warnings[:] = [text for text in checked.warnings if text not in inputs.assumed]
         if len(inputs.log):
@@ -82,7 +83,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
         if survey.images.path is not None and is_source(survey.images.path):
             return checked
         if model is None:
-            keyframes, times = checked_keyframes(survey, inputs, journal)
+            keyframes, times = checked_keyframes(run)
         else:
             sfm = read_registered(model, journal)
             checked.facts.append(f"model: {sfm.num_reg_images()} photos and {sfm.num_points3D()} points in {model}")

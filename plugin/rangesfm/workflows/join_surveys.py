@@ -17,7 +17,6 @@ from rangesfm.files.atomic import require_apart, sole_writer
 from rangesfm.files.folders import real_path
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
-from rangesfm.join.join_models import PathOfModel
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
@@ -31,7 +30,8 @@ from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.run import map_in_metres
+from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.workflows.run import map_in_metres, with_results
 from rangesfm.workflows.run_results import RunResult
 
 # In metres. The files of two surveys may round the position of the same anchor differently.
@@ -268,7 +268,8 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress)
     )
     with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         paths = paths_of_surveys(finished, log, number, is_check, tags_in_cam_m)
-        return map_in_metres(as_joined, inputs, paths, None, journal, refine=survey.refine.enabled, must_join=True)
+        run = SurveyRun(as_joined, inputs, journal)
+        return with_results(*map_in_metres(run, paths, refine=survey.refine.enabled, must_join=True))
 
 
 def _anchors(survey: Survey, finished: Sequence[FinishedRun], log: RangeLog) -> tuple[tuple[Anchor, ...], str]:

@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.reprojection import point_errors
-from rangesfm.colmap.transform import rescale, without_photos
+from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
 from rangesfm.diagnostics.finished_map import Doubt, doubts_of_map, doubts_of_pieces, place_of_map, why_broken
@@ -19,17 +18,13 @@ from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.distances.tape import Tape
-from rangesfm.errors import GeometryError, InputError, SolverError
+from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import gravity_of
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera, trajectory_from_reconstruction
-from rangesfm.join.join_models import ModelVerdict, PathOfModel, estimate_scale, join_models
-from rangesfm.progress import Journal
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset, estimate_time_offset
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.join.join_models import ModelVerdict, join_models
+from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.ranging.range_log import RangeKind
-from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.refine.photo_bending import bending_of_model, by_photos
 from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, RefineSummary, refine_with_ranges
@@ -37,9 +32,8 @@ from rangesfm.result.metric_result import MetricResult, Rivals
 from rangesfm.scale.at_map import MapWithRanges, estimate_at
 from rangesfm.scale.scale_estimate import NORMAL_95, ScaleEstimate
 from rangesfm.scale.scale_verdict import refuse_unknown
-from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.image_times import ImageTimes
+from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 
 # Two likely time offsets whose scales differ by more than this fraction leave the scale undetermined, ...
 _MAX_SPREAD = 0.03
@@ -50,180 +44,14 @@ _ANY_STDDEV = 1e3  # a relative stddev of the scale that never leads to a refusa
 _NOTHING_KNOWN = 1.0
 
 
-def path_of_model(model: pycolmap.Reconstruction, times: ImageTimes | None) -> Trajectory:
-    """Return the camera's path in a model, with the times of the photos unless ``times`` is None."""
-    if times is None:
-        return trajectory_from_reconstruction(model)
-    return trajectory_from_reconstruction(model, times.by_name(), time_resolution_s=times.resolution_s)
-
-
-def path_with_times(
-    survey: Survey, model: pycolmap.Reconstruction, times: ImageTimes | None, journal: Journal
-) -> Trajectory:
-    """Return the path of a model's photos; photos without a time are left out with a warning, if times are needed.
-
-    Raises:
-        InputError: times are needed, and no photo has one.
-    """
-    trajectory = path_of_model(model, times)
-    if not len(trajectory):
-        first = min(image.name for image in model.images.values())
-        raise InputError(f"none of the model's photos has a time, the first is {first}", survey.images.times)
-    num = model.num_reg_frames()
-    if num_without_time := num - len(trajectory):
-        journal.warn(f"{num_without_time} of {num} photos of the model have no time and are left out")
-    return trajectory
-
-
-def find_time_offset(
-    survey: Survey, inputs: RangingInputs, trajectory: Trajectory, journal: Journal
-) -> TimeOffset | None:
-    """Search for the time offset between the clocks; None where it is given, or where the log names photos.
-
-    Raises:
-        GeometryError: the ranges do not determine it.
-    """
-    if inputs.log.image_name is not None or survey.ranges.time_offset_s is not None:
-        return None
-    with journal.stage("time offset"):
-        offset = estimate_time_offset(
-            inputs.log,
-            trajectory,
-            inputs.tag_in_cam_m,
-            association=survey.ranges,
-            seed=survey.output.seed,
-            progress=journal.progress,
-        )
-    journal.warn(*([offset.note] if offset.note else []))
-    return offset
-
-
-def ranges_on_paths(
-    survey: Survey,
-    inputs: RangingInputs,
-    models: Sequence[pycolmap.Reconstruction],
-    trajectory: Trajectory,
-    times: ImageTimes | None,
-    offset: TimeOffset | None,
-    journal: Journal,
-) -> list[PathOfModel]:
-    """Return the models with the ranges on their paths. A photo that several models have is kept in the first of them.
-
-    Args:
-        survey: options.
-        inputs: of the survey.
-        models: unscaled models of its photos.
-        trajectory: path of the first model.
-        times: of the photos; None where the log names photos.
-        offset: estimate of the time offset; None where it is given or not needed.
-        journal: for warnings about models that are left out.
-
-    Raises:
-        InputError: no range has a place on the first path.
-    """
-    given_s, radio_times_s = survey.ranges.time_offset_s or 0.0, inputs.log.timestamp_s
-    offsets_s = given_s if offset is None or radio_times_s is None else offset.at(radio_times_s)
-    paths = [PathOfModel("sparse/0", models[0], trajectory, ranges_on_path(survey, inputs, trajectory, offsets_s))]
-    names = set(trajectory.image_names)
-    for k, model in enumerate(models[1:], start=1):
-        rest = without_photos(model, names)
-        path = path_of_model(rest, times)
-        if not len(path):
-            journal.warn(f"sparse/{k} is left out: its photos have no times, or are also in other models")
-            continue
-        names.update(path.image_names)
-        observations = ranges_on_path(survey, inputs, path, offsets_s, may_be_none=True)
-        paths.append(PathOfModel(f"sparse/{k}", rest, path, observations))
-    return paths
-
-
-def ranges_on_path(
-    survey: Survey,
-    inputs: RangingInputs,
-    trajectory: Trajectory,
-    offset_s: float | Array,
-    *,
-    may_be_none: bool = False,
-) -> RangeObservations:
-    """Place the ranges on a path and hold out the check ranges.
-
-    Args:
-        survey: options.
-        inputs: of the survey.
-        trajectory: of the camera.
-        offset_s: image time minus range time, one for all ranges or (n,).
-        may_be_none: whether it is fine if no range has a place on the path.
-
-    Raises:
-        InputError: no range has a place on the path; the text says why.
-    """
-    observations = associate(inputs.log, trajectory, inputs.tag_in_cam_m, time_offset_s=offset_s, options=survey.ranges)
-    if len(inputs.log) and not may_be_none and not observations.has_place.any():
-        why = _why_no_range_has_a_place(observations, trajectory, float(np.mean(offset_s)))
-        raise InputError(why, survey.ranges.path)
-    return hold_out(observations, survey.ranges, survey.output.seed)
-
-
-def _why_no_range_has_a_place(observations: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:
-    times, photo_times = observations.log.timestamp_s, trajectory.timestamps_s
-    if times is None or photo_times is None:
-        return "none of the photos that the log names is in the model"
-    if np.all(observations.status[observations.log.kind == RangeKind.TAG_ANCHOR] == RangeStatus.OUTSIDE_PATH):
-        return (
-            f"the log's times ({times.min():.3f} to {times.max():.3f} s, plus an offset of {offset_s:g} s) do not "
-            f"overlap the photos' ({photo_times[0]:.3f} to {photo_times[-1]:.3f} s): give another time offset, or auto"
-        )
-    return "no range is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
-
-
-def refine_by_survey(
-    survey: Survey,
-    inputs: RangingInputs,
-    scaled: pycolmap.Reconstruction,
-    trajectory: Trajectory,
-    estimate: ScaleEstimate,
-    tape: Tape | None,
-    learn: Learn | None = None,
-) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-    """Call ``refine_with_ranges`` with the options of a survey and the results of the scale stage.
-
-    Args:
-        survey: options.
-        inputs: of the survey.
-        scaled: model in the metric world.
-        trajectory: path of the unscaled model, as in the scale stage.
-        estimate: of the scale.
-        tape: measured lengths for the refinement; None without any.
-        learn: as in ``refine_with_ranges``.
-    """
-    return refine_with_ranges(
-        scaled,
-        trajectory,
-        estimate.observations,
-        estimate.metric_from_sfm,
-        estimate.anchors,
-        estimate.errors,
-        tag_in_cam_m=inputs.tag_in_cam_m,
-        first_pose_is_fixed=estimate.frame != "site",
-        gravity=gravity_of(survey.scale.up_in_first_camera),
-        camera=survey.camera,
-        options=survey.refine,
-        tape=tape,
-        learn=learn,
-        num_threads=survey.mapper.num_threads,
-    )
-
-
 def join_by_survey(
-    survey: Survey, inputs: RangingInputs, paths: Sequence[PathOfModel], journal: Journal, *, must_join: bool
+    run: SurveyRun, paths: Sequence[PathOfModel], *, must_join: bool
 ) -> tuple[PathOfModel, tuple[ModelVerdict, ...]]:
     """Join the models to the first one; models that cannot be joined are left out with a warning.
 
     Args:
-        survey: options.
-        inputs: of the survey.
+        run: survey of the models.
         paths: models with the ranges on their paths.
-        journal: for warnings.
         must_join: whether it is an error if no other model can be joined.
 
     Returns:
@@ -234,25 +62,17 @@ def join_by_survey(
     """
     if len(paths) == 1:
         return paths[0], ()
-    joined = join_models(paths, survey, inputs)
+    joined = join_models(run, paths)
     left_out = [model for model in joined.verdicts if model.joined_from_sfm is None]
     if must_join and len(left_out) == len(paths) - 1:
         reasons = "; ".join(f"{model.name}: {model.reason}" for model in left_out)
         raise GeometryError(f"nothing can be joined to {paths[0].name}: {reasons}")
     whose = (f"{model.name} ({model.num_images} photos) is left out: {model.reason}" for model in left_out)
-    journal.warn(*joined.notes, *whose)
+    run.journal.warn(*joined.notes, *whose)
     return joined.path, joined.verdicts
 
 
-def metric_map(
-    survey: Survey,
-    inputs: RangingInputs,
-    path: PathOfModel,
-    offset: TimeOffset | None,
-    journal: Journal,
-    *,
-    refine: bool,
-) -> MetricResult:
+def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResult:
     """Scale a map, refine it if asked for, and judge the final map.
 
     Raises:
@@ -260,51 +80,41 @@ def metric_map(
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
     of_pieces = doubts_of_pieces(loose_pieces(path.sfm), path.sfm.num_reg_images())
-    journal.warn(*(doubt.reason for doubt in of_pieces))
-    with journal.stage("scale"):
-        metric = scale_by_survey(survey, inputs, path, offset, journal, is_a_start=refine)
+    run.journal.warn(*(doubt.reason for doubt in of_pieces))
+    with run.journal.stage("scale"):
+        metric = scale_by_survey(run, path, is_a_start=refine)
     if refine:
-        with journal.stage("refinement"):
-            metric = refine_map(survey, inputs, metric, journal)
-    with journal.timed("judgement"):
-        return judge_map(survey, metric, of_pieces, journal)
+        with run.journal.stage("refinement"):
+            metric = refine_map(run, metric)
+    with run.journal.timed("judgement"):
+        return judge_map(run, metric, of_pieces)
 
 
-def scale_by_survey(
-    survey: Survey,
-    inputs: RangingInputs,
-    path: PathOfModel,
-    offset: TimeOffset | None,
-    journal: Journal,
-    *,
-    is_a_start: bool,
-) -> MetricResult:
+def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> MetricResult:
     """Estimate the scale and return the rescaled map.
 
     Args:
-        survey: options.
-        inputs: of the survey.
+        run: the survey.
         path: model with the ranges on its path.
-        offset: estimate of the time offset; None where it is given or not needed.
-        journal: unused where there is nothing to warn of.
         is_a_start: whether a refinement follows. Then the refined map is judged, and not this one.
 
     Raises:
         GeometryError: the scale is not determined.
     """
+    survey, inputs, offset = run.survey, run.inputs, path.time_offset
     if offset is not None and offset.offset_matters:
         path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
     bending = None if is_a_start else bending_by_survey(survey, path)
     limit = max(survey.scale.max_relative_stddev, _NOTHING_KNOWN)
     try:
-        estimate = estimate_scale(survey.changed({"scale.max_relative_stddev": limit}), inputs, path, bending)
+        estimate = run.changed({"scale.max_relative_stddev": limit}).estimate_scale(path, bending)
     except GeometryError as error:
-        raise _refused_with_cause(error, survey, inputs, path) from None
+        raise _refused_with_cause(error, run, path) from None
     on_map, rivals = None, None
     if not is_a_start and (on_map := _ranges_on_scaled(estimate, path.trajectory, bending)) is not None:
         estimate = estimate_by_bent(estimate, on_map, survey.scale)
     if offset is not None and offset.rivals:
-        rivals = scale_by_rivals(survey, inputs, path, offset, estimate.value)
+        rivals = scale_by_rivals(run, path, offset, estimate.value)
     scaled = rescale(path.sfm, estimate.metric_from_sfm)
     predicted = ranges_predicted_by_model(
         scaled,
@@ -330,16 +140,14 @@ def bending_by_survey(survey: Survey, path: PathOfModel) -> MapBending:
     return bending_of_model(path.sfm, path.trajectory, survey.camera, survey.refine, survey.mapper.num_threads)
 
 
-def _refused_with_cause(
-    error: GeometryError, survey: Survey, inputs: RangingInputs, path: PathOfModel
-) -> GeometryError:
+def _refused_with_cause(error: GeometryError, run: SurveyRun, path: PathOfModel) -> GeometryError:
     """Return the refusal, with the likeliest mistake added if the ranges show one on a map with any uncertainty."""
-    lenient, bending = survey.changed({"scale.max_relative_stddev": _ANY_STDDEV}), bending_by_survey(survey, path)
+    lenient, bending = run.changed({"scale.max_relative_stddev": _ANY_STDDEV}), bending_by_survey(run.survey, path)
     try:
-        estimate = estimate_scale(lenient, inputs, path, bending)
+        estimate = lenient.estimate_scale(path, bending)
     except (GeometryError, np.linalg.LinAlgError):
         return error
-    return _with_cause(error, survey, _ranges_on_scaled(estimate, path.trajectory, bending))
+    return _with_cause(error, run.survey, _ranges_on_scaled(estimate, path.trajectory, bending))
 
 
 def _with_cause(error: GeometryError, survey: Survey, on_map: RangesOnMap | None) -> GeometryError:
@@ -369,14 +177,11 @@ def _diagnose(survey: Survey, on_map: RangesOnMap | None) -> Diagnosis | None:
     return None if on_map is None else diagnose_ranges(on_map, seed=survey.output.seed)
 
 
-def scale_by_rivals(
-    survey: Survey, inputs: RangingInputs, path: PathOfModel, offset: TimeOffset, scale: float
-) -> Rivals:
+def scale_by_rivals(run: SurveyRun, path: PathOfModel, offset: TimeOffset, scale: float) -> Rivals:
     """Estimate the scale for every other likely time offset.
 
     Args:
-        survey: options.
-        inputs: of the survey; their log has times.
+        run: the survey; its log has times.
         path: model with the ranges on its path.
         offset: estimate of the time offset, with its rivals.
         scale: at this offset, metres per SfM unit.
@@ -389,15 +194,16 @@ def scale_by_rivals(
     Raises:
         GeometryError: a very different scale follows from other offsets, and they are not unlikely.
     """
-    assert inputs.log.timestamp_s is not None, "clocks belong to a log with times"
+    timestamp_s = run.inputs.log.timestamp_s
+    assert timestamp_s is not None, "clocks belong to a log with times"
     doubts, far_apart = [], []
     far_probability, variance, farthest = 0.0, 0.0, 0.0
     for rival in offset.rivals:
         said = f"{rival.value_s:+.2f} s ({rival.probability:.0%})"
-        offsets_s = offset.of_rival(rival).at(inputs.log.timestamp_s)
+        offsets_s = offset.of_rival(rival).at(timestamp_s)
         try:
-            observations = ranges_on_path(survey, inputs, path.trajectory, offsets_s)
-            other = estimate_scale(survey, inputs, replace(path, observations=observations)).value
+            observations = run.ranges_on(path.trajectory, offsets_s)
+            other = run.estimate_scale(replace(path, observations=observations)).value
         except GeometryError:
             doubts.append(f"the time offset may also be {said}, which gives no scale")
             continue
@@ -418,15 +224,16 @@ def scale_by_rivals(
     return Rivals(tuple(doubts), max(float(np.sqrt(variance)), farthest / NORMAL_95))
 
 
-def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> MetricResult:
+def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:
     """Refine a scaled map with its ranges. Where the refinement breaks the map, the scaled map stays the result.
 
     Raises:
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
     offset = metric.time_offset
-    if offset is not None and not offset.is_certain and not survey.refine.time_offset_stddev_s:
-        survey = survey.changed({"refine.time_offset_stddev_s": offset.stddev_s})
+    if offset is not None and not offset.is_certain and not run.survey.refine.time_offset_stddev_s:
+        run = run.changed({"refine.time_offset_stddev_s": offset.stddev_s})
+    survey, inputs = run.survey, run.inputs
     tape = metric.tape or Tape()
     if inputs.anchor_frame == "site" and metric.estimate.frame != "site":
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
@@ -441,11 +248,11 @@ def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, jour
 
     estimate = metric.estimate
     has_ranges = estimate.problem is not None
-    refined, summary = refine_by_survey(
-        survey, inputs, metric.scaled, metric.trajectory, estimate, tape, learn if has_ranges else None
-    )
+    refined, summary = _refined(run, metric, tape, learn if has_ranges else None)
     if survey.refine.covariance and summary.covariance is None:
-        journal.warn("no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses")
+        run.journal.warn(
+            "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
+        )
     broken = why_broken(metric.scaled, refined, metric.trajectory, estimate, summary, survey.refine.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
         raise SolverError(
@@ -459,6 +266,29 @@ def refine_map(survey: Survey, inputs: RangingInputs, metric: MetricResult, jour
         refinement=summary,
         why_broken=broken,
         refined_with_ranges=at_rest[0] if at_rest else None,
+    )
+
+
+def _refined(
+    run: SurveyRun, metric: MetricResult, tape: Tape, learn: Learn | None
+) -> tuple[pycolmap.Reconstruction, RefineSummary]:
+    """Call ``refine_with_ranges`` with the options of a survey and the results of the scale stage."""
+    survey, estimate = run.survey, metric.estimate
+    return refine_with_ranges(
+        metric.scaled,
+        metric.trajectory,
+        estimate.observations,
+        estimate.metric_from_sfm,
+        estimate.anchors,
+        estimate.errors,
+        tag_in_cam_m=run.inputs.tag_in_cam_m,
+        first_pose_is_fixed=estimate.frame != "site",
+        gravity=gravity_of(survey.scale.up_in_first_camera),
+        camera=survey.camera,
+        options=survey.refine,
+        tape=tape,
+        learn=learn,
+        num_threads=survey.mapper.num_threads,
     )
 
 
@@ -480,7 +310,7 @@ def _at_rest(metric: MetricResult, rest: AtRest) -> MapWithRanges:
     )
 
 
-def judge_map(survey: Survey, metric: MetricResult, known_doubts: Sequence[Doubt], journal: Journal) -> MetricResult:
+def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt]) -> MetricResult:
     """Judge the final map: add the final estimate of the scale, the tests of mistakes, all doubts and the place.
 
     The doubts also go to the journal as warnings, except for those that were known before.
@@ -488,6 +318,7 @@ def judge_map(survey: Survey, metric: MetricResult, known_doubts: Sequence[Doubt
     Raises:
         GeometryError: the scale is less certain than asked for.
     """
+    survey, journal = run.survey, run.journal
     metric, on_map = _estimated(survey, metric)
     diagnosis = diagnose_lengths(metric.estimate, metric.tape)
     try:

@@ -22,17 +22,18 @@ from rangesfm.progress import Journal
 from rangesfm.result.result_folder import RESULT_NAMES, places_for_photos, refuse_to_overwrite
 from rangesfm.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.sources.source import is_source
-from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
+from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
-from rangesfm.workflows.make_metric_map import ranges_on_path
+from rangesfm.workflows.place_ranges import check_times
 
 
-def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
+def begin_run(survey: Survey, journal: Journal) -> SurveyRun:
     """Read and check all inputs but the photos, so that errors are found before the long work begins.
 
     Raises:
@@ -44,47 +45,32 @@ def read_inputs(survey: Survey, journal: Journal) -> RangingInputs:
     refuse_to_overwrite(survey)
     inputs = read_ranging_inputs(survey)
     journal.warn(*inputs.assumed, *inputs.notes, *notes_before_work(survey, inputs))
-    return inputs
+    return SurveyRun(survey, inputs, journal)
 
 
-def checked_keyframes(
-    survey: Survey, inputs: RangingInputs, journal: Journal
-) -> tuple[tuple[str, ...], ImageTimes | None]:
+def checked_keyframes(run: SurveyRun) -> tuple[tuple[str, ...], ImageTimes | None]:
     """Return the keyframes and their times, after checking that these fit those of ranges and reference.
 
     Raises:
         InputError: they do not.
     """
-    keyframes, times = find_keyframes(survey, journal, log_names_photos=inputs.log.image_name is not None)
+    names_photos = run.inputs.log.image_name is not None
+    keyframes, times = find_keyframes(run.survey, run.journal, log_names_photos=names_photos)
     n, timestamps_s = len(keyframes), None if times is None else times.timestamps_s
     nowhere = Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
-    check_times(survey, inputs, nowhere)
-    tell_of_times(survey, inputs, times, journal)
+    check_times(run, nowhere)
+    tell_of_times(run, times)
     return keyframes, times
 
 
-def check_times(survey: Survey, inputs: RangingInputs, path: Trajectory) -> None:
-    """Check that reference and ranges belong to the photos of a path, by names or times. Its positions do not matter.
-
-    Raises:
-        InputError: the reference has none of the photos, or no range has a place on the path.
-    """
-    reference, offset_s = inputs.reference, survey.ranges.time_offset_s
-    if reference is not None and not np.isfinite(reference.positions_at(path)[0]).any():
-        raise InputError(
-            reference.why_nothing_is_known("keyframes", path.image_names, path.timestamps_s), survey.report.reference
-        )
-    if inputs.log.image_name is not None or offset_s is not None:
-        ranges_on_path(survey, inputs, path, offset_s or 0.0)
-
-
-def tell_of_times(survey: Survey, inputs: RangingInputs, times: ImageTimes | None, journal: Journal) -> None:
+def tell_of_times(run: SurveyRun, times: ImageTimes | None) -> None:
     """Warn of oddities in the times of the photos, and in both clocks if no time offset is given."""
-    if times is None or inputs.log.timestamp_s is None:
+    radio_s, options = run.inputs.log.timestamp_s, run.survey.ranges
+    if times is None or radio_s is None:
         return
-    journal.warn(*notes_on_gaps(times.timestamps_s, survey.ranges.max_interpolation_gap_s))
-    if survey.ranges.time_offset_s is None:
-        journal.warn(*notes_on_times(inputs.log.timestamp_s, times.timestamps_s))
+    run.journal.warn(*notes_on_gaps(times.timestamps_s, options.max_interpolation_gap_s))
+    if options.time_offset_s is None:
+        run.journal.warn(*notes_on_times(radio_s, times.timestamps_s))
 
 
 def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
@@ -166,15 +152,16 @@ def find_keyframes(
         return keyframes, image_times.of(keyframes)
 
 
-def with_tags(survey: Survey, inputs: RangingInputs, names: Sequence[str], journal: Journal) -> RangingInputs:
-    """Return the inputs with the printed tags found in photos, if tags are to be looked for.
+def with_tags(run: SurveyRun, names: Sequence[str]) -> SurveyRun:
+    """Add the printed tags found in photos to the inputs, if tags are to be looked for.
 
     Raises:
         InputError: no tags were found, and nothing else is measured in metres.
     """
+    survey, inputs, journal = run.survey, run.inputs, run.journal
     wanted = survey.markers
     if wanted.dictionary is None:
-        return inputs
+        return run
     folder = survey.photos_path
     with journal.stage("tags"):
         found = find_tags(folder, names, wanted.dictionary, journal.progress)
@@ -187,7 +174,7 @@ def with_tags(survey: Survey, inputs: RangingInputs, names: Sequence[str], journ
         journal.warn(message)
     journal.progress.message(f"tags: {len(found.tags)} of {wanted.dictionary} in {found.num_photos} photos")
     sides = () if wanted.side_m is None else found.sides(wanted.side_m, wanted.side_stddev_m)
-    return replace(inputs, tape=(inputs.tape or Tape()).with_more(sides, found.markers))
+    return replace(run, inputs=replace(inputs, tape=(inputs.tape or Tape()).with_more(sides, found.markers)))
 
 
 def map_keyframes(

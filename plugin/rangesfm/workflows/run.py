@@ -15,35 +15,28 @@ from rangesfm.distances.locate_lengths import locatable
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer
-from rangesfm.join.join_models import PathOfModel
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress
-from rangesfm.ranging.clock.time_offset import TimeOffset
+from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.result_folder import refuse_to_overwrite, result_names
 from rangesfm.result.summary import ResultSummary
-from rangesfm.survey.inputs import RangingInputs, times_of_model
+from rangesfm.survey.inputs import times_of_model
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.image_times import ImageTimes
+from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.adoption import with_likeliest_cause
-from rangesfm.workflows.make_metric_map import (
-    find_time_offset,
-    join_by_survey,
-    metric_map,
-    path_with_times,
-    ranges_on_paths,
-)
+from rangesfm.workflows.make_metric_map import join_by_survey, metric_map
 from rangesfm.workflows.map_photos import (
-    check_times,
+    begin_run,
     checked_keyframes,
     find_keyframes,
     map_keyframes,
-    read_inputs,
     read_registered,
     tell_of_times,
     with_photos_in_folder,
     with_tags,
 )
+from rangesfm.workflows.place_ranges import place_ranges
 from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.run_results import RunResult, write_results
 
@@ -70,17 +63,16 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         ReconstructionError: the photos give no model.
         SolverError: the refinement failed.
     """
-    journal = Journal(progress)
-    inputs = read_inputs(survey, journal)
+    run = begin_run(survey, Journal(progress))
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
-        survey = with_photos_in_folder(survey, journal, restart=restart)
-        keyframes, times = checked_keyframes(survey, inputs, journal)
-        inputs = with_tags(survey, inputs, keyframes, journal)
+        run = replace(run, survey=with_photos_in_folder(survey, run.journal, restart=restart))
+        keyframes, times = checked_keyframes(run)
+        run = with_tags(run, keyframes)
         # An earlier result keeps its reconstruction until the new result is complete.
         deferred = (output.path / ResultSummary.NAME).exists()
-        models = map_keyframes(survey, keyframes, journal, restart, deferred=deferred)
-        return to_metric(survey, inputs, models, times, journal, refine=survey.refine.enabled)
+        models = map_keyframes(run.survey, keyframes, run.journal, restart, deferred=deferred)
+        return with_results(*map_in_metres(run, place_ranges(run, models, times), refine=survey.refine.enabled))
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
@@ -107,72 +99,61 @@ def scale_model(survey: Survey, *, progress: Progress) -> RunResult:
 
 @with_one_blas_thread
 def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
-    journal = Journal(progress)
-    inputs = read_inputs(survey, journal)
-    sfm = read_registered(survey.given_model_path, journal)
+    run = begin_run(survey, Journal(progress))
+    sfm = read_registered(survey.given_model_path, run.journal)
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.images.model)
-    times = None
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
-        survey = with_photos_in_folder(survey, journal)
-        if inputs.log.image_name is None:
-            times = times_of_model(survey, sfm, survey.given_model_path)
-            journal.warn(*times.notes)
-            tell_of_times(survey, inputs, times, journal)
-        inputs = with_tags(survey, inputs, sorted(image.name for image in sfm.images.values()), journal)
-        return to_metric(survey, inputs, [sfm], times, journal, refine=refine)
+        run = replace(run, survey=with_photos_in_folder(survey, run.journal))
+        return with_results(*map_of_model(run, sfm, refine=refine))
 
 
-def to_metric(
-    survey: Survey,
-    inputs: RangingInputs,
-    models: Sequence[pycolmap.Reconstruction],
-    times: ImageTimes | None,
-    journal: Journal,
-    *,
-    refine: bool,
-) -> RunResult:
-    """Do all stages after the unscaled models, which were just mapped or were given."""
-    trajectory = path_with_times(survey, models[0], times, journal)
-    check_times(survey, inputs, trajectory)
-    # Time offset between the clocks, and with it the place of each range on the path.
-    offset = find_time_offset(survey, inputs, trajectory, journal)
-    paths = ranges_on_paths(survey, inputs, models, trajectory, times, offset, journal)
-    return map_in_metres(survey, inputs, paths, offset, journal, refine=refine)
+def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) -> tuple[SurveyRun, MetricResult]:
+    """Scale the model that a survey gives, and refine it if asked for; nothing is written.
+
+    Args:
+        run: the survey.
+        sfm: its model.
+        refine: whether to refine the map after scaling it.
+
+    Returns:
+        As ``map_in_metres``.
+    """
+    times = None
+    if run.inputs.log.image_name is None:
+        times = times_of_model(run.survey, sfm, run.survey.given_model_path)
+        run.journal.warn(*times.notes)
+        tell_of_times(run, times)
+    run = with_tags(run, sorted(image.name for image in sfm.images.values()))
+    return map_in_metres(run, place_ranges(run, [sfm], times), refine=refine)
 
 
 def map_in_metres(
-    survey: Survey,
-    inputs: RangingInputs,
-    paths: Sequence[PathOfModel],
-    offset: TimeOffset | None,
-    journal: Journal,
-    *,
-    refine: bool,
-    must_join: bool = False,
-) -> RunResult:
-    """Join models with ranges to one map, scale and refine it, and write the results.
+    run: SurveyRun, paths: Sequence[PathOfModel], *, refine: bool, must_join: bool = False
+) -> tuple[SurveyRun, MetricResult]:
+    """Join models with ranges to one map, scale and refine it, and judge it.
 
     Args:
-        survey: options.
-        inputs: of the survey.
-        paths: models with the ranges of ``inputs.log`` on their paths. The others are joined to the first, or left out.
-        offset: estimate of the time offset; None where it is given or not needed.
-        journal: for stages and warnings.
+        run: the survey.
+        paths: models with the ranges of its log on their paths. The others are joined to the first, or left out.
         refine: whether to refine the map after scaling it.
         must_join: whether it is an error if all others are left out.
+
+    Returns:
+        The survey, with the lengths that are in the map, and corrected if a mistake was adopted; and the map.
     """
-    with journal.timed("scale"):
-        path, verdicts = join_by_survey(survey, inputs, paths, journal, must_join=must_join)
-        tape = (inputs.tape or Tape()).with_more(
-            read_rigs(survey.images.rig_config).baselines(path.sfm, survey.images.baseline_stddev_m)
-        )
-        inputs = replace(inputs, tape=locatable(tape, path.sfm) if tape.distances else None)
+    with run.journal.timed("scale"):
+        path, verdicts = join_by_survey(run, paths, must_join=must_join)
+        images = run.survey.images
+        baselines = read_rigs(images.rig_config).baselines(path.sfm, images.baseline_stddev_m)
+        tape = (run.inputs.tape or Tape()).with_more(baselines)
+        run = replace(run, inputs=replace(run.inputs, tape=locatable(tape, path.sfm) if tape.distances else None))
     # Scale, refinement of photos and ranges together, and judgement of the final map.
-    made = replace(metric_map(survey, inputs, path, offset, journal, refine=refine), models=verdicts)
-    if survey.scale.adopt:
-        inputs, made = with_likeliest_cause(survey, inputs, path, made, journal)
-    # Comparison and results.
-    judged = with_advice(made, inputs.tag_in_cam_m)
-    return write_results(survey, inputs, judged, journal)
+    made = replace(metric_map(run, path, refine=refine), models=verdicts)
+    return with_likeliest_cause(run, path, made) if run.survey.scale.adopt else (run, made)
+
+
+def with_results(run: SurveyRun, made: MetricResult) -> RunResult:
+    """Add advice for the next survey to a map, compare it with the reference, and write all results."""
+    return write_results(run, with_advice(made, run.inputs.tag_in_cam_m))

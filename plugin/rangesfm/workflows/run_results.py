@@ -13,7 +13,6 @@ from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
 from rangesfm.geometry.reference import write_reference
-from rangesfm.progress import Journal
 from rangesfm.report import write_report_of
 from rangesfm.report.content import Content
 from rangesfm.result.entries import ComparisonRow
@@ -29,7 +28,7 @@ from rangesfm.result.result_folder import (
 from rangesfm.result.summary import ResultSummary
 from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes
-from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.steps import DATABASE_NAME
 
 
@@ -48,13 +47,14 @@ class RunResult:
     lines: tuple[str, ...]
 
 
-def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, journal: Journal) -> RunResult:
+def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
     """Write all files of the result, with ``result.json`` last, and the report.
 
     Raises:
         InputError: a format of [export] cannot be written, but everything else has been; or a file that a result would
             replace was not written by this tool, and nothing has been written.
     """
+    survey, inputs, journal = run.survey, run.inputs, run.journal
     if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
     if metric.estimate.frame == "site":
@@ -66,7 +66,7 @@ def write_results(survey: Survey, inputs: RangingInputs, metric: MetricResult, j
     folder = survey.output.path
     with new_result(folder, survey.images.path) as staged:
         with journal.stage("results"):
-            comparison = _comparison(survey, inputs, metric, staged)
+            comparison = _comparison(inputs, metric, staged)
             # The georeference of the anchors is that of the map, if the map is in their frame.
             georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
             not_exported = write_models_and_tables(
@@ -109,7 +109,7 @@ def _distances(metric: MetricResult) -> list[DistanceRow]:
     return distance_rows(metric.tape, located.lengths_m(1.0, anchors_m))
 
 
-def _comparison(survey: Survey, inputs: RangingInputs, metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
+def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
     """Return the comparison with the reference, empty without one; write the reference in the frame of the map."""
     if inputs.reference is None:
         return ()

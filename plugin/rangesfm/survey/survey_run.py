@@ -1,0 +1,142 @@
+"""A survey at work: its options, inputs and journal in one, which place its ranges on paths and scale its models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from rangesfm.arrays import Array
+from rangesfm.distances.locate_lengths import locate_distances
+from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.progress import Journal
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.clock.time_offset import TimeOffset, estimate_time_offset
+from rangesfm.ranging.errors.bending import MapBending
+from rangesfm.ranging.range_log import RangeKind
+from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.settings import Survey
+
+
+@dataclass(frozen=True)
+class PathOfModel:
+    """A model with its path and the ranges on that path.
+
+    Attributes:
+        name: name for the user, such as "sparse/0".
+        sfm: the unscaled model.
+        trajectory: path of its photos that have a time.
+        observations: ranges on that path, from the log that all models share.
+        time_offset: estimate of the time offset, with which the ranges were placed; None where it was given or is not
+            needed.
+    """
+
+    name: str
+    sfm: pycolmap.Reconstruction
+    trajectory: Trajectory
+    observations: RangeObservations
+    time_offset: TimeOffset | None = None
+
+
+@dataclass(frozen=True)
+class SurveyRun:
+    """A survey at work.
+
+    Attributes:
+        survey: options.
+        inputs: what was read from its files, measured in metres.
+        journal: is told of stages and warnings.
+    """
+
+    survey: Survey
+    inputs: RangingInputs
+    journal: Journal
+
+    def changed(self, values: Mapping[str, Any]) -> SurveyRun:
+        """Return the same with other options by dotted key, as ``Survey.changed``."""
+        return replace(self, survey=self.survey.changed(values))
+
+    def find_time_offset(self, trajectory: Trajectory) -> TimeOffset | None:
+        """Search for the time offset between the clocks; None where it is given, or where the log names photos.
+
+        Raises:
+            GeometryError: the ranges do not determine it.
+        """
+        inputs, survey = self.inputs, self.survey
+        if inputs.log.image_name is not None or survey.ranges.time_offset_s is not None:
+            return None
+        with self.journal.stage("time offset"):
+            offset = estimate_time_offset(
+                inputs.log,
+                trajectory,
+                inputs.tag_in_cam_m,
+                association=survey.ranges,
+                seed=survey.output.seed,
+                progress=self.journal.progress,
+            )
+        self.journal.warn(*([offset.note] if offset.note else []))
+        return offset
+
+    def ranges_on(
+        self, trajectory: Trajectory, offset_s: float | Array, *, may_be_none: bool = False
+    ) -> RangeObservations:
+        """Place the ranges on a path and hold out the check ranges.
+
+        Args:
+            trajectory: of the camera.
+            offset_s: image time minus range time, one for all ranges or (n,).
+            may_be_none: whether it is fine if no range has a place on the path.
+
+        Raises:
+            InputError: no range has a place on the path; the text says why.
+        """
+        log, options = self.inputs.log, self.survey.ranges
+        placed = associate(log, trajectory, self.inputs.tag_in_cam_m, time_offset_s=offset_s, options=options)
+        if len(log) and not may_be_none and not placed.has_place.any():
+            why = _why_no_range_has_a_place(placed, trajectory, float(np.mean(offset_s)))
+            raise InputError(why, options.path)
+        return hold_out(placed, options, self.survey.output.seed)
+
+    def estimate_scale(self, path: PathOfModel, bending: MapBending | None = None) -> ScaleEstimate:
+        """Estimate the scale of a model by ``initialize_scale``, with the options and measured lengths of the survey.
+
+        Args:
+            path: model with the ranges on its path.
+            bending: how the map is bent; None: it drifts as a map of poses does.
+
+        Raises:
+            GeometryError: the scale is not determined.
+        """
+        survey, inputs, distances = self.survey, self.inputs, None
+        if inputs.tape is not None:
+            distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
+        return initialize_scale(
+            path.observations,
+            path.trajectory,
+            inputs.anchors,
+            anchor_frame=inputs.anchor_frame,
+            options=survey.scale,
+            range_model=survey.ranges,
+            distances=distances,
+            bending=bending,
+            seed=survey.output.seed,
+        )
+
+
+def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:
+    times, photo_times = placed.log.timestamp_s, trajectory.timestamps_s
+    if times is None or photo_times is None:
+        return "none of the photos that the log names is in the model"
+    if np.all(placed.status[placed.log.kind == RangeKind.TAG_ANCHOR] == RangeStatus.OUTSIDE_PATH):
+        return (
+            f"the log's times ({times.min():.3f} to {times.max():.3f} s, plus an offset of {offset_s:g} s) do not "
+            f"overlap the photos' ({photo_times[0]:.3f} to {photo_times[-1]:.3f} s): give another time offset, or auto"
+        )
+    return "no range is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"
