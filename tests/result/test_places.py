@@ -11,7 +11,7 @@ from rangesfm.result.places import input_beside, is_within, path_in, recorded_pa
 from rangesfm.result.result_folder import read_result_folder
 
 if TYPE_CHECKING:
-    from tests.conftest import Command, WalkedSurvey
+    from tests.conftest import Command, PhotoRun, WalkedSurvey
 
 
 @pytest.mark.parametrize(
@@ -84,3 +84,9 @@ def test_neither_a_result_nor_its_page_says_where_they_were_made(
     assert (settings["images"]["model"], settings["ranges"]["path"]) == ("../sparse/0", "../uwb.csv")
     assert result.anchors_path == folder / "anchors.csv"
     assert {"../uwb.csv", "../anchors.csv", "../reference.csv"} <= {entry.path for entry in result.summary.inputs}
+
+
+def test_nor_do_those_of_a_run_on_photos(photo_run: PhotoRun) -> None:
+    names = ("result.json", "report.html", "ranges.csv", "reconstruct.json", "mapper.log")
+    for name in names:
+        assert bytes(photo_run.survey.folder.parent) not in (photo_run.output_path / name).read_bytes(), name

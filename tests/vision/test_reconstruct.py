@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -17,6 +19,7 @@ from tests.outputs import names_in, paths_below, unfinished
 from tests.vision.matches import content_of
 
 from rangesfm.errors import InputError, ReconstructionError
+from rangesfm.files.records import write_json
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 
@@ -351,13 +354,36 @@ class TestOtherPhotos:
         assert not listener.messages
         assert listener.stages == ["features", "matching", "mapping"]
 
-    def test_are_refused_where_somebody_changed_the_database(self, room: Room, output: Path) -> None:
-        data = (output / "database.db").read_bytes()
-        changed = data[:4096] + bytes(len(data) - 4096)
-        (output / "database.db").write_bytes(changed)
-        with pytest.raises(InputError, match=r"database\.db: is not a file that rangesfm wrote, or has changed since"):
+    @pytest.mark.parametrize(
+        ("name", "change"),
+        [
+            ("database.db", lambda path: path.write_bytes(path.read_bytes()[:4096] + bytes(4096))),
+            ("database.db", lambda path: path.write_bytes(path.read_bytes()[:5000])),
+            ("database.db/mine.txt", lambda path: (path.parent.unlink(), path.parent.mkdir(), path.write_text("mine"))),
+            ("database.db-wal", lambda path: path.write_bytes(b"of a program that writes to the database")),
+        ],
+        ids=["overwritten", "cut", "a folder", "open elsewhere"],
+    )
+    def test_are_refused_where_somebody_changed_the_database(
+        self, room: Room, output: Path, name: str, change: Callable[[Path], object]
+    ) -> None:
+        change(output / name)
+        changed = (output / name).read_bytes()
+        said = rf"{re.escape(name)}: is not a file that rangesfm wrote, or has changed since"
+        with pytest.raises(InputError, match=said):
             reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER)
-        assert (output / "database.db").read_bytes() == changed
+        # All photos need no database, because their models are there.
+        assert reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER).num_registered == 6
+        assert (output / name).read_bytes() == changed
+
+    def test_are_reconstructed_where_a_hash_of_the_record_is_a_list(self, room: Room, output: Path) -> None:
+        record = json.loads((output / "reconstruct.json").read_text())
+        photos, database = record["notes"]["photos"], record["notes"]["database"]
+        photos |= {name: [state, ["a list"]] for name, (state, _) in photos.items()}
+        database["photos"] = dict.fromkeys(database["photos"], ["a list"])
+        write_json(record, output / "reconstruct.json")
+        summary = reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER)
+        assert summary.num_registered == 4
 
     def test_are_reconstructed_though_colmap_has_looked_at_the_database(self, room: Room, output: Path) -> None:
         with pycolmap.Database.open(output / "database.db") as database:  # this updates a counter in the file's header

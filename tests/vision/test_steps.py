@@ -127,7 +127,9 @@ def test_what_is_lost_is_done_anew(run: Run, folder: Path, lost: str, done: list
     assert run() == done
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]", '{"a": 1}', '{"steps": {"a": 1}}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[1]", '{"a": 1}', '{"steps": {"a": 1}}', '{"steps": {"a": {"inputs": ["1"]}}}']
+)
 def test_a_damaged_record_is_no_record(run: Run, folder: Path, text: str) -> None:
     run()
     (folder / "steps.json").write_text(text)
