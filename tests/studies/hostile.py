@@ -42,6 +42,7 @@ from pydantic.fields import FieldInfo
 from tests.studies.foreign_files import FORMATS, MODEL_FLAGS, RUN, content_of, make_template
 
 from rangesfm.colmap.model_files import read_model
+from rangesfm.demo.survey import TIME_OFFSET_S
 from rangesfm.files.output_folder import LOCK_NAME, PRIVATE_NAME
 from rangesfm.survey.settings import SURVEY_TABLES
 
@@ -98,9 +99,9 @@ RECONSTRUCTION = (
     *("out/reconstruct.json", "out/database.db", "out/sparse", "out/mapper.log", *MODEL, *RECORDS, "out/result.json"),
     *("out/report.html", "out/trajectory.tum", "out/sparse_metric"),
 )
-TABLES_READ = ("uwb.csv", "anchors.csv", "out/images.csv", "reference.csv", "distances.csv", "markers.csv", "curve.csv")
+TABLES_READ = ("uwb.csv", "anchors.csv", "times.csv", "reference.csv", "distances.csv", "markers.csv", "curve.csv")
 TAPED = ("--distances", "distances.csv", "--markers", "markers.csv", "--error_curve", "curve.csv")
-TIMED = ("--images", "out/images.csv", "--reference", "reference.csv", "--ranges_time_offset", "auto")
+TIMED = ("--images", "times.csv", "--reference", "reference.csv", "--ranges_time_offset", "auto")
 # Commands, and the files that each reads.
 COMMANDS: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
     (RUN, (*SURVEY, *RECONSTRUCTION)),
@@ -142,7 +143,7 @@ COMMANDS: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
         ),
         ("uwb.csv", "tag.csv", "anchors.csv"),
     ),
-    (("init", "."), (*SURVEY, "distances.csv", "camera.json")),
+    (("init", ".", "--images", "images", "--output_path", "new.toml"), (*SURVEY, "distances.csv", "camera.json")),
     (("check", "survey.toml"), (*SURVEY, "out/result.json")),
     (("check", "."), (*SURVEY, "camera.json")),
 )
@@ -417,12 +418,16 @@ def make_site(folder: Path) -> None:
     """Make the survey that probes copy: that of ``foreign_files`` with a file of each further kind."""
     make_template(folder)
     survey = folder / "survey"
-    images = (survey / "out" / "images.csv").read_text().splitlines()[1:]
-    names, times = zip(*(line.split(",")[:2] for line in images), strict=True)
+    shutil.copyfile(survey / "out" / "images.csv", survey / "times.csv")
+    rows = [line.split(",") for line in (survey / "times.csv").read_text().splitlines()[1:]]
+    names, times = [row[0] for row in rows], np.array([float(row[1]) for row in rows])
     places = dict(line.split(",", 1) for line in (survey / "reference.csv").read_text().splitlines()[1:])
-    rows = [f"{float(time) - 0.0},{places[name]}" for name, time in zip(names, times, strict=True)]
-    header = (survey / "reference.csv").read_text().splitlines()[0].replace("image_name", "timestamp_s")
-    (survey / "tag.csv").write_text("\n".join([header, *rows]) + "\n")
+    path_m = np.array([places[name].split(",") for name in names], dtype=float)
+    positions = ["timestamp_s,x_m,y_m,z_m"]
+    for time in np.arange(times[0], times[-1], 0.05):
+        x, y, z = (np.interp(time, times, column) for column in path_m.T)
+        positions.append(f"{time - TIME_OFFSET_S:.3f},{x:.3f},{y:.3f},{z:.3f}")
+    (survey / "tag.csv").write_text("\n".join(positions) + "\n")
     model = read_model(survey / "out" / "sparse" / "0")
     point = max(model.points3D.values(), key=lambda point: point.track.length())
     marks = []
@@ -431,8 +436,7 @@ def make_site(folder: Path) -> None:
         x, y = image.points2D[element.point2D_idx].xy.tolist()
         marks.append(f"m,{image.name},{x!r},{y!r}")
     (survey / "markers.csv").write_text("\n".join(["marker,image_name,x_px,y_px", *marks]) + "\n")
-    ends = [np.array(places[name].split(",")[:3], dtype=float) for name in (names[0], names[-1])]
-    length_m = float(np.linalg.norm(ends[0] - ends[1]))
+    length_m = float(np.linalg.norm(path_m[0] - path_m[-1]))
     (survey / "distances.csv").write_text(f"from,to,distance_m,stddev_m\n{names[0]},{names[-1]},{length_m},0.05\n")
     curve = "".join(f"{distance},0.02,0.01,0.03\n" for distance in (1.0, 4.0, 9.0, 20.0))
     (survey / "curve.csv").write_text(f"distance_m,error_m,stddev_m,noise_stddev_m\n{curve}")
