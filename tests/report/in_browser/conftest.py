@@ -97,10 +97,8 @@ class Browser:
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), dtype=np.int64)
 
     def console(self) -> list[str]:
-        """Return the console messages, without the graphics driver's remarks on its own speed."""
-        return [
-            entry["message"] for entry in self._driver.get_log("browser") if "GL Driver Message" not in entry["message"]
-        ]
+        """Return the messages on the console."""
+        return [entry["message"] for entry in self._driver.get_log("browser")]
 
     def requests(self) -> list[str]:
         """Return the addresses that the page requested, including its own and its parts'."""
