@@ -380,7 +380,7 @@ class TestOtherPhotos:
         record = json.loads((output / "reconstruct.json").read_text())
         photos, database = record["notes"]["photos"], record["notes"]["database"]
         photos |= {name: [state, ["a list"]] for name, (state, _) in photos.items()}
-        database["photos"] = dict.fromkeys(database["photos"], ["a list"])
+        database["photos"] = {name: ["a list"] for name in database["photos"]}
         write_json(record, output / "reconstruct.json")
         summary = reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER)
         assert summary.num_registered == 4

@@ -182,7 +182,7 @@ def _cross(start: Array, end: Array, from_: Array, to: Array) -> Mask:
 
     def side(a: Array, b: Array, point: Array) -> Array:
         (x, y), (dx, dy) = (point - a).T, (b - a).T
-        return np.sign(dx * y - dy * x)
+        return np.asarray(np.sign(dx * y - dy * x))
 
     apart = side(start, end, from_) * side(start, end, to) < 0
     return np.asarray(apart & (side(from_, to, start) * side(from_, to, end) < 0))

@@ -117,7 +117,6 @@ def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool)
 
     The scale is that of the similarity that fits all centres best. The place is also that of the similarity if it is
     free; otherwise it is that of the first pose.
-    the first pose.
 
     Args:
         path: the poses, in the model's world.
