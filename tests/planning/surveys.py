@@ -46,8 +46,8 @@ def turned_out(expected: Expected, seed: int) -> RangeObservations:
     white = learned.names.index("white")
     together = learned.covariance_m2 - learned.covariances_m2[white]
     together += 1e-10 * np.trace(together) * np.eye(len(together))
-    of_cells = np.linalg.cholesky(together) @ rng.standard_normal(len(together))
-    errors = of_cells[learned.of_range] + learned.stddevs[white] * rng.standard_normal(len(learned.of_range))
+    of_bins = np.linalg.cholesky(together) @ rng.standard_normal(len(together))
+    errors = of_bins[learned.of_range] + learned.stddevs[white] * rng.standard_normal(len(learned.of_range))
     ranges = log.range_m.copy()
     ranges[expected.posed.rows] += errors
     return replace(expected.observations, log=replace(log, range_m=np.maximum(ranges, 0.05)))

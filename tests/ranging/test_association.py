@@ -81,7 +81,7 @@ class TestBetweenKeyframes:
         keyframe_times = np.arange(0.0, 20.0, 0.5)
         path = trajectory_of(keyframe_times, curved(keyframe_times))
         found = associate(log_at(np.arange(0.0, 19.5, 0.07)), path, np.zeros(3))
-        weight = found.weight[:, None]
+        weight = found.fraction[:, None]
         on_chords = (1 - weight) * path.centers[found.before] + weight * path.centers[found.after]
         np.testing.assert_allclose(found.centers, on_chords + found.center_offsets, atol=1e-12)
 
@@ -124,7 +124,7 @@ class TestBetweenKeyframes:
         usual = associate(log_at(range_times), trajectory_of(keyframe_times, centers), np.zeros(3))
         centers[len(centers) // 2] += [5.0, 3.0, 0.0]
         found = associate(log_at(range_times), trajectory_of(keyframe_times, centers), np.zeros(3))
-        between = found.weight > 0
+        between = found.fraction > 0
         assert np.all(found.center_stddev[between] < 1.5 * usual.center_stddev[between])
 
     def test_ranges_in_a_long_gap_are_known_less_well_than_those_in_a_short_one(self) -> None:
@@ -154,7 +154,7 @@ class TestBetweenKeyframes:
         error = found.tag_from_center - turned[15:-15].apply(arm_m)
         between = found.before != found.after
         shortest = Rotation.from_matrix(np.swapaxes(path.world_from_cam[:-1], 1, 2) @ path.world_from_cam[1:])
-        part = Rotation.from_rotvec(found.weight[between, None] * shortest[found.before[between]].as_rotvec())
+        part = Rotation.from_rotvec(found.fraction[between, None] * shortest[found.before[between]].as_rotvec())
         at = Rotation.from_matrix(path.world_from_cam[found.before[between]])
         of_shortest = (at * part).apply(arm_m) - turned[15:-15].apply(arm_m)[between]
         assert np.mean(error[between] ** 2) < 0.7 * np.mean(of_shortest**2)
@@ -173,7 +173,7 @@ class TestBetweenKeyframes:
             path = trajectory_of(keyframe_times, walk(keyframe_times))
             options = AssociationOptions(max_interpolation_gap_s=5.0)
             found = associate(log_at(range_times), path, np.zeros(3), options=options)
-            middle = np.abs(found.weight - 0.5) < 0.2
+            middle = np.abs(found.fraction - 0.5) < 0.2
             error = np.sqrt(np.mean((found.centers - walk(range_times))[middle] ** 2))
             # With the gain of a smooth path, the ratio would be 2.7 to 6.
             assert 0.4 < error / np.mean(found.center_stddev[middle]) < 2.5
@@ -228,7 +228,7 @@ class TestNextToAKeyframe:
         path = trajectory_of(keyframe_times, straight(keyframe_times))
         found = associate(log_at([0.0, 1.0, 1.00005, 2.0]), path, TAG_IN_CAM_M)
         assert found.before.tolist() == found.after.tolist() == [0, 1, 1, 2]
-        assert found.weight.tolist() == [0.0] * 4
+        assert found.fraction.tolist() == [0.0] * 4
         np.testing.assert_array_equal(found.centers, path.centers[[0, 1, 1, 2]])
 
     def test_a_range_counts_as_taken_there_where_nothing_can_be_interpolated(self) -> None:
@@ -316,7 +316,7 @@ class TestLongGaps:
         assert np.ptp(np.diff(times)) > 0
         found = associate(log_at(times[:-1] + 1.0), trajectory_of(times, straight(times - times[0])), TAG_IN_CAM_M)
         assert statuses(found) == ["used"] * 19
-        np.testing.assert_allclose(found.weight, 0.5, atol=1e-6)
+        np.testing.assert_allclose(found.fraction, 0.5, atol=1e-6)
 
     def test_the_limit_is_an_option(self) -> None:
         path = trajectory_of(self.TIMES, straight(self.TIMES))

@@ -33,7 +33,7 @@ from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import shared_stddev
-from rangesfm.ranging.errors.range_bins import cells
+from rangesfm.ranging.errors.range_bins import range_bins
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
@@ -800,7 +800,9 @@ def told_of_shared_errors(survey: Survey, noise_m: float) -> RangeErrors:
     log = survey.observations.log
     each, apart = np.arange(len(log)), np.tile([1.0, 0.0, 0.0], (len(log), 1))
     turns = np.tile(np.eye(3), (len(log), 1, 1))
-    of_all = cells(log.anchor_index, log.tag_index, each.astype(float), apart, turns, np.ones(len(log)), np.ones(9))
+    of_all = range_bins(
+        log.anchor_index, log.tag_index, each.astype(float), apart, turns, np.ones(len(log)), np.ones(9)
+    )
     covariance = noise_m**2 * np.eye(len(log)) + shared_covariance(survey)
     learned = LearnedErrors(of_all, each, ("all",), np.ones(1), covariance[None])
     return replace(known_errors(survey.observations, noise_m), learned=learned)

@@ -13,9 +13,9 @@ from scipy.sparse import csr_array
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.bending import BendingOfCells
+from rangesfm.ranging.errors.bending import BendingOfBins
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.ranging.errors.range_bins import Cells
+from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.uncertainty import expected_scale_uncertainty, known_map
@@ -33,8 +33,8 @@ IN_TIME = ("white", "time", "place", "view", "reweighting")
 class Rigid:
     """The bending of a map that is known not to be bent."""
 
-    def of_cells(self, cells: Cells, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfCells:
-        return BendingOfCells((), np.zeros((len(cells), len(cells))), np.zeros(len(cells)))
+    def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
+        return BendingOfBins((), np.zeros((len(bins), len(bins))), np.zeros(len(bins)))
 
 
 def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -> Array:

@@ -1,7 +1,7 @@
 """Simulated outcomes of a planned survey: ranges of a radio with errors, a bent map, and what the surveyor knows.
 
 The errors are drawn as functions of time, distance and direction, each in its own way, rather than from the covariances
-of cells that the estimates use.
+of bins that the estimates use.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def errors_of_radio(
     from_anchor = places.centers + places.tag_from_center - standing_m[index]
     distance = np.linalg.norm(from_anchor, axis=1)
     direction = from_anchor / distance[:, None]
-    nearest = np.where(places.weight < 0.5, places.before, places.after)
+    nearest = np.where(places.fraction < 0.5, places.before, places.after)
     in_cam = np.einsum("nji,nj->ni", true.world_from_cam[nearest], direction)
     errors = stddevs["white"] * rng.standard_normal(len(distance)) + stddevs["common_bias"] * rng.standard_normal()
     errors += stddevs["short"] * rng.standard_normal() * np.exp(-distance)

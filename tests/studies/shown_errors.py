@@ -68,10 +68,10 @@ def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
         bias_m=posed.ranges.bias_mean_m,
     )
     solution = replace(solution, fit=replace(solution.fit, state=true))
-    cells = errors_to_expect(posed, solution, observations, model_from_cam(observations, path, posed), {}).cells
+    bins = errors_to_expect(posed, solution, observations, model_from_cam(observations, path, posed), {}).bins
     off_m = posed.ranges.range_m - predicted_ranges(posed.ranges, true)
     nothing_open = np.zeros((len(off_m), 1))
-    learned = learn_errors(cells, off_m, nothing_open, np.ones((1, 1)), solution.noise_stddev_m)
+    learned = learn_errors(bins, off_m, nothing_open, np.ones((1, 1)), solution.noise_stddev_m)
     return dict(zip(learned.names, learned.stddevs.tolist(), strict=True))
 
 

@@ -71,8 +71,8 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
     if metric_path.timestamps_s is None:
         names = [metric_path.image_names[row] for row in before[rows]]
     else:
-        weight, known = ranges.weight[rows], metric_path.timestamps_s
-        times = (1 - weight) * known[before[rows]] + weight * known[after[rows]]
+        fraction, known = ranges.weight[rows], metric_path.timestamps_s
+        times = (1 - fraction) * known[before[rows]] + fraction * known[after[rows]]
     tag_ids = [ranges.tag_id[row] for row in rows]
     log = RangeLog.from_arrays(
         [ranges.anchor_id[row] for row in rows],

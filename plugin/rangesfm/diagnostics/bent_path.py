@@ -69,14 +69,14 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
         return estimate
     known = _known(problem, posed, estimate.uncertainty.formal)
     uncertainty, covariance = known.uncertainty, known.covariance
-    fit = replace(solution.fit, state=on_map.state, weights=problem.cells.weight)
+    fit = replace(solution.fit, state=on_map.state, weights=problem.bins.robust_weight)
     judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, (), options)
     columns = problem.columns
     of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
     positions = zip(estimate.anchors, on_map.state.anchors_m, strict=True)
     drift = f"the path drifts by {drift_m:.2g} m (root mean square) from where the ranges have it"
     status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
-    status[on_map.rows] = status_by_weight(problem.cells.weight)
+    status[on_map.rows] = status_by_weight(problem.bins.robust_weight)
     stddev_m[on_map.rows] = problem.scatter_m
     return replace(
         estimate,
@@ -94,14 +94,14 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
 
 def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
     """Return the uncertainty of a path at the estimate with the best weights, compared with simple weights."""
-    errors, given, index = problem.errors, posed.ranges, problem.cells.anchor_index
+    errors, given, index = problem.errors, posed.ranges, problem.bins.anchor_index
     simple = errors.without(*(set(errors.names) - {"white", *BENDS})).covariance_m2
     simple += given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
-    _, of_cells, of_priors = best_estimate(simple, problem.design, problem.prior_design)
-    variances = np.einsum("pi,ij,pj->p", of_cells, errors.covariance_m2, of_cells) + np.sum(of_priors**2, axis=1)
+    _, of_bins, of_priors = best_estimate(simple, problem.design, problem.prior_design)
+    variances = np.einsum("pi,ij,pj->p", of_bins, errors.covariance_m2, of_bins) + np.sum(of_priors**2, axis=1)
     off_m, prior_off = -problem.residual_m, -problem.prior_residual
     linear = LinearMap(off_m, problem.design, prior_off, problem.prior_design, problem.columns)
-    return linear.known(errors, formal, variances, of_cells @ off_m + of_priors @ prior_off)
+    return linear.known(errors, formal, variances, of_bins @ off_m + of_priors @ prior_off)
 
 
 def learnt_at(on_map: RangesOnMap) -> Linearized:
@@ -115,7 +115,7 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
     on_map, walk = problem.on_map, problem.on_map.bending
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
-    factors = walk.factors(problem.cells, slopes_by_poses(on_map), frame_is_free=is_free)
+    factors = walk.factors(problem.bins, slopes_by_poses(on_map), frame_is_free=is_free)
     step = Factorization(problem).step()
     left_m = problem.residual_m + problem.design @ step
     pulls = cho_solve(cho_factor(problem.errors.covariance_m2), left_m)
@@ -129,8 +129,8 @@ def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> Ra
     at, problem = on_map.on_path, on_map.problem
     moved = after.path.centers - before.path.centers
     turned = after.path.world_from_cam @ np.swapaxes(before.path.world_from_cam, 1, 2)
-    turn = turned[np.where(at.weight < 0.5, at.before, at.after)]
-    share = at.weight[:, None]
+    turn = turned[np.where(at.fraction < 0.5, at.before, at.after)]
+    share = at.fraction[:, None]
 
     def turned_by(vectors: Array) -> Array:
         return np.asarray(np.einsum("nij,nj->ni", turn, vectors))

@@ -17,7 +17,7 @@ from rangesfm.diagnostics.hypothesis import (
     longer,
     longest_m,
     of_anchor_place,
-    of_cells,
+    of_bins,
     too_long,
 )
 from rangesfm.diagnostics.linearized import Linearized
@@ -49,7 +49,7 @@ def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
 def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     name, at = problem.on_map.anchor_ids[k], problem.on_map.problem.anchor_mean_m[k]
     # The anchor must be within its ranges of the path, wherever its coordinates put it.
-    most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.cells.anchor_index == k]))
+    most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.bins.anchor_index == k]))
 
     def unknown(_: Array) -> Correction:
         return Correction({name: None})
@@ -97,7 +97,7 @@ def anchor_biases(problem: Linearized) -> Iterator[Hypothesis]:
 def _bias(problem: Linearized, anchors: list[int], kind: str, subject: str, whose: str) -> Hypothesis:
     return Hypothesis(
         kind,
-        of_cells(problem, -np.isin(problem.cells.anchor_index, anchors).astype(np.float64)),
+        of_bins(problem, -np.isin(problem.bins.anchor_index, anchors).astype(np.float64)),
         subject=subject,
         words=lambda size: f"the ranges to {whose} {too_long(size)}",
         remedy="calibrate the radio's delay (range_bias_m in the anchors' file), or look for what stands in the way",
@@ -113,7 +113,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
     distance_m = problem.on_map.problem.range_m
     yield Hypothesis(
         "range share",
-        of_cells(problem, -problem.gradient.distance_m),
+        of_bins(problem, -problem.gradient.distance_m),
         words=lambda size: f"all ranges read about {100 * abs(size[0]):.1f} % too {'long' if size[0] > 0 else 'short'}",
         remedy="check the unit, and the propagation speed that the radio assumes, against a taped distance",
         correction=lambda size: Correction(longer_m=distance_m * size[0] / (1 + size[0])),
@@ -128,7 +128,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
 
 def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
     name, distance_m = problem.on_map.anchor_ids[k], problem.gradient.distance_m
-    is_of, of_ranges = problem.cells.anchor_index == k, problem.on_map.problem.anchor_index == k
+    is_of, of_ranges = problem.bins.anchor_index == k, problem.on_map.problem.anchor_index == k
     mean = distance_m[is_of].mean()
 
     def words(size: Array) -> str:
@@ -142,7 +142,7 @@ def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
 
     return Hypothesis(
         "anchor share",
-        of_cells(problem, np.where(is_of, -distance_m + mean, 0.0)),
+        of_bins(problem, np.where(is_of, -distance_m + mean, 0.0)),
         subject=name,
         words=words,
         remedy="look at its ranges in the log, and leave it out (use_anchors)",
@@ -209,7 +209,7 @@ def to_other_side_m(lever_arm_m: float) -> float:
 
 def wrong_lever_arms(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield for each tag: it is elsewhere on the camera."""
-    return (_lever_arm(problem, k) for k in np.unique(problem.cells.tag_index).tolist())
+    return (_lever_arm(problem, k) for k in np.unique(problem.bins.tag_index).tolist())
 
 
 def lever_arm_m(problem: Linearized, tag: int | None = None) -> float:
@@ -234,7 +234,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
 
     return Hypothesis(
         "lever arm",
-        of_cells(problem, np.where((problem.cells.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)),
+        of_bins(problem, np.where((problem.bins.tag_index == k)[:, None], -problem.by_lever_arm, 0.0)),
         subject=name,
         words=words,
         remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
@@ -255,7 +255,7 @@ def radios_warming(problem: Linearized) -> Iterator[Hypothesis]:
 
     yield Hypothesis(
         "radio drift",
-        of_cells(problem, -since / lasts),
+        of_bins(problem, -since / lasts),
         words=words,
         remedy="let the radio warm up before the survey, or calibrate it at the end too",
         correction=lambda size: Correction(longer_m=size[0] / lasts * of_ranges),
@@ -270,7 +270,7 @@ def people_in_between(problem: Linearized) -> Iterator[Hypothesis]:
     is_behind = np.sum(on_map.from_anchor_m * on_map.world_from_cam[:, :, 2], axis=1) > 0
     yield Hypothesis(
         "behind the camera",
-        of_cells(problem, -problem.cells.mean(is_behind.astype(np.float64))),
+        of_bins(problem, -problem.bins.mean(is_behind.astype(np.float64))),
         words=lambda size: f"the ranges to anchors behind the camera {too_long(size)}",
         remedy="carry the tag above the head, or see what stands behind it",
         correction=longer(lambda: is_behind),
@@ -288,7 +288,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     remedy = "let the offset be searched for (ranges_time_offset auto), or film a sharp turn at both ends"
     yield Hypothesis(
         "clock offset",
-        of_cells(problem, -problem.by_time),
+        of_bins(problem, -problem.by_time),
         words=lambda size: (
             f"the clocks are off by about {abs(size[0]):.2f} s more than assumed ({size[0]:+.2f} s on the offset)"
         ),
@@ -299,7 +299,7 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     )
     yield Hypothesis(
         "clock drift",
-        of_cells(problem, -problem.by_time * since),
+        of_bins(problem, -problem.by_time * since),
         words=lambda size: (
             f"the radio's clock runs {1e6 * abs(size[0]):.0f} ppm too {'slow' if size[0] > 0 else 'fast'}"
         ),

@@ -136,7 +136,7 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
     ):
         words = f"the ranges {what} {stddev_m:.2f} m; radios in the open reach {most_m:.2f} m at most"
         yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")
-    on_map, cells = problem.on_map, problem.cells
+    on_map, bins = problem.on_map, problem.bins
     index = on_map.problem.anchor_index
     for k in np.unique(index).tolist():
         is_of, name = index == k, on_map.anchor_ids[k]
@@ -145,7 +145,7 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
         words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
         remedy = "look whether it is the anchor that it is taken for, and where it stands"
         yield _seen("anchor hardly used", name, unused, 1 - _LEAST_USED, words, remedy)
-        rows = np.flatnonzero(is_of & (cells.weight < 0.5))
+        rows = np.flatnonzero(is_of & (bins.robust_weight < 0.5))
         if len(rows) >= _MIN_NUM_OUTLYING and len(on_map.anchor_ids) > 1:
             yield _mixed_up(problem, k, rows)
         outlying = len(rows) / num
@@ -171,10 +171,10 @@ def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTes
 
 
 def _lasting_m(problem: Linearized) -> float:
-    """Return the root mean square of the lasting errors over the cells, metres."""
+    """Return the root mean square of the lasting errors over the bins, metres."""
     lasting = np.isin(problem.errors.names, _LASTING)
     variances = np.trace(problem.errors.covariances_m2[lasting].sum(axis=0))
-    return float(np.sqrt(variances / len(problem.cells)))
+    return float(np.sqrt(variances / len(problem.bins)))
 
 
 def _seen(

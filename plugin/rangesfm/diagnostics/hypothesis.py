@@ -38,7 +38,7 @@ class Effect:
     """Derivatives of the residuals by the k numbers of a mistake.
 
     Attributes:
-        columns: (c, k) for the residuals of the cells, metres per unit.
+        columns: (c, k) for the residuals of the bins, metres per unit.
         priors: (r, k) for the residuals of the priors, in standard deviations per unit.
     """
 
@@ -98,7 +98,7 @@ class Hypothesis:
             return self
         steps = [self.correction(sizes + _SMALL * unit).longer_m for unit in np.eye(len(sizes))]
         slopes = [(step - longer_m) / _SMALL for step in steps if step is not None]
-        return replace(self, effect=of_cells(problem, -problem.cells.mean(np.stack(slopes, axis=1))))
+        return replace(self, effect=of_bins(problem, -problem.bins.mean(np.stack(slopes, axis=1))))
 
     def can_be(self, sizes: Array) -> bool:
         """Return True if a mistake of this size (k,) is possible."""
@@ -118,8 +118,8 @@ class Hypothesis:
         return self.name, self.subject
 
 
-def of_cells(problem: Linearized, columns: Array) -> Effect:
-    """Return an effect on the cells alone, without a part in the priors."""
+def of_bins(problem: Linearized, columns: Array) -> Effect:
+    """Return an effect on the bins alone, without a part in the priors."""
     columns = columns.reshape(len(problem.residual_m), -1)
     return Effect(columns, np.zeros((problem.num_priors, columns.shape[1])))
 
@@ -149,8 +149,8 @@ def of_anchor_place(problem: Linearized, anchor: int, directions: Array) -> Effe
     """Return the effect of an anchor that is off its given position along directions (3, k), towards its true place."""
     stddev_m = problem.on_map.problem.anchor_stddev_m
     if problem.columns.anchor[anchor] < 0:
-        is_of = (problem.cells.anchor_index == anchor)[:, None]
-        return of_cells(problem, np.where(is_of, problem.gradient.by_tag @ directions, 0.0))
+        is_of = (problem.bins.anchor_index == anchor)[:, None]
+        return of_bins(problem, np.where(is_of, problem.gradient.by_tag @ directions, 0.0))
     has_rows = (problem.columns.anchor >= 0) & np.isfinite(stddev_m)
     row = 3 * np.count_nonzero(has_rows[:anchor])
     priors = np.zeros((problem.num_priors, directions.shape[1]))

@@ -112,8 +112,8 @@ class Factorization:
         self._place = place.T @ place / len(problem.place)
         self.residual = self._off(self._whitened(problem.residual_m[:, None], problem.prior_residual[:, None]))[:, 0]
 
-    def _whitened(self, cells: Array, priors: Array) -> Array:
-        return np.vstack([solve_triangular(self._factor, cells, lower=True), priors])
+    def _whitened(self, bins: Array, priors: Array) -> Array:
+        return np.vstack([solve_triangular(self._factor, bins, lower=True), priors])
 
     def _off(self, whitened: Array) -> Array:
         """Project off what the unknowns can explain."""
@@ -123,18 +123,18 @@ class Factorization:
     def deviance(self, made: Test | None = None) -> float:
         """Return -2 times the log-likelihood of observations and errors, up to a constant; with a mistake if given.
 
-        It compares two explanations of the same cells, each with the errors that it leaves.
+        It compares two explanations of the same bins, each with the errors that it leaves.
         """
         squares = float(self.residual @ self.residual) - (made.statistic if made else 0.0)
         return squares + 2 * float(np.sum(np.log(np.diag(self._factor)))) + self.problem.errors.unlikeliness
 
     def step(self, made: tuple[Effect, Array] | None = None) -> Array:
         """Return the (p,) step from the state to the likeliest one, given a mistake of some size (k,)."""
-        cells, priors = self.problem.residual_m, self.problem.prior_residual
+        bins, priors = self.problem.residual_m, self.problem.prior_residual
         if made is not None:
             effect, sizes = made
-            cells, priors = cells - effect.columns @ sizes, priors - effect.priors @ sizes
-        return -self._solved(self._whitened(cells[:, None], priors[:, None]))[:, 0]
+            bins, priors = bins - effect.columns @ sizes, priors - effect.priors @ sizes
+        return -self._solved(self._whitened(bins[:, None], priors[:, None]))[:, 0]
 
     def _solved(self, whitened: Array) -> Array:
         return np.asarray(solve_triangular(self._triangle, self._basis.T @ whitened))

@@ -10,11 +10,11 @@ from scipy.sparse import csr_array
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.errors.bending import BendingOfCells, MapBending, by_poses
+from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, by_poses
 from rangesfm.ranging.errors.components import PLACES
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
-from rangesfm.ranging.errors.range_bins import Cells, cells, noisiness
+from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath, RangeObservations
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
@@ -32,8 +32,8 @@ from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.uncertainty import ruled_out, times_of_ranges
 
-# Fewer cells than for an interval, because the tests learn the errors many times.
-_MAX_NUM_CELLS = 160
+# Fewer bins than for an interval, because the tests learn the errors many times.
+_MAX_NUM_BINS = 160
 _NUM_NEIGHBOURS = 8
 # A range farther than this many standard deviations from the median of its neighbours is an outlier among them. For
 # this the noise counts as _LEAST_SCATTER_M or more: a radio may repeat itself to a centimetre and still err by ten from
@@ -136,15 +136,15 @@ def ranges_on_map(
 
 @dataclass(frozen=True)
 class Linearized:
-    """The linear problem of c cells of ranges and r priors with p parameters; the anchors' biases are random errors.
+    """The linear problem of c bins of ranges and r priors with p parameters; the anchors' biases are random errors.
 
     Attributes:
         residual_m: (c,) predicted minus measured, on the map as the photos alone would have it.
         design: (c, p) Jacobian of the residuals.
         prior_residual, prior_design: (r,) and (r, p), in standard deviations; first those of the anchors' positions.
         columns: position of each parameter; the first is the logarithm of the scale.
-        place: (c, 3, p) derivative of the camera's position in each cell.
-        cells: how ranges are averaged. time_s: (c,) mean times.
+        place: (c, 3, p) derivative of the camera's position in each bin.
+        bins: how ranges are averaged. time_s: (c,) mean times.
         gradient: of the c distances.
         by_lever_arm: (c, 3) derivative of the residual by the lever arm in the camera's frame.
         by_time: (c,) derivative by the clocks' offset; None without times.
@@ -158,7 +158,7 @@ class Linearized:
     prior_design: Array
     columns: Columns
     place: Array
-    cells: Cells
+    bins: RangeBins
     time_s: Array
     gradient: RangeGradient
     by_lever_arm: Array
@@ -175,7 +175,7 @@ class Linearized:
     @property
     def heard(self) -> list[int]:
         """Indices of the anchors that have ranges."""
-        anchors: list[int] = np.unique(self.cells.anchor_index).tolist()
+        anchors: list[int] = np.unique(self.bins.anchor_index).tolist()
         return anchors
 
     def with_learnt_errors(self, columns: Array, priors: Array) -> Linearized:
@@ -200,14 +200,14 @@ class Linearized:
         return replace(self, errors=self.expected.usual({"white": self.scatter_m}))
 
 
-def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Linearized:
+def linearized(on_map: RangesOnMap, bins_of_ranges: RangeBins | None = None) -> Linearized:
     """Linearise at the map's own state, with the usual errors.
 
     Args:
-        cells_of_ranges: for ranges without noise; None: cells are formed from the ranges that agree with their
+        bins_of_ranges: for ranges without noise; None: bins are formed from the ranges that agree with their
             neighbours, however far they are from the map.
     """
-    found, scatter_m = _cells(on_map) if cells_of_ranges is None else (cells_of_ranges, 0.0)
+    found, scatter_m = _bins(on_map) if bins_of_ranges is None else (bins_of_ranges, 0.0)
     towards = RangeGradient.of(on_map.from_anchor_m).by_tag
     others_m2 = _wandering(found) | {PLACES: found.shared_by_places(towards, on_map.placing_m, on_map.gap)}
     expected = ExpectedErrors.of(
@@ -217,7 +217,7 @@ def linearized(on_map: RangesOnMap, cells_of_ranges: Cells | None = None) -> Lin
 
 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
-    """Linearise the problem at another state or for corrected ranges, with the same cells and errors."""
+    """Linearise the problem at another state or for corrected ranges, with the same bins and errors."""
     return _linearized(on_map, problem.expected, problem.scatter_m, problem.errors)
 
 
@@ -225,11 +225,11 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
     # The anchors' biases are random errors here, not parameters.
     problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
     state, placed = on_map.state, on_map.state.metric_from_model
-    columns, gradient, mean = columns_of([problem])[0], RangeGradient.of(on_map.from_anchor_m), expected.cells.mean
+    columns, gradient, mean = columns_of([problem])[0], RangeGradient.of(on_map.from_anchor_m), expected.bins.mean
     by_time = None
     if on_map.velocity is not None:
         by_time = mean(gradient.by_log_scale(placed.scale * on_map.velocity @ placed.rotation.T))
-    place = np.zeros((len(expected.cells), 3, columns.num))
+    place = np.zeros((len(expected.bins), 3, columns.num))
     place[:, :, columns.scale] = mean(placed.scale * problem.centers @ placed.rotation.T)
     if columns.frame >= 0:
         arms_m = mean(antenna_positions(problem, placed) - placed.translation)
@@ -241,7 +241,7 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
         prior_design=prior_jacobian(problem, columns, state, state),
         columns=columns,
         place=place,
-        cells=expected.cells,
+        bins=expected.bins,
         time_s=mean(on_map.time_s),
         gradient=RangeGradient(mean(gradient.distance_m), mean(gradient.by_tag)),
         by_lever_arm=mean(gradient.by_tag_in_cam(on_map.world_from_cam)),
@@ -253,10 +253,10 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
     )
 
 
-def _bending(on_map: RangesOnMap, cells_of_ranges: Cells) -> BendingOfCells | None:
+def _bending(on_map: RangesOnMap, bins_of_ranges: RangeBins) -> BendingOfBins | None:
     if on_map.bending is None:
         return None
-    return on_map.bending.of_cells(cells_of_ranges, slopes_by_poses(on_map), frame_is_free=on_map.problem.frame_is_free)
+    return on_map.bending.of_bins(bins_of_ranges, slopes_by_poses(on_map), frame_is_free=on_map.problem.frame_is_free)
 
 
 def slopes_by_poses(on_map: RangesOnMap) -> csr_array:
@@ -265,19 +265,19 @@ def slopes_by_poses(on_map: RangesOnMap) -> csr_array:
     return by_poses(gradient, placed, on_map.model_from_cam, on_map.problem.tag_from_center, on_map.on_path)
 
 
-def _wandering(cells_of_ranges: Cells) -> dict[str, Array]:
-    index, time_s = cells_of_ranges.anchor_index, cells_of_ranges.time_s
+def _wandering(bins_of_ranges: RangeBins) -> dict[str, Array]:
+    index, time_s = bins_of_ranges.anchor_index, bins_of_ranges.time_s
     together = np.exp(-np.abs(time_s[:, None] - time_s) / _WANDERING_S)
     return {"wandering": _WANDERING_M**2 * (1.0 + (index[:, None] == index)) * together}
 
 
-def _cells(on_map: RangesOnMap) -> tuple[Cells, float]:
+def _bins(on_map: RangesOnMap) -> tuple[RangeBins, float]:
     index = on_map.problem.anchor_index
     order = np.lexsort((on_map.time_s, on_map.tag_index, index))
     off_m, scatter_m = _off_neighbours(on_map.residual_m[order], index[order])
     is_near = np.empty(len(order), dtype=bool)
     is_near[order] = np.abs(off_m) <= near_m(scatter_m)
-    of_ranges = cells(
+    of_ranges = range_bins(
         index,
         on_map.tag_index,
         on_map.time_s,
@@ -285,7 +285,7 @@ def _cells(on_map: RangesOnMap) -> tuple[Cells, float]:
         np.swapaxes(on_map.world_from_cam, 1, 2),
         np.where(is_near, 1.0, _NO_WEIGHT),
         noisiness(index[order], off_m, on_map.problem.num_anchors),
-        _MAX_NUM_CELLS,
+        _MAX_NUM_BINS,
     )
     return of_ranges, scatter_m
 

@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives
 from rangesfm.diagnostics.catalogue import STANDING
-from rangesfm.diagnostics.hypothesis import Correction, Effect, Hypothesis, corrected, of_cells
+from rangesfm.diagnostics.hypothesis import Correction, Effect, Hypothesis, corrected, of_bins
 from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
@@ -96,7 +96,7 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
 
 def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized:
     """Return the problem with the errors learnt while some mistakes explain what they can."""
-    effects = Effect.of_all([of_cells(problem, problem.design[:, :0]), *(h.effect for h in explaining)])
+    effects = Effect.of_all([of_bins(problem, problem.design[:, :0]), *(h.effect for h in explaining)])
     return problem.with_learnt_errors(effects.columns, effects.priors)
 
 

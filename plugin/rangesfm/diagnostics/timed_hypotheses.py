@@ -16,7 +16,7 @@ from rangesfm.diagnostics.hypothesis import (
     in_axes,
     longer,
     longest_m,
-    of_cells,
+    of_bins,
     too_long,
 )
 from rangesfm.diagnostics.linearized import Linearized
@@ -29,8 +29,8 @@ _NUM_FINER = 17
 _LEAST_SHARE = 1 / 12
 # Shares of the survey that a stretch may last.
 _STRETCHES = (1 / 4, 1 / 8, 1 / 16)
-# Fewest cells before and after a change.
-_MIN_NUM_CELLS = 3
+# Fewest bins before and after a change.
+_MIN_NUM_BINS = 3
 # Kinds of moves at some time: text for whose, when and by how much; remedy; largest unnoticed size, metres.
 _MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
     "anchor moved": (
@@ -107,10 +107,10 @@ def _elsewhere(
         grown_m = np.linalg.norm(from_anchor_m + axes() @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
         return Correction(longer_m=np.where(later(), grown_m, 0.0))
 
-    for time, later, after in _changes(problem, anchor, 3 * _MIN_NUM_CELLS, around):
+    for time, later, after in _changes(problem, anchor, 3 * _MIN_NUM_BINS, around):
         yield Hypothesis(
             name,
-            of_cells(problem, -after[:, None] * by_shift),
+            of_bins(problem, -after[:, None] * by_shift),
             subject=whose,
             words=partial(words, whose, _when(problem, time)),
             remedy=remedy,
@@ -135,10 +135,10 @@ def _steps(problem: Linearized, anchor: int | None, around: float | None = None)
         to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
         return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
 
-    for time, later, after in _changes(problem, anchor, _MIN_NUM_CELLS, around):
+    for time, later, after in _changes(problem, anchor, _MIN_NUM_BINS, around):
         yield Hypothesis(
             "anchor step" if name else "step",
-            of_cells(problem, -after),
+            of_bins(problem, -after),
             subject=name,
             words=partial(words, _when(problem, time)),
             remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
@@ -159,13 +159,13 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
     for k in _each_and_all(problem):
         name = _name(problem, k)
         for start, end, share in windows:
-            inside = np.where(_is_of(problem.cells.anchor_index, k), share, 0.0)
-            if inside.sum() < _MIN_NUM_CELLS:
+            inside = np.where(_is_of(problem.bins.anchor_index, k), share, 0.0)
+            if inside.sum() < _MIN_NUM_BINS:
                 continue
             within = partial(_later, problem, k, start, end)
             yield Hypothesis(
                 "anchor stretch" if name else "stretch",
-                of_cells(problem, -inside),
+                of_bins(problem, -inside),
                 subject=name,
                 words=partial(words, name, _when(problem, start, end)),
                 remedy="look for what stood in the line of sight, and leave that stretch out",
@@ -187,10 +187,10 @@ def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hy
     def correction(later: Callable[[], Mask], size: Array) -> Correction:
         return Correction(time_shift_s=np.where(later(), size[0], 0.0))
 
-    for time, later, after in _changes(problem, None, _MIN_NUM_CELLS, around):
+    for time, later, after in _changes(problem, None, _MIN_NUM_BINS, around):
         yield Hypothesis(
             "clock jump",
-            of_cells(problem, -after * problem.by_time),
+            of_bins(problem, -after * problem.by_time),
             words=partial(words, _when(problem, time)),
             remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
             correction=partial(correction, later),
@@ -230,11 +230,11 @@ def _changes(
 ) -> Iterator[tuple[float, Callable[[], Mask], Array]]:
     """Yield times away from the ends of the survey, with what follows them.
 
-    Each comes with a function that returns the later ranges of one anchor, or of all, and with (c,) shares of the cells
+    Each comes with a function that returns the later ranges of one anchor, or of all, and with (c,) shares of the bins
     that are later.
 
     Args:
-        least: fewest cells before and after. around: try only times near this one, more closely spaced.
+        least: fewest bins before and after. around: try only times near this one, more closely spaced.
     """
     ends = _LEAST_SHARE, 1 - _LEAST_SHARE
     of_ranges = _is_of(problem.on_map.problem.anchor_index, anchor)
@@ -242,7 +242,7 @@ def _changes(
     if around is not None:
         at = int(np.searchsorted(times, around))
         times = np.linspace(times[max(at - 1, 0)], times[min(at + 1, len(times) - 1)], _NUM_FINER)
-    is_of = _is_of(problem.cells.anchor_index, anchor)
+    is_of = _is_of(problem.bins.anchor_index, anchor)
     for time, share in zip(times.tolist(), _shares_after(problem, times), strict=True):
         after = np.where(is_of, share, 0.0)
         if min(after.sum(), is_of.sum() - after.sum()) >= least:
@@ -250,7 +250,7 @@ def _changes(
 
 
 def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
-    """Yield begin, end and the (c,) shares of the cells in between, for stretches of several lengths."""
+    """Yield begin, end and the (c,) shares of the bins in between, for stretches of several lengths."""
     starts = [(start, share) for share in _STRETCHES for start in np.arange(0.0, 1.0 - share + 1e-9, share / 2)]
     ends = np.quantile(problem.on_map.time_s, [(start, min(start + share, 1.0)) for start, share in starts])
     times, rows = np.unique(ends, return_inverse=True)
@@ -260,11 +260,11 @@ def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:
 
 
 def _shares_after(problem: Linearized, times: Array) -> Array:
-    """Return (t, c) the share of each cell's weight that is later than each of (t,) increasing times."""
-    cells, num = problem.cells, len(times) + 1
-    of_span = cells.of_range * num + np.searchsorted(times, problem.on_map.time_s)
-    worth = np.bincount(of_span, cells.weight, len(cells) * num).reshape(len(cells), num)
-    later: Array = np.cumsum(worth[:, :0:-1], axis=1)[:, ::-1].T / cells.worth
+    """Return (t, c) the share of each bin's weight that is later than each of (t,) increasing times."""
+    bins, num = problem.bins, len(times) + 1
+    of_span = bins.of_range * num + np.searchsorted(times, problem.on_map.time_s)
+    worth = np.bincount(of_span, bins.robust_weight, len(bins) * num).reshape(len(bins), num)
+    later: Array = np.cumsum(worth[:, :0:-1], axis=1)[:, ::-1].T / bins.worth
     return later
 
 

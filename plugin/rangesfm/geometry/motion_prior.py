@@ -53,29 +53,29 @@ class MotionPrior:
     bends: Array
     bend_covariance: Array
 
-    def beyond_chord(self, before: Indices, weight: Array) -> tuple[Array, Array]:
+    def beyond_chord(self, before: Indices, fraction: Array) -> tuple[Array, Array]:
         """Return the offset of the motion from the straight line between two keyframes, with its uncertainty.
 
         Args:
             before: (m,) index of the keyframe before each time; the gap after it must be bridged.
-            weight: (m,) fraction of the gap that has passed.
+            fraction: (m,) fraction of the gap that has passed.
 
         Returns:
             (m, d) offset to add to the straight line between the keyframes, and (m,) standard deviation of each
             coordinate of the sum, including the errors of the keyframes.
         """
         gap_s = self.times_s[before + 1] - self.times_s[before]
-        early = gap_s**2 / 6 * ((1 - weight) ** 3 - (1 - weight))
-        late = gap_s**2 / 6 * (weight**3 - weight)
+        early = gap_s**2 / 6 * ((1 - fraction) ** 3 - (1 - fraction))
+        late = gap_s**2 / 6 * (fraction**3 - fraction)
         offsets = early[:, None] * self.bends[before] + late[:, None] * self.bends[before + 1]
         of_before, of_next = self.bend_covariance[0, before], self.bend_covariance[0, before + 1]
         told = early**2 * of_before + late**2 * of_next + 2 * early * late * self.bend_covariance[1, before]
-        variance = self.power * np.maximum(gap_s**3 * (weight * (1 - weight)) ** 2 / 3 - told, 0.0)
-        variance += self.noise_stddev**2 * ((1 - weight) ** 2 + weight**2)
-        variance += 2 * self.noise_stddev**2 * self._bent_by_ends(before, weight, early, late)
+        variance = self.power * np.maximum(gap_s**3 * (fraction * (1 - fraction)) ** 2 / 3 - told, 0.0)
+        variance += self.noise_stddev**2 * ((1 - fraction) ** 2 + fraction**2)
+        variance += 2 * self.noise_stddev**2 * self._bent_by_ends(before, fraction, early, late)
         return offsets, np.sqrt(np.maximum(variance, 0.0))
 
-    def _bent_by_ends(self, before: Indices, weight: Array, early: Array, late: Array) -> Array:
+    def _bent_by_ends(self, before: Indices, fraction: Array, early: Array, late: Array) -> Array:
         """Return the covariance (m,) of the offset and the straight line's error, over ``noise_stddev**2``.
 
         Both depend on the errors of the two keyframes around each time.
@@ -85,7 +85,7 @@ class MotionPrior:
         by_line = np.zeros((4, len(before)))
         for row, k in enumerate(range(-1, 3)):
             at = np.clip(before + k, 0, len(self.times_s) - 1)
-            for end, share in ((0, 1 - weight), (1, weight)):
+            for end, share in ((0, 1 - fraction), (1, fraction)):
                 step = end - k
                 if -1 <= step <= 1:
                     by_line[row] += np.where(at == before + k, second[1 + step, at], 0.0) * share

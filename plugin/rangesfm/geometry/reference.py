@@ -100,13 +100,13 @@ class Reference:
 
         gap = known[after] - known[before]
         between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times_s >= known[before]) & (times_s <= known[after])
-        weight = ((times_s - known[before])[between] / gap[between])[:, None]
+        fraction = ((times_s - known[before])[between] / gap[between])[:, None]
         start_m, end_m = self.positions_m[before[between]], self.positions_m[after[between]]
-        positions[between] = (1 - weight) * start_m + weight * end_m
+        positions[between] = (1 - fraction) * start_m + fraction * end_m
         if rotations is not None and between.any():
             assert self.world_from_cam is not None
             start, end = (Rotation.from_matrix(self.world_from_cam[index[between]]) for index in (before, after))
-            turned = start * Rotation.from_rotvec(weight * (start.inv() * end).as_rotvec())
+            turned = start * Rotation.from_rotvec(fraction * (start.inv() * end).as_rotvec())
             rotations[between] = turned.as_matrix()
         return positions, rotations
 

@@ -19,7 +19,7 @@ from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.learned import LearnedErrors, usual_stddevs
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.place import shares_of_places
-from rangesfm.ranging.errors.range_bins import MAX_NUM_CELLS
+from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
@@ -39,8 +39,8 @@ from rangesfm.scale.uncertainty import (
 
 # Rounds in which the noise that the run will see and the weights of its ranges are made consistent.
 _NUM_NOISE_ROUNDS = 2
-# Numbers of ranges and of cells in the quick computation that compares plans.
-_NUM_COMPARED_RANGES, _NUM_COMPARED_CELLS = 600, 120
+# Numbers of ranges and of bins in the quick computation that compares plans.
+_NUM_COMPARED_RANGES, _NUM_COMPARED_BINS = 600, 120
 # A parameter's information below this fraction of the largest counts as this fraction.
 _ROUNDING = 1e-20
 OPEN = 1e3
@@ -134,21 +134,21 @@ def _stddevs(variances: Array) -> Array:
 
 
 def expect_roughly(planned: PlannedSurvey) -> Expected | None:
-    """Compute ``expect`` for a rigid map with fewer ranges and cells, in a tenth of the time, to compare plans.
+    """Compute ``expect`` for a rigid map with fewer ranges and bins, in a tenth of the time, to compare plans.
 
     None if a run will find too few ranges.
     """
     try:
-        return expect(replace(planned, photos=None, max_num_ranges=_NUM_COMPARED_RANGES), _NUM_COMPARED_CELLS)
+        return expect(replace(planned, photos=None, max_num_ranges=_NUM_COMPARED_RANGES), _NUM_COMPARED_BINS)
     except GeometryError:
         return None
 
 
-def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expected:
+def expect(planned: PlannedSurvey, max_num_bins: int = MAX_NUM_BINS) -> Expected:
     """Compute the noise that the run will see, and with the resulting weights the uncertainty that it will state.
 
     Args:
-        max_num_cells: largest number of cells in which common errors of ranges are computed; fewer are coarser.
+        max_num_bins: largest number of bins in which common errors of ranges are computed; fewer are coarser.
 
     Raises:
         GeometryError: the run will find too few ranges on the path.
@@ -165,7 +165,7 @@ def expect(planned: PlannedSurvey, max_num_cells: int = MAX_NUM_CELLS) -> Expect
         made = PlannedMap(path, planned.photos.information(path), posed, observations, planned.tag_in_cam_m)
         stddevs |= {**dict.fromkeys(BENDS, 0.0), "bending": made.bend_m(solution)}
     bending = WalkBending(in_first_camera(path))
-    learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_cells, bending)
+    learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_bins, bending)
     for _ in range(_NUM_NOISE_ROUNDS):
         solution = _at_the_truth(posed, _as_seen(solution, learned), state, planned.num_alike)
     open_m2 = _undetermined(solution.fit)
@@ -207,30 +207,30 @@ def _undetermined(fit: RangeFit) -> Array:
 def _as_seen(solution: Solution, learned: LearnedErrors) -> RangeErrors:
     """Return the range errors that ``RangeErrors.seen_by_rigid_map`` and ``inflated`` will find, on average.
 
-    The residuals of a cell have the cells' covariance without the part that the fit absorbs. The scatter of single
-    ranges about the mean of their cell is added.
+    The residuals of a bin have the bins' covariance without the part that the fit absorbs. The scatter of single
+    ranges about the mean of their bin is added.
     """
-    errors, problem, cells = solution.errors, solution.problem, learned.cells
+    errors, problem, bins = solution.errors, solution.problem, learned.bins
     ones = replace(problem, stddev_m=np.ones_like(problem.stddev_m))
-    design = cells.mean(range_jacobian(ones, solution.fit.columns[0], solution.fit.state, solution.fit.state))
-    left = np.eye(len(cells)) - design @ parameter_influence(solution.fit, problem, learned)
+    design = bins.mean(range_jacobian(ones, solution.fit.columns[0], solution.fit.state, solution.fit.state))
+    left = np.eye(len(bins)) - design @ parameter_influence(solution.fit, problem, learned)
     residuals_m2 = left @ learned.covariance_m2 @ left.T
-    white_m2 = np.diag(learned.covariances_m2[learned.names.index("white")]) * cells.worth  # (c,) of single ranges
+    white_m2 = np.diag(learned.covariances_m2[learned.names.index("white")]) * bins.worth  # (c,) of single ranges
     together_m2 = np.maximum(np.diag(residuals_m2), 1e-12)
-    alone_m2 = white_m2 * (1 - 1 / np.maximum(cells.worth, 1.0))
+    alone_m2 = white_m2 * (1 - 1 / np.maximum(bins.worth, 1.0))
     ordinary = np.hypot(errors.shared_m, errors.placing_m) < START_STDDEV_M
     rows = learned.of_range[ordinary] if ordinary.any() else learned.of_range
     noise_m2 = float(np.mean((together_m2 + alone_m2)[rows]))
-    alike = 1 - min(float(np.mean((white_m2 * np.ones(len(cells)))[rows])) / noise_m2, 1.0)
+    alike = 1 - min(float(np.mean((white_m2 * np.ones(len(bins)))[rows])) / noise_m2, 1.0)
     num_alike = int(solution.fit.weights[0])
     share = shares_of_places(np.repeat(errors.place, num_alike), alike)[::num_alike]
     base = np.where(errors.is_estimated, np.sqrt(noise_m2), errors.given_m)
     stddev_m = np.sqrt(base**2 + errors.placing_m**2 + errors.shared_m**2)
-    weights = cells.total(num_alike * share / stddev_m)
-    group = np.zeros(len(cells), dtype=np.int64)
+    weights = bins.total(num_alike * share / stddev_m)
+    group = np.zeros(len(bins), dtype=np.int64)
     group[learned.of_range] = errors.group
     same = group[:, None] == group
     in_groups = float(np.sum(np.outer(weights, weights) * residuals_m2 * same))
-    apart = float(np.sum(cells.total(num_alike * share / stddev_m**2) * (together_m2 + alone_m2)))
+    apart = float(np.sum(bins.total(num_alike * share / stddev_m**2) * (together_m2 + alone_m2)))
     inflation = max(float(np.sqrt(in_groups / apart)), 1.0)
     return replace(errors, stddev_m=stddev_m, share=share, inflation=inflation, noise_m=float(np.sqrt(noise_m2)))

@@ -140,12 +140,12 @@ class PlannedPhotos(Options, table="photos"):
         point = np.repeat(np.arange(len(points)), [len(by) for by in seen_by])
         frame = np.concatenate([*seen_by, np.zeros(0, dtype=np.int64)]).astype(np.int64)
         in_cam = np.einsum("nji,nj->ni", path.world_from_cam[frame], points[point] - path.centers[frame])
-        root_weight = np.sqrt(num_alike) / (self.feature_stddev * 2 * self._half_width)
+        root_information = np.sqrt(num_alike) / (self.feature_stddev * 2 * self._half_width)
         return Observations(
             frame,
             point,
             in_cam[:, :2] / in_cam[:, 2:],
-            np.full(len(frame), root_weight),
+            np.full(len(frame), root_information),
             np.tile(np.eye(3), (len(frame), 1, 1)),
             np.zeros((len(frame), 3)),
             points,
@@ -201,8 +201,8 @@ class PlannedMap:
         """
         graph = self._graph(solution, num_alike)
         by_photos, by_metre = linear_functions(graph, self._gradients)
-        by_cell = np.stack([learned.cells.total(column) for column in by_metre.T], axis=1)
-        by_ranges = by_cell.T @ learned.covariance_m2 @ by_cell
+        by_bin = np.stack([learned.bins.total(column) for column in by_metre.T], axis=1)
+        by_ranges = by_bin.T @ learned.covariance_m2 @ by_bin
         # In the first camera's frame, the map as a whole can only change its scale.
         bent = _without(self._motions if graph.held_frame is None else self._motions[:, :, :1])
         variances = np.diag(by_photos + bent @ by_ranges @ bent).reshape(-1, 3).sum(axis=1)

@@ -173,7 +173,7 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     Nothing has been measured yet, so that there is nothing to test. The sizes and effects are known all the same.
     """
     on_map = ranges_on_map(expected.posed, expected.solution, expected.observations, expected.planned.trajectory, None)
-    problem = replace(linearized(on_map, expected.learned.cells), errors=expected.learned)
+    problem = replace(linearized(on_map, expected.learned.bins), errors=expected.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = []
     for test in Factorization(problem).test(hypotheses, seed=0):

@@ -64,11 +64,11 @@ def associate(
     if log.image_name is not None:
         index_of = {name: index for index, name in enumerate(trajectory.image_names)}
         before = after = np.array([index_of.get(name, -1) for name in log.image_name], dtype=np.int64)
-        weight = np.zeros(len(log))
+        fraction = np.zeros(len(log))
         status[before < 0] = RangeStatus.UNKNOWN_IMAGE
     elif trajectory.timestamps_s is not None:
         times = log.timestamp_s + time_offset_s if log.timestamp_s is not None else np.empty(0)
-        before, after, weight = _places_by_time(log, times, trajectory.timestamps_s, options, status)
+        before, after, fraction = _places_by_time(log, times, trajectory.timestamps_s, options, status)
     else:
         raise InputError("the log has timestamps but the photos have none: give image times", log.source)
     if anchor_ids is not None:
@@ -78,13 +78,13 @@ def associate(
     status[log.kind == RangeKind.TAG_TAG] = RangeStatus.TAG_TAG
     placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
     before, after = np.where(placed, before, -1), np.where(placed, after, -1)
-    weight = np.where(placed, weight, 0.0)
+    fraction = np.where(placed, fraction, 0.0)
     # The last row is for the tag index -1, which means no tag.
     tags_in_cam_m = np.vstack([lever_arms(log, tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
     centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
     offsets, stddev, arm_stddev_m = np.zeros((len(log), 3)), np.zeros(len(log)), np.zeros(len(log))
 
-    b, a, w = before[placed], after[placed], weight[placed]
+    b, a, w = before[placed], after[placed], fraction[placed]
     if trajectory.timestamps_s is None or len(trajectory) < 2:
         lever[placed] = np.einsum("nij,nj->ni", trajectory.world_from_cam[b], tags_in_cam_m[placed])
     else:
@@ -96,7 +96,7 @@ def associate(
         stddev[placed] = np.hypot(stddev[placed], _timing_stddev(log, trajectory, b, a, w, options))
     linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
     centers[placed] = linear + offsets[placed]
-    return RangeObservations(log, status, before, after, weight, centers, offsets, lever, stddev, arm_stddev_m)
+    return RangeObservations(log, status, before, after, fraction, centers, offsets, lever, stddev, arm_stddev_m)
 
 
 def tag_positions(
@@ -165,7 +165,7 @@ def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
 def _places_by_time(
     log: RangeLog, times: Array, keyframe_times: Array, options: AssociationOptions, status: npt.NDArray[np.int8]
 ) -> tuple[Indices, Indices, Array]:
-    """Return the keyframes before and after each time, and the weight of the later one.
+    """Return the keyframes before and after each time, and the fraction of the later one.
 
     ``status`` is changed where a range has no position on the path.
     """
@@ -173,8 +173,8 @@ def _places_by_time(
     after = np.clip(np.searchsorted(keyframe_times, times), min(1, last), last)
     before = np.maximum(after - 1, 0)
     gap = keyframe_times[after] - keyframe_times[before]
-    weight = np.clip((times - keyframe_times[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
-    nearest = np.where(weight < 0.5, before, after)
+    fraction = np.clip((times - keyframe_times[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+    nearest = np.where(fraction < 0.5, before, after)
     distance = np.abs(times - keyframe_times[nearest])
     inside = (times >= keyframe_times[0]) & (times <= keyframe_times[last])
 
@@ -188,10 +188,10 @@ def _places_by_time(
     snapped = same_time | ((at_keyframe | still) & ~interpolated)
 
     before, after = np.where(snapped, nearest, before), np.where(snapped, nearest, after)
-    weight = np.where(snapped, 0.0, weight)
+    fraction = np.where(snapped, 0.0, fraction)
     no_place = ~(snapped | interpolated)
     status[no_place] = np.where(inside[no_place], RangeStatus.NO_KEYFRAME_NEAR, RangeStatus.OUTSIDE_PATH)
-    return before, after, weight
+    return before, after, fraction
 
 
 def _camera_is_still(
@@ -236,7 +236,7 @@ def _deviations(values: Array) -> Array:
 
 
 def _interpolated_centers(
-    trajectory: Trajectory, before: Indices, weight: Array, is_bridged: Mask
+    trajectory: Trajectory, before: Indices, fraction: Array, is_bridged: Mask
 ) -> tuple[Array, Array]:
     """Return the offsets (n, 3) of the centres from the straight lines between keyframes, in model units.
 
@@ -245,13 +245,13 @@ def _interpolated_centers(
     assert trajectory.timestamps_s is not None, "a motion in time needs times"
     motion = learn_motion(trajectory.timestamps_s, trajectory.centers, is_bridged)
     offsets, stddev = np.zeros((len(before), 3)), np.full(len(before), motion.noise_stddev)
-    between = weight > 0
-    offsets[between], stddev[between] = motion.beyond_chord(before[between], weight[between])
+    between = fraction > 0
+    offsets[between], stddev[between] = motion.beyond_chord(before[between], fraction[between])
     return offsets, stddev
 
 
 def _interpolated_lever_arms(
-    trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, weight: Array, is_bridged: Mask
+    trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, fraction: Array, is_bridged: Mask
 ) -> tuple[Array, Array]:
     """Return the lever arms (n, 3) in the world, and the standard deviation (n,) of each coordinate, metres.
 
@@ -263,10 +263,10 @@ def _interpolated_lever_arms(
     turned = np.vstack([np.zeros((1, 3)), np.cumsum(to_next.as_rotvec(), axis=0)])
     motion = learn_motion(trajectory.timestamps_s, turned, is_bridged)
     stddev = np.full(len(before), motion.noise_stddev)
-    between = weight > 0
-    beyond, stddev[between] = motion.beyond_chord(before[between], weight[between])
+    between = fraction > 0
+    beyond, stddev[between] = motion.beyond_chord(before[between], fraction[between])
     arms = tags_in_cam_m.copy()
-    turns = weight[between, None] * to_next.as_rotvec()[before[between]] + beyond
+    turns = fraction[between, None] * to_next.as_rotvec()[before[between]] + beyond
     if len(turns):  # SciPy before 1.16 cannot make an empty set of rotations
         arms[between] = Rotation.from_rotvec(turns).apply(arms[between])
     # A rotation moves the end of the arm in two of the three directions.
@@ -275,7 +275,7 @@ def _interpolated_lever_arms(
 
 
 def _timing_stddev(
-    log: RangeLog, trajectory: Trajectory, before: Indices, after: Indices, weight: Array, options: AssociationOptions
+    log: RangeLog, trajectory: Trajectory, before: Indices, after: Indices, fraction: Array, options: AssociationOptions
 ) -> Array:
     """Return the standard deviation (n,) of each coordinate due to rounded times of photos and ranges, in model units.
 
@@ -290,5 +290,5 @@ def _timing_stddev(
     speeds = np.where(is_too_long(gaps, options), 0, np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps)
     around = np.concatenate([[0.0], speeds, [0.0]])
     speed = np.where(before == after, np.maximum(around[before], around[before + 1]), around[before + 1])
-    photo_share = np.where(before == after, 1.0, np.hypot(1 - weight, weight))
+    photo_share = np.where(before == after, 1.0, np.hypot(1 - fraction, fraction))
     return np.asarray(speed / np.sqrt(3) * np.hypot(log_stddev_s, photo_share * photo_stddev_s))

@@ -38,11 +38,11 @@ class RangeStatus(IntEnum):
 
 @dataclass(frozen=True)
 class OnPath:
-    """Positions of n ranges on a path of keyframes: ``(1 - weight) * before + weight * after``."""
+    """Positions of n ranges on a path of keyframes: ``(1 - fraction) * before + fraction * after``."""
 
     before: Indices
     after: Indices
-    weight: Array
+    fraction: Array
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ class RangeObservations:
     The antenna of range i is at ``centers[i] + tag_from_center[i]``, with both vectors in the axes of the model's
     world. The centres are in the world's unit, and the lever arm is in metres, so that a similarity scales the centres
     and never the lever arm. Centres are interpolated between the keyframes ``before`` and ``after``:
-    ``(1 - weight) * c_before + weight * c_after + center_offsets``. The offset is the deviation of a curved path from
-    the straight line.
+    ``(1 - fraction) * c_before + fraction * c_after + center_offsets``. The offset is the deviation of a curved path
+    from the straight line.
 
     Attributes:
         log: the ranges.
         status: (n,) RangeStatus.
         before, after: (n,) int, indices of keyframes in the trajectory; -1 without a position on the path.
-        weight: (n,) weight of the later keyframe, in [0, 1].
+        fraction: (n,) place between the two keyframes, from 0 (before) to 1 (after).
         centers: (n, 3) camera centres in model units; NaN without a position.
         center_offsets: (n, 3) deviation from the straight line, in model units.
         tag_from_center: (n, 3) lever arm in the axes of the world, metres.
@@ -73,7 +73,7 @@ class RangeObservations:
     status: npt.NDArray[np.int8]
     before: Indices
     after: Indices
-    weight: Array
+    fraction: Array
     centers: Array
     center_offsets: Array
     tag_from_center: Array
@@ -93,11 +93,11 @@ class RangeObservations:
     @property
     def nearest(self) -> Indices:
         """Index of the nearest keyframe (n,); -1 without a position on the path."""
-        return np.where(self.weight < 0.5, self.before, self.after)
+        return np.where(self.fraction < 0.5, self.before, self.after)
 
     def on_path(self, rows: Indices) -> OnPath:
         """Return the positions on the path of these rows, which must have one."""
-        return OnPath(self.before[rows], self.after[rows], self.weight[rows])
+        return OnPath(self.before[rows], self.after[rows], self.fraction[rows])
 
     @property
     def placed_rows(self) -> Indices:
@@ -186,7 +186,7 @@ def joined_observations(
             "status": part.status,
             "before": keyframe[part.before],
             "after": keyframe[part.after],
-            "weight": part.weight,
+            "fraction": part.fraction,
             "centers": similarity.apply(part.centers),
             "center_offsets": similarity.scale * part.center_offsets @ similarity.rotation.T,
             "tag_from_center": part.tag_from_center @ similarity.rotation.T,

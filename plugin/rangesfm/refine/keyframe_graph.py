@@ -147,7 +147,7 @@ def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Arr
     solved = _factor(terms, 0.0).solve(gradient[layout.free])
     by_stddev = terms.whitened[:, layout.free] @ solved
     by_prior = terms.prior[:, layout.free] @ solved
-    by_metre = (np.sqrt(graph.errors.weight) / graph.errors.stddev_m)[:, None] * by_stddev
+    by_metre = (np.sqrt(graph.errors.worth) / graph.errors.stddev_m)[:, None] * by_stddev
     return gradient[layout.free].T @ solved - by_stddev.T @ by_stddev - by_prior.T @ by_prior, by_metre
 
 
@@ -230,7 +230,7 @@ class _Terms:
         gradient[: layout.first_anchor] = jacobian.T @ bound
 
         scaled, derivative = _range_rows(graph, layout, state)
-        rho, weights, _ = graph.errors.weight * graph.errors.loss.rho(scaled**2)
+        rho, weights, _ = graph.errors.worth * graph.errors.loss.rho(scaled**2)
         cost += 0.5 * float(rho.sum())
         gradient = gradient + derivative.T @ (weights * scaled)
         derivative.data *= np.repeat(np.sqrt(weights), layout.of_ranges.shape[1])
@@ -302,10 +302,10 @@ def _range_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     antennas, stddev_m = graph.antennas, graph.errors.stddev_m
     residuals_m, by = graph.ranges_at(state)
     value = np.empty((len(residuals_m), 16))
-    for first, frame, weight in ((0, antennas.before, 1 - antennas.weight), (6, antennas.after, antennas.weight)):
+    for first, frame, share in ((0, antennas.before, 1 - antennas.fraction), (6, antennas.after, antennas.fraction)):
         value[:, first : first + 3] = by.by_turn_of_cam(antennas.tag_in_cam_m, state.poses.world_from_rig[frame])
         value[:, first + 3 : first + 6] = by.by_tag
-        value[:, first : first + 6] *= weight[:, None]
+        value[:, first : first + 6] *= share[:, None]
     value[:, 12:15] = by.by_anchor
     value[:, 15] = 1.0
     value /= stddev_m[:, None]

@@ -16,14 +16,14 @@ from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.bending import (
-    BendingOfCells,
+    BendingOfBins,
     MapBending,
     WalkBending,
     averaged,
     component_of,
     without_similarity,
 )
-from rangesfm.ranging.errors.range_bins import Cells
+from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
@@ -52,14 +52,14 @@ class PhotoBending:
     metres_per_unit: float
     is_at_optimum: bool
 
-    def of_cells(self, cells: Cells, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfCells:
-        functions = without_similarity(averaged(cells, by_pose, len(self.path)), self.path, frame_is_free=frame_is_free)
-        parts = functions.reshape(len(cells), -1, 6)
+    def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
+        functions = without_similarity(averaged(bins, by_pose, len(self.path)), self.path, frame_is_free=frame_is_free)
+        parts = functions.reshape(len(bins), -1, 6)
         by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
         covariance, shift_m = self.photos.of_functions(self.frame_ids, parts[:, :, :3], by_center)
         found = component_of("bending", covariance, _FACTOR, _SPREAD)
-        shift_m = np.zeros(len(cells)) if self.is_at_optimum else shift_m
-        return BendingOfCells(() if found is None else (found,), covariance, shift_m)
+        shift_m = np.zeros(len(bins)) if self.is_at_optimum else shift_m
+        return BendingOfBins(() if found is None else (found,), covariance, shift_m)
 
 
 def bending_of_model(

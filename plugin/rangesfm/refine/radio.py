@@ -24,18 +24,20 @@ from rangesfm.refine.bundle_adjustment import BundleAdjustment
 
 @dataclass(frozen=True)
 class Antennas:
-    """Positions of n antennas: ``(1 - weight) * p_before + weight * p_after + offset`` with ``p = c + R tag_in_cam``.
+    """Positions of n antennas.
+
+    They are ``(1 - fraction) * p_before + fraction * p_after + offset`` with ``p = c + R tag_in_cam``.
 
     Attributes:
         before, after: (n,) indices of keyframes of the trajectory; -1 for a range without a place.
-        weight: (n,) interpolation fraction in [0, 1].
+        fraction: (n,) interpolation fraction in [0, 1].
         tag_in_cam_m: (n, 3) lever arms in the camera's frame.
         offset_in_world_m: (n, 3) difference of the curved path from the straight line; constant while the map bends.
     """
 
     before: Indices
     after: Indices
-    weight: Array
+    fraction: Array
     tag_in_cam_m: Array
     offset_in_world_m: Array
 
@@ -45,8 +47,8 @@ class Antennas:
             centers[ends] + np.einsum("nij,nj->ni", world_from_cam[ends], self.tag_in_cam_m)
             for ends in (self.before, self.after)
         )
-        weight = self.weight[:, None]
-        return np.asarray((1 - weight) * before + weight * after + self.offset_in_world_m)
+        fraction = self.fraction[:, None]
+        return np.asarray((1 - fraction) * before + fraction * after + self.offset_in_world_m)
 
     def subset(self, rows: Indices) -> Antennas:
         """Return the antennas of some of the ranges."""
@@ -65,7 +67,7 @@ def antennas(
     """
     tags_in_cam = tags_in_cam_m[observations.log.tag_index]
     on_line = Antennas(
-        observations.before, observations.after, observations.weight, tags_in_cam, np.zeros_like(tags_in_cam)
+        observations.before, observations.after, observations.fraction, tags_in_cam, np.zeros_like(tags_in_cam)
     )
     from_center = on_line.positions(np.zeros_like(trajectory.centers), trajectory.world_from_cam)
     beyond = metric_from_sfm.scale * observations.center_offsets + observations.tag_from_center - from_center
@@ -120,13 +122,13 @@ class RadioRanges:
 
         The camera's are on straight lines between keyframes; only the tag's include the curve of the path.
         """
-        weight, between = self.antennas.weight.copy(), self.antennas.before != self.antennas.after
+        fraction, between = self.antennas.fraction.copy(), self.antennas.before != self.antennas.after
         if radio.time_shift_s:
-            weight[between] += radio.time_shift_s / self.interval_s[between]
+            fraction[between] += radio.time_shift_s / self.interval_s[between]
         tags_in_cam_m = radio.tags_in_cam_m[self.observations.log.tag_index]
-        at = replace(self.antennas, tag_in_cam_m=tags_in_cam_m, weight=weight)
+        at = replace(self.antennas, tag_in_cam_m=tags_in_cam_m, fraction=fraction)
         ends = path.centers[at.before], path.centers[at.after]
-        centers_m = (1 - weight)[:, None] * ends[0] + weight[:, None] * ends[1]
+        centers_m = (1 - fraction)[:, None] * ends[0] + fraction[:, None] * ends[1]
         return at.positions(path.centers, path.world_from_cam), centers_m
 
     def predicted_m(self, metric: pycolmap.Reconstruction, radio: RadioEstimate) -> Array:
@@ -231,12 +233,12 @@ def add_range_residuals(
         stddev_m=errors.stddev_m,
         before=at.before,
         after=at.after,
-        weight=at.weight,
+        weight=at.fraction,
         offset_in_world_m=at.offset_in_world_m,
         anchor_index=log.anchor_index[rows],
         tag_index=log.tag_index[rows],
         interval_s=ranges.interval_s[rows],
-        share=bundle.pixel_stddev**2 * errors.weight,
+        share=bundle.pixel_stddev**2 * errors.worth,
     )
     return ceres.add_ranges(
         bundle.adjuster,

@@ -104,11 +104,11 @@ class RefinementProblem:
             return None
         learned = errors.learned.without(*BENDS)  # bending is already in the errors of the photos' residuals
         scaled = self.residuals_m(added.estimate(self.radio))[self.ranges.rows] / errors.stddev_m
-        in_residuals = np.sqrt(errors.weight) * errors.loss.slopes(scaled) / errors.stddev_m
-        covariance_m2, has_cell = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
-        places = (has_cell, learned.of_range[has_cell])
-        of_cells = csr_array((in_residuals[has_cell], places), shape=(len(scaled), len(covariance_m2)))
-        return ResidualErrors(added.residual_rows, of_cells, covariance_m2 / bending_factor**2, bending_factor**-2)
+        in_residuals = np.sqrt(errors.worth) * errors.loss.slopes(scaled) / errors.stddev_m
+        covariance_m2, has_bin = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
+        places = (has_bin, learned.of_range[has_bin])
+        of_bins = csr_array((in_residuals[has_bin], places), shape=(len(scaled), len(covariance_m2)))
+        return ResidualErrors(added.residual_rows, of_bins, covariance_m2 / bending_factor**2, bending_factor**-2)
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
         """Return the (n,) residuals, predicted minus measured, metres; NaN for ranges without a place."""

@@ -62,7 +62,7 @@ class Observations:
     Attributes:
         frame, point: (n,) indices of keyframe and point.
         ray: (n, 2) camera coordinates x/z and y/z.
-        weight: (n,) focal length over the standard deviation of a pixel coordinate.
+        root_information: (n,) focal length over the standard deviation of a pixel coordinate.
         cam_from_rig_rotation, cam_from_rig_translation: (n, 3, 3), (n, 3) camera in its rig.
         points: (p, 3) in the world.
         point_ids: (p,) ids in the model.
@@ -71,7 +71,7 @@ class Observations:
     frame: Indices
     point: Indices
     ray: Array
-    weight: Array
+    root_information: Array
     cam_from_rig_rotation: Array
     cam_from_rig_translation: Array
     points: Array
@@ -79,11 +79,11 @@ class Observations:
 
     def with_pixel_stddev(self, pixel_stddev: float) -> Observations:
         """Return a copy with another standard deviation of feature coordinates, in units of the present one."""
-        return replace(self, weight=self.weight / pixel_stddev)
+        return replace(self, root_information=self.root_information / pixel_stddev)
 
     def subset(self, rows: Indices) -> Observations:
         """Return some of the observations; all points stay, even those that are no longer seen."""
-        of_each = ("frame", "point", "ray", "weight", "cam_from_rig_rotation", "cam_from_rig_translation")
+        of_each = ("frame", "point", "ray", "root_information", "cam_from_rig_rotation", "cam_from_rig_translation")
         return replace(self, **{name: getattr(self, name)[rows] for name in of_each})
 
 
@@ -141,9 +141,11 @@ def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> O
         )
     if not columns:
         raise SolverError("no photo of the model sees any of its points")
-    frame, point, ray, weight, rotation, translation = (np.concatenate(column) for column in zip(*columns, strict=True))
+    frame, point, ray, root_information, rotation, translation = (
+        np.concatenate(column) for column in zip(*columns, strict=True)
+    )
     points = np.array([metric.point3D(int(point_id)).xyz for point_id in point_ids])
-    all_of_them = Observations(frame, point, ray, weight, rotation, translation, points, point_ids)
+    all_of_them = Observations(frame, point, ray, root_information, rotation, translation, points, point_ids)
     valid = np.isfinite(ray).all(axis=1)
     return all_of_them.subset(np.flatnonzero(valid)[np.lexsort((frame[valid], point[valid]))])
 
@@ -159,7 +161,7 @@ def project(observations: Observations, poses: Poses, points: Array) -> tuple[Ar
     derivative = np.zeros((len(frame), 2, 3))
     derivative[:, 0, 0] = derivative[:, 1, 1] = inverse_depth
     derivative[:, :, 2] = -in_cam[:, :2] * inverse_depth[:, None] ** 2
-    return in_rig, in_cam, derivative * observations.weight[:, None, None]
+    return in_rig, in_cam, derivative * observations.root_information[:, None, None]
 
 
 def misplaced_points(observations: Observations, poses: Poses) -> Mask:
@@ -181,7 +183,7 @@ def misplaced_points(observations: Observations, poses: Poses) -> Mask:
 def ray_residuals(observations: Observations, in_cam: Array) -> Array:
     """Return the (n, 2) residuals in standard deviations; infinite behind the camera."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        residuals = (in_cam[:, :2] / in_cam[:, 2:] - observations.ray) * observations.weight[:, None]
+        residuals = (in_cam[:, :2] / in_cam[:, 2:] - observations.ray) * observations.root_information[:, None]
     return np.where(in_cam[:, 2:] > 0, residuals, np.inf)
 
 

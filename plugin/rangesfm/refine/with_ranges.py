@@ -344,7 +344,7 @@ def _summary(
     residuals_m, weights, status = problem.residuals_m(radio), np.full(len(log), np.nan), observations.status.copy()
     weights[rows] = errors.robust_weights(residuals_m[rows])
     status[rows] = status_by_weight(weights[rows])
-    times = observations.before + observations.weight if log.timestamp_s is None else log.timestamp_s
+    times = observations.before + observations.fraction if log.timestamp_s is None else log.timestamp_s
     last = done.solutions[-1]
     return RefineSummary(
         num_iterations=sum(solution.num_iterations for solution in done.solutions),

@@ -113,10 +113,10 @@ class Content:
         index_of = {name: i for i, name in enumerate(path.image_names)}
         distances = np.full(len(ranges.status), np.nan)
         for row in np.flatnonzero(np.isfinite(ranges.weight) & ranges.is_used):
-            weight = float(ranges.weight[row])
-            name = (ranges.keyframe_before if weight < 0.5 else ranges.keyframe_after)[row]
+            fraction = float(ranges.weight[row])
+            name = (ranges.keyframe_before if fraction < 0.5 else ranges.keyframe_after)[row]
             position, anchor = self.reference_by_photo.get(name), anchors_m.get(ranges.anchor_id[row])
-            is_at_photo = min(weight, 1 - weight) <= MAX_KEYFRAME_SHARE and name in index_of
+            is_at_photo = min(fraction, 1 - fraction) <= MAX_KEYFRAME_SHARE and name in index_of
             if is_at_photo and position is not None and anchor is not None:
                 tag = position + path.world_from_cam[index_of[name]] @ self.tags_in_cam_m[row]
                 distances[row] = np.linalg.norm(tag - anchor)

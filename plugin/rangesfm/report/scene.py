@@ -274,7 +274,7 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
         return None
     rows = np.arange(0, len(ranges.status), every_nth(len(ranges.status), MAX_NUM_RANGES))
     before, after, has_place = (of_all[rows] for of_all in ranges.places_on(path.image_names))
-    weight = np.where(has_place, ranges.weight[rows], 0.0)
+    fraction = np.where(has_place, ranges.weight[rows], 0.0)
     anchor_ids, anchor = np.unique(np.array(ranges.anchor_id, dtype=str), return_inverse=True)
     present = set(ranges.status)
     known = [status.label for status in RangeStatus if status.label in present]
@@ -303,8 +303,8 @@ def _ranges(content: Content, path: Trajectory) -> dict[str, Any] | None:
         "has_place": pack(has_place, "uint8"),
         "before": pack(np.maximum(before, 0), "int32"),
         "after": pack(np.maximum(after, 0), "int32"),
-        "weight": pack(np.round(255 * weight), "uint8"),
-        "camera": pack(np.where(has_place, np.where(weight < 0.5, before, after), -1), "int32"),
+        "weight": pack(np.round(255 * fraction), "uint8"),
+        "camera": pack(np.where(has_place, np.where(fraction < 0.5, before, after), -1), "int32"),
     }
 
 

@@ -108,7 +108,7 @@ class RangesAsUsed(TableFile):
         range_m: (n,) measured ranges.
         range_stddev_m: (n,) last noise stddev of each range; NaN without a place.
         keyframe_before, keyframe_after: n photos between which each range was taken; empty without a place.
-        weight: (n,) interpolation weight of ``keyframe_after``, in [0, 1]; NaN without a place.
+        weight: (n,) interpolation fraction, 0 at ``keyframe_before`` and 1 at ``keyframe_after``; NaN without a place.
         predicted_scaled_m, predicted_refined_m: (n,) ranges predicted by the scaled and by the refined model; NaN
             without a place or without that model.
         residual_m: (n,) range predicted by the final model, minus measured range.
@@ -151,7 +151,7 @@ class RangesAsUsed(TableFile):
             range_stddev_m=found.range_stddev_m,
             keyframe_before=tuple(names[i] for i in observations.before),
             keyframe_after=tuple(names[i] for i in observations.after),
-            weight=np.where(observations.before >= 0, observations.weight, np.nan),
+            weight=np.where(observations.before >= 0, observations.fraction, np.nan),
             predicted_scaled_m=found.predicted_scaled_m,
             predicted_refined_m=unknown if found.kept_refinement is None else found.kept_refinement.predicted_m,
             residual_m=found.residuals_m,

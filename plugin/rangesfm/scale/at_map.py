@@ -11,9 +11,9 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.errors.bending import BendingOfCells, MapBending
+from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
 from rangesfm.ranging.errors.learned import LearnedErrors
-from rangesfm.ranging.errors.range_bins import Cells
+from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
@@ -22,11 +22,11 @@ from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from
 from rangesfm.scale.scale_verdict import judge
 from rangesfm.scale.solution import Solution, weighted
-from rangesfm.scale.uncertainty import KnownMap, bending_of_cells, known_refined_map, learned_errors
+from rangesfm.scale.uncertainty import KnownMap, bending_of_bins, known_refined_map, learned_errors
 
-# With twice as many cells the learnt errors change by less than a twentieth (hall and laps of
-# ``tests.studies.drifting_maps``), and each cell costs one solution of the photos' normal equations.
-MAX_NUM_CELLS = 450
+# With twice as many bins the learnt errors change by less than a twentieth (hall and laps of
+# ``tests.studies.drifting_maps``), and each bin costs one solution of the photos' normal equations.
+MAX_NUM_BINS = 450
 
 
 @dataclass(frozen=True)
@@ -91,22 +91,22 @@ class MapWithRanges:
         """Estimate the errors of the ranges and of the map from the residuals at this map."""
         velocities = camera_velocities(self.observations, self.trajectory, self.posed)
         return learned_errors(
-            self.posed, self.solution, self.observations, self._rotations, velocities, self.bending, MAX_NUM_CELLS
+            self.posed, self.solution, self.observations, self._rotations, velocities, self.bending, MAX_NUM_BINS
         )
 
     def bending_factor(self, learned: LearnedErrors) -> float:
         """Return the learnt bending over the bending expected from the photos' residuals; 1 if that is unknown."""
-        bending = self._bending_of(learned.cells)
-        mean_m = 0.0 if bending is None else float(np.sqrt(np.trace(bending.formal_m2) / len(learned.cells)))
+        bending = self._bending_of(learned.bins)
+        mean_m = 0.0 if bending is None else float(np.sqrt(np.trace(bending.formal_m2) / len(learned.bins)))
         return learned.stddev_of_component["bending"] / mean_m if mean_m > 0 else 1.0
 
     def known(self, learned: LearnedErrors) -> KnownMap:
         """Return the uncertainty of the map as a whole: scale, placement and anchors."""
-        return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.cells))
+        return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.bins))
 
-    def _bending_of(self, cells: Cells) -> BendingOfCells | None:
+    def _bending_of(self, bins: RangeBins) -> BendingOfBins | None:
         state = self.solution.fit.state
-        return bending_of_cells(self.bending, cells, self.posed, state, self.observations, self._rotations)
+        return bending_of_bins(self.bending, bins, self.posed, state, self.observations, self._rotations)
 
 
 def estimate_at(

@@ -238,7 +238,7 @@ def _problem(model: ScaledModel, anchors: Sequence[AnchorEstimate]) -> RangeProb
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
         stddev_m=errors.stddev_m,
-        share=errors.weight,
+        share=errors.worth,
         anchor_mean_m=np.array([no_place if a.prior_position_m is None else a.prior_position_m for a in anchors]),
         anchor_stddev_m=np.array([anchor.prior_position_stddev_m for anchor in anchors]),
         bias_mean_m=np.array([anchor.prior_bias_m for anchor in anchors]),

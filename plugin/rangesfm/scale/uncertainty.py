@@ -9,10 +9,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
-from rangesfm.ranging.errors.bending import BendingOfCells, MapBending, by_poses
+from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, by_poses
 from rangesfm.ranging.errors.components import CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
-from rangesfm.ranging.errors.range_bins import MAX_NUM_CELLS, Cells, cells, noisiness
+from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisiness, range_bins
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.range_equation import (
     Columns,
@@ -42,7 +42,7 @@ def learned_errors(
     model_from_cam: Array,
     velocities: Array | None = None,
     bending: MapBending | None = None,
-    max_num_cells: int = MAX_NUM_CELLS,
+    max_num_bins: int = MAX_NUM_BINS,
 ) -> LearnedErrors:
     """Estimate the errors of the ranges from the residuals of a solution.
 
@@ -52,7 +52,7 @@ def learned_errors(
         velocities: (n, 3) camera velocities, model units per second; None: the time offset's uncertainty is ignored.
     """
     linear, taken_off = _linear(posed, solution), observations.log.shared_stddev_m
-    of_ranges = _cells(posed, solution, observations, model_from_cam, max_num_cells)
+    of_ranges = _bins(posed, solution, observations, model_from_cam, max_num_bins)
     others_m2 = _by_places(posed, solution, of_ranges)
     if velocities is not None and observations.time_offset_stddev_s:
         placed, by = solution.fit.state.metric_from_model, range_gradient(solution.problem, solution.fit.state)
@@ -67,25 +67,25 @@ def learned_errors(
         curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
         ruled_out=ruled_out(solution.problem),
         others_m2=others_m2,
-        bending=bending_of_cells(bending, of_ranges, posed, solution.fit.state, observations, model_from_cam),
+        bending=bending_of_bins(bending, of_ranges, posed, solution.fit.state, observations, model_from_cam),
     )
 
 
-def bending_of_cells(
+def bending_of_bins(
     bending: MapBending | None,
-    of_ranges: Cells,
+    of_ranges: RangeBins,
     posed: ScaleProblem,
     state: RangeState,
     observations: RangeObservations,
     model_from_cam: Array,
-) -> BendingOfCells | None:
-    """Return the bending in the cells of a problem's ranges at a state; None for a map that is not bent."""
+) -> BendingOfBins | None:
+    """Return the bending in the bins of a problem's ranges at a state; None for a map that is not bent."""
     if bending is None:
         return None
     problem, on_path = posed.ranges, observations.on_path(posed.rows)
     gradient, arms_m = range_gradient(problem, state), problem.tag_from_center
     slopes = by_poses(gradient, state.metric_from_model, model_from_cam, arms_m, on_path)
-    return bending.of_cells(of_ranges, slopes, frame_is_free=problem.frame_is_free)
+    return bending.of_bins(of_ranges, slopes, frame_is_free=problem.frame_is_free)
 
 
 def _linear(posed: ScaleProblem, solution: Solution) -> LinearMap:
@@ -109,28 +109,28 @@ def errors_to_expect(
     observations: RangeObservations,
     model_from_cam: Array,
     stddevs: Mapping[str, float],
-    max_num_cells: int = MAX_NUM_CELLS,
+    max_num_bins: int = MAX_NUM_BINS,
     bending: MapBending | None = None,
 ) -> LearnedErrors:
     """Return the errors to expect before anything is measured, from what is usual for radios.
 
     Args:
         stddevs: by name, standard deviations of components of which more is known.
-        max_num_cells: fewer cells are coarser and take less time.
+        max_num_bins: fewer bins are coarser and take less time.
     """
     taken_off, state = observations.log.shared_stddev_m, solution.fit.state
-    of_ranges = _cells(posed, solution, observations, model_from_cam, max_num_cells)
+    of_ranges = _bins(posed, solution, observations, model_from_cam, max_num_bins)
     return ExpectedErrors.of(
         of_ranges,
         None if taken_off is None else taken_off[posed.rows],
         ruled_out(solution.problem),
         _by_places(posed, solution, of_ranges),
-        bending=bending_of_cells(bending, of_ranges, posed, state, observations, model_from_cam),
+        bending=bending_of_bins(bending, of_ranges, posed, state, observations, model_from_cam),
     ).usual(stddevs)
 
 
-def _by_places(posed: ScaleProblem, solution: Solution, of_ranges: Cells) -> dict[str, Array]:
-    """Return the cells' covariance due to uncertain antenna places, by name; empty where places are certain."""
+def _by_places(posed: ScaleProblem, solution: Solution, of_ranges: RangeBins) -> dict[str, Array]:
+    """Return the bins' covariance due to uncertain antenna places, by name; empty where places are certain."""
     placing_m = posed.placing_stddev_m(solution.fit.state.metric_from_model.scale)
     if not np.any(placing_m > 0):
         return {}
@@ -144,17 +144,17 @@ def ruled_out(problem: RangeProblem) -> list[str]:
     return [name for name, stddev in stddevs.items() if stddev == 0]
 
 
-def _cells(
+def _bins(
     posed: ScaleProblem,
     solution: Solution,
     observations: RangeObservations,
     model_from_cam: Array,
-    max_num: int = MAX_NUM_CELLS,
-) -> Cells:
+    max_num: int = MAX_NUM_BINS,
+) -> RangeBins:
     problem, state, log = solution.problem, solution.fit.state, observations.log
     by = range_gradient(problem, state)
     world_from_cam = state.metric_from_model.rotation @ model_from_cam
-    return cells(
+    return range_bins(
         problem.anchor_index,
         log.tag_index[posed.rows],
         times_of_ranges(posed, solution, observations),
@@ -192,7 +192,7 @@ class KnownMap:
 
 @dataclass(frozen=True)
 class LinearMap:
-    """Linear equations of c cells of ranges and r priors for p unknowns of a map, about the map's state.
+    """Linear equations of c bins of ranges and r priors for p unknowns of a map, about the map's state.
 
     Attributes:
         off_m: (c,) measured minus predicted range, without any bias.
@@ -224,11 +224,11 @@ class LinearMap:
             change_by_others: (p,) change from the estimate with the best weights, at which the map is, to the estimate
                 with the other weights; None: the map is at the estimate with the other weights.
         """
-        best, of_cells, of_priors = best_estimate(learned.covariance_m2, self.design, self.prior_design)
-        change = of_cells @ self.off_m + of_priors @ self.prior_off if change_by_others is None else change_by_others
+        best, of_bins, of_priors = best_estimate(learned.covariance_m2, self.design, self.prior_design)
+        change = of_bins @ self.off_m + of_priors @ self.prior_off if change_by_others is None else change_by_others
         chance = np.sqrt(np.maximum(variance_by_others - np.diag(best), 0.0))
         half = np.clip(change, -chance, chance) / 2
-        components = learned.stddev_of_cells(of_cells[0])
+        components = learned.stddev_of_bins(of_bins[0])
         if (given := float(np.linalg.norm(of_priors[0]))) > 0:
             components[GIVEN] = given
         components[REWEIGHTING] = abs(float(half[0]))
@@ -245,35 +245,35 @@ def known_map(
         posed: its measured lengths must have the uncertainty that the map's bending gives them.
         bending_of_lengths: relative standard deviation of the scale by measured lengths, due to the map's bending.
     """
-    linear = _of_cells(_linear(posed, solution), learned.cells)
+    linear = _of_bins(_linear(posed, solution), learned.bins)
     variances = np.diag(parameter_covariance(solution, learned))[: linear.columns.num].copy()
     variances[linear.columns.scale] += (_say_of_lengths(solution) * bending_of_lengths) ** 2
     return linear.known(learned, solution.fit.log_scale_stddev, variances)
 
 
 def known_refined_map(
-    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending: BendingOfCells | None
+    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending: BendingOfBins | None
 ) -> KnownMap:
     """Return the uncertainty of a refined map.
 
     Args:
-        solution: at the refined map, weighted as in the refinement. bending: of the map, in its cells.
+        solution: at the refined map, weighted as in the refinement. bending: of the map, in its bins.
     """
-    errors, cells, given = solution.errors, learned.cells, posed.ranges
-    linear = _of_cells(_linear(posed, solution), cells)
-    robust, index = solution.fit.weights / errors.stddev_m**2, cells.anchor_index
+    errors, bins, given = solution.errors, learned.bins, posed.ranges
+    linear = _of_bins(_linear(posed, solution), bins)
+    robust, index = solution.fit.weights / errors.stddev_m**2, bins.anchor_index
     bent_m2 = np.zeros_like(learned.covariance_m2) if bending is None else bending.formal_m2
     of_biases = given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
-    alone, weighed = (np.diag(1 / np.maximum(cells.total(w), 1e-12)) for w in (robust, errors.weight * robust))
+    alone, weighed = (np.diag(1 / np.maximum(bins.total(w), 1e-12)) for w in (robust, errors.worth * robust))
     formal, _, _ = best_estimate(alone + bent_m2, linear.design, linear.prior_design)
-    _, of_cells, of_priors = best_estimate(weighed + bent_m2 + of_biases, linear.design, linear.prior_design)
-    variances = np.einsum("pi,ij,pj->p", of_cells, learned.covariance_m2, of_cells) + np.sum(of_priors**2, axis=1)
+    _, of_bins, of_priors = best_estimate(weighed + bent_m2 + of_biases, linear.design, linear.prior_design)
+    variances = np.einsum("pi,ij,pj->p", of_bins, learned.covariance_m2, of_bins) + np.sum(of_priors**2, axis=1)
     at_optimum = linear if bending is None else replace(linear, off_m=linear.off_m - bending.shift_m)
     return at_optimum.known(learned, float(np.sqrt(formal[0, 0])), variances)
 
 
-def _of_cells(linear: LinearMap, cells: Cells) -> LinearMap:
-    return replace(linear, off_m=cells.mean(linear.off_m), design=cells.mean(linear.design))
+def _of_bins(linear: LinearMap, bins: RangeBins) -> LinearMap:
+    return replace(linear, off_m=bins.mean(linear.off_m), design=bins.mean(linear.design))
 
 
 def best_estimate(covariance: Array, design: Array, prior_design: Array) -> tuple[Array, Array, Array]:
@@ -328,14 +328,14 @@ def _by_what_was_given(solution: Solution) -> Array:
 
 def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
     """Return the (p, p) covariance of all parameters of a fit, from the errors of ranges and of given values."""
-    of_cells = parameter_influence(solution.fit, solution.problem, learned)
-    return of_cells @ learned.covariance_m2 @ of_cells.T + _by_what_was_given(solution)
+    of_bins = parameter_influence(solution.fit, solution.problem, learned)
+    return of_bins @ learned.covariance_m2 @ of_bins.T + _by_what_was_given(solution)
 
 
 def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
-    """Return the (p, c) change of all parameters of a fit per metre by which the ranges of a cell are longer."""
-    of_cells = [learned.cells.total(column / problem.stddev_m) for column in fit.gradients.T]
-    return _inverse(fit) @ np.stack(of_cells)
+    """Return the (p, c) change of all parameters of a fit per metre by which the ranges of a bin are longer."""
+    of_bins = [learned.bins.total(column / problem.stddev_m) for column in fit.gradients.T]
+    return _inverse(fit) @ np.stack(of_bins)
 
 
 def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:

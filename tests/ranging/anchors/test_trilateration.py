@@ -12,7 +12,7 @@ from tests.studies import anchor_initialization
 from rangesfm.errors import GeometryError
 from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate, trilaterate_anchors
 from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.ranging.errors.range_bins import cells
+from rangesfm.ranging.errors.range_bins import range_bins
 from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
@@ -157,7 +157,7 @@ def population_errors(
 ) -> Array:
     """(n,) range errors of a radio drawn from the population, with stddevs of its own."""
     alike = np.tile(np.eye(3), (len(times), 1, 1))
-    alone = cells(anchor_index, 0 * anchor_index, times, from_anchor_m, alike, np.ones(len(times)), np.ones(4))
+    alone = range_bins(anchor_index, 0 * anchor_index, times, from_anchor_m, alike, np.ones(len(times)), np.ones(4))
     assert len(alone) == len(times)
     errors = np.zeros(len(times))
     for component in COMPONENTS:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.bending import WalkBending, averaged, bent_path, by_poses, without_similarity
-from rangesfm.ranging.errors.range_bins import Cells, cells
+from rangesfm.ranging.errors.range_bins import RangeBins, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 
@@ -41,7 +41,7 @@ def path() -> Trajectory:
 
 def placed(path: Trajectory) -> tuple[Array, Array, Array]:
     """Linearly interpolated centres and rotations at the ranges, and lever arms in the model's axes."""
-    weight = ON_PATH.weight[:, None]
+    weight = ON_PATH.fraction[:, None]
     centers = (1 - weight) * path.centers[ON_PATH.before] + weight * path.centers[ON_PATH.after]
     arms = (1 - weight) * (path.world_from_cam[ON_PATH.before] @ ARM_IN_CAM_M)
     arms = arms + weight * (path.world_from_cam[ON_PATH.after] @ ARM_IN_CAM_M)
@@ -58,13 +58,13 @@ def from_anchors_m(path: Trajectory) -> Array:
     return np.asarray(tags_m - ANCHORS_M[ANCHOR_INDEX])
 
 
-def in_cells(path: Trajectory) -> Cells:
+def in_bins(path: Trajectory) -> RangeBins:
     _, rotations, _ = placed(path)
-    time_s = ON_PATH.before + ON_PATH.weight
+    time_s = ON_PATH.before + ON_PATH.fraction
     index = np.asarray(ANCHOR_INDEX, dtype=np.int64)
     weight = RNG.uniform(0.5, 1.0, NUM_RANGES)
     from_m = from_anchors_m(path)
-    return cells(index, 0 * index, time_s, from_m, np.swapaxes(rotations, 1, 2), weight, np.ones(3), 30)
+    return range_bins(index, 0 * index, time_s, from_m, np.swapaxes(rotations, 1, 2), weight, np.ones(3), 30)
 
 
 def slopes(path: Trajectory) -> Array:
@@ -109,9 +109,9 @@ def test_a_map_that_grows_turns_and_moves_as_a_whole_is_not_bent(path: Trajector
     assert np.abs(functions @ moves.ravel()).max() < 1e-9 * np.abs(slopes(path)).max()
 
 
-def test_cells_grow_by_each_step_of_a_walk_as_its_factors_say(path: Trajectory) -> None:
+def test_bins_grow_by_each_step_of_a_walk_as_its_factors_say(path: Trajectory) -> None:
     """Motions of the map as a whole are left out, because they are estimated otherwise."""
-    of_ranges, walk = in_cells(path), WalkBending(path)
+    of_ranges, walk = in_bins(path), WalkBending(path)
     by_range = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, *placed(path)[1:], ON_PATH)
     factors = walk.factors(of_ranges, by_range, frame_is_free=True)
     starts, unit = walk._steps_of_path
@@ -140,8 +140,8 @@ def test_a_path_that_is_bent_back_is_as_large_as_it_came(path: Trajectory, frame
 
 def test_a_path_that_stands_still_is_not_bent(path: Trajectory) -> None:
     still = replace(path, centers=np.zeros_like(path.centers))
-    of_ranges = in_cells(path)
+    of_ranges = in_bins(path)
     by_range = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, *placed(path)[1:], ON_PATH)
-    found = WalkBending(still).of_cells(of_ranges, by_range, frame_is_free=False)
+    found = WalkBending(still).of_bins(of_ranges, by_range, frame_is_free=False)
     assert {component.name for component in found.components} <= {"heading_drift"}
     assert not found.shift_m.any()

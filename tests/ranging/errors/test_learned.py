@@ -10,7 +10,7 @@ import pytest
 
 from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors, learn_errors
-from rangesfm.ranging.errors.range_bins import MAX_NUM_CELLS, Cells, cells
+from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, range_bins
 
 Array = npt.NDArray[np.float64]
 
@@ -19,8 +19,8 @@ NO_MAP = np.zeros((0, 1))
 
 
 @pytest.fixture(scope="module")
-def walked() -> Cells:
-    """Cells of one range each, to four anchors every half second on a walk among them."""
+def walked() -> RangeBins:
+    """Bins of one range each, to four anchors every half second on a walk among them."""
     rng = np.random.default_rng(0)
     time_s = np.repeat(np.arange(NUM_EPOCHS) * 0.5, NUM_ANCHORS)
     along = time_s / 50 * 2 * np.pi
@@ -29,7 +29,7 @@ def walked() -> Cells:
     anchors_m = np.array([[6.0, 0, 2], [-6, 1, 0.5], [0, 7, 2.5], [1, -7, 0.3]])
     turns = np.linalg.qr(rng.standard_normal((len(time_s), 3, 3)))[0]
     num = len(time_s)
-    return cells(
+    return range_bins(
         anchor_index,
         np.zeros(num, int),
         time_s,
@@ -40,7 +40,7 @@ def walked() -> Cells:
     )
 
 
-def learn(of: Cells, off_m: Array) -> LearnedErrors:
+def learn(of: RangeBins, off_m: Array) -> LearnedErrors:
     return learn_errors(of, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.05)
 
 
@@ -49,13 +49,13 @@ def stddevs(learned: LearnedErrors) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("component", COMPONENTS, ids=lambda component: component.name)
-def test_every_component_is_a_covariance(component, walked: Cells) -> None:  # type: ignore[no-untyped-def]
+def test_every_component_is_a_covariance(component, walked: RangeBins) -> None:  # type: ignore[no-untyped-def]
     correlation = component.correlation(walked)
     np.testing.assert_allclose(correlation, correlation.T, atol=1e-12)
     assert np.linalg.eigvalsh(correlation).min() > -1e-9 * len(walked)
 
 
-def test_unknowns_that_say_the_same_twice_change_nothing(walked: Cells) -> None:
+def test_unknowns_that_say_the_same_twice_change_nothing(walked: RangeBins) -> None:
     """Redundant columns of the design do not change the result, not even by rounding.
 
     Otherwise rounding would decide how much such a direction may explain.
@@ -71,7 +71,7 @@ def test_unknowns_that_say_the_same_twice_change_nothing(walked: Cells) -> None:
 
 
 @pytest.mark.parametrize("name", ["antenna", "off_axis", "time", "place", "view", "bias"])
-def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for(name: str, walked: Cells) -> None:
+def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for(name: str, walked: RangeBins) -> None:
     component = next(each for each in COMPONENTS if each.name == name)
     values, vectors = np.linalg.eigh(component.correlation(walked))
     drawn = vectors @ (np.sqrt(np.maximum(values, 0)) * np.random.default_rng(1).standard_normal(len(values)))
@@ -83,7 +83,7 @@ def test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for
     assert 0.7 < np.sqrt(variance) / np.std(off_m) < 3.0
 
 
-def test_anchors_that_are_all_late_towards_where_they_do_not_face_are_seen_to_be_alike(walked: Cells) -> None:
+def test_anchors_that_are_all_late_towards_where_they_do_not_face_are_seen_to_be_alike(walked: RangeBins) -> None:
     facing = np.stack([walked.from_anchor[walked.anchor_index == k].mean(axis=0) for k in range(NUM_ANCHORS)])
     facing /= np.linalg.norm(facing, axis=1)[:, None]
     angle = np.arccos(np.clip(np.sum(walked.from_anchor * facing[walked.anchor_index], axis=1), -1, 1))
@@ -92,7 +92,7 @@ def test_anchors_that_are_all_late_towards_where_they_do_not_face_are_seen_to_be
     assert found["off_axis"] > 2 * found["tag_antenna"]
 
 
-def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: Cells) -> None:
+def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: RangeBins) -> None:
     off_m = 0.05 * np.random.default_rng(2).standard_normal(len(walked))
     found, usual = stddevs(learn(walked, off_m)), stddevs(ExpectedErrors.of(walked).usual({}))
     assert found.pop("white") == pytest.approx(0.05, rel=0.15)
@@ -100,7 +100,7 @@ def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: C
         assert stddev < 1.2 * usual[name], name
 
 
-def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_radios(walked: Cells) -> None:
+def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_radios(walked: RangeBins) -> None:
     slope = next(each for each in COMPONENTS if each.name == "slope")
     of_radios = slope.median * np.exp(slope.spread * np.random.default_rng(6).standard_normal(200_000))
     expected = np.sqrt(np.mean(of_radios**2))
@@ -110,35 +110,35 @@ def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_r
     assert stddevs(scaled_free)["slope"] == pytest.approx(expected, rel=0.02)
 
 
-def test_a_learnt_curve_counts_as_it_is_stated(walked: Cells) -> None:
+def test_a_learnt_curve_counts_as_it_is_stated(walked: RangeBins) -> None:
     off_m = 0.02 * np.random.default_rng(3).standard_normal(len(walked))
     learned = learn_errors(walked, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.02, np.full(len(off_m), 0.03))
     assert learned.names[-1] == "learnt_curve"
     np.testing.assert_allclose(np.diag(learned.covariances_m2[-1]), 0.03**2)
 
 
-def test_a_radio_with_far_more_noise_may_be_off_by_more_in_all_else(walked: Cells) -> None:
+def test_a_radio_with_far_more_noise_may_be_off_by_more_in_all_else(walked: RangeBins) -> None:
     off_m = 0.05 * np.random.default_rng(4).standard_normal(len(walked))
     usual, bad = (learn_errors(walked, k * off_m, np.zeros((len(off_m), 1)), NO_MAP, k * 0.05) for k in (1, 16))
     ratio = [np.sqrt(each.covariances_m2[each.names.index("slope")].max()) for each in (usual, bad)]
     assert ratio[1] > 5 * ratio[0]
 
 
-def test_cells_are_few_and_hold_all_ranges_of_an_anchor_and_a_moment() -> None:
+def test_bins_are_few_and_hold_all_ranges_of_an_anchor_and_a_moment() -> None:
     num = 50_000
     time_s = np.linspace(0, 1000, num)
     anchor_index = np.arange(num) % 5
     from_anchor_m = np.column_stack([5 + 0.001 * time_s, np.zeros(num), np.ones(num)])
     turns = np.broadcast_to(np.eye(3), (num, 3, 3))
-    found = cells(anchor_index, np.zeros(num, int), time_s, from_anchor_m, turns, np.ones(num), np.ones(5))
-    assert 0.5 * MAX_NUM_CELLS < len(found) <= MAX_NUM_CELLS
+    found = range_bins(anchor_index, np.zeros(num, int), time_s, from_anchor_m, turns, np.ones(num), np.ones(5))
+    assert 0.5 * MAX_NUM_BINS < len(found) <= MAX_NUM_BINS
     np.testing.assert_allclose(found.mean(time_s), found.time_s)
     np.testing.assert_array_equal(found.anchor_index[found.of_range], anchor_index)
     assert found.worth.sum() == pytest.approx(num)
     assert np.ptp(time_s[found.of_range == 7]) < 15
 
 
-def test_ranges_of_some_rows_keep_their_cells(walked: Cells) -> None:
+def test_ranges_of_some_rows_keep_their_bins(walked: RangeBins) -> None:
     learned = learn(walked, 0.05 * np.random.default_rng(5).standard_normal(len(walked)))
     rows = np.array([3, 8, 20])
     spread = replace(learned, of_range=learned.of_range[rows]).spread(rows, 30)

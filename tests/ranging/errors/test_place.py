@@ -8,7 +8,7 @@ import pytest
 from rangesfm.ranging.errors.place import correlation_in_place, place_labels, shares_of_places
 
 
-def test_a_place_is_a_cell_and_an_anchor() -> None:
+def test_a_place_is_a_bin_and_an_anchor() -> None:
     tags = np.array(
         [[0.05, 0.05, 0.05], [0.15, 0.01, 0.19], [0.25, 0.05, 0.05], [0.05, 0.05, 0.05], [-0.05, 0.05, 0.05]]
     )
@@ -65,7 +65,7 @@ def test_the_formal_variance_holds_for_independent_errors() -> None:
 
 
 def test_rounding_does_not_part_a_place_on_round_coordinates() -> None:
-    """Every other coordinate lies on the edge of a grid cell, on a level path at 1.6 m in whole decimetres."""
+    """Every other coordinate lies on the edge of a grid bin, on a level path at 1.6 m in whole decimetres."""
     rng = np.random.default_rng(0)
     tags = np.column_stack([0.1 * rng.integers(-50, 50, (400, 2)), np.full(400, 1.6)])
     index = np.zeros(400, dtype=np.int64)

@@ -1,10 +1,10 @@
-"""Averages of ranges in cells, and the covariance that shared errors give them."""
+"""Averages of ranges in bins, and the covariance that shared errors give them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rangesfm.ranging.errors.range_bins import cells
+from rangesfm.ranging.errors.range_bins import range_bins
 
 
 def test_uncertain_places_of_one_gap_are_one_error_for_all_of_its_ranges() -> None:
@@ -14,7 +14,7 @@ def test_uncertain_places_of_one_gap_are_one_error_for_all_of_its_ranges() -> No
     towards = rng.normal(size=(num, 3))
     towards /= np.linalg.norm(towards, axis=1)[:, None]
     placing_m, weight = rng.uniform(0.0, 0.05, num), rng.uniform(0.1, 1.0, num)
-    found = cells(
+    found = range_bins(
         anchor,
         np.zeros(num, dtype=np.int64),
         np.arange(num) / 10.0,

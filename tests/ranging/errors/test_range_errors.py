@@ -94,7 +94,7 @@ def test_independent_errors_keep_their_say() -> None:
     for seed in range(20):
         residuals = 0.1 * np.random.default_rng(seed).standard_normal(3 * NUM_EACH)
         found = crowded.seen_by_bending_map(residuals, 0.0)
-        says.append(np.mean(found.weight / found.stddev_m**2) * 0.1**2)
+        says.append(np.mean(found.worth / found.stddev_m**2) * 0.1**2)
     assert 0.85 < np.mean(says) < 1.1
     assert np.min(says) > 0.6
 

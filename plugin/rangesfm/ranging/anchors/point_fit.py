@@ -18,7 +18,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.errors.learned import learn_errors
 from rangesfm.ranging.errors.noise import inlier_noise, robust_stddevs
-from rangesfm.ranging.errors.range_bins import cells, noisiness
+from rangesfm.ranging.errors.range_bins import noisiness, range_bins
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 
@@ -274,17 +274,17 @@ class FitErrors:
     """Errors of the n ranges of one anchor.
 
     Attributes:
-        of_cell: (n,) index of each range's cell.
-        covariance_m2: (c, c) covariance of the errors of all cells.
+        of_bin: (n,) index of each range's bin.
+        covariance_m2: (c, c) covariance of the errors of all bins.
     """
 
-    of_cell: Indices
+    of_bin: Indices
     covariance_m2: Array
 
     def of_sums(self, influence: Array) -> Array:
         """Return the covariance (k, k) of k weighted sums of the ranges' errors, with weights (k, n)."""
-        of_cells = np.stack([np.bincount(self.of_cell, row, len(self.covariance_m2)) for row in influence])
-        covariance: Array = of_cells @ self.covariance_m2 @ of_cells.T
+        of_bins = np.stack([np.bincount(self.of_bin, row, len(self.covariance_m2)) for row in influence])
+        covariance: Array = of_bins @ self.covariance_m2 @ of_bins.T
         return covariance
 
     def inflation(self, fit: PointFit, change_m: Array) -> float:
@@ -322,7 +322,7 @@ def errors_of_fits(
     curve_stddev_m = np.concatenate([fit.problem.shared_stddev_m for fit in fits])
     precision = np.concatenate([fit.own_stddev_m**-2 for fit in fits])
     learned = learn_errors(
-        cells(
+        range_bins(
             anchor_index,
             np.concatenate(tags),
             np.concatenate(times_s),

@@ -15,14 +15,14 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.components import BENDS, Component
-from rangesfm.ranging.errors.range_bins import Cells
+from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 
 # Weight of turns against shifts in the fit of a similarity. Turns only matter for a turn about a straight path, which
 # nothing else shows; elsewhere this weight is too small to have an effect.
 _TURNS_COUNT = 1e-3
-# Largest number of steps of a random walk; the cells of ranges do not resolve more.
+# Largest number of steps of a random walk; the bins of ranges do not resolve more.
 _MAX_NUM_STEPS = 100
 # Random drift from the start to the end of a path: relative change of the scale, turn in radians, and shift as a share
 # of the path's length (medians over maps of poses alone); _SPREAD is the standard deviation of their logarithms.
@@ -57,15 +57,15 @@ def by_poses(
     rows = np.repeat(np.arange(len(values)), 6)
     parts = [
         ((share[:, None] * values).ravel(), rows, (6 * pose[:, None] + np.arange(6)).ravel())
-        for pose, share in ((on_path.before, 1 - on_path.weight), (on_path.after, on_path.weight))
+        for pose, share in ((on_path.before, 1 - on_path.fraction), (on_path.after, on_path.fraction))
     ]
     value, row, column = (np.concatenate(each) for each in zip(*parts, strict=True))
     return coo_array((value, (row, column)), shape=(len(values), 6 * num_poses)).tocsr()
 
 
 @dataclass(frozen=True)
-class BendingOfCells:
-    """Effect of a map's bending on c cells of ranges.
+class BendingOfBins:
+    """Effect of a map's bending on c bins of ranges.
 
     Attributes:
         components: of the ranges' errors, in metres.
@@ -81,8 +81,8 @@ class BendingOfCells:
 class MapBending(Protocol):
     """Prior knowledge of how a map is bent."""
 
-    def of_cells(self, cells: Cells, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfCells:
-        """Return the bending in cells of ranges.
+    def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
+        """Return the bending in bins of ranges.
 
         Args:
             by_pose: (n, 6 k) derivatives of each range by the path's poses, from ``by_poses``.
@@ -92,7 +92,7 @@ class MapBending(Protocol):
 
 
 def component_of(name: str, covariance: Array, factor: float, spread: float) -> Component | None:
-    """Return a component in metres with ``factor`` as the median of its size; None if the cells are not affected.
+    """Return a component in metres with ``factor`` as the median of its size; None if the bins are not affected.
 
     Args:
         covariance: (c, c) for a factor of 1. spread: standard deviation of the logarithm of the factor.
@@ -104,10 +104,10 @@ def component_of(name: str, covariance: Array, factor: float, spread: float) -> 
     return Component(name, factor * size_m, spread, None, False, lambda _: alike, BENDS[name])
 
 
-def averaged(cells: Cells, by_range: csr_array, num_poses: int) -> Array:
-    """Average (n, 6 k') derivatives over cells and return (c, 6 k); the last of the k poses may have no ranges."""
-    of_range, shape = cells.of_range, (len(cells), len(cells.of_range))
-    share = cells.weight / np.maximum(cells.worth, 1e-12)[of_range]
+def averaged(bins: RangeBins, by_range: csr_array, num_poses: int) -> Array:
+    """Average (n, 6 k') derivatives over bins and return (c, 6 k); the last of the k poses may have no ranges."""
+    of_range, shape = bins.of_range, (len(bins), len(bins.of_range))
+    share = bins.robust_weight / np.maximum(bins.worth, 1e-12)[of_range]
     sums = csr_array((share, (of_range, np.arange(len(of_range)))), shape=shape) @ by_range
     return np.pad(sums.toarray(), ((0, 0), (0, 6 * num_poses - sums.shape[1])))
 
@@ -154,27 +154,27 @@ class WalkBending:
         given: the original path, in the model's world.
         steps: (s, 7) corrections at some of the poses: logarithm of the scale, turn and shift, in units of the walks'
             standard deviations from start to end; None: no correction.
-        frame_is_free: as in ``of_cells``, for the corrected path.
+        frame_is_free: as in ``of_bins``, for the corrected path.
     """
 
     given: Trajectory
     steps: Array | None = None
     frame_is_free: bool = False
 
-    def of_cells(self, cells: Cells, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfCells:
-        nothing = np.zeros((len(cells), len(cells)))
-        factors = self.factors(cells, by_pose, frame_is_free=frame_is_free)
-        shift_m = np.zeros(len(cells)) if self.steps is None else -np.einsum("csi,si->c", factors, self.steps)
+    def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
+        nothing = np.zeros((len(bins), len(bins)))
+        factors = self.factors(bins, by_pose, frame_is_free=frame_is_free)
+        shift_m = np.zeros(len(bins)) if self.steps is None else -np.einsum("csi,si->c", factors, self.steps)
         found = []
         for name, which in _OF_STEP.items():
-            own = factors[:, :, which].reshape(len(cells), -1)
+            own = factors[:, :, which].reshape(len(bins), -1)
             found.append(component_of(name, own @ own.T, _OF_PATH[name], _SPREAD))
-        return BendingOfCells(tuple(each for each in found if each is not None), nothing, shift_m)
+        return BendingOfBins(tuple(each for each in found if each is not None), nothing, shift_m)
 
-    def factors(self, cells: Cells, by_pose: csr_array, *, frame_is_free: bool) -> Array:
-        """Return the (c, s, 7) derivatives of the cells by each step."""
+    def factors(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> Array:
+        """Return the (c, s, 7) derivatives of the bins by each step."""
         path = self.path
-        functions = without_similarity(averaged(cells, by_pose, len(path)), path, frame_is_free=frame_is_free)
+        functions = without_similarity(averaged(bins, by_pose, len(path)), path, frame_is_free=frame_is_free)
         starts, unit = self._steps_of_path
         return np.asarray(_after(functions, path, starts) * unit)
 
@@ -182,7 +182,7 @@ class WalkBending:
         """Return the walk corrected by the most likely steps.
 
         Args:
-            factors: of the cells. pulls: (c,) residuals multiplied by their inverse covariance.
+            factors: of the bins. pulls: (c,) residuals multiplied by their inverse covariance.
             errors: learnt standard deviations in metres, by name.
         """
         steps = -np.einsum("csi,c->si", factors, pulls)

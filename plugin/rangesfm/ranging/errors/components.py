@@ -1,6 +1,6 @@
 """The components of the ranges' errors, each with its typical size over a population of radios.
 
-The errors of two cells are correlated if their anchors, places, directions, distances or times are similar. Each survey
+The errors of two bins are correlated if their anchors, places, directions, distances or times are similar. Each survey
 learns its own standard deviations, with the population as prior.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.errors.range_bins import Cells
+from rangesfm.ranging.errors.range_bins import RangeBins
 
 # Decay length of the short-range error, metres, and correlation time of errors that last for seconds.
 _SHORT_M = 1.0
@@ -67,7 +67,7 @@ class Component:
         calibrated_median: the median after a learnt error curve was subtracted: the change from one day, mounting and
             room to the next. None: the calibration makes no difference.
         is_of_anchor: whether it is independent for each anchor, and larger where the anchor's ranges are noisier.
-        correlation: returns the (c, c) covariance of cells for a standard deviation of 1.
+        correlation: returns the (c, c) covariance of bins for a standard deviation of 1.
         words: description for people.
     """
 
@@ -76,7 +76,7 @@ class Component:
     spread: float
     calibrated_median: float | None
     is_of_anchor: bool
-    correlation: Callable[[Cells], Array]
+    correlation: Callable[[RangeBins], Array]
     words: str
 
 
@@ -84,8 +84,8 @@ def _same(labels: Indices) -> Array:
     return np.asarray((labels[:, None] == labels).astype(np.float64))
 
 
-def _same_link(cells: Cells) -> Array:
-    return _same(cells.anchor_index) * _same(cells.tag_index)
+def _same_link(bins: RangeBins) -> Array:
+    return _same(bins.anchor_index) * _same(bins.tag_index)
 
 
 def _fading(values: Array, within: float) -> Array:
@@ -98,17 +98,17 @@ def _smooth(values: Array, within: float) -> Array:
     return np.exp(-0.5 * (np.abs(values[:, None] - values) / within) ** 2)
 
 
-def _log_distance(cells: Cells) -> Array:
-    return np.log(np.maximum(cells.distance_m, _MIN_DISTANCE_M))
+def _log_distance(bins: RangeBins) -> Array:
+    return np.log(np.maximum(bins.distance_m, _MIN_DISTANCE_M))
 
 
-def _in_place(cells: Cells) -> Array:
-    places_m = cells.distance_m[:, None] * cells.from_anchor
-    return np.asarray(np.exp(-cdist(places_m, places_m) / _PLACE_M) * _same_link(cells))
+def _in_place(bins: RangeBins) -> Array:
+    places_m = bins.distance_m[:, None] * bins.from_anchor
+    return np.asarray(np.exp(-cdist(places_m, places_m) / _PLACE_M) * _same_link(bins))
 
 
-def _short(cells: Cells) -> Array:
-    shortness = np.exp(-cells.distance_m / _SHORT_M)
+def _short(bins: RangeBins) -> Array:
+    shortness = np.exp(-bins.distance_m / _SHORT_M)
     return np.outer(shortness, shortness)
 
 
@@ -118,11 +118,11 @@ def _by_direction(directions: Array) -> Array:
     return cosine / 2 + (3 * cosine**2 - 1) / 4
 
 
-def _off_axis(cells: Cells) -> Array:
+def _off_axis(bins: RangeBins) -> Array:
     """Return the covariance of delays away from the direction an anchor faces; anchors of one make are alike."""
-    same = _same(cells.anchor_index)
-    facing = same @ cells.from_anchor
-    cosine = np.sum(cells.from_anchor * facing, axis=1) / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)
+    same = _same(bins.anchor_index)
+    facing = same @ bins.from_anchor
+    cosine = np.sum(bins.from_anchor * facing, axis=1) / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)
     return _smooth(np.arccos(np.clip(cosine, -1.0, 1.0)), _OFF_AXIS_RAD)
 
 
@@ -132,7 +132,7 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
     def of(
         name: str,
         words: str,
-        correlation: Callable[[Cells], Array],
+        correlation: Callable[[RangeBins], Array],
         *,
         is_of_anchor: bool = False,
         calibrated_median: float | None = None,

@@ -10,9 +10,9 @@ from scipy.linalg import lapack
 from scipy.optimize import minimize
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.errors.bending import BendingOfCells
+from rangesfm.ranging.errors.bending import BendingOfBins
 from rangesfm.ranging.errors.components import BENDS, COMPONENTS, LEARNT_CURVE, Component
-from rangesfm.ranging.errors.range_bins import Cells
+from rangesfm.ranging.errors.range_bins import RangeBins
 
 # Noise of single ranges up to which a radio belongs to the population. With more noise all other components may be
 # larger too, by more than in proportion: an old radio with five times the noise reads 7 % too long, while the others
@@ -30,18 +30,18 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class LearnedErrors:
-    """Errors of c cells of ranges.
+    """Errors of c bins of ranges.
 
     Attributes:
-        cells: of the ranges.
-        of_range: (n,) cell of each range; -1 for a range that did not take part.
+        bins: of the ranges.
+        of_range: (n,) bin of each range; -1 for a range that did not take part.
         names, stddevs: of the components, in metres (``slope``: share of the distance). For covariances that were not
-            learnt, the root mean square over cells.
+            learnt, the root mean square over bins.
         covariances_m2: (k, c, c) contribution of each.
         unlikeliness: -2 times the logarithm of the prior probability of these standard deviations.
     """
 
-    cells: Cells
+    bins: RangeBins
     of_range: Indices
     names: tuple[str, ...]
     stddevs: Array
@@ -80,16 +80,16 @@ class LearnedErrors:
 
     def stddev_of(self, influence: Array) -> dict[str, float]:
         """Return the effect of each component on a number that changes by (n,) ``influence`` per metre of a range."""
-        return self.stddev_of_cells(self.cells.total(influence))
+        return self.stddev_of_bins(self.bins.total(influence))
 
-    def stddev_of_cells(self, of_cells: Array) -> dict[str, float]:
-        """Return the effect of each component on a number that changes by (c,) ``of_cells`` per metre of a cell."""
-        variances = np.einsum("i,kij,j->k", of_cells, self.covariances_m2, of_cells)
+    def stddev_of_bins(self, of_bins: Array) -> dict[str, float]:
+        """Return the effect of each component on a number that changes by (c,) ``of_bins`` per metre of a bin."""
+        variances = np.einsum("i,kij,j->k", of_bins, self.covariances_m2, of_bins)
         return dict(zip(self.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
 
 
 def learn_errors(
-    cells: Cells,
+    bins: RangeBins,
     off_m: Array,
     design: Array,
     prior_design: Array,
@@ -97,7 +97,7 @@ def learn_errors(
     curve_stddev_m: Array | None = None,
     ruled_out: Collection[str] = (),
     others_m2: Mapping[str, Array] | None = None,
-    bending: BendingOfCells | None = None,
+    bending: BendingOfBins | None = None,
 ) -> LearnedErrors:
     """Estimate the components by restricted maximum likelihood with lognormal priors on the standard deviations.
 
@@ -113,8 +113,8 @@ def learn_errors(
         others_m2: (c, c) covariances of further errors, by name, which are not learnt.
         bending: of the map; None: the map is not bent.
     """
-    expected = ExpectedErrors.of(cells, curve_stddev_m, ruled_out, others_m2, bending)
-    return expected.learnt(cells.mean(off_m), cells.mean(design), prior_design, noise_m)
+    expected = ExpectedErrors.of(bins, curve_stddev_m, ruled_out, others_m2, bending)
+    return expected.learnt(bins.mean(off_m), bins.mean(design), prior_design, noise_m)
 
 
 def usual_stddevs(*, is_calibrated: bool) -> dict[str, float]:
@@ -128,7 +128,7 @@ def _usual(components: Iterable[Component], *, is_calibrated: bool) -> dict[str,
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Errors to expect in c cells before anything is measured, with k components to be learnt.
+    """Errors to expect in c bins before anything is measured, with k components to be learnt.
 
     Attributes:
         components: to be learnt. of_components: (k, c, c) covariances for a standard deviation of 1 of each.
@@ -137,7 +137,7 @@ class ExpectedErrors:
         is_calibrated: whether a learnt error curve was subtracted.
     """
 
-    cells: Cells
+    bins: RangeBins
     components: tuple[Component, ...]
     of_components: Array
     known: Mapping[str, Array]
@@ -147,26 +147,26 @@ class ExpectedErrors:
     @classmethod
     def of(
         cls,
-        cells: Cells,
+        bins: RangeBins,
         curve_stddev_m: Array | None = None,
         ruled_out: Collection[str] = (),
         others_m2: Mapping[str, Array] | None = None,
-        bending: BendingOfCells | None = None,
+        bending: BendingOfBins | None = None,
     ) -> ExpectedErrors:
         """Set up the expected errors; arguments as for ``learn_errors``."""
         # With one tag, its own bias is the common bias.
-        left_out = {*ruled_out, *(() if np.ptp(cells.tag_index) else ("tag_bias",))}
+        left_out = {*ruled_out, *(() if np.ptp(bins.tag_index) else ("tag_bias",))}
         components = tuple(component for component in COMPONENTS if component.name not in left_out)
         components += () if bending is None else bending.components
-        of_anchor = np.outer(cells.noisiness, cells.noisiness)
-        of_components = [c.correlation(cells) * (of_anchor if c.is_of_anchor else 1.0) for c in components]
+        of_anchor = np.outer(bins.noisiness, bins.noisiness)
+        of_components = [c.correlation(bins) * (of_anchor if c.is_of_anchor else 1.0) for c in components]
         known = dict(others_m2 or {})
         if curve_stddev_m is not None:
-            stddev = cells.mean(curve_stddev_m)
+            stddev = bins.mean(curve_stddev_m)
             smooth = next(component for component in COMPONENTS if component.name == "curve")
-            known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(cells)
-        shift_m = np.zeros(len(cells)) if bending is None else bending.shift_m
-        return cls(cells, components, np.array(of_components), known, shift_m, curve_stddev_m is not None)
+            known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(bins)
+        shift_m = np.zeros(len(bins)) if bending is None else bending.shift_m
+        return cls(bins, components, np.array(of_components), known, shift_m, curve_stddev_m is not None)
 
     def usual(self, stddevs: Mapping[str, float]) -> LearnedErrors:
         """Return the errors with usual standard deviations, or with given ones by name."""
@@ -177,7 +177,7 @@ class ExpectedErrors:
     def learnt(
         self, off_m: Array, design: Array, prior_design: Array, noise_m: float, most_unusual: float = np.inf
     ) -> LearnedErrors:
-        """Learn the errors as in ``learn_errors``, from (c,) and (c, p) cells of the map as it is.
+        """Learn the errors as in ``learn_errors``, from (c,) and (c, p) bins of the map as it is.
 
         Args:
             most_unusual: largest standard deviation above its median, in spreads over radios.
@@ -189,7 +189,7 @@ class ExpectedErrors:
             np.array(widened)[:, None, None] * self.of_components if widening > 1 else self.of_components,
             np.log([_median(component, self.is_calibrated) for component in self.components]),
             np.array([component.spread for component in self.components]),
-            np.sum([*self.known.values(), np.zeros((len(self.cells), len(self.cells)))], axis=0),
+            np.sum([*self.known.values(), np.zeros((len(self.bins), len(self.bins)))], axis=0),
             off_m - self.shift_m,
             *_independent(design, prior_design),
         )
@@ -205,8 +205,8 @@ class ExpectedErrors:
         """Return the errors with the covariances that are not learnt added."""
         names = (*(component.name for component in self.components), *self.known)
         return LearnedErrors(
-            self.cells,
-            self.cells.of_range,
+            self.bins,
+            self.bins.of_range,
             names,
             np.append(stddevs, [np.sqrt(np.trace(m) / len(m)) for m in self.known.values()]),
             np.concatenate([covariances, *(m[None] for m in self.known.values())]),
@@ -221,7 +221,7 @@ def _median(component: Component, is_calibrated: bool) -> float:
 
 @dataclass(frozen=True)
 class _Likelihood:
-    """Posterior likelihood of the logarithms of k standard deviations, given c cells."""
+    """Posterior likelihood of the logarithms of k standard deviations, given c bins."""
 
     of_components: Array
     log_medians: Array

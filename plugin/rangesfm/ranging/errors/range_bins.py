@@ -1,4 +1,4 @@
-"""Cells: averages of ranges to one anchor in one stretch of time, few enough to compute their joint covariance."""
+"""Range bins: averages of ranges to one anchor in one stretch of time, few enough to compute their joint covariance."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from scipy.sparse import csr_array
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import robust_stddev
 
-# The covariance of the cells is a full matrix, and learning it takes some twenty inversions.
-MAX_NUM_CELLS = 450
+# The covariance of the bins is a full matrix, and learning it takes some twenty inversions.
+MAX_NUM_BINS = 450
 _SHORTEST_S = 0.5
 _LONGER = 1.25
 _MIN_NOISINESS, _MAX_NOISINESS = 0.5, 3.0
@@ -20,22 +20,22 @@ _MIN_NUM_OF_ANCHOR = 20
 
 
 @dataclass(frozen=True)
-class Cells:
+class RangeBins:
     """c averages of n ranges.
 
     Attributes:
-        of_range: (n,) cell of each range.
-        weight: (n,) weights of the averages.
-        worth: (c,) sum of the weights in each cell, an equivalent number of ranges.
+        of_range: (n,) bin of each range.
+        robust_weight: (n,) robust weights, by which ranges are averaged.
+        worth: (c,) sum of the robust weights in each bin, an equivalent number of ranges.
         anchor_index, tag_index: (c,).
         time_s: (c,) mean time since the first range; without times, photos since the first.
         distance_m: (c,) mean distance from anchor to tag.
         from_anchor: (c, 3) unit vectors from anchor to tag. in_cam: (c, 3) the same in the camera's frame.
-        noisiness: (c,) noise of the cell's anchor relative to all anchors.
+        noisiness: (c,) noise of the bin's anchor relative to all anchors.
     """
 
     of_range: Indices
-    weight: Array
+    robust_weight: Array
     worth: Array
     anchor_index: Indices
     tag_index: Indices
@@ -51,12 +51,13 @@ class Cells:
     def mean(self, values: Array) -> Array:
         """Return the (c, ...) weighted means of (n, ...) values of the ranges."""
         flat = values.reshape(len(values), -1)
-        sums = np.stack([np.bincount(self.of_range, self.weight * column, len(self)) for column in flat.T], axis=1)
+        weighted = (self.robust_weight * column for column in flat.T)
+        sums = np.stack([np.bincount(self.of_range, column, len(self)) for column in weighted], axis=1)
         means: Array = sums / np.maximum(self.worth, 1e-12)[:, None]
         return means.reshape(len(self), *values.shape[1:])
 
     def shared_by_places(self, towards: Array, placing_m: Array, gap: Indices) -> Array:
-        """Return the covariance (c, c), square metres, of the cells due to uncertain positions of the antenna.
+        """Return the covariance (c, c), square metres, of the bins due to uncertain positions of the antenna.
 
         Ranges from one gap between keyframes share one position error, a vector; errors of different gaps are
         independent.
@@ -65,7 +66,7 @@ class Cells:
             towards: (n, 3) unit vectors from anchor to tag. placing_m: (n,) standard deviation of each coordinate.
             gap: (n,) index of each range's gap.
         """
-        share = self.weight * placing_m / np.maximum(self.worth[self.of_range], 1e-12)
+        share = self.robust_weight * placing_m / np.maximum(self.worth[self.of_range], 1e-12)
         covariance = np.zeros((len(self), len(self)))
         for along in towards.T:
             of_gaps = csr_array((share * along, (self.of_range, gap)), shape=(len(self), int(gap.max()) + 1))
@@ -77,32 +78,32 @@ class Cells:
         return np.bincount(self.of_range, values, len(self)).astype(np.float64)
 
 
-def cells(
+def range_bins(
     anchor_index: Indices,
     tag_index: Indices,
     time_s: Array,
     from_anchor_m: Array,
     cam_from_world: Array,
-    weight: Array,
+    robust_weight: Array,
     noise_of_anchor: Array,
-    max_num: int = MAX_NUM_CELLS,
-) -> Cells:
-    """Average ranges in cells, with stretches of time long enough that there are at most ``max_num`` cells.
+    max_num: int = MAX_NUM_BINS,
+) -> RangeBins:
+    """Average ranges in bins, with stretches of time long enough that there are at most ``max_num`` bins.
 
     Args:
         anchor_index, tag_index, time_s: (n,). from_anchor_m: (n, 3) from anchor to tag.
-        cam_from_world: (n, 3, 3) rotations. weight: (n,) robust weights. noise_of_anchor: (m,) relative noise.
+        cam_from_world: (n, 3, 3) rotations. robust_weight: (n,). noise_of_anchor: (m,) relative noise.
     """
     since = time_s - time_s.min()
     distance = np.linalg.norm(from_anchor_m, axis=1)
     towards = from_anchor_m / np.maximum(distance, 1e-9)[:, None]
     of_range = _labels(anchor_index, tag_index, since, max_num)
     first = np.unique(of_range, return_index=True)[1]
-    weight = np.maximum(weight, 1e-6)
-    begun = Cells(
+    robust_weight = np.maximum(robust_weight, 1e-6)
+    begun = RangeBins(
         of_range=of_range,
-        weight=weight,
-        worth=np.bincount(of_range, weight).astype(np.float64),
+        robust_weight=robust_weight,
+        worth=np.bincount(of_range, robust_weight).astype(np.float64),
         anchor_index=anchor_index[first],
         tag_index=tag_index[first],
         time_s=since[first],
@@ -134,7 +135,7 @@ def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Ar
 
 
 def _labels(anchor_index: Indices, tag_index: Indices, since_s: Array, max_num: int) -> Indices:
-    """Return (n,) cell numbers from 0, for the shortest stretches of time that do not make too many cells."""
+    """Return (n,) bin numbers from 0, for the shortest stretches of time that do not make too many bins."""
     link = anchor_index * (int(tag_index.max()) + 2) + tag_index + 1
     length_s = _SHORTEST_S
     while True:

@@ -52,11 +52,11 @@ _MIN_DIFFERENCES = 20
 class RangeErrors:
     """Errors of n ranges, and the weights that follow; the scale stage passes them on to the refinement.
 
-    The cost of a map contains half of ``weight * loss(residual / stddev)`` for each range.
+    The cost of a map contains half of ``worth * loss(residual / stddev)`` for each range.
 
     Attributes:
         stddev_m: (n,) standard deviation of each range, as weighted; NaN for a range without a place.
-        share: (n,) weight besides the standard deviation, as ranges from one place err alike.
+        share: (n,) share of an independent range, as ranges from one place err alike.
         inflation: factor on the standard deviation of estimates from many ranges, for their errors' correlation in
             time.
         given_m: (n,) noise stated by the log or the survey; NaN where it is estimated.
@@ -116,8 +116,8 @@ class RangeErrors:
         )
 
     @property
-    def weight(self) -> Array:
-        """(n,) weight of each range against everything that is not a range, besides its standard deviation."""
+    def worth(self) -> Array:
+        """(n,) number of independent ranges that each range counts as, at its standard deviation."""
         return self.share / self.inflation**2
 
     @property
@@ -271,8 +271,8 @@ class RangeErrors:
         return mean
 
     def change(self, other: RangeErrors) -> float:
-        """Return the largest relative difference of a weight from that of other errors."""
-        ratio = np.sqrt(self.weight / other.weight) * other.stddev_m / self.stddev_m
+        """Return the largest relative difference of a range's information from that by other errors."""
+        ratio = np.sqrt(self.worth / other.worth) * other.stddev_m / self.stddev_m
         return float(np.max(np.abs(np.log(ratio)), initial=0.0))
 
 
