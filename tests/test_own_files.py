@@ -133,6 +133,15 @@ def test_a_result_is_not_joined_into_itself(own_survey: WalkedSurvey, rangesfm_c
         assert "would overwrite this input" in line
 
 
+@pytest.mark.parametrize("output", ["sparse/0", "copy", "copy/new"])
+def test_nothing_is_written_into_a_model_that_is_compared(
+    output: str, own_survey: WalkedSurvey, rangesfm_command: Command
+) -> None:
+    shutil.copytree(own_survey.folder / "sparse" / "0", own_survey.folder / "copy")
+    line = refusal(rangesfm_command, "compare", "sparse/0", "copy", "--output_path", output, cwd=own_survey.folder)
+    assert "would overwrite this input" in line
+
+
 @pytest.mark.parametrize("moment", ["write_model", "export_map"])
 def test_a_full_disk_costs_no_earlier_result(
     moment: str, own_survey: WalkedSurvey, rangesfm_command: Command, monkeypatch: pytest.MonkeyPatch

@@ -190,6 +190,8 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.geometry.reference import read_reference
     from rangesfm.workflows.ranges_for_models import ranges_of_survey
 
+    if args.output_path is not None:
+        require_apart(paths, Path(args.output_path))
     given = flags_given(args, *_COMPARE_KEYS)
     of_log = [name for name in given if name not in _WITHOUT_LOG]
     if of_log and "--ranges" not in given:
