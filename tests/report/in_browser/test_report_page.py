@@ -167,17 +167,29 @@ def test_every_control_has_a_name(browser: Browser, page: Path) -> None:
     assert browser.run(nameless) == []
 
 
-def test_names_from_files_cannot_break_out(browser: Browser, make_result: MakeResult) -> None:
-    folder = make_result(anchor_ids=HOSTILE, num_keyframes=12, num_ranges_per_anchor=30)
-    for table in ("ranges.csv", "scale_candidates.csv"):
+def test_names_from_files_cannot_break_out(
+    browser: Browser, make_result: MakeResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = (*HOSTILE, "constructor", "1.jpg", "2.jpg")
+    monkeypatch.setattr("tests.report.conftest._names", lambda num: photos[:num])
+    folder = make_result(anchor_ids=HOSTILE, num_keyframes=len(photos), num_ranges_per_anchor=30)
+    for table in ("ranges.csv", "scale_candidates.csv", "images.csv"):
         assert EVIL in (folder / table).read_text()
-    browser.open(write_report(folder))
+    path = write_report(folder)
+    browser.open(path)
     browser.draw_figures()
     assert browser.console() == []
     assert "broken out" not in browser.run("return document.title")
     browser.wait_for("document.querySelector('.label.anchor')")  # with the first frame
     labels = "return [...document.querySelectorAll('.label.anchor')].map(x => x.textContent)"
     assert sorted(browser.run(labels)) == sorted(HOSTILE)
+    said = [
+        browser.run(f"rangesfmView.choose({k}); return document.querySelector('.photo h3').textContent")
+        for k in range(len(photos))
+    ]
+    assert said == [*photos]
+    assert browser.console() == []
+    assert {url for url in browser.requests() if not url.startswith("data:")} == {path.as_uri()}
     rows = downloaded(browser, "range_residuals")[1:]
     assert {row[1] for row in rows} == {*HOSTILE[:-1], f"'{HOSTILE[-1]}"}
 

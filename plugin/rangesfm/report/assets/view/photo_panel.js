@@ -10,7 +10,8 @@ class PhotoPanel {
   /** numbers: those of the ranges nearest to the photo. */
   show(path, i, numbers) {
     const name = path.names[i];
-    const thumbnail = this.scene.thumbnails[name];
+    const { thumbnails } = this.scene;
+    const thumbnail = Object.hasOwn(thumbnails, name) ? thumbnails[name] : undefined; // a photo may be called "constructor"
     this.#say("h3", name);
     this.#say(".place", this.#place(path, i));
     this.image.hidden = thumbnail === undefined;
