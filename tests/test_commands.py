@@ -222,6 +222,19 @@ class TestRefineInASiteFrame:
         for row in refined.result["comparison"]:
             assert_has(row, COMPARISON)
 
+    def test_result_says_what_checks_what_and_bounds_the_scale(self, refined: Left) -> None:
+        reliability = refined.result["reliability"]
+        half_width = 1.96 * refined.relative_stddev
+        assert 3.7 / 1.96 * half_width < reliability["scale_within"] < 0.2
+        assert reliability["unchecked"] == []
+        line = f"reliability: scale within {100 * reliability['scale_within']:.2g} % at a risk of 0.0001, "
+        assert line + "one unfound mistake included" in refined.stdout
+        places = {row["subject"]: row for row in refined.result["tests"] if row["name"] == "anchor place"}
+        assert set(places) == {"A1", "A2", "A3", "A4"}
+        for row in places.values():
+            assert row["is_checked"]
+            assert 0.01 < row["redundancy"] < 1.0
+
     def test_metric_from_sfm_carries_the_model_onto_the_scaled_one(
         self, refined: Left, walked_survey: WalkedSurvey
     ) -> None:

@@ -51,6 +51,8 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     # The anchor must be within its ranges of the path, wherever its coordinates put it.
     most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.bins.anchor_index == k]))
 
+    seen = np.where((problem.cells.anchor_index == k)[:, None], problem.gradient.by_tag, 0.0)
+
     def unknown(_: Array) -> Correction:
         return Correction({name: None})
 
@@ -68,6 +70,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
             correction=lambda size: Correction({name: at + size[0] * direction}),
             most=most_m,
             adoption=unknown,
+            seen=seen[:, axis : axis + 1],
         )
 
     return Hypothesis(
@@ -84,6 +87,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
         adoption=unknown,
         max_unnoticed=UNSEEN_MOVE_M,
         sub_hypotheses=tuple(map(coordinate, range(3))),
+        seen=seen,
     )
 
 

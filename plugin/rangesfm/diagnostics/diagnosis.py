@@ -11,6 +11,7 @@ from rangesfm.arrays import Indices
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, Test, row_of
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
 from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
+from rangesfm.diagnostics.scale_bound import HiddenMistake
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
@@ -39,17 +40,20 @@ class Diagnosis:
         reasons: sentences, the likeliest cause first; without any, at most a mistake that could stay hidden.
         causes: the likeliest cause, and those that cannot be told from it.
         rows: (n,) rows of the log to which the corrections refer.
+        hidden: mistakes that the tests may miss.
     """
 
     tests: tuple[MistakeTest, ...]
     reasons: tuple[str, ...]
     causes: tuple[Cause, ...] = ()
     rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    hidden: tuple[HiddenMistake, ...] = ()
 
     def with_more(self, more: Diagnosis) -> Diagnosis:
         """Return the verdict with tests of something other than ranges added."""
         tests = (*more.tests, *self.tests)
-        return replace(self, tests=tests, reasons=(*self.reasons, *more.reasons))
+        reasons, hidden = (*self.reasons, *more.reasons), (*self.hidden, *more.hidden)
+        return replace(self, tests=tests, reasons=reasons, hidden=hidden)
 
 
 @with_one_blas_thread
@@ -65,7 +69,7 @@ def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     reasons = [f"{row.words}: {row.remedy}" for row in (*before, *(row for row in after if row.rejected))]
     if found.causes:
         reasons.insert(len(before), causes_in_words(found.causes))
-    return Diagnosis(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows)
+    return Diagnosis(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows, found.hidden)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:

@@ -73,6 +73,8 @@ class Hypothesis:
         refine_time: yields the same mistake at times between those that are searched; None if it has no time.
         sub_hypotheses: hypotheses with fewer numbers, which explain as much if the mistake was of their kind.
         is_linear: whether one step finds its size, however large it is.
+        seen: (c, k) effect on the ranges if the map was known, where that differs from ``effect.columns``: an error of
+            an anchor's coordinates is an effect on their prior.
         is_in_interval: whether the scale's interval already includes its usual size, or it changes the unit of length.
     """
 
@@ -90,6 +92,7 @@ class Hypothesis:
     sub_hypotheses: tuple[Hypothesis, ...] = ()
     is_linear: bool = False
     is_in_interval: bool = False
+    seen: Array | None = None
 
     def at_size(self, problem: Linearized, sizes: Array) -> Hypothesis:
         """Return the hypothesis with its effect linearised about an estimate, as large mistakes are not linear."""

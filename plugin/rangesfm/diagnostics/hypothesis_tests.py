@@ -37,7 +37,10 @@ class Test:
         threshold: for all hypotheses together.
         sizes, stddevs: (k,) estimate of the mistake's numbers.
         smallest_detectable: minimal detectable bias in the worst direction; inf: it cannot be detected.
+        redundancy: how much of the mistake the other observations check, 0 to 1: the share of its information in the
+            ranges that the unknowns leave, in the worst direction (Baarda's redundancy number, for several numbers).
         effect_on_log_scale, effect_on_place_m: largest effect of an undetected mistake of that size.
+        log_scale_by_unit: largest change of the scale's logarithm per unit of the mistake, also where none is found.
         basis: (c + r, num) orthonormal basis of the effect, whitened and projected.
     """
 
@@ -48,14 +51,21 @@ class Test:
     sizes: Array
     stddevs: Array
     smallest_detectable: float
+    redundancy: float
     effect_on_log_scale: float
     effect_on_place_m: float
+    log_scale_by_unit: float
     basis: Array
 
     @property
     def is_possible(self) -> bool:
         """True if a mistake of the estimated size is possible."""
         return self.hypothesis.can_be(self.sizes)
+
+    @property
+    def is_checked(self) -> bool:
+        """True if some mistake of this kind that is possible would be found."""
+        return self.smallest_detectable <= self.hypothesis.most
 
     @property
     def is_rejected(self) -> bool:
@@ -75,6 +85,8 @@ class MistakeTest:
         unit: of ``size``, ``stddev`` and ``smallest_detectable``; "1": a ratio.
         size, stddev: of the mistake, estimated; the length of a vector. None: not estimated, or impossible.
         smallest_detectable: a mistake of this size is found in four cases of five; None: it cannot be detected.
+        redundancy: how much of the mistake the other observations check, 0 to 1; None: not known.
+        is_checked: whether some mistake of this kind that is possible would be found; None: not known.
         effect_on_scale, effect_on_place_m: largest effect of a mistake of that size, relative and as root mean square
             along the path; None: unlimited.
     """
@@ -91,6 +103,8 @@ class MistakeTest:
     smallest_detectable: float | None = None
     effect_on_scale: float | None = None
     effect_on_place_m: float | None = None
+    redundancy: float | None = None
+    is_checked: bool | None = None
 
     @property
     def rejected(self) -> bool:
@@ -154,12 +168,21 @@ class Factorization:
         parts = [slice(end - h.num, end) for end, h in zip(ends, hypotheses, strict=True)]
         bases = [_basis_of(left[:, part], whitened[:, part]) for part in parts]
         by_unknowns = -self._solved(whitened)
+        seen = self._seen(hypotheses, whitened, parts)
         return [
-            self._test(h, left[:, part], basis, by_unknowns[:, part])
-            for h, part, basis in zip(hypotheses, parts, bases, strict=True)
+            self._test(h, left[:, part], basis, by_unknowns[:, part], of_ranges)
+            for h, part, basis, of_ranges in zip(hypotheses, parts, bases, seen, strict=True)
         ]
 
-    def _test(self, hypothesis: Hypothesis, left: Array, basis: Array, by_unknowns: Array) -> Test:
+    def _seen(self, hypotheses: Sequence[Hypothesis], whitened: Array, parts: Sequence[slice]) -> list[Array]:
+        """Return the whitened effects on ranges with a known map, a matrix for each hypothesis."""
+        num = len(self._factor)
+        return [
+            whitened[:num, part] if h.seen is None else solve_triangular(self._factor, h.seen, lower=True)
+            for h, part in zip(hypotheses, parts, strict=True)
+        ]
+
+    def _test(self, hypothesis: Hypothesis, left: Array, basis: Array, by_unknowns: Array, seen: Array) -> Test:
         values, vectors = np.linalg.eigh(left.T @ left)
         is_seen = values > _NOTHING_LEFT * values[-1]
         # Root of the inverse, without the directions that cannot be seen.
@@ -182,6 +205,8 @@ class Factorization:
             sizes=inverse @ (left.T @ self.residual),
             stddevs=np.sqrt(np.diag(inverse)) if is_whole else np.full(len(inverse), np.inf),
             smallest_detectable=worst,
+            redundancy=_redundancy(left, seen) if is_whole else 0.0,
+            log_scale_by_unit=float(np.linalg.norm(by_unknowns[0])),
             effect_on_log_scale=on_scale,
             effect_on_place_m=on_place,
             basis=basis,
@@ -197,6 +222,20 @@ def noncentrality(num: int) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if special.chndtr(critical, num, middle) > _BETA else (low, middle)
     return high
+
+
+def _redundancy(left: Array, seen: Array) -> float:
+    """Return the smallest share, over all directions, of an effect's squared length that is left.
+
+    Args:
+        left, seen: (c + r, k) and (c, k) whitened effects, with all unknowns projected off, and with all of them known.
+    """
+    of_left, of_seen = left.T @ left, seen.T @ seen
+    values, vectors = np.linalg.eigh(of_seen)
+    if values[0] <= _NOTHING_LEFT * values[-1]:
+        return 0.0
+    root = vectors / np.sqrt(values)
+    return float(np.clip(np.linalg.eigvalsh(root.T @ of_left @ root)[0], 0.0, 1.0))
 
 
 def _basis_of(left: Array, whitened: Array) -> Array:
@@ -254,6 +293,8 @@ def row_of(test: Test) -> MistakeTest:
         smallest_detectable=finite(test.smallest_detectable),
         effect_on_scale=finite(test.effect_on_log_scale),
         effect_on_place_m=finite(test.effect_on_place_m),
+        redundancy=test.redundancy,
+        is_checked=test.is_checked,
         words=test.hypothesis.words(test.sizes),
         remedy=test.hypothesis.remedy,
     )

@@ -9,6 +9,7 @@ from scipy import special
 
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
+from rangesfm.diagnostics.scale_bound import hidden_lengths
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
@@ -39,7 +40,7 @@ def diagnose_lengths(estimate: ScaleEstimate, tape: Tape | None) -> Diagnosis:
     # Printed tags are shown only if something was found: their sides are many and alike.
     told = [row for row, one in zip(rows, taped, strict=True) if row.rejected or not one.is_printed]
     told.sort(key=lambda row: row.threshold - row.statistic)
-    return Diagnosis((*told, *against), reasons)
+    return Diagnosis((*told, *against), reasons, hidden=hidden_lengths(lengths, against[0].stddev if against else None))
 
 
 def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[MistakeTest]:
@@ -61,6 +62,8 @@ def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[Mista
             stddev=finite(stddev_m),
             smallest_detectable=finite(smallest_m),
             effect_on_scale=finite(abs(float(lengths.by_metre[k])) * smallest_m) if is_known else None,
+            redundancy=float(lengths.redundancy[k]),
+            is_checked=bool(is_known),
         )
 
 
@@ -85,4 +88,6 @@ def _against_ranges(estimate: ScaleEstimate) -> Iterator[MistakeTest]:
         stddev=finite(stddev),
         smallest_detectable=smallest,
         effect_on_scale=smallest,
+        redundancy=(lengths.stddev / lengths.value / stddev) ** 2 if np.isfinite(stddev) else 0.0,
+        is_checked=bool(np.isfinite(stddev)),
     )

@@ -13,6 +13,7 @@ from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.hypothesis import Correction, Effect, Hypothesis, corrected, of_bins
 from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized
+from rangesfm.diagnostics.scale_bound import HiddenMistake, hidden_among
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
 from rangesfm.scale.range_equation import RangeState, state_after
 
@@ -66,11 +67,13 @@ class Findings:
         problem: with the errors that are left with the likeliest cause.
         tests: for each kind and subject the one that fits best, the likeliest first.
         causes: the likeliest, and those that cannot be told from it; empty if nothing was found.
+        hidden: all mistakes that the tests may miss, at all times.
     """
 
     problem: Linearized
     tests: tuple[Test, ...]
     causes: tuple[Cause, ...]
+    hidden: tuple[HiddenMistake, ...]
 
 
 def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
@@ -84,14 +87,15 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     standing = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
     problem = _learnt(problem, standing)
-    tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
+    all_tests = Factorization(problem).test(hypotheses, seed)
+    tests = _best_of_each(all_tests, problem)
     possible = [test for test in tests if test.is_possible]
     rejected = [test for test in possible if test.is_rejected]
     causes = _causes(problem, rejected or possible[:_NUM_NEARLY], is_sure=bool(rejected))
     if causes and causes[0].test is not None:
         problem = _learnt(problem, [*standing, causes[0].test.hypothesis])
         tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
-    return Findings(problem, tuple(tests), tuple(causes))
+    return Findings(problem, tuple(tests), tuple(causes), hidden_among(all_tests))
 
 
 def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized:

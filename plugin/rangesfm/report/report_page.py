@@ -54,7 +54,7 @@ _SECTIONS: dict[str, tuple[Callable[[Content], Figure | report_tables.ReportTabl
         *(figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
         *(report_tables.range_statuses, report_tables.ranges_per_anchor),
     ),
-    "Mistakes": (figures_mistakes.mistakes_figure, report_tables.mistakes),
+    "Mistakes": (figures_mistakes.mistakes_figure, report_tables.mistakes, report_tables.reliability),
     "Anchors": (report_tables.anchors, report_tables.distances),
     "Run": (
         *(report_tables.stages, report_tables.refinement, report_tables.versions),

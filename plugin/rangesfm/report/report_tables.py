@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from rangesfm.diagnostics.scale_bound import CHECKED_KINDS
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.text import count, duration, fixed, keyed, mistake, plain, signed
+from rangesfm.report.text import count, duration, fixed, keyed, mistake, percent, plain, rough, signed
 from rangesfm.result.entries import AnchorEntry, MistakeEntry, median, rms
 from rangesfm.survey.settings import KEYS
 
@@ -124,6 +125,26 @@ def mistakes(content: Content) -> ReportTable:
         "then change the scale (as a fraction of it) and places in the map. All tests are in result.json.",
         kind="mistakes",
     )
+
+
+def reliability(content: Content) -> ReportTable:
+    """Return the table of how much of each given thing the others check."""
+    rows = [
+        [
+            mistake(test.name, test.subject),
+            "untested" if test.is_checked is False else percent(test.redundancy),
+            percent(test.smallest_detectable) if test.unit == "1" else rough(test.smallest_detectable, test.unit),
+            percent(test.effect_on_scale),
+        ]
+        for test in content.summary.tests
+        if test.name in CHECKED_KINDS
+    ]
+    note = (
+        "Checked: how much of an error the other observations show (redundancy number); the rest would move the map. "
+        "Untested: they show no error that is possible. Found from: smallest error that is found in four cases of "
+        "five, and how it would change the scale if it was not."
+    )
+    return ReportTable("What checks what was given", ["", "checked", "found from", "then the scale"], rows, note)
 
 
 def _from_stddevs(tests: Sequence[MistakeEntry]) -> str:

@@ -45,9 +45,9 @@ def rough(value: float | None, unit: str) -> str:
     return "open" if number is None else f"{number:.2g}\u00a0{unit}"
 
 
-def percent(share: float) -> str:
-    """Return a fraction as a percentage with two digits."""
-    return rough(100 * share, "%")
+def percent(share: float | None) -> str:
+    """Return a fraction as a percentage with two digits, or "open" where nothing determines it."""
+    return rough(None if share is None else 100 * share, "%")
 
 
 def mistake(name: str, subject: str) -> str:

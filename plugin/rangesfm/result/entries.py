@@ -10,6 +10,8 @@ from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Mask
+from rangesfm.diagnostics.hypothesis_tests import finite
+from rangesfm.diagnostics.scale_bound import CHECKED_KINDS, RISK, scale_bound
 from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
@@ -339,9 +341,43 @@ class MistakeEntry(Record):
     smallest_detectable: NumberOrNull
     effect_on_scale: NumberOrNull
     effect_on_place_m: NumberOrNull
+    redundancy: NumberOrNull = None
+    is_checked: Flag | None = None
     rejected: Flag
     words: Text
     remedy: Text
+
+
+class ReliabilityEntry(Record):
+    """How far the scale may be off even if one mistake was made and not found; see ``scale_bound``.
+
+    Attributes:
+        scale_within: largest relative error of the scale; null without a limit, or where a mistake was found.
+        risk: probability with which it is exceeded.
+        limited_by: kind and subject of the mistake that may change the scale most unnoticed; empty: none adds anything.
+        unchecked: given things of which the other observations show no mistake that is possible: kind and subject.
+    """
+
+    scale_within: NumberOrNull
+    risk: Number
+    limited_by: Text
+    unchecked: tuple[Text, ...]
+
+    @classmethod
+    def of(cls, found: MetricResult) -> ReliabilityEntry | None:
+        """Return the entry; None where no mistakes were tested."""
+        diagnosis = found.diagnosis
+        if diagnosis is None or not diagnosis.hidden:
+            return None
+        bound, limited_by = scale_bound(found.estimate.uncertainty, diagnosis.hidden)
+        is_found = any(test.rejected for test in diagnosis.tests)
+        given = [test for test in diagnosis.tests if test.name in CHECKED_KINDS and test.is_checked is False]
+        return cls(
+            scale_within=None if is_found else finite(float(np.expm1(bound))),
+            risk=RISK,
+            limited_by=limited_by,
+            unchecked=tuple(f"{test.name} {test.subject}".strip() for test in given),
+        )
 
 
 class ComparisonRow(Record):

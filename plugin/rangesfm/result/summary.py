@@ -34,6 +34,7 @@ class ResultSummary(Record):
         refine: null without a refinement.
         models: all models that were to be joined to this one; empty where there was only one.
         tests: of mistakes that may have been made; those that were found come first.
+        reliability: of the scale with one unfound mistake; null where no mistakes were tested.
         distances: lengths that were taped, or are known between cameras of a rig.
         comparison: empty without a reference.
         georeference: null if the anchors do not give one.
@@ -55,6 +56,7 @@ class ResultSummary(Record):
     refine: entries.RefineEntry | None
     models: tuple[entries.ModelEntry, ...]
     tests: tuple[entries.MistakeEntry, ...] = ()
+    reliability: entries.ReliabilityEntry | None = None
     distances: tuple[DistanceRow, ...]
     comparison: tuple[entries.ComparisonRow, ...] = ()
     georeference: entries.GeoreferenceEntry | None
@@ -90,6 +92,7 @@ class ResultSummary(Record):
             check_ranges=entries.CheckRangesEntry.of(found),
             refine=entries.RefineEntry.of(found),
             tests=tuple(map(entries.MistakeEntry.model_validate, found.diagnosis.tests if found.diagnosis else ())),
+            reliability=entries.ReliabilityEntry.of(found),
             models=tuple(entries.ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
             **others,
         )
@@ -115,6 +118,8 @@ class ResultSummary(Record):
         yield from _notable(scale.sensitivity)
         if self.refine is not None:
             yield _refined(self.refine)
+        if self.reliability is not None and self.reliability.scale_within is not None:
+            yield _reliable(self.reliability)
         rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
         residuals = f", rms {rms} m, median {median} m" if ranges.num_used else ""
         if self.has_ranges:
@@ -139,6 +144,14 @@ def _refined(refine: entries.RefineEntry) -> str:
         return "the refinement broke the map: the result is the scaled map"
     bent_back = f"; the ranges took a bend of {refine.bend_m:.2g} m (rms) out of the map"
     return f"refined after {refine.iterations} iterations{bent_back if refine.bend_m else ''}"
+
+
+def _reliable(reliability: entries.ReliabilityEntry) -> str:
+    """Return the line about mistakes that were not found."""
+    within = f"{100 * (reliability.scale_within or 0.0):.2g} % at a risk of {reliability.risk:g}"
+    limited = f" (worst: {reliability.limited_by})" if reliability.limited_by else ""
+    unchecked = f"; untested: {', '.join(reliability.unchecked)}" if reliability.unchecked else ""
+    return f"reliability: scale within {within}, one unfound mistake included{limited}{unchecked}"
 
 
 def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:

@@ -41,6 +41,7 @@ class LengthScale:
         is_kept: (m,) True for lengths that agree with each other; the others are not used.
         too_long_m, stddev_m: (m,) excess of each length over what all other kept lengths predict, and its standard
             deviation; inf where nothing predicts it.
+        redundancy: (m,) how much of an error of each length the others check, 0 to 1 (Baarda's redundancy number).
         by_metre: (m,) relative change of the scale if the length was a metre longer.
         threshold: squared error of a length, in standard deviations, above which it is an outlier.
     """
@@ -51,6 +52,7 @@ class LengthScale:
     is_kept: Mask
     too_long_m: Array
     stddev_m: Array
+    redundancy: Array
     by_metre: Array
     threshold: float
 
@@ -109,11 +111,11 @@ def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> Leng
         kept[worst] = False
     fit = lengths.fit(kept)
     errors = [lengths.errors(kept, k, fit) for k in range(len(rows))]
-    too_long_m, stddev_m = np.array(errors).T
+    too_long_m, stddev_m, redundancy = np.array(errors).T
     by_metre = np.zeros(len(rows))
     by_metre[kept] = fit.gains / fit.scale
     components = {name: float(np.sqrt(fit.gains @ part @ fit.gains)) / fit.scale for name, part in fit.parts.items()}
-    return LengthScale(fit.scale, components, rows, kept, too_long_m, stddev_m, by_metre, threshold)
+    return LengthScale(fit.scale, components, rows, kept, too_long_m, stddev_m, redundancy, by_metre, threshold)
 
 
 @dataclass(frozen=True)
@@ -197,21 +199,24 @@ class _Lengths:
             scale = float(gains @ metric)
         return _Fit(scale, bending, parts, gains)
 
-    def errors(self, kept: Mask, k: int, fit: _Fit | None = None) -> tuple[float, float]:
+    def errors(self, kept: Mask, k: int, fit: _Fit | None = None) -> tuple[float, float, float]:
         """Return the excess of length k over the prediction by the kept ones, and its stddev, metres (Baarda's test).
+
+        The third number is its redundancy.
 
         Args:
             fit: of the kept lengths; None: fit them here (for a k that is not among them).
         """
         if (kept & (np.arange(len(kept)) != k)).sum() < 1:
-            return 0.0, np.inf
+            return 0.0, np.inf, 0.0
         fit = fit or self.fit(kept)
         chosen = kept | (np.arange(len(kept)) == k)
         at, model = int(chosen[:k].sum()), self.model[chosen]
         inverse = np.linalg.inv(_total(self._parts(chosen, fit.scale, fit.bending)))
         by_model = inverse @ model
         off = inverse - np.outer(by_model, by_model) / (model @ by_model)
-        return float(off[at] @ self.metric[chosen] / off[at, at]), float(off[at, at] ** -0.5)
+        excess_m = float(off[at] @ self.metric[chosen] / off[at, at])
+        return excess_m, float(off[at, at] ** -0.5), float(off[at, at] / inverse[at, at])
 
 
 def _total(parts: Mapping[str, Array]) -> Array:

@@ -1,0 +1,126 @@
+"""Bound on the scale's error that holds with a small risk, even if one mistake was made and not found.
+
+Aviation computes protection levels of satellite positions in this way. A mistake that moves its test by s standard
+deviations is missed with the probability that a noncentral chi-square variable with noncentrality s^2 stays below the
+threshold, and moves the scale in proportion to s. Noise of the scale and the tests are independent, because the tests
+see only what the estimate leaves. So the risk of a bound is the largest product, over all sizes s, of the probabilities
+to miss the mistake and to exceed the bound with it (R. G. Brown, "A baseline GPS RAIM scheme and a note on the
+equivalence of three RAIM methods", Navigation 39, 1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from rangesfm.arrays import Array
+from rangesfm.diagnostics.hypothesis_tests import Test, noncentrality
+from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
+from rangesfm.scale.scale_estimate import ScaleUncertainty
+
+RISK = 1e-4
+"""Probability with which the scale may be off by more than the bound."""
+CHECKED_KINDS = ("anchor place", "anchor bias", "lever arm", "length", "lengths against ranges")
+"""Mistakes in what was given: coordinates and ranges of each anchor, lever arm of each tag, measured lengths."""
+# Mistakes that move a test by this many standard deviations beyond its threshold are found for certain. Sizes up to
+# there are tried, so many of them.
+_CERTAINLY_FOUND, _NUM_SIZES = 6.0, 80
+_NUM_BISECTIONS = 50
+
+
+@dataclass(frozen=True)
+class HiddenMistake:
+    """A mistake that a test may miss.
+
+    Attributes:
+        words: kind and subject.
+        slope: change of the scale's logarithm by a mistake that moves the test by one standard deviation; inf for a
+            mistake that no test sees.
+        threshold, num: of the test, and its degrees of freedom.
+        most: largest change of the scale's logarithm by such a mistake that people would not notice.
+    """
+
+    words: str
+    slope: float
+    threshold: float
+    num: int
+    most: float
+
+    @property
+    def sizes(self) -> tuple[Array, Array]:
+        """Possible changes of the scale's logarithm (k,), and the probabilities (k,) that the test misses them."""
+        if not np.isfinite(self.slope):
+            return np.array([self.most]), np.ones(1)
+        farthest = np.sqrt(self.threshold) + _CERTAINLY_FOUND
+        if self.slope > 0:
+            farthest = min(farthest, self.most / self.slope)
+        moves = np.linspace(0.0, farthest, _NUM_SIZES)
+        return self.slope * moves, np.asarray(special.chndtr(self.threshold, max(self.num, 1), moves**2))
+
+
+def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:
+    """Return the mistakes behind tests, without those whose usual size is already in the interval of the scale."""
+    return tuple(
+        HiddenMistake(
+            words=" ".join(test.hypothesis.key).strip(),
+            slope=test.effect_on_log_scale / float(np.sqrt(noncentrality(max(test.num, 1)))),
+            threshold=test.threshold,
+            num=test.num,
+            most=test.log_scale_by_unit * test.hypothesis.most_unnoticed,
+        )
+        for test in tests
+        if not test.hypothesis.is_in_interval
+    )
+
+
+def hidden_lengths(lengths: LengthScale, against_ranges_stddev: float | None) -> tuple[HiddenMistake, ...]:
+    """Return mistakes of measured lengths.
+
+    Args:
+        against_ranges_stddev: relative standard deviation of the comparison with the ranges; None without ranges.
+    """
+    slopes = np.abs(lengths.by_metre) * np.where(np.isfinite(lengths.stddev_m), lengths.stddev_m, 0.0)
+    hidden = [HiddenMistake("length", slope, lengths.threshold, 1, np.inf) for slope in slopes.tolist()]
+    if against_ranges_stddev is not None:
+        threshold = float(special.chdtri(1, LENGTH_FALSE_ALARM_RATE))
+        hidden.append(HiddenMistake("lengths", against_ranges_stddev, threshold, 1, np.inf))
+    elif not np.isfinite(lengths.stddev_m).all():
+        hidden.append(HiddenMistake("length", np.inf, lengths.threshold, 1, np.inf))
+    return tuple(hidden)
+
+
+def scale_bound(uncertainty: ScaleUncertainty, hidden: Sequence[HiddenMistake]) -> tuple[float, str]:
+    """Return the bound on the scale's error, in its logarithm, and what limits it; inf if a mistake has no limit.
+
+    Args:
+        uncertainty: of the scale.
+        hidden: mistakes of which one may have been made.
+    """
+    bounds = {"": _bound(uncertainty, np.zeros(1), np.ones(1))}
+    for mistake in hidden:
+        changes, missed = mistake.sizes
+        # Only a mistake that exceeds the bound so far can raise it.
+        if not np.isfinite(changes).all():
+            return np.inf, mistake.words
+        if np.max(missed * _beyond(uncertainty, changes, max(bounds.values()))) > RISK:
+            bounds[mistake.words] = _bound(uncertainty, changes, missed)
+    worst = max(bounds, key=bounds.__getitem__)
+    return bounds[worst], worst
+
+
+def _bound(uncertainty: ScaleUncertainty, changes: Array, missed: Array) -> float:
+    low, high = 0.0, float(np.max(changes)) + abs(uncertainty.lean) + 10 * uncertainty.empirical
+    for _ in range(_NUM_BISECTIONS):
+        middle = (low + high) / 2
+        is_exceeded = np.max(missed * _beyond(uncertainty, changes, middle)) > RISK
+        low, high = (middle, high) if is_exceeded else (low, middle)
+    return high
+
+
+def _beyond(uncertainty: ScaleUncertainty, changes: Array, bound: float) -> Array:
+    """Return the probabilities (k,) that the scale is off by more than a bound, given changes (k,) of its logarithm."""
+    middles, stddev = changes + abs(uncertainty.lean), max(uncertainty.empirical, 1e-300)
+    return np.asarray(special.ndtr((middles - bound) / stddev) + special.ndtr((-middles - bound) / stddev))

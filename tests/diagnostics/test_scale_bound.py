@@ -1,0 +1,97 @@
+"""The bound on the scale holds with its risk, also if one mistake was not found; and what was given is checked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import special
+from tests.studies.erring_surveys import SITES, run, surveyed
+
+from rangesfm.diagnostics import hypothesis_tests
+from rangesfm.diagnostics.catalogue import anchor_places, wrong_lever_arms
+from rangesfm.diagnostics.hypothesis_tests import Factorization
+from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.diagnostics.mistakes import find_mistakes
+from rangesfm.diagnostics.scale_bound import RISK, HiddenMistake, scale_bound
+from rangesfm.scale.scale_estimate import ScaleUncertainty
+
+ONE_PERCENT = ScaleUncertainty(0.0, {"noise": 0.01})
+
+
+@pytest.fixture(scope="module")
+def problem() -> Linearized:
+    on_map = run(surveyed(SITES[0], 3), 3).on_map
+    assert on_map is not None
+    return find_mistakes(on_map).problem
+
+
+def results_of(problem: Linearized) -> list[hypothesis_tests.Test]:
+    return Factorization(problem).test([*anchor_places(problem), *wrong_lever_arms(problem)], 0)
+
+
+def test_without_a_mistake_the_bound_is_that_of_a_normal_error() -> None:
+    bound, limited_by = scale_bound(ONE_PERCENT, [])
+    assert bound == pytest.approx(-0.01 * special.ndtri(RISK / 2), rel=1e-6)
+    assert limited_by == ""
+    leaning, _ = scale_bound(replace(ONE_PERCENT, lean=0.005), [])
+    assert sum(special.ndtr((end - leaning) / 0.01) for end in (0.005, -0.005)) == pytest.approx(RISK, rel=1e-6)
+
+
+def test_a_mistake_of_any_size_exceeds_the_bound_unnoticed_no_more_often_than_the_risk() -> None:
+    """Draw the two independent normal numbers, of the test and of the scale, for mistakes of many sizes."""
+    hidden = HiddenMistake("a step", 0.004, 15.0, 1, np.inf)
+    bound, limited_by = scale_bound(ONE_PERCENT, [hidden])
+    assert limited_by == "a step"
+    rng, num = np.random.default_rng(0), 1_000_000
+    noise, of_test = 0.01 * rng.standard_normal(num), rng.standard_normal(num)
+    risks = [
+        np.mean(((of_test + moves) ** 2 < 15.0) & (np.abs(noise + 0.004 * moves) > bound))
+        for moves in np.linspace(0.0, 8.0, 9)
+    ]
+    assert 0.5 * RISK < max(risks) < 1.4 * RISK  # of a million draws, 100 +- 10 exceed it
+    assert np.argmax(risks) not in (0, 8)
+
+
+def test_what_people_would_notice_limits_what_no_test_sees() -> None:
+    bound, limited_by = scale_bound(ONE_PERCENT, [HiddenMistake("lever arm", np.inf, 15.0, 0, 0.02)])
+    assert bound == pytest.approx(0.02 - 0.01 * special.ndtri(RISK), rel=1e-6)
+    assert limited_by == "lever arm"
+    assert scale_bound(ONE_PERCENT, [HiddenMistake("length", np.inf, 15.0, 1, np.inf)]) == (np.inf, "length")
+    little, _ = scale_bound(ONE_PERCENT, [HiddenMistake("a step", 0.004, 15.0, 1, 0.002)])
+    assert little < bound
+
+
+def test_redundancy_is_the_share_of_a_mistake_that_the_residuals_show(problem: Linearized) -> None:
+    """By the residuals themselves: with all unknowns adapting to it, against a map that is known."""
+    silent = replace(problem, residual_m=0 * problem.residual_m, prior_residual=0 * problem.prior_residual)
+    inverse = np.linalg.inv(problem.errors.covariance_m2)
+    for test in results_of(problem):
+        effect, seen = test.hypothesis.effect, test.hypothesis.seen
+        off_m = effect.columns if seen is None else seen
+        of_units = [
+            replace(silent, residual_m=column, prior_residual=prior)
+            for column, prior in zip(effect.columns.T, effect.priors.T, strict=True)
+        ]
+        left = np.stack([Factorization(made).residual for made in of_units], axis=1)
+        directions = np.random.default_rng(0).standard_normal((test.hypothesis.num, 1000))
+        shares = np.sum((left @ directions) ** 2, axis=0)
+        shares /= np.einsum("ij,ik,kj->j", off_m @ directions, inverse, off_m @ directions)
+        assert 0.0 < test.redundancy <= shares.min() * (1 + 1e-9)
+        assert shares.min() < test.redundancy + 0.05
+        assert shares.max() <= 1.0 + 1e-9
+
+
+def test_what_two_anchors_alone_are_given_is_untested(problem: Linearized) -> None:
+    """Three coordinates of each of two anchors determine the map, and nothing is left to check them."""
+    few = np.isin(problem.cells.anchor_index, problem.heard[:2])
+    loose = np.where(few[:, None] & few, problem.errors.covariance_m2, 0.0) + 1e8 * np.diag(~few)
+    lonely = replace(problem, errors=replace(problem.errors, covariances_m2=loose[None]))
+    places = {test.hypothesis.subject: test for test in results_of(lonely) if test.hypothesis.name == "anchor place"}
+    assert places
+    assert not any(test.is_checked for test in places.values())
+    names = [problem.on_map.anchor_ids[k] for k in problem.heard[:2]]
+    assert all(places[name].redundancy < 0.01 for name in names)
+    with_all = [test for test in results_of(problem) if test.hypothesis.name == "anchor place"]
+    assert all(test.is_checked for test in with_all)
