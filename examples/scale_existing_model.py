@@ -23,7 +23,8 @@ trajectory = rangesfm.trajectory_from_reconstruction(reconstruction, times)
 observations = rangesfm.associate(log, trajectory, tag_in_cam_m)
 anchors = [rangesfm.Anchor(anchor_id) for anchor_id in log.anchor_ids]
 estimate = rangesfm.initialize_scale(observations, trajectory, anchors, anchor_frame="unknown")
-print(f"{estimate.value:.4f} m per unit, +- {100 * estimate.uncertainty.empirical:.2f} %, {estimate.verdict}")
+low, high = estimate.interval_95  # of this map, which is scaled only; rangesfm.run_survey judges the refined one
+print(f"{estimate.value:.4f} m per unit, 95 % interval {low:.4f} to {high:.4f}, {estimate.verdict}")
 
 metric, summary = rangesfm.refine_with_ranges(
     rangesfm.rescale(reconstruction, estimate.metric_from_sfm),

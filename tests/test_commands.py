@@ -72,6 +72,7 @@ RESULT = {
     "versions": {"rangesfm": TEXT, "pycolmap": TEXT, "pyceres": TEXT},
     "settings": TABLE,
     "seconds": {"*": NUMBER},
+    "computed": TEXT,
     "warnings": LIST,
 }
 REFINE = {
@@ -128,7 +129,7 @@ class Left:
     def without_seconds(self) -> dict[str, Any]:
         """Return a copy of result.json without durations and its own location, with absolute paths of its inputs."""
         result = copy.deepcopy(self.result)
-        del result["seconds"], result["settings"]["output"]["path"]
+        del result["seconds"], result["computed"], result["settings"]["output"]["path"]
         paths = [(result["settings"][key.table], key.name) for key in KEYS if key.role not in (None, "output")]
         for table, name in [*paths, *((entry, "path") for entry in result["inputs"])]:
             table[name] = table[name] and str(path_in(self.folder, table[name]))
@@ -290,7 +291,7 @@ class TestRefineInASiteFrame:
         assert stages == ["scale", "refinement", "results"]
         assert "\r" not in refined.stderr
         assert "\033" not in refined.stderr
-        assert refined.stdout.startswith(f"scale: {refined.result['scale']['value']:.6g} m per SfM unit")
+        assert f"\nscale: {refined.result['scale']['value']:.6g} m per SfM unit" in refined.stdout
         assert f"\nall results: {refined.folder / 'result.json'}\n" in refined.stdout
         assert refined.stdout.endswith(f"\nreport: {refined.folder / 'report.html'}\n")
 

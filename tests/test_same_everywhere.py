@@ -51,7 +51,7 @@ class Left:
     def result(self) -> dict[str, Any]:
         """Return the content of result.json without times, paths and settings."""
         result: dict[str, Any] = json.loads((self.folder / "result.json").read_text(encoding="utf-8"))
-        for name in ("seconds", "settings", "inputs"):
+        for name in ("seconds", "computed", "settings", "inputs"):
             del result[name]
         del result["refine"]["seconds"]
         return result

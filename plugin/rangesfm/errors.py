@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import errno
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,15 @@ def shown(value: object) -> str:
         return "a table" if isinstance(value, Mapping) else printable(str(value))
     except ValueError:  # Python refuses to convert a whole number of thousands of digits
         return "a number beyond all bounds"
+
+
+def number_text(value: float, spec: str) -> str:
+    """Return a number by a format specification, as ``format`` does; one that is rounded to zero has no sign.
+
+    All numbers that may be negative are shown by this function, so that nobody reads "-0.000 %".
+    """
+    text = format(value, spec)
+    return text if any(digit in text for digit in "123456789") or not math.isfinite(value) else text.strip("+-")
 
 
 def nearest_known(name: str, known: Iterable[str]) -> str:

@@ -441,6 +441,10 @@ class ReportOptions(Options, table="report"):
 
     reference: Annotated[Path | None, KeyMeta(metavar="FILE", role="file", is_common=True)] = None
     """File with true positions of the camera, for comparison: CSV or TUM."""
+    title: Annotated[str | None, KeyMeta(flag="report_title", metavar="TEXT")] = None
+    """Title of the report. Without one it is the name of the folder."""
+    by: Annotated[str | None, KeyMeta(flag="report_by", metavar="TEXT")] = None
+    """Who made the survey, for the report."""
     enabled: Annotated[bool, KeyMeta(flag="report")] = True
     """Write report.html."""
 

@@ -35,7 +35,7 @@ class Calls:
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
     calls = Calls()
     pipeline = ModuleType("rangesfm.workflows.run")
-    for name in ("metric_map_of", "run_survey", "reconstruct_survey", "scale_model", "refine_model"):
+    for name in ("run_survey", "reconstruct_survey", "scale_model", "refine_model"):
         setattr(pipeline, name, calls.stage(name))
     monkeypatch.setitem(sys.modules, "rangesfm.workflows.run", pipeline)
     (tmp_path / "photos").mkdir()
@@ -49,9 +49,9 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
 @pytest.mark.parametrize(
     ("argv", "stage", "options"),
     [
-        (["run", "--images", "photos", "--ranges", "uwb.csv"], "metric_map_of", {"restart": False}),
-        (["run", "--images", "photos", "--ranges", "uwb.csv", "--restart"], "metric_map_of", {"restart": True}),
-        (["run", "--input_path", "model", "--ranges", "uwb.csv"], "metric_map_of", {"restart": False}),
+        (["run", "--images", "photos", "--ranges", "uwb.csv"], "run_survey", {"restart": False}),
+        (["run", "--images", "photos", "--ranges", "uwb.csv", "--restart"], "run_survey", {"restart": True}),
+        (["run", "--input_path", "model", "--ranges", "uwb.csv"], "run_survey", {"restart": False}),
         (["reconstruct", "--images", "photos", "--restart"], "reconstruct_survey", {"restart": True}),
         (["reconstruct", "--images", "walk.MP4"], "reconstruct_survey", {"restart": False}),
         (["scale", "--input-path", "model", "--ranges", "uwb.csv"], "scale_model", {}),

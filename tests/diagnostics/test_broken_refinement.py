@@ -115,6 +115,7 @@ def test_where_it_breaks_the_scaled_map_is_the_result_and_says_so(survey: Survey
     summary, refine, place = done.summary, known(done.summary.refine), known(done.summary.place)
     assert not refine.kept
     assert not refine.converged
+    assert refine.message not in refine.why_not_kept
     assert refine.why_not_kept
     (reason,) = (reason for reason in summary.scale.reasons if reason.startswith("the refinement broke the map"))
     assert reason in summary.warnings
@@ -129,6 +130,16 @@ def test_where_it_breaks_the_scaled_map_is_the_result_and_says_so(survey: Survey
     np.testing.assert_allclose(ranges.residual_m, ranges.predicted_scaled_m - ranges.range_m, atol=1e-4)
     assert known(summary.ranges.rms_m) < 0.2
     assert "the refinement broke the map: the result is the scaled map" in done.lines
+
+
+def test_converged_is_what_the_solver_did_even_where_the_map_is_not_kept(
+    survey: Survey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rangesfm.workflows.make_metric_map.why_broken", lambda *_: ("the map is bent",))
+    refine = known(refined(survey).summary.refine)
+    assert refine.converged
+    assert (refine.kept, refine.why_not_kept) == (False, ("the map is bent",))
+    assert "the map is bent" not in refine.message
 
 
 @pytest.mark.parametrize("spoil", [mirror_points, shorten_focal_length])

@@ -141,7 +141,7 @@ def _read_whole_result(path: Path) -> ResultFolder:
     """Read everything that pages and exports ask for."""
     result = read_result_folder(path.parent)
     summary = result.summary
-    summary.metric_from_sfm.similarity, summary.scale.relative_stddev_empirical, summary.scale.larger_stddev  # noqa: B018
+    summary.metric_from_sfm.similarity, summary.scale.relative_stddev_empirical, summary.scale.in_words  # noqa: B018
     result.anchor_positions_m, result.images_path, result.lever_arms_m(["T1"])
     _expect(summary.georeference is None or summary.georeference.georeference.crs, "a coordinate system")
     _expect(list(summary.lines(path.parent, None)), "lines for people")

@@ -1,7 +1,8 @@
-"""Quality checks: the values at which each light changes."""
+"""Accuracy in figures: the lights change where the verdict does."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ from tests.result_document import result_document
 
 from rangesfm.report.checks import QualityCheck, quality_checks
 from rangesfm.result.summary import ResultSummary
+from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
 
 def check_of(name: str, **changes: Any) -> QualityCheck:
@@ -17,60 +19,50 @@ def check_of(name: str, **changes: Any) -> QualityCheck:
     return check
 
 
-def light_of(name: str, **changes: Any) -> str:
-    return check_of(name, **changes).light
+def noise(statistic: float) -> dict[str, Any]:
+    unknown = dict.fromkeys(("size", "stddev", "smallest_detectable", "effect_on_scale", "effect_on_place_m"))
+    words = {"words": "the ranges scatter", "remedy": "look"}
+    test = {"name": "range noise", "subject": "", "statistic": statistic, "threshold": 0.3, "unit": "m"}
+    return {"tests": [{**test, **unknown, **words, "rejected": statistic > 0.3}]}
 
 
-@pytest.mark.parametrize(("value", "light"), [(0.0, "green"), (1.0, "green"), (1.1, "amber"), (2.1, "red")])
-def test_smaller_is_better_up_to_and_with_each_limit(value: float, light: str) -> None:
-    assert QualityCheck("n", "m", value, "px", green_limit=1.0, amber_limit=2.0, decimals=1).light == light
-
-
-@pytest.mark.parametrize(("value", "light"), [(90.0, "green"), (70.0, "green"), (50.0, "amber"), (39.0, "red")])
-def test_larger_is_better_where_it_says_so(value: float, light: str) -> None:
-    check = QualityCheck("n", "m", value, "%", green_limit=70.0, amber_limit=40.0, decimals=1, larger_is_better=True)
+@pytest.mark.parametrize(("share", "light"), [(0.0, "off"), (0.99, "green"), (1.01, "amber")])
+def test_the_scale_has_the_limit_of_its_verdict(share: float, light: str) -> None:
+    half = share * DOUBTFUL_ABOVE
+    check = check_of("Scale", scale={"value": 2.0, "interval_95": [2.0 * math.exp(-half), 2.0 * math.exp(half)]})
     assert check.light == light
+    assert check.value == (None if light == "off" else pytest.approx(100 * half))
+    assert check.limit_in_words == "Doubtful above 4.0\u00a0%."
 
 
-def test_the_larger_stddev_of_the_scale_counts() -> None:
-    assert (
-        light_of("Scale uncertainty", scale={"value": 2.0, "stddev_formal": 0.001, "stddev_empirical": None}) == "green"
-    )
-    both = {"value": 2.0, "stddev_formal": 0.001, "stddev_empirical": 0.2}
-    assert light_of("Scale uncertainty", scale=both) == "red"
+@pytest.mark.parametrize(("scatter_m", "light"), [(0.29, "green"), (0.31, "amber")])
+def test_the_scatter_of_ranges_has_the_limit_of_its_test(scatter_m: float, light: str) -> None:
+    check = check_of("Range noise", **noise(scatter_m))
+    assert (check.light, check.limit, check.value) == (light, 0.3, scatter_m)
 
 
-def test_one_anchor_cannot_agree_with_others() -> None:
-    assert light_of("Anchor agreement", scale={"value": 1.0, "per_anchor": {"A": 1.0}}) == "off"
-    assert light_of("Anchor agreement", scale={"value": 1.0, "per_anchor": {"A": 1.0, "B": 0.9}}) == "red"
+def test_what_the_verdict_has_no_limit_for_has_no_light() -> None:
+    document = result_document(ranges={"num": 10, "num_used": 9, "rms_m": 5.0}, check_ranges={"num": 1, "rms_m": 9.0})
+    checks = {check.name: check for check in quality_checks(ResultSummary.model_validate(document))}
+    assert {checks[name].light for name in ("Ranges and map", "Check ranges", "Ranges used", "Clocks")} == {None}
+    assert checks["Ranges and map"].limit_in_words == ""
+    assert checks["Ranges used"].text == "90.0\u00a0%"
 
 
-def test_no_check_ranges_is_no_good_check() -> None:
-    assert light_of("Check ranges", check_ranges={"num": 0, "rms_m": None}) == "off"
-    assert light_of("Check ranges", check_ranges={"num": 10, "rms_m": 0.1}) == "green"
+def test_without_check_ranges_there_is_no_check_of_them() -> None:
+    document = result_document(check_ranges={"num": 0, "rms_m": None})
+    assert "Check ranges" not in {check.name for check in quality_checks(ResultSummary.model_validate(document))}
 
 
-def test_an_offset_that_does_not_matter_is_no_fault_however_uncertain() -> None:
+def test_the_clocks_offset_is_told_with_its_interval_and_whether_it_matters() -> None:
     note = "the camera stands still at every photo"
-    assert light_of("Clock offset", time_offset={"stddev_s": 0.6, "offset_matters": True}) == "red"
-    check = check_of("Clock offset", time_offset={"stddev_s": 0.6, "offset_matters": False, "note": note})
-    assert check.light == "green"
-    assert check.no_matter == "The camera stands still at every photo."
+    check = check_of("Clocks", time_offset={"stddev_s": 0.05, "offset_matters": False, "note": note})
+    assert check.value == pytest.approx(0.098)
+    assert ">0.098\u00a0s</data>" in check.text
+    assert "The camera stands still at every photo." in check.meaning
+    assert note not in check_of("Clocks", time_offset={"stddev_s": 0.05, "offset_matters": True, "note": note}).meaning
 
 
-def test_nothing_measured_means_no_light() -> None:
-    unknown = {"stddev_formal": None, "stddev_empirical": None}
-    document = result_document(scale=unknown, time_offset={"stddev_s": None})
-    assert {check.light for check in quality_checks(ResultSummary.model_validate(document))} == {"off"}
-
-
-def test_the_gauge_shows_the_limits_to_scale_and_the_value_on_it() -> None:
-    smaller = QualityCheck("n", "m", 1.5, "px", green_limit=1.0, amber_limit=2.0, decimals=1)
-    assert [color for color, _ in smaller.zones] == ["green", "amber", "red"]
-    assert [width for _, width in smaller.zones] == pytest.approx([100 / 3] * 3)
-    assert smaller.needle_percent == pytest.approx(50.0)
-    assert smaller.text == "1.5\u00a0px"
-    assert smaller.limits == "green ≤ 1\u00a0px · amber ≤ 2\u00a0px"
-    larger = QualityCheck("n", "m", 120.0, "%", green_limit=70.0, amber_limit=40.0, decimals=1, larger_is_better=True)
-    assert larger.zones == [("red", 40.0), ("amber", 30.0), ("green", 30.0)]
-    assert larger.needle_percent == 100.0
+def test_what_was_not_measured_says_so() -> None:
+    check = check_of("Photos", refine=None)
+    assert (check.value, check.text) == (None, "not measured")

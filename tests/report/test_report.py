@@ -26,12 +26,16 @@ if TYPE_CHECKING:
     from tests.conftest import Command
 
 MakeResult = Callable[..., Path]
-SECTIONS = ["verdict", "checks", "view-section", "path", "scale", "ranges", "mistakes", "anchors", "run"]
+SECTIONS = [
+    *("verdict", "found", "view-section", "checks", "path", "scale", "ranges", "anchors"),
+    *("mistakes", "candidates", "run"),
+]
 FIGURES = {
     "path": ["trajectory", "map_points", "local_scale"],
-    "scale": ["scale_per_anchor", "scale_consensus", "time_offset_curve", "scale_candidates"],
+    "scale": ["scale_per_anchor", "scale_consensus", "time_offset_curve"],
     "ranges": ["range_residuals", "range_residual_histogram", "absolute_range_errors"],
     "mistakes": ["mistake_tests"],
+    "candidates": ["scale_candidates"],
 }
 
 
@@ -44,19 +48,21 @@ class Page(HTMLParser):
         self.ids: list[str] = []
         self.attributes: list[tuple[str, str | None]] = []
         self.texts: list[str] = []
-        self.numbers: list[tuple[str, str, str]] = []
+        self.numbers: list[tuple[str, str, float, str]] = []
         self.feed(html)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         if tag == "data":
-            self.numbers.append((str(dict(attrs)["data-key"]), str(dict(attrs)["value"]), ""))
+            given = dict(attrs)
+            times = float(given.get("data-times") or 1.0)
+            self.numbers.append((str(given["data-key"]), str(given["value"]), times, ""))
         self.tags.append(tag)
         self.attributes += attrs
         self.ids += [value for name, value in attrs if name == "id" and value]
 
     def handle_data(self, data: str) -> None:
-        if self.tags[-1:] == ["data"] and self.numbers[-1][2] == "":
-            self.numbers[-1] = (*self.numbers[-1][:2], data)
+        if self.tags[-1:] == ["data"] and self.numbers[-1][3] == "":
+            self.numbers[-1] = (*self.numbers[-1][:3], data)
         if self.tags[-1:] not in (["style"], ["script"]) and data.strip():
             self.texts.append(data.strip().replace("\u00a0", " ").replace("\u202f", " "))
 
@@ -97,7 +103,9 @@ def test_the_numbers_are_those_of_the_result(make_result: MakeResult) -> None:
     texts = page_of(folder).texts
     expected = [
         "0.7421",
-        "± 0.0041",
+        "0.7341",
+        "0.7502",
+        "10 m in this map are 9.89 to 10.11 m.",
         "Scale: good",
         "Eight anchors agree within 1.5 %.",
         "12 ranges were taken before the first photo.",
@@ -107,7 +115,7 @@ def test_the_numbers_are_those_of_the_result(make_result: MakeResult) -> None:
         str(summary["check_ranges"]["num"]),
         "0.83 px",
         "+0.0123 s",
-        "2 min 10 s",
+        "rangesfm 0.1.0 in 2 min 10 s (all stages)",
         "1.9132",
         "+1.094",
         "−0.051",
@@ -117,7 +125,6 @@ def test_the_numbers_are_those_of_the_result(make_result: MakeResult) -> None:
         "4.2.1",
     ]
     assert [text for text in expected if text not in texts] == []
-    assert any("95 % interval 0.7341 to 0.7502" in text for text in texts)
 
 
 def value_at(summary: Any, key: str) -> Any:
@@ -139,23 +146,24 @@ def test_every_number_of_the_result_stands_on_the_page_as_it_is(make_result: Mak
     folder = make_result()
     summary = json.loads((folder / "result.json").read_text())
     shown = page_of(folder).numbers
-    for key, value, text in shown:
+    for key, value, times, text in shown:
         assert float(value) == value_at(summary, key)
+        shown_as = float(value) * times
         digits = text.replace("−", "-").replace("\u202f", "").removeprefix("+").split("\u00a0")[0]
         decimals = len(digits.partition(".")[2].partition("e")[0])
-        assert float(digits) == pytest.approx(float(value), abs=0.5001 * 10.0**-decimals, rel=1e-12), key
+        assert float(digits) == pytest.approx(shown_as, abs=0.5001 * 10.0**-decimals, rel=1e-12), key
     wanted = [
         found
         for key in ("ranges", "check_ranges", "time_offset", "refine", "comparison", "anchors", "distances")
         for found in numbers_in(summary[key], key)
     ]
-    wanted += ["scale.value", "scale.stddev_formal", "scale.stddev_empirical"]
+    wanted += ["scale.value", "scale.interval_95.0", "scale.interval_95.1"]
     wanted += numbers_in(summary["scale"]["two_candidate"], "scale.two_candidate")
     # Some numbers are shown otherwise: ranges in the table of statuses, surveyed positions as differences, lever arms
     # in one cell.
     counts = ("num_rejected", "num_anchor_anchor", "num_tag_tag", "num_keyframes", "num_without_root")
     others = [key for key in wanted if key.endswith(counts) or "surveyed" in key or "tag_in_cam_m" in key]
-    assert set(wanted) - set(others) <= {key for key, _, _ in shown}
+    assert set(wanted) - set(others) <= {key for key, *_ in shown}
 
 
 def doubtful_place(reason: str, stddev_m: list[float]) -> dict[str, Any]:
@@ -168,11 +176,60 @@ def test_the_place_has_its_verdict_beside_that_of_the_scale(make_result: MakeRes
     texts = page_of(make_result(changes={"place": place})).texts
     begin = texts.index("Place: doubtful")
     assert begin > texts.index("Scale: good")
-    assert [text for text in texts[begin:] if text in ("0.03", "0.04", "0.12", "Why not.")] == [
-        *("0.03", "0.04", "0.12", "Why not.")
+    assert [text for text in texts[begin:] if text in ("0.06 m", "0.08 m", "0.24 m", "Why not.")] == [
+        *("0.06 m", "0.08 m", "0.24 m", "Why not.")
     ]
     texts = page_of(make_result("elsewhere", changes={"place": None})).texts
     assert not any(text.startswith("Place") for text in texts)
+
+
+def facts_on(page: Page) -> dict[str, str]:
+    names = ("What was done", "When", "By", "Coordinates", "Computed")
+    return {name: page.texts[page.texts.index(name) + 1] for name in names if name in page.texts}
+
+
+def test_what_was_done_when_by_whom_and_in_which_coordinates(make_result: MakeResult) -> None:
+    told = {"report": {"title": "Hall 7, north", "by": "E. Muster"}, "anchors": {"crs": "EPSG:25832"}}
+    changes = {"settings": told, "computed": "2026-05-15T08:03:00+00:00", "map": {"num_photos": 20}}
+    folder = make_result(num_keyframes=20, num_ranges_per_anchor=10, changes=changes)
+    at_s = [1_778_768_430 + 7 * i for i in range(20)]
+    rows = "".join(f"image{i:05d}.jpg,{at_s[i]}\n" for i in range(20))
+    (folder / "images.csv").write_text(f"image_name,timestamp_s\n{rows}")
+    page, summary = page_of(folder), json.loads((folder / "result.json").read_text())
+    assert "Hall 7, north" in page.texts
+    facts, used = facts_on(page), summary["ranges"]["num_used"]
+    assert facts["What was done"].startswith("20 photos along ")
+    assert f" {used} of 80 ranges to 8 radio anchors, 8 of them surveyed" in facts["What was done"]
+    assert facts["What was done"].endswith("Photos and measurements were adjusted together.")
+    assert facts["When"] == "14 May 2026, 14:20 to 14:22 by the photos' clock"
+    assert facts["By"] == "E. Muster"
+    assert "anchors.csv (EPSG:25832)" in facts["Coordinates"]
+    assert facts["Computed"].startswith("15 May 2026, rangesfm 0.1.0 in ")
+
+
+def test_a_fact_that_is_not_known_is_left_out(make_result: MakeResult) -> None:
+    folder = make_result(num_keyframes=5, num_ranges_per_anchor=5, is_refined=False, changes={"frame": "first_camera"})
+    facts = facts_on(page_of(folder))  # the photos' clock does not tell the date
+    assert facts.keys() == {"What was done", "Coordinates", "Computed"}
+    assert facts["What was done"].endswith("The map was scaled as a whole.")
+    assert facts["Coordinates"].startswith("x right, y down, z forward in metres from the first photo, image00000.jpg.")
+
+
+def test_only_mistakes_that_were_found_stand_above_the_appendix(make_result: MakeResult) -> None:
+    page = page_of(make_result(num_keyframes=5, num_ranges_per_anchor=5))
+    texts = page.texts
+    appendix = texts.index("Appendix")
+    assert texts.index("anchor coordinate 1 y", 0, appendix)
+    assert "lever arm" not in texts[:appendix]
+    assert "lever arm" in texts[appendix:]
+    clean = make_result("clean", num_keyframes=5, num_ranges_per_anchor=5, changes={"tests": []})
+    assert "found" not in page_of(clean).ids
+
+
+def test_no_stddev_stands_above_the_appendix(make_result: MakeResult) -> None:
+    """A reader compares spreads, so all of them are half of a 95 % interval."""
+    texts = page_of(make_result(num_keyframes=5, num_ranges_per_anchor=5)).texts
+    assert [text for text in texts[: texts.index("Appendix")] if "stddev" in text] == []
 
 
 def test_what_would_help_and_what_speaks_against_both_is_said_once(make_result: MakeResult) -> None:
@@ -302,7 +359,17 @@ def test_a_result_without_ranges_or_models_has_a_page(make_result: MakeResult) -
         for file in (folder / stage / "0").iterdir():
             file.unlink()
         (folder / stage / "0").rmdir()
-    assert sections_of(page_of(folder)) == ["verdict", "checks", "path", "scale", "mistakes", "anchors", "run"]
+    assert sections_of(page_of(folder)) == [
+        "verdict",
+        "found",
+        "checks",
+        "path",
+        "scale",
+        "anchors",
+        "mistakes",
+        "candidates",
+        "run",
+    ]
 
 
 def test_a_log_by_photo_without_times_is_drawn_in_its_order(make_result: MakeResult) -> None:

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from tests.result_document import REFINE, anchor_entry, result_document
 
-from rangesfm.errors import InputError
+from rangesfm.comparison.with_reference import format_table
+from rangesfm.errors import InputError, number_text
+from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.summary import ResultSummary, schema
 
 if TYPE_CHECKING:
@@ -103,6 +105,33 @@ def test_similarity_is_that_of_its_keys() -> None:
     np.testing.assert_allclose(again.rotation_xyzw, [0.0, 0.0, 1.0, 0.0], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("interval_95", "words"),
+    [
+        ([1.485, 1.5153], "10 m in this map are 9.90 to 10.10 m"),
+        ([1.4, 1.7], "10 m in this map are 9.33 to 11.33 m"),
+        ([1.49985, 1.50018], "10 m in this map are 9.9990 to 10.0012 m"),
+        (None, "how long 10 m in this map are is open"),
+    ],
+)
+def test_the_accuracy_is_told_for_ten_metres(interval_95: list[float] | None, words: str) -> None:
+    summary = ResultSummary.model_validate(result_document(scale={"value": 1.5, "interval_95": interval_95}))
+    assert summary.scale.in_words == words
+    assert words in repr(summary)
+    assert len(repr(summary)) < 100
+    assert any(words in line for line in summary.lines(Path("out"), None)) == (interval_95 is not None)
+
+
+def test_a_number_that_rounds_to_zero_has_no_sign() -> None:
+    assert [number_text(value, "+.3f") for value in (-1e-5, 1e-5, -0.0, -0.0006)] == ["0.000"] * 3 + ["-0.001"]
+    assert number_text(-3e-7, ".2e") == "-3.00e-07"
+    assert number_text(-float("inf"), "+.1f") == "-inf"
+    row = {"name": "true scale", "num_keyframes": 9, "rmse_m": None, "rmse_se3_m": -0.0, "rmse_sim3_m": 0.1}
+    table = format_table((ComparisonRow.model_validate({**row, "scale_error_percent": -2e-9}),))
+    assert "-0.000" not in table
+    assert "0.000 %" in table
+
+
 def test_lines_for_people_tell_what_is_known() -> None:
     sensitive = {"sensitivity": {"short_range_per_cm": -0.6, "common_bias_per_cm": 0.5}, "interval_95": None}
     document = result_document(scale=sensitive, refine=REFINE, ranges={"num": 9, "num_used": 7, "rms_m": 0.0512})
@@ -112,7 +141,7 @@ def test_lines_for_people_tell_what_is_known() -> None:
         "verdict: good: the scale is known to 2 % (95 % interval)",
         "the scale is sensitive: -0.60 % per cm of bias in short ranges",
         "refined after 23 iterations; the ranges took a bend of 0.01 m (rms) out of the map",
-        "ranges: 7 of 9 used, rms 0.051 m, median unknown m",
+        "ranges: 7 of 9 used; they differ from the map by 0.051 m (rms), half of them by less than unknown m",
         "map: 40 photos, 900 points, frame site",
         *("", "a  b", "c  d", ""),
         f"metric model: {Path('out/sparse_metric/0')}",

@@ -103,7 +103,9 @@ def test_result_and_summary_are_returned_as_written(refined: Done) -> None:
     assert done.output_path == refined.survey.output.path
     written = ResultSummary.read(done.output_path / "result.json")
     assert written == done.summary
-    assert done.lines[0].startswith(f"scale: {done.summary.scale.value:.6g} m per SfM unit")
+    assert done.lines[0] == f"accuracy: {done.summary.scale.in_words} (95 % interval)"
+    assert done.lines[1].startswith(f"scale: {done.summary.scale.value:.6g} m per SfM unit")
+    assert str(done) == repr(done) == "\n".join(done.lines)
     assert "comparison" not in written.to_json()
 
 
@@ -409,5 +411,5 @@ def test_a_survey_begins_with_its_photos_or_with_its_model(
         monkeypatch.setattr(run, name, lambda survey, name=name, **_: begun.append(name))
     images = {"path": "photos"} | ({} if model is None else {"model": model})
     survey = survey_from_tables({"images": images, "refine": {"enabled": refine}}, tmp_path)
-    run.metric_map_of(survey, progress=SilentProgress())
+    run.run_survey(survey, progress=SilentProgress())
     assert begun == [stage]

@@ -9,6 +9,7 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from rangesfm.batch.batch_state import BatchState, Status, SurveyRow
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report import report_page
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain
@@ -29,8 +30,8 @@ _HEADER = (
     "time",
 )
 _NOTE = (
-    "Scale: metres per unit of the unscaled model, with the larger of its two standard deviations. RMSE: error of the "
-    "keyframe centres against a reference, without any alignment. Attempts: more than one where a worker was killed."
+    "Scale: metres per unit of the unscaled model, ± half of its 95 % interval. RMSE: error of the keyframe centres "
+    "against a reference, without any alignment. Attempts: more than one where a worker was killed."
 )
 
 
@@ -64,12 +65,13 @@ def _tiles(batch_state: BatchState) -> list[tuple[str, str, str]]:
 
 
 def _row(row: SurveyRow, folder: Path) -> list[str]:
-    decimals = decimals_for(row.scale_stddev, default=5)
+    within = None if row.scale_stddev is None else NORMAL_95 * row.scale_stddev
+    decimals = decimals_for(within, default=5)
     scale = fixed(row.scale, decimals)
     return [
         _name(row, folder),
         Markup("{} {}").format(report_page.light(_light(row)), row.verdict or row.status.value),
-        scale if row.scale_stddev is None else f"{scale} ± {fixed(row.scale_stddev, decimals)}",
+        scale if within is None else f"{scale} ± {fixed(within, decimals)}",
         count(row.num_photos),
         f"{count(row.num_ranges_used)} of {count(row.num_ranges)}" if row.num_ranges is not None else plain(None),
         fixed(row.range_rms_m, 3, "m"),

@@ -42,7 +42,7 @@ class SurveyRow:
         host: machine of the last attempt.
         output_path: folder of the results; empty if the survey file cannot be read.
         scale: metres per unit of the unscaled model.
-        scale_stddev: the larger of its formal and its empirical standard deviation.
+        scale_stddev: its empirical standard deviation, which is never less than the formal one.
         num_photos: number of photos in the model.
         rmse_m: RMSE of the final map's keyframe centres without alignment, where there is a reference.
     """
@@ -78,7 +78,7 @@ def figures_of(summary: ResultSummary) -> dict[str, Any]:
     return {
         "verdict": scale.verdict,
         "scale": scale.value,
-        "scale_stddev": scale.larger_stddev,
+        "scale_stddev": scale.stddev_empirical,
         "frame": summary.frame,
         "num_photos": summary.map.num_photos,
         "num_ranges": ranges.num,

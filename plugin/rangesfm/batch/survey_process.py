@@ -18,9 +18,9 @@ def _run(given: tuple[Survey, bool], worker: MessagesToParent) -> dict[str, Any]
     # The lock of the output folder names this command to other processes.
     sys.argv = ["rangesfm", "batch", str(survey.source.path)]
     from rangesfm.batch.batch_state import figures_of
-    from rangesfm.workflows.run import metric_map_of
+    from rangesfm.workflows.run import run_survey
 
-    summary = metric_map_of(survey, progress=worker, restart=restart).summary
+    summary = run_survey(survey, progress=worker, restart=restart).summary
     reasons = summary.scale.reasons if summary.scale.verdict != "good" else ()
     return {"figures": figures_of(summary), "reason": "; ".join(reasons)}
 

@@ -75,9 +75,9 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
         survey.require_metres()
     else:
         _require_model_and_metres(survey)
-    from rangesfm.workflows.run import metric_map_of
+    from rangesfm.workflows.run import run_survey
 
-    return Outcome(metric_map_of(survey, progress=progress, restart=args.restart).lines)
+    return Outcome(run_survey(survey, progress=progress, restart=args.restart).lines)
 
 
 def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:

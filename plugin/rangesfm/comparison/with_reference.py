@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, number_text
 from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.similarity import Similarity, align_points, rmse, similarity_between
@@ -151,4 +151,4 @@ def format_table(rows: tuple[ComparisonRow, ...]) -> str:
 
 def text_or_dash(value: float | None, spec: str, unit: str = "") -> str:
     """Return a number as text with its unit, or "-" where it is unknown, for a table in plain text."""
-    return "-" if value is None or math.isnan(value) else f"{value:{spec}}{unit}"
+    return "-" if value is None or math.isnan(value) else f"{number_text(value, spec)}{unit}"

@@ -18,9 +18,10 @@ from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
-from rangesfm.scale.scale_estimate import NORMAL_95, ScaleEstimate
+from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
 # Largest deviation of an anchor's coordinate, in prior standard deviations: chance exceeds it once in two thousand.
@@ -194,8 +195,8 @@ def place_of_map(
     surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
     size_m = float(np.linalg.norm(np.ptp(np.vstack([centers_m, *surveyed]), axis=0)))
     summary_of_place = (
-        f"the map's place is known to {np.linalg.norm(stddevs[4:]):.2g} m, its heading to {heading_deg:.2g} deg, each "
-        f"keyframe to {worst_m:.2g} m or better (1 stddev)"
+        f"the map's place is known to {NORMAL_95 * np.linalg.norm(stddevs[4:]):.2g} m, its heading to "
+        f"{NORMAL_95 * heading_deg:.2g} deg, each keyframe to {NORMAL_95 * worst_m:.2g} m or better (95 %)"
     )
     # The scale's own limit, applied to the site's size and to a radian: then no length and no place is less certain.
     is_wide = NORMAL_95 * worst_m > DOUBTFUL_ABOVE * size_m or NORMAL_95 * stddevs[3] > DOUBTFUL_ABOVE

@@ -11,6 +11,8 @@ from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
 from rangesfm.diagnostics.scale_bound import hidden_lengths
 from rangesfm.distances.tape import Tape, TapedDistance
+from rangesfm.errors import number_text
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
@@ -55,7 +57,7 @@ def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[Mista
             float(lengths.statistic[k]),
             lengths.threshold,
             words=f"the length from {between} is given as {one.distance_m:.3f} m, but the other lengths give "
-            f"{one.distance_m - size_m:.3f} m ({size_m:+.3f} m)",
+            f"{one.distance_m - size_m:.3f} m ({number_text(size_m, '+.3f')} m)",
             remedy=_MEASURE_AGAIN,
             unit="m",
             size=size_m if is_known else None,
@@ -80,8 +82,8 @@ def _against_ranges(estimate: ScaleEstimate) -> Iterator[MistakeTest]:
         "",
         (apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
         float(special.chdtri(1, LENGTH_FALSE_ALARM_RATE)),
-        words=f"by the measured lengths the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the ranges; their "
-        f"errors together explain {100 * stddev:.1f} % (1 stddev)",
+        words=f"by the measured lengths the map is {number_text(100 * (np.exp(apart) - 1), '+.1f')} % larger than by "
+        f"the ranges; their errors together explain {100 * NORMAL_95 * stddev:.1f} % (95 %)",
         remedy="measure a length again, and calibrate the radio (rangesfm ranges calibrate)",
         unit="1",
         size=apart,

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import AliasChoices, Field
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, number_text
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.text_tables import TextTable, read_table, repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
@@ -204,6 +204,6 @@ def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float, ben
         if row.kind != LEFT_OUT and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
             yield (
                 f"{row.kind} distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
-                f"{row.measured_m:.3f} m by tape ({row.residual_m:+.3f} m, expected within "
+                f"{row.measured_m:.3f} m by tape ({number_text(row.residual_m, '+.3f')} m, expected within "
                 f"{_DISAGREES * stddev_m:.3f} m)"
             )

@@ -94,6 +94,11 @@ class RefineSummary:
     predicted_m: Array
     weights: Array
 
+    def __repr__(self) -> str:
+        """Return what the refinement did on one line."""
+        ended = "converged" if self.converged else "not converged"
+        return f"<refinement of {self.num_iterations} iterations, {ended}, {self.reprojection_rms_px:.2f} px>"
+
 
 @dataclass(frozen=True)
 class AtRest:

@@ -70,7 +70,7 @@ class Content:
             InputError: a file of the result is there but cannot be read.
         """
         self.result, self.summary = result, result.summary
-        self.title = _title(real_path(home or result.path))
+        self.title = self.summary.settings.report.title or _title(real_path(home or result.path))
         self.images_path = images_path or result.images_path
         self.ranges = result.read(RangesAsUsed)
         self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)

@@ -15,14 +15,13 @@ CANDIDATE_AXIS = (-1.0, 4.0)
 
 
 def scale_per_anchor_figure(content: Content) -> Figure | None:
-    """Return the figure of the scale from each anchor alone, beside the joint scale and its standard deviation."""
-    scale = content.summary.scale
-    joint, stddev = scale.value, scale.larger_stddev
+    """Return the figure of the scale from each anchor alone, beside that of all anchors and its 95 % interval."""
+    scale, joint = content.summary.scale, content.summary.metric_from_sfm.scale
     values = {anchor_id: scale.per_anchor[anchor_id] for anchor_id in in_natural_order(scale.per_anchor)}
     alone = {anchor_id: value for anchor_id, value in values.items() if value is not None}
     if len(alone) < 2:
         return None
-    half = 1.25 * max([*(abs(value - joint) for value in alone.values()), stddev or 0.0, 1e-4 * joint])
+    half = 1.25 * max([abs(end - joint) for end in (*alone.values(), *(scale.interval_95 or ()), 1.0001 * joint)])
     marks, rows = [], []
     for row, (anchor_id, value) in enumerate(alone.items()):
         percent = signed(100.0 * (value / joint - 1.0), 2, "%")
@@ -31,13 +30,14 @@ def scale_per_anchor_figure(content: Content) -> Figure | None:
         marks.append(Mark("one anchor", "after", "disc", value, row, "", title))
     return figure_of(
         "scale_per_anchor",
-        "The scale from each anchor alone, and its difference from the joint scale. Line and band: the joint scale "
-        "and one standard deviation. An error of a single anchor, such as a wrong position, shows here.",
-        "Scale from each anchor alone against the joint scale",
+        "The scale from each anchor alone, and its difference from the scale from all of them before the refinement "
+        "(the line). Band: the 95 % interval of the scale. An error of a single anchor, such as a wrong position, "
+        "shows here.",
+        "Scale from each anchor alone against the scale from all",
         ("scale m per unit", ""),
         (),
-        line=("joint scale", joint),
-        band=None if stddev is None else ("± one standard deviation", joint - stddev, joint + stddev),
+        line=("all anchors", joint),
+        band=None if scale.interval_95 is None else ("95 % interval", *scale.interval_95),
         marks=tuple(marks),
         x_range=(joint - half, joint + half),
         y_range=(len(alone) - 0.5, -0.5),
@@ -48,16 +48,16 @@ def scale_per_anchor_figure(content: Content) -> Figure | None:
 
 def candidates(content: Content) -> Figure | None:
     """Return the figure of the 2018 paper: both candidates of each range over time."""
-    table, scale = content.result.read(ScaleCandidates), content.summary.scale.value
+    table, scale = content.result.read(ScaleCandidates), content.summary.metric_from_sfm.scale
     if table is None or len(table.alpha0) == 0:
         return None
     stride = every_nth(len(table.alpha0), MAX_NUM_CANDIDATES)
     times, label = time_axis(table.timestamp_s[::stride])
     found = np.array([[times.min(), scale], [times.max(), scale]])
     caption = (
-        "Each range has two possible scales, its candidates. The true one is constant over time, the other is not. "
-        "They swap where the path turns towards an anchor or away from it. Values beyond the axis are drawn at its "
-        "edge."
+        "The method of Lee, Zhu, Giorgi and Günther (2018): two scales, its candidates, make a range fit the path. "
+        "The true one is constant over time, the other is not. They swap where the path turns towards an anchor or "
+        "away from it. Values beyond the axis are drawn at its edge."
     )
     if stride > 1:
         caption += f" One range in {stride} is drawn; scale_candidates.csv has all."
@@ -89,7 +89,7 @@ def consensus(content: Content) -> Figure | None:
         "Number of ranges that agree with each scale",
         ("scale m per unit", "ranges"),
         (curve,),
-        line=("scale found", content.summary.scale.value),
+        line=("scale found", content.summary.metric_from_sfm.scale),
         y_range=from_zero([curve]),
     )
 

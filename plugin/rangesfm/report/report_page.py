@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
 from markupsafe import Markup
 
 from rangesfm.files.atomic import new_file
@@ -17,6 +16,7 @@ from rangesfm.report import figures_mistakes, figures_path, figures_ranges, figu
 from rangesfm.report.chart import ASSETS, css, page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
+from rangesfm.report.facts import facts_of
 from rangesfm.report.plot import Figure
 from rangesfm.report.scene import scene_of, view_of
 
@@ -29,34 +29,48 @@ CONTENT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; 
 
 
 class Section(NamedTuple):
-    """A card of a page. The page leaves it out where it has neither a figure nor a table with rows."""
+    """A card of a page. The page leaves it out where it has neither a figure nor a table with rows.
+
+    Attributes:
+        is_open: whether it is unfolded at first.
+        is_appendix: whether it stays folded on paper unless the reader unfolds it.
+    """
 
     id: str
     title: str
     figures: Sequence[Figure] = ()
     tables: Sequence[report_tables.ReportTable] = ()
+    is_open: bool = True
+    is_appendix: bool = False
 
 
-# Sections of the report: title, and the functions that make its figures and tables.
-_SECTIONS: dict[str, tuple[Callable[[Content], Figure | report_tables.ReportTable | None], ...]] = {
-    "Path": (figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale, report_tables.comparison),
-    "Scale": (
-        *(
-            figures_scale.scale_per_anchor_figure,
-            figures_scale.consensus,
-            figures_scale.clock_curve,
-            figures_scale.candidates,
-        ),
-        *(report_tables.scale_by_kind, report_tables.error_budget),
-        *(report_tables.two_candidates, report_tables.sensitivity),
+_Maker = Callable[[Content], Figure | report_tables.ReportTable | None]
+# Sections of the report: id and title, and the functions that make its figures and tables.
+_FOUND = ("found", "Mistakes that the ranges show")
+_SECTIONS: dict[tuple[str, str], tuple[_Maker, ...]] = {
+    _FOUND: (report_tables.mistakes_found,),
+    ("path", "Path"): (
+        *(figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale),
+        report_tables.comparison,
     ),
-    "Ranges": (
+    ("scale", "Scale and clocks"): (
+        *(figures_scale.scale_per_anchor_figure, figures_scale.consensus, figures_scale.clock_curve),
+        *(report_tables.scale_by_kind, report_tables.error_budget, report_tables.sensitivity),
+    ),
+    ("ranges", "Ranges"): (
         *(figures_ranges.residuals_over_time, figures_ranges.residual_histogram, figures_ranges.absolute_errors),
         *(report_tables.range_statuses, report_tables.ranges_per_anchor),
     ),
-    "Mistakes": (figures_mistakes.mistakes_figure, report_tables.mistakes, report_tables.reliability),
-    "Anchors": (report_tables.anchors, report_tables.distances),
-    "Run": (
+    ("anchors", "Anchors and measured lengths"): (report_tables.anchors, report_tables.distances),
+}
+_APPENDIX: dict[tuple[str, str], tuple[_Maker, ...]] = {
+    ("mistakes", "Mistakes that were tested for and not found"): (
+        *(figures_mistakes.mistakes_figure, report_tables.mistakes_not_found, report_tables.reliability),
+    ),
+    ("candidates", "The method of the 2018 paper, for comparison"): (
+        *(figures_scale.candidates, report_tables.two_candidates),
+    ),
+    ("run", "How it was computed"): (
         *(report_tables.stages, report_tables.refinement, report_tables.versions),
         *(report_tables.intrinsics, report_tables.inputs, report_tables.settings),
     ),
@@ -66,20 +80,18 @@ _SCRIPTS = (
     *("data", "stage", "points", "cameras", "anchors", "ranges", "grid", "picking", "measuring", "photo_panel"),
     *("charts", "csv", "main"),
 )
-_FILTERS = (text.count, text.duration, text.fixed, text.percent, text.plain, text.sentence, text.signed)
+_FILTERS = (text.count, text.duration, text.fixed, text.percent, text.sentence, text.signed)
 
 
 def sections_of(content: Content) -> list[Section]:
     """Return all sections of the report, with their figures and tables."""
     sections = []
-    for title, makers in _SECTIONS.items():
+    for (id_, title), makers in (_SECTIONS | _APPENDIX).items():
         made = [make(content) for make in makers]
         figures = [each for each in made if isinstance(each, Figure)]
-        sections.append(
-            Section(
-                title.lower(), title, figures, [each for each in made if isinstance(each, report_tables.ReportTable)]
-            )
-        )
+        tables = [each for each in made if isinstance(each, report_tables.ReportTable)]
+        is_open, is_appendix = (id_, title) == _FOUND, (id_, title) in _APPENDIX
+        sections.append(Section(id_, title, figures, tables, is_open, is_appendix))
     return sections
 
 
@@ -92,24 +104,10 @@ def render_report(content: Content) -> str:
         heading=content.title,
         summary=content.summary,
         checks=quality_checks(content.summary),
-        tiles=_tiles(content),
+        facts=facts_of(content),
         view=None if scene is None else view_of(scene),
         sections=sections_of(content),
     )
-
-
-def _tiles(content: Content) -> list[tuple[str, str, str]]:
-    """Return name, value and note of each tile; the tiles say how large the survey was."""
-    path, seconds, anchors = content.final, content.summary.seconds, content.summary.anchors
-    num_surveyed = sum(anchor.surveyed_position_m is not None for anchor in anchors.values())
-    length_m = None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
-    known = [value for value in seconds.values() if value is not None]
-    return [
-        ("Keyframes", text.count(None if path is None else len(path)), f"path of {text.fixed(length_m, 2, 'm')}"),
-        ("Map points", text.count(None if path is None else len(content.points_m)), "seen by two keyframes or more"),
-        *([("Anchors", text.count(len(anchors)), f"{num_surveyed} of them surveyed")] if anchors else []),
-        ("Time taken", text.duration(seconds.get("total") or (sum(known) if known else None)), "all stages"),
-    ]
 
 
 def render_page(template: str, *, sections: Sequence[Section] = (), **values: Any) -> str:
@@ -169,7 +167,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {function.__name__: function for function in _FILTERS}
-    globals_ = (text.keyed, text.decimals_for, text.said_once, css)
+    globals_ = (text.keyed, text.within_95, text.decimals_for, text.said_once, css)
     environment.globals |= {function.__name__: function for function in globals_}
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment

@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from rangesfm.diagnostics.scale_bound import CHECKED_KINDS
 from rangesfm.ranging.errors.components import component_words
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, mistake, percent, plain, rough, signed
 from rangesfm.result.entries import AnchorEntry, MistakeEntry, median, rms
@@ -31,13 +32,13 @@ _REFINEMENT = {
     "initial_cost": "cost before",
     "final_cost": "cost after",
     "reprojection_rms_px": "reprojection RMS, px",
-    "pixel_stddev": "stddev of an observation, px",
+    "pixel_stddev": "scatter of an observation, px",
     "correlation_inflation": "factor on stddevs, for errors that last",
     "seconds": "time, s",
-    "converged": "converged",
+    "converged": "solver converged",
     "message": "solver's message",
     "scale_value": "scale after, m per unit",
-    "relative_scale_stddev": "relative stddev of the scale",
+    "relative_scale_stddev": "± of the scale as a fraction (95 %), by the solver alone",
     "tag_in_cam_m": "lever arm, m",
     "time_offset_change_s": "change of the time offset, s",
     "short_range_error_m": "error of short ranges, m",
@@ -89,22 +90,31 @@ def ranges_per_anchor(content: Content) -> ReportTable:
     return ReportTable("Ranges of each anchor", header, rows)
 
 
-def mistakes(content: Content) -> ReportTable:
-    """Return the table of the tests of mistakes: which were made and found, and what the others may do.
+def mistakes_found(content: Content) -> ReportTable:
+    """Return the table of the mistakes that the ranges show."""
+    return _mistakes(content, "Mistakes that the ranges show", are_found=True)
 
-    A bar that is half full is at the threshold of the test. Where several mistakes of one kind were not found, such as
-    one for each anchor, the table has only the one with the most evidence.
+
+def mistakes_not_found(content: Content) -> ReportTable:
+    """Return the table of the mistakes that were tested for and not found.
+
+    Where there are several of one kind, such as one for each anchor, it has only the one with the most evidence.
     """
+    return _mistakes(content, "Mistakes that were tested for and not found", are_found=False)
+
+
+def _mistakes(content: Content, caption: str, *, are_found: bool) -> ReportTable:
+    """Return a table of tests of mistakes. A bar that is half full is at the threshold of the test."""
     tests, rows = content.summary.tests, []
     numbers = {
-        "stddev": "stddev",
+        "stddev": "± (95 %)",
         "smallest_detectable": "smallest found",
         "effect_on_scale": "effect on scale",
         "effect_on_place_m": "on places m",
     }
     likeliest: set[str] = set()
     for i, test in enumerate(tests):
-        if not test.rejected and test.name in likeliest:
+        if test.rejected != are_found or (not test.rejected and test.name in likeliest):
             continue
         likeliest |= set() if test.rejected else {test.name}
         num_others = 0 if test.rejected else sum(other.name == test.name and not other.rejected for other in tests) - 1
@@ -117,13 +127,26 @@ def mistakes(content: Content) -> ReportTable:
         verdict = "found" if test.rejected else unfound
         rows.append([mistake(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
     return ReportTable(
-        "Mistakes that may have been made",
-        ["mistake", "if it was made", "evidence", "", "unit", *numbers.values()],
+        caption,
+        [
+            "mistake",
+            "what the ranges say" if are_found else "if it was made",
+            "evidence",
+            "",
+            "unit",
+            *numbers.values(),
+        ],
         rows,
+        "A bar more than half full is more than chance explains." if are_found else _note_on_not_found(tests),
+        kind="mistakes",
+    )
+
+
+def _note_on_not_found(tests: Sequence[MistakeEntry]) -> str:
+    return (
         f"A bar more than half full is more than chance explains{_from_stddevs(tests)}. A mistake that is not found "
         "may still be there, if it is smaller than the smallest one found. The last two columns say how much it may "
-        "then change the scale (as a fraction of it) and places in the map. All tests are in result.json.",
-        kind="mistakes",
+        "then change the scale (as a fraction of it) and places in the map. All tests are in result.json."
     )
 
 
@@ -180,10 +203,11 @@ def two_candidates(content: Content) -> ReportTable:
         rows.append([name, *cells, "chosen" if given and given.chosen == name else ""])
     return ReportTable(
         "The paper's two candidates",
-        ["branch", "mean", "stddev", ""],
+        ["candidates", "mean", "stddev", ""],
         rows,
-        "Each range has two possible scales, alpha0 and alpha1. The 2018 paper takes the mean of the branch with the "
-        "smaller standard deviation. This is shown for comparison; other methods do not use it.",
+        "Each range has two possible scales; alpha0 is the smaller one. The paper takes the mean of the candidates "
+        "with the smaller standard deviation. A range that says little about the scale has candidates far away, which "
+        "spoil the mean. Other methods do not use it.",
     )
 
 
@@ -191,8 +215,8 @@ def anchors(content: Content) -> ReportTable:
     """Return the table of the anchors: positions, their standard deviations, and range biases."""
     given = content.summary.anchors
     rows = [_anchor(anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given)]
-    header = ["anchor", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
-    note = "Δ: estimated minus surveyed position, for surveyed anchors. A stddev of 0: the position was held fixed."
+    header = ["anchor", "x m", "y m", "z m", "± m (95 %)", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
+    note = "Δ: estimated minus surveyed position, for surveyed anchors. ± 0: the position was held fixed."
     return ReportTable("Anchors in the map's frame", header, rows, note)
 
 
@@ -218,7 +242,7 @@ def distances(content: Content) -> ReportTable:
         [f"{row.from_} to {row.to}", row.kind, *_cells(f"distances.{i}", row, columns)]
         for i, row in enumerate(content.summary.distances)
     ]
-    header = ["distance", "kind", "by tape m", "stddev m", "in the map m", "difference m"]
+    header = ["distance", "kind", "by tape m", "± m (95 %)", "in the map m", "difference m"]
     return ReportTable("Control and check distances", header, rows)
 
 
@@ -258,6 +282,8 @@ def refinement(content: Content) -> ReportTable:
     values = {} if refine is None else refine.to_json()
     rows = [
         [_REFINEMENT[name], keyed(f"refine.{name}", value, plain(value))]
+        if name != "relative_scale_stddev"
+        else [_REFINEMENT[name], _cell(f"refine.{name}", value, plain)]
         for name, value in values.items()
         if value not in (None, "", {})
     ]
@@ -265,11 +291,18 @@ def refinement(content: Content) -> ReportTable:
 
 
 def error_budget(content: Content) -> ReportTable:
-    """Return the table of the components of the scale's standard deviation, the largest first."""
+    """Return the table of the components of the scale's 95 % interval, the largest first."""
     parts = content.summary.scale.relative_stddev.components
     words = component_words(parts)
-    rows = [[words[name], f"{100 * stddev:.2f}"] for name, stddev in sorted(parts.items(), key=lambda part: -part[1])]
-    return ReportTable("Components of the scale's stddev", ["errors", "stddev %"], rows, is_narrow=True)
+    rows = [
+        [words[name], fixed(100 * NORMAL_95 * stddev, 2)]
+        for name, stddev in sorted(parts.items(), key=lambda part: -part[1])
+    ]
+    note = (
+        "Each is half of the 95 % interval that this error alone would cause. Together they count as the root of the "
+    )
+    note += "sum of their squares."
+    return ReportTable("What makes up the scale's 95 % interval", ["errors", "± %"], rows, note, is_narrow=True)
 
 
 def sensitivity(content: Content) -> ReportTable:
@@ -295,7 +328,7 @@ def scale_by_kind(content: Content) -> ReportTable:
         for kind, entry in content.summary.scale.by_kind.items()
     ]
     return ReportTable(
-        "The scale from each kind of measurement", ["from", "metres per unit", "stddev"], rows, is_narrow=True
+        "The scale from each kind of measurement", ["from", "metres per unit", "± (95 %)"], rows, is_narrow=True
     )
 
 
@@ -313,6 +346,14 @@ def settings(content: Content) -> ReportTable:
 
 
 def _cells(key: str, entry: object, columns: _Columns) -> list[str]:
-    """Return cells with numbers of an entry of ``result.json``; ``columns`` has a formatter for each by its name."""
-    given = {name: getattr(entry, name) for name in columns}
-    return [keyed(f"{key}.{name}", value, columns[name](value)) for name, value in given.items()]
+    """Return cells with numbers of an entry of ``result.json``; ``columns`` has a formatter for each by its name.
+
+    Of a standard deviation, the cell has half of the 95 % interval.
+    """
+    return [_cell(f"{key}.{name}", getattr(entry, name), show) for name, show in columns.items()]
+
+
+def _cell(key: str, value: Any, show: Callable[[Any], str]) -> str:
+    if value is None or "stddev" not in key.rpartition(".")[2]:
+        return keyed(key, value, show(value))
+    return keyed(key, value, show(NORMAL_95 * value), times=NORMAL_95)

@@ -10,6 +10,8 @@ from typing import Any
 from markupsafe import Markup
 
 from rangesfm import progress
+from rangesfm.errors import number_text
+from rangesfm.ranging.errors.noise import NORMAL_95
 
 NOTHING = "–"
 
@@ -23,14 +25,17 @@ def fixed(value: float | None, decimals: int, unit: str = "", *, nothing: str = 
     number = _known(value)
     if number is None:
         return nothing
-    text = f"{round(number, decimals) + 0.0:.{decimals}f}"  # adding 0.0 turns minus zero into zero
-    return text.replace("-", "−") + (f"\u00a0{unit}" if unit else "")
+    return _with_unit(number, f".{decimals}f", unit)
 
 
 def signed(value: float | None, decimals: int, unit: str = "") -> str:
     """Return a number as ``fixed`` does, with a plus sign before positive numbers."""
     number = _known(value)
-    return ("+" if number is not None and number > 0 else "") + fixed(value, decimals, unit)
+    return NOTHING if number is None else _with_unit(number, f"+.{decimals}f", unit)
+
+
+def _with_unit(number: float, spec: str, unit: str) -> str:
+    return number_text(number, spec).replace("-", "−") + (f"\u00a0{unit}" if unit else "")
 
 
 def count(value: float | None) -> str:
@@ -90,14 +95,24 @@ def plain(value: Any) -> str:
     return str(value)
 
 
-def keyed(key: str, value: Any, text: str) -> str:
+def keyed(key: str, value: Any, text: str, *, times: float = 1.0) -> str:
     """Return the text of a number of ``result.json``, marked in HTML with its key (joined by dots) and its full value.
 
     The text of any other value is returned unmarked.
+
+    Args:
+        times: factor of the number that the text shows, if it shows another unit or half a 95 % interval.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return text
-    return Markup('<data value="{}" data-key="{}">{}</data>').format(repr(float(value)), key, text)
+    factor = "" if times == 1.0 else Markup(' data-times="{}"').format(repr(times))
+    return Markup('<data value="{}" data-key="{}"{}>{}</data>').format(repr(float(value)), key, factor, text)
+
+
+def within_95(key: str, stddev: float | None, decimals: int, unit: str = "") -> str:
+    """Return half of the 95 % interval of a number, marked with the key of its standard deviation; see ``keyed``."""
+    half = None if stddev is None else NORMAL_95 * stddev
+    return keyed(key, stddev, fixed(half, decimals, unit), times=NORMAL_95)
 
 
 def said_once(texts: Iterable[str], others: Sequence[str] = ()) -> list[str]:

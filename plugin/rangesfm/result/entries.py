@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -30,6 +32,15 @@ def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
     return quaternion
 
 
+def _iso_time(text: str) -> str:
+    try:
+        datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError("a date and time (ISO 8601)") from None
+    return text
+
+
+Time = Annotated[Text, AfterValidator(_iso_time)]
 Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit)]
 
 
@@ -103,10 +114,19 @@ class ScaleEntry(Record):
     by_kind: dict[Text, ScaleByKindEntry] = Field(default_factory=dict)
 
     @property
-    def larger_stddev(self) -> float | None:
-        """Return the larger of the formal and the empirical stddev; None if both are unknown."""
-        known = (stddev for stddev in (self.stddev_formal, self.stddev_empirical) if stddev is not None)
-        return max(known, default=None)
+    def half_width_95(self) -> float | None:
+        """Return half the width of the 95 % interval, in the logarithm of the scale; None if it is unknown."""
+        low, high = self.interval_95 or (0.0, 0.0)
+        return 0.5 * (math.log(high) - math.log(low)) if 0 < low < high else None
+
+    @property
+    def in_words(self) -> str:
+        """Return the interval as a client reads it: "10 m in this map are 9.88 to 10.12 m"."""
+        if self.interval_95 is None or self.half_width_95 is None or not self.value:
+            return "how long 10 m in this map are is open"
+        low_m, high_m = (10 * bound / self.value for bound in self.interval_95)
+        decimals = min(max(1 - math.floor(math.log10(10 * self.half_width_95)), 0), 6)  # two digits of half the width
+        return f"10 m in this map are {low_m:.{decimals}f} to {high_m:.{decimals}f} m"
 
     @property
     def relative_stddev_empirical(self) -> float | None:
@@ -280,6 +300,7 @@ class RefineEntry(Record):
     """Summary of the refinement; see RefineSummary. What was not estimated is null.
 
     Attributes:
+        converged: whether the solver did. message: of the solver.
         kept: whether the final map is the refined one. Otherwise it is the scaled one.
         why_not_kept: reasons why the refined map cannot be right; empty where it is kept.
         bending_factor: bend of the map before the refinement, divided by the bend that the residuals of the photos let
@@ -318,8 +339,7 @@ class RefineEntry(Record):
             "iterations": summary.num_iterations,
             "keyframe_graph_steps": summary.num_graph_steps,
             "correlation_inflation": summary.errors.inflation,
-            "converged": summary.converged and not summary.misfits and not found.why_broken,
-            "message": "; ".join((*found.why_broken, *summary.misfits)) or summary.message,
+            "converged": summary.converged,
             "scale_value": found.refined_scale,
             "relative_scale_stddev": None if covariance is None else covariance.relative_scale_stddev,
             "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
@@ -447,6 +467,11 @@ class TagSettings(_Table):
     lever_arms_m: dict[Text, Vector]
 
 
+class ReportSettings(_Table):
+    title: Text | None = None
+    by: Text | None = None
+
+
 class Settings(_Table):
     """The settings of the survey as the run had them, by table and key."""
 
@@ -454,6 +479,7 @@ class Settings(_Table):
     ranges: RangesSettings
     anchors: AnchorSettings
     tag: TagSettings
+    report: ReportSettings = ReportSettings()
 
 
 class InputEntry(Record):

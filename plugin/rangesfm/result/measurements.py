@@ -12,8 +12,9 @@ from rangesfm.arrays import Array
 from rangesfm.distances.map_points import MapPoint, MapPoints
 from rangesfm.geometry.gravity import UP_IN_SITE, gravity_of
 from rangesfm.geometry.map_errors import MapErrors
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.result.summary import ResultSummary
-from rangesfm.scale.scale_estimate import NORMAL_95, ScaleUncertainty
+from rangesfm.scale.scale_estimate import ScaleUncertainty
 
 Interval = tuple[float, float]
 

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from rangesfm.distances.tape import CONTROL, DistanceRow
+from rangesfm.errors import number_text
 from rangesfm.files.records import NumberOrNull, Record, Text
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.result import entries
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.scale.scale_estimate import ScaleSensitivity
@@ -40,6 +42,7 @@ class ResultSummary(Record):
         georeference: null if the anchors do not give one.
         versions: of the software, by name.
         seconds: by stage, and in total ("total").
+        computed: date and time of the end of the run, ISO 8601 in UTC; null for results of earlier versions.
     """
 
     NAME: ClassVar[str] = "result.json"
@@ -64,7 +67,12 @@ class ResultSummary(Record):
     settings: entries.Settings
     inputs: tuple[entries.InputEntry, ...]
     seconds: dict[Text, NumberOrNull]
+    computed: entries.Time | None = None
     warnings: tuple[Text, ...]
+
+    def __repr__(self) -> str:
+        """Return the accuracy and the verdict of the map on one line."""
+        return f"<result: {self.scale.in_words} (95 % interval), {self.scale.verdict}>"
 
     @property
     def has_ranges(self) -> bool:
@@ -107,6 +115,8 @@ class ResultSummary(Record):
         scale, ranges, offset = self.scale, self.ranges, self.time_offset
         low, high = scale.interval_95 or (None, None)
         interval = f"{_text(low, '.6g')} to {_text(high, '.6g')}"
+        if scale.interval_95 is not None:
+            yield f"accuracy: {scale.in_words} (95 % interval)"
         yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {interval}"
         yield f"verdict: {scale.verdict}: {'; '.join(scale.reasons)}"
         if self.place is not None:
@@ -121,16 +131,16 @@ class ResultSummary(Record):
         if self.reliability is not None and self.reliability.scale_within is not None:
             yield _reliable(self.reliability)
         rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
-        residuals = f", rms {rms} m, median {median} m" if ranges.num_used else ""
+        residuals = f"; they differ from the map by {rms} m (rms), half of them by less than {median} m"
         if self.has_ranges:
-            yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"
+            yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals if ranges.num_used else ''}"
         if self.distances:
             held = [abs(row.residual_m) for row in self.distances if row.kind == CONTROL and row.residual_m is not None]
             worst = f"; the map differs from these by {max(held):.3f} m at most" if held else ""
             yield f"measured lengths: {len(held)} of {len(self.distances)} used for the scale{worst}"
         if offset.estimated:
-            value, stddev = _text(offset.value_s, "+.3f"), _text(offset.stddev_s, ".3f")
-            yield f"time offset: image time = range time {value} s, +- {stddev} s"
+            value, within = _text(offset.value_s, "+.3f"), _text(_within_95(offset.stddev_s), ".3f")
+            yield f"time offset: image time = range time {value} s, within {within} s (95 %)"
         yield f"map: {self.map.num_photos} photos, {self.map.num_points3D} points, frame {self.frame}"
         if table is not None:
             yield from ("", *table.splitlines(), "")
@@ -161,13 +171,18 @@ def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:
         "of bias in all ranges": sensitivity.common_bias_per_cm,
         **{f"of lever arm in {axis}": value for axis, value in zip("xyz", sensitivity.lever_arm_per_cm)},
     }
-    notable = [f"{v:+.2f} % per cm {what}" for what, v in values.items() if abs(v) > _NOTABLE_PERCENT]
+    notable = [f"{number_text(v, '+.2f')} % per cm {what}" for what, v in values.items() if abs(v) > _NOTABLE_PERCENT]
     if notable:
         yield f"the scale is sensitive: {', '.join(notable)}"
 
 
+def _within_95(stddev: float | None) -> float | None:
+    """Return half the width of the 95 % interval of a number with this standard deviation."""
+    return None if stddev is None else NORMAL_95 * stddev
+
+
 def _text(value: float | None, spec: str) -> str:
-    return "unknown" if value is None else f"{value:{spec}}"
+    return "unknown" if value is None else number_text(value, spec)
 
 
 def schema() -> str:

@@ -10,14 +10,13 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
-
-NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -174,3 +173,8 @@ class ScaleEstimate:
         """Bounds of the scale with 95 % probability, in metres per SfM unit."""
         low, high = self.uncertainty.interval_95
         return self.value * float(np.exp(low)), self.value * float(np.exp(high))
+
+    def __repr__(self) -> str:
+        """Return the scale with its interval and its verdict on one line."""
+        low, high = self.interval_95
+        return f"<scale {self.value:.6g} m per SfM unit, 95 % interval {low:.6g} to {high:.6g}, {self.verdict}>"

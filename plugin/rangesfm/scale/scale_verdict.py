@@ -8,14 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesfm.errors import GeometryError
+from rangesfm.errors import GeometryError, number_text
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.scale_by_lengths import LengthScale
-from rangesfm.scale.scale_estimate import NORMAL_95, CutoffTest, ScaleUncertainty
+from rangesfm.scale.scale_estimate import CutoffTest, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.sensitivity import scale_drift
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
@@ -75,7 +76,7 @@ def judge(
         if abs(change) >= _MIN_DRIFT:
             reason = (
                 f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would "
-                f"change by {100 * change:+.1f} %"
+                f"change by {number_text(100 * change, '+.1f')} %"
             )
             doubt = _Doubt(reason, f"{CALIBRATE}, or put the anchors farther from the path")
             (doubts if abs(change) > half_width else remarks).append(doubt)
@@ -103,8 +104,8 @@ def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[s
     if half_width > NORMAL_95 * options.max_relative_stddev:
         planned = "plan it first, which says what would narrow it (rangesfm plan)"
         raise GeometryError(
-            f"the scale is only known to {100 * half_width / NORMAL_95:.1f} % (1 stddev), more than the "
-            f"{100 * options.max_relative_stddev:g} % allowed (max_relative_stddev)"
+            f"the scale is only known to {100 * half_width:.1f} % (95 % interval), worse than the "
+            f"{100 * NORMAL_95 * options.max_relative_stddev:.3g} % allowed ({NORMAL_95} times max_relative_stddev)"
             f"{''.join(f': {reason}' for reason in reasons[:1])}; next time: {next(iter(advice), planned)}"
         )
 

@@ -9,7 +9,7 @@ import numpy as np
 from rangesfm.arrays import Array, Indices
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import Correction
-from rangesfm.errors import GeometryError
+from rangesfm.errors import GeometryError, number_text
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
@@ -37,8 +37,8 @@ def with_likeliest_cause(run: SurveyRun, path: PathOfModel, metric: MetricResult
     except GeometryError as error:
         run.journal.warn(f"no mistake is corrected, because the corrected survey fails: {error}")
         return run, metric
-    change = 100 * (adopted.estimate.value / metric.estimate.value - 1)
-    said = f"adopted: {cause.words}; the scale changed by {change:+.2f} %, from {metric.estimate.value:.6g}"
+    change = number_text(100 * (adopted.estimate.value / metric.estimate.value - 1), "+.2f")
+    said = f"adopted: {cause.words}; the scale changed by {change} %, from {metric.estimate.value:.6g}"
     run.journal.warn(said)
     return corrected, adopted.doubted((said,))
 

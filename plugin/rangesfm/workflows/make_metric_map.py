@@ -25,12 +25,13 @@ from rangesfm.join.join_models import ModelVerdict, join_models
 from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.refine.photo_bending import bending_of_model, by_photos
 from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult, Rivals
 from rangesfm.scale.at_map import MapWithRanges, estimate_at
-from rangesfm.scale.scale_estimate import NORMAL_95, ScaleEstimate
+from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_verdict import refuse_unknown
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun

@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, number_text
 from rangesfm.files.text_tables import align_rows, read_table, write_table
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.measurements import Interval, MeasuredMap, Measurement, up_in_map
@@ -50,7 +50,7 @@ class Measurements:
                 *row.ends,
                 f"{row.distance_m:.3f}",
                 _interval(row.distance_interval_m),
-                "-" if row.height_difference_m is None else f"{row.height_difference_m:+.3f}",
+                "-" if row.height_difference_m is None else number_text(row.height_difference_m, "+.3f"),
                 "-" if row.height_interval_m is None else _interval(row.height_interval_m, "+"),
             )
             for row in self.rows

@@ -16,7 +16,7 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import sole_writer
 from rangesfm.processes.threads import at_most, with_one_blas_thread
-from rangesfm.progress import Journal, Progress
+from rangesfm.progress import Journal, Progress, SilentProgress
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.result_folder import refuse_to_overwrite, result_names
 from rangesfm.result.summary import ResultSummary
@@ -41,21 +41,16 @@ from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.run_results import RunResult, write_results
 
 
-def metric_map_of(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
-    """Make the metric model of a survey, from its photos or from the unscaled model that it gives."""
-    if survey.images.model is None:
-        return run_survey(survey, progress=progress, restart=restart)
-    return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
-
-
-@with_one_blas_thread
-def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> RunResult:
-    """Make a metric model from photos and ranges, and write the result folder.
+def run_survey(survey: Survey, *, progress: Progress | None = None, restart: bool = False) -> RunResult:
+    """Make the metric model of a survey and write the result folder, as ``rangesfm run`` does.
 
     Args:
-        survey: settings and inputs.
-        progress: is told of stages and warnings.
+        survey: settings and inputs. It has either photos or an unscaled model.
+        progress: is told of stages and warnings; None: nobody is.
         restart: whether to do all steps again; otherwise finished steps of an earlier run are reused.
+
+    Returns:
+        The result; ``print`` shows the lines that the command prints at its end.
 
     Raises:
         InputError: an input is wrong.
@@ -63,7 +58,14 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         ReconstructionError: the photos give no model.
         SolverError: the refinement failed.
     """
-    run = begin_run(survey, Journal(progress))
+    if survey.images.model is None:
+        return _from_photos(survey, progress, restart=restart)
+    return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
+
+
+@with_one_blas_thread
+def _from_photos(survey: Survey, progress: Progress | None, *, restart: bool) -> RunResult:
+    run = begin_run(survey, Journal(progress or SilentProgress()))
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
         run = replace(run, survey=with_photos_in_folder(survey, run.journal, restart=restart))
@@ -75,9 +77,9 @@ def run_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> 
         return with_results(*map_in_metres(run, place_ranges(run, models, times), refine=survey.refine.enabled))
 
 
-def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = False) -> list[str]:
+def reconstruct_survey(survey: Survey, *, progress: Progress | None = None, restart: bool = False) -> list[str]:
     """Make an unscaled model from photos, and return a summary for the user."""
-    journal = Journal(progress)
+    journal = Journal(progress or SilentProgress())
     refuse_to_overwrite(survey)
     with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         survey = with_photos_in_folder(survey, journal, restart=restart)
@@ -87,19 +89,19 @@ def reconstruct_survey(survey: Survey, *, progress: Progress, restart: bool = Fa
     return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
 
 
-def refine_model(survey: Survey, *, progress: Progress) -> RunResult:
+def refine_model(survey: Survey, *, progress: Progress | None = None) -> RunResult:
     """Make a refined metric model from an existing model and ranges, and write the result folder."""
     return _from_model(survey, progress, refine=True)
 
 
-def scale_model(survey: Survey, *, progress: Progress) -> RunResult:
+def scale_model(survey: Survey, *, progress: Progress | None = None) -> RunResult:
     """Scale an existing model, or a model with poses only, by ranges, and write the result folder."""
     return _from_model(survey, progress, refine=False)
 
 
 @with_one_blas_thread
-def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
-    run = begin_run(survey, Journal(progress))
+def _from_model(survey: Survey, progress: Progress | None, *, refine: bool) -> RunResult:
+    run = begin_run(survey, Journal(progress or SilentProgress()))
     sfm = read_registered(survey.given_model_path, run.journal)
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.images.model)

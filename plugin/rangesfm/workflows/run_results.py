@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,10 @@ class RunResult:
     summary: ResultSummary
     lines: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        """Return the summary for the user."""
+        return "\n".join(self.lines)
+
 
 def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
     """Write all files of the result, with ``result.json`` last, and the report.
@@ -86,6 +91,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
             settings=recorded_settings(survey),
             inputs=recorded_inputs(input_hashes(survey), survey),
             seconds=journal.all_seconds(),
+            computed=datetime.now(timezone.utc).isoformat(timespec="seconds"),
             warnings=journal.warnings,
         )
         summary.write(staged / summary.NAME)

@@ -42,8 +42,14 @@ class Browser:
         service = selenium.ChromeService(executable_path=driver)
         self._driver = selenium.Chrome(options=options, service=service)
 
-    def open(self, page: Path, *, width: int = 1280, height: int = 900, theme: str = "light") -> None:
-        """Open a page from disk in a window of this size, wait for its figures and view, and forget earlier logs."""
+    def open(
+        self, page: Path, *, width: int = 1280, height: int = 900, theme: str = "light", is_unfolded: bool = True
+    ) -> None:
+        """Open a page from disk in a window of this size, wait for its figures and view, and forget earlier logs.
+
+        Args:
+            is_unfolded: whether to unfold all sections, as a reader can.
+        """
         features = [{"name": "prefers-color-scheme", "value": theme}]
         self.command("Emulation.setEmulatedMedia", features=features)
         is_phone = width < 600
@@ -54,6 +60,8 @@ class Browser:
         self._driver.get(page.as_uri())
         self.wait_for("!document.querySelector('#figures') || window.rangesfmFigures")
         self.wait_for("!document.querySelector('#view') || window.rangesfmView")
+        if is_unfolded:
+            self.run("document.querySelectorAll('details').forEach(section => { section.open = true; })")
 
     def draw_figures(self) -> None:
         """Draw all figures, not only those near the visible part."""

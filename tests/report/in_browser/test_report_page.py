@@ -299,6 +299,42 @@ def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(brow
     assert domain() == pytest.approx(whole)
 
 
+def test_one_screen_answers_what_a_client_asks(browser: Browser, page: Path) -> None:
+    browser.open(page, is_unfolded=False)
+    for shown in ("h1", "#verdict .figure", ".stage canvas", "[name=measure]", ".facts > :last-child"):
+        bottom = browser.run("return document.querySelector(arguments[0]).getBoundingClientRect().bottom", shown)
+        assert 0 < bottom <= 900, shown
+    folded = browser.run("return [...document.querySelectorAll('details:not([open])')].map(section => section.id)")
+    assert folded == ["view-section", "checks", "path", "scale", "ranges", "anchors", "mistakes", "candidates", "run"]
+    assert not browser.run("return document.querySelector('#ranges .chart').checkVisibility()")
+    assert browser.run("return document.querySelector('#found table').checkVisibility()")
+
+
+def test_a_folded_section_shows_its_figures_as_wide_as_it_is(browser: Browser, page: Path) -> None:
+    browser.open(page, is_unfolded=False)
+    browser.wait_for("Object.values(rangesfmFigures).flat().every(chart => chart.view)")  # drawn while folded
+    browser.run("document.querySelector('#ranges summary').click()")
+    browser.draw_frame()
+    widths = browser.run(
+        "return rangesfmFigures.range_residuals.map("
+        "({node}) => [node, node.querySelector('svg')].map(element => element.clientWidth))"
+    )
+    assert all(room > 200 and drawn == pytest.approx(room, abs=1) for room, drawn in widths)
+
+
+def test_paper_has_all_but_the_appendix_unfolded(browser: Browser, page: Path) -> None:
+    browser.open(page, is_unfolded=False)
+    unfolded = "return [...document.querySelectorAll('details[open]')].map(section => section.id)"
+    browser.run("dispatchEvent(new Event('beforeprint'))")
+    assert browser.run(unfolded) == ["view-section", "checks", "path", "scale", "ranges", "anchors"]
+    browser.run("dispatchEvent(new Event('afterprint'))")
+    assert browser.run(unfolded) == []
+    a4 = {"paperWidth": 8.27, "paperHeight": 11.69, "printBackground": True}
+    pdf = base64.b64decode(browser.command("Page.printToPDF", **a4)["data"])
+    assert len(re.findall(rb"/Type */Page\b", pdf)) <= 9
+    assert browser.console() == []
+
+
 def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) -> None:
     browser.open(page, theme="dark")
     pdf = base64.b64decode(browser.command("Page.printToPDF", printBackground=True)["data"])

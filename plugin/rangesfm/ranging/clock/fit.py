@@ -13,6 +13,7 @@ from scipy import special
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.clock.search import PathSamples, TimedRanges
 from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev, rows_by_anchor
+from rangesfm.ranging.errors.noise import NORMAL_95
 
 # Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
 _CELL_S = 1.0
@@ -282,7 +283,7 @@ def drift_note(drift: float, stddev: float, times_s: Array) -> str:
     """Return a message for the user about a drift that was found."""
     half_span_s = float(np.ptp(times_s)) / 2
     return (
-        f"the clocks drift: the camera's gains {1e6 * drift:+.0f} ppm on the radio's (stddev {1e6 * stddev:.0f} ppm); "
-        f"the drift is corrected, and the time offset at the end of the log differs by {drift * half_span_s:+.3f} s "
-        f"from that in its middle"
+        f"the clocks drift: the camera's gains {1e6 * drift:+.0f} ppm on the radio's (within "
+        f"{1e6 * NORMAL_95 * stddev:.0f} ppm, 95 %); the drift is corrected, and the time offset at the end of the log "
+        f"differs by {drift * half_span_s:+.3f} s from that in its middle"
     )

@@ -26,6 +26,7 @@ from rangesfm.ranging.clock.search import (
     ranges_at_offset,
     scan_offsets,
 )
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 
@@ -196,7 +197,7 @@ def _offset_of_motion(
     near = ranges_at_offset(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL)
     final, timing, drift, reference_s = fit_clocks(near, path, best.offset_s)
     is_certain = bool(timing.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m)
-    found = f"(about {final.offset_s:+.2f} s, stddev {timing.stddev_s:.2g} s)"
+    found = f"(about {final.offset_s:+.2f} s, within {NORMAL_95 * timing.stddev_s:.2g} s, 95 %)"
     if not is_certain and not timing.stddev_s < _MOST_UNCERTAIN_S:
         raise GeometryError(f"the motion is too even to tell the time offset {found}: {REMEDY}")
     notes = [drift_note(drift, timing.drift_stddev, near.times_s)] if drift else []

@@ -21,6 +21,8 @@ from rangesfm.ranging.range_log import RangeLog
 _SHORT_RANGE_STDDEV_M = 2.0
 SHORT_RANGE_LENGTH_M = 1.0
 # Assumed noise before an estimate. Ranges with a larger common error are not used to estimate the noise.
+NORMAL_95 = 1.96
+"""Half the width of a 95 % interval, in standard deviations of a normal distribution."""
 START_STDDEV_M = 0.1
 MIN_STDDEV_M = 1e-9
 # Ratio of standard deviation to median absolute value of a normal distribution.

@@ -20,8 +20,8 @@ class Chart {
     this.tip = this.node.appendChild(Object.assign(document.createElement("output"), { className: "tip", hidden: true }));
     this.node.addEventListener("pointermove", (event) => this.#point(event));
     this.node.addEventListener("pointerleave", () => (this.tip.hidden = true));
-    this.#fit();
-    new ResizeObserver(() => this.#fit()).observe(this.node);
+    this.fit();
+    new ResizeObserver(() => this.fit()).observe(this.node);
   }
 
   /** Yields {name, x, y} of all data, as the CSV file has them. */
@@ -44,7 +44,8 @@ class Chart {
     return [width, this.keeps_shape ? Math.round((width * this.spec.height) / this.spec.width) : this.spec.height];
   }
 
-  #fit() {
+  /** Makes the chart as wide as there is room. */
+  fit() {
     const [width, height] = this.#size();
     this.view.width(width).height(height).run();
   }
@@ -77,18 +78,27 @@ function rowsOf({ points, origin }) {
   return Array.from({ length: points.length / 2 }, (_, i) => ({ x: origin[0] + points[2 * i], y: origin[1] + points[2 * i + 1] }));
 }
 
-/** Returns the charts of each figure by its name. They are drawn when they come near the window, or for printing. */
+/**
+ * Returns the charts of each figure by its name. They are drawn when they come near the window, and the others, which may
+ * be folded, while the browser has nothing to do: on paper a picture would be missing that is drawn only then.
+ */
 function makeFigures(figures) {
   const chartOf = new Map();
   const drawSeen = (entries) => entries.forEach((entry) => entry.isIntersecting && chartOf.get(entry.target).draw());
   const observer = new IntersectionObserver(drawSeen, { rootMargin: "100%" });
-  addEventListener("beforeprint", () => chartOf.forEach((chart) => chart.draw()));
+  addEventListener("beforeprint", () => {
+    for (const chart of chartOf.values()) {
+      chart.draw();
+      chart.fit();
+    }
+  });
   for (const [name, charts] of Object.entries(figures)) {
     const nodes = document.querySelectorAll(`#${name} .chart`);
     figures[name] = charts.map((chart, i) => new Chart(nodes[i], chart));
     for (const chart of figures[name]) {
       chartOf.set(chart.node, chart);
       observer.observe(chart.node);
+      requestIdleCallback(() => chart.draw());
     }
   }
   return figures;

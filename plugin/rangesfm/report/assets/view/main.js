@@ -118,10 +118,25 @@ class View {
   }
 }
 
+/** Unfolds all sections but the appendix while the page is printed. */
+function unfoldOnPaper() {
+  const unfolded = [];
+  addEventListener("beforeprint", () => {
+    for (const section of document.querySelectorAll("details:not([open], .appendix)")) {
+      section.open = true;
+      unfolded.push(section);
+    }
+  });
+  addEventListener("afterprint", () => {
+    for (const section of unfolded.splice(0)) section.open = false;
+  });
+}
+
 // The text of the page is shown before figures and view are made, because starting WebGL may take longer than the rest.
 const start = () => {
   const scene = readBlock("scene");
   if (scene?.ranges) scene.ranges.residual = scene.ranges[scene.ranges.final];
+  unfoldOnPaper(); // before the figures are fitted to the paper
   window.rangesfmFigures = makeFigures(readBlock("figures"));
   attachDownloads(scene, rangesfmFigures);
   if (scene !== null) window.rangesfmView = new View(document.getElementById("view"), scene);

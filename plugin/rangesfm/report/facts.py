@@ -1,0 +1,87 @@
+"""What a client asks first about a map: what was done, when, by whom, and in which coordinates it is."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from typing import NamedTuple
+
+import numpy as np
+
+from rangesfm.report.content import Content
+from rangesfm.report.text import count, duration, fixed
+
+# Clocks that count seconds since 1970 show a time between these; others do not tell the date.
+_FIRST_S, _LAST_S = 1e9, 1e11
+
+
+class Fact(NamedTuple):
+    """One of the facts, with its name."""
+
+    name: str
+    text: str
+
+
+def facts_of(content: Content) -> list[Fact]:
+    """Return the facts about a result that are known."""
+    summary = content.summary
+    found = (
+        Fact("What was done", _what(content)),
+        Fact("When", _when(content)),
+        Fact("By", summary.settings.report.by or ""),
+        Fact("Coordinates", _coordinates(content)),
+        Fact("Computed", _computed(content)),
+    )
+    return [fact for fact in found if fact.text]
+
+
+def _what(content: Content) -> str:
+    """Return a sentence about the photos, another about the ranges and lengths, and one about the adjustment."""
+    summary, path = content.summary, content.final
+    ranges, num_points = summary.ranges, count(summary.map.num_points3D)
+    length_m = None if path is None else float(np.linalg.norm(np.diff(path.centers, axis=0), axis=1).sum())
+    way = "" if length_m is None else f" along {fixed(length_m, 1, 'm')}"
+    said = [f"{count(summary.map.num_photos)} photos{way} show {num_points} points."]
+    if summary.has_ranges:
+        num_surveyed = sum(anchor.surveyed_position_m is not None for anchor in summary.anchors.values())
+        surveyed = f"{num_surveyed} of them surveyed" if num_surveyed else "none of them surveyed"
+        of_anchors = f"{len(summary.anchors)} radio anchors, {surveyed}"
+        said.append(f"{count(ranges.num_used)} of {count(ranges.num)} ranges to {of_anchors}, give it metres.")
+    if summary.distances:
+        said.append(f"Measured lengths that fix its scale or check it: {len(summary.distances)}.")
+    if summary.refine is None or not summary.refine.kept:
+        return " ".join((*said, "The map was scaled as a whole."))
+    return " ".join((*said, "Photos and measurements were adjusted together."))
+
+
+def _when(content: Content) -> str:
+    """Return date and times of the photos; empty where they have no times, or their clock does not tell the date."""
+    times_s = [time for time in (content.result.timestamps_s or {}).values() if np.isfinite(time)]
+    if not times_s or not _FIRST_S < min(times_s) <= max(times_s) < _LAST_S:
+        return ""
+    begin, end = (datetime.fromtimestamp(time, timezone.utc) for time in (min(times_s), max(times_s)))
+    if begin.date() != end.date():
+        return f"{_day(begin)} to {_day(end)}, by the photos' clock"
+    return f"{_day(begin)}, {begin:%H:%M} to {end:%H:%M} by the photos' clock"
+
+
+def _computed(content: Content) -> str:
+    """Return when and how long the result was computed, and by which version."""
+    summary = content.summary
+    on = "" if summary.computed is None else f"{_day(datetime.fromisoformat(summary.computed))}, "
+    known_s = [value for name, value in summary.seconds.items() if value is not None and name != "total"]
+    took = f" in {duration(sum(known_s))} (all stages)" if known_s else ""
+    return f"{on}rangesfm {summary.versions.get('rangesfm', '')}{took}"
+
+
+def _coordinates(content: Content) -> str:
+    summary, path = content.summary, content.final
+    if summary.frame == "site":
+        anchors, crs = summary.settings.anchors.path, summary.settings.anchors.crs
+        whose = "the site" if anchors is None else f"the site, those of {anchors.rsplit('/', 1)[-1]}"
+        return f"x, y, z in metres in the frame of {whose}{'' if crs is None else f' ({crs})'}; z is up."
+    first = "first photo" if path is None else f"first photo, {path.image_names[0]}"
+    return f"x right, y down, z forward in metres from the {first}. Nothing fixes the map's place in a site."
+
+
+def _day(date: datetime) -> str:
+    return f"{date.day} {date:%B %Y}"
