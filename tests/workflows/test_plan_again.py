@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.planning.advice import advise
 from rangesfm.planning.expected import expect
 from rangesfm.planning.survey_plan import plan_survey
+from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.scale.scale_verdict import CALIBRATE
-from rangesfm.workflows.plan_again import plan_of_result
+from rangesfm.workflows.plan_again import _planned, plan_of_result
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
@@ -60,6 +63,27 @@ def test_a_doubtful_survey_is_told_what_its_plan_would_change(
     assert best[0].startswith(advised[0].words)
     assert sum(advice.startswith(CALIBRATE) for advice in scale["advice"]) <= 1
     assert f"next time: {best[0]}" in printed
+
+
+def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None:
+    """In a room of 8 x 6 x 2.6 m there is no place farther out or above, and in a yard there is."""
+    times = np.linspace(0.0, 40.0, 41)
+    centers = np.column_stack([2 * np.cos(times / 6), 1.5 * np.sin(times / 6), 1.5 + 0.1 * np.sin(times)])
+    names = tuple(f"{k:02d}.jpg" for k in range(41))
+    path = Trajectory(np.arange(41), names, times, centers, np.tile(np.eye(3), (41, 1, 1)))
+    anchors = [Anchor(f"A{x}{y}", np.array([3.9 * x, 2.9 * y, 1.8]), 0.02) for x in (-1, 1) for y in (-1, 1)]
+    rng = np.random.default_rng(2)
+    room = rng.uniform((-4.0, -3.0, 0.0), (4.0, 3.0, 2.6), size=(500, 3))
+    yard = rng.uniform((-40.0, -40.0, 0.0), (40.0, 40.0, 0.4), size=(500, 3))
+    told = {}
+    for name, points in (("room", room), ("yard", yard)):
+        planned = _planned(path, points, anchors, "site", np.zeros(3), 2000, {})
+        told[name] = [advice.words for advice in advise(expect(planned))]
+    outward = "put the anchors 1.5 times as far out"
+    assert outward in told["yard"]
+    assert outward not in told["room"]
+    raised = [words for words in told["room"] if words.startswith("raise anchor")]
+    assert not any(words.endswith(" by 1 m, to 2.8 m") or " by 2 m" in words for words in raised)
 
 
 def test_a_folder_that_holds_no_result_is_refused(tmp_path: Path, rangesfm_command: Command) -> None:

@@ -170,10 +170,13 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
 
 
 def _leads_through_walls(before: PlannedSurvey, after: PlannedSurvey) -> bool:
-    """Return whether a keyframe moves through a wall, or nearer to it than people walk."""
+    """Return whether an anchor or a keyframe moves through a wall, or a keyframe nearer to it than people walk."""
     start, end = before.trajectory.centers[:, :2], after.trajectory.centers[:, :2]
     moved_m = np.linalg.norm(end - start, axis=1, keepdims=True)
     end = end + _CLEARANCE_M * (end - start) / np.maximum(moved_m, _CLEARANCE_M)
+    num = min(len(before.anchors), len(after.anchors))  # a new anchor moves nowhere
+    start = np.vstack([start, before.anchors_m[:num, :2]])
+    end = np.vstack([end, after.anchors_m[:num, :2]])
     return any(np.any(_cross(start, end, *wall)) for line in before.walls_m for wall in itertools.pairwise(line))
 
 

@@ -43,7 +43,7 @@ class PlannedSurvey:
         path_is_level: whether the camera cannot go up and down, as on a rover.
         photos: field of view and features of the camera; None: the map is assumed to be rigid.
         allowed_m: (k, 3) allowed places for anchors; None: not given.
-        walls_m: corners (k, 2) of each wall, as seen from above, through which no advice leads.
+        walls_m: corners (k, 2) of each wall, as seen from above, through which no advice leads path or anchors.
         is_placed: whether the anchors' places are fixed; else they may be moved to any allowed place.
         max_num_ranges: largest number of simulated ranges; if there are more, each stands for several.
     """

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.export.metric_map import up_in_world
+from rangesfm.export.metric_map import colored_points, up_in_world
 from rangesfm.geometry.gravity import UP_IN_SITE
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.planning.advice import advise, best_words
@@ -27,6 +27,10 @@ from rangesfm.scale.scale_verdict import CALIBRATE
 
 # Assumed rate of photos without times.
 _PHOTO_RATE_HZ = 2.0
+# Shares of the points between which the room is: some points are seen through windows, or wrong.
+_MOST_OF_POINTS = (0.01, 0.99)
+# An anchor on a wall is in front of it: distance of the wall behind it, metres.
+_BEHIND_M = 0.05
 
 
 def plan_of_result(path: str | Path) -> PlannedSurvey:
@@ -53,7 +57,7 @@ def plan_of_result(path: str | Path) -> PlannedSurvey:
     anchors = [Anchor(name, at, stddevs[name]) for name, at in heard.items()]
     is_known = any(anchor.surveyed_position_m is not None for anchor in folder.summary.anchors.values())
     frame, stddevs_m = _frame(folder.summary.frame, is_known=is_known), folder.summary.scale.error_stddevs
-    return _planned(trajectory, anchors, frame, arm, len(used), stddevs_m)
+    return _planned(trajectory, colored_points(model)[0], anchors, frame, arm, len(used), stddevs_m)
 
 
 def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
@@ -81,7 +85,8 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
     try:
         frame, learned = _frame(estimate.frame, is_known=is_known), estimate.errors.learned
         stddevs = {} if learned is None else learned.stddev_of_component
-        planned = _planned(trajectory, anchors, frame, arm, int(used.sum()), stddevs)
+        points_m = colored_points(metric.final)[0]
+        planned = _planned(trajectory, points_m, anchors, frame, arm, int(used.sum()), stddevs)
         expected = expect(planned)
     except (InputError, GeometryError):  # the upward direction is unknown, or a survey like this one would be refused
         return metric
@@ -93,13 +98,18 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
 
 def _planned(
     trajectory: Trajectory,
+    points_m: Array,
     anchors: Sequence[Anchor],
     frame: str,
     tag_in_cam_m: Array,
     num_ranges: int,
     component_stddevs: Mapping[str, float],
 ) -> PlannedSurvey:
-    """Return the plan with z up, and with assumed times where the photos have none."""
+    """Return the plan with z up, inside what the photos show, and with assumed times where the photos have none.
+
+    Args:
+        points_m: (n, 3) points of the map.
+    """
     up = up_in_world(trajectory, "auto", is_site=frame == "site")
     level = Rotation.align_vectors(UP_IN_SITE[None], up[None])[0].as_matrix()
     times = np.arange(len(trajectory)) / _PHOTO_RATE_HZ if trajectory.timestamps_s is None else trajectory.timestamps_s
@@ -111,7 +121,22 @@ def _planned(
         tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
         component_stddevs=component_stddevs,
     )
-    return planned.ranging(num_ranges)
+    return _inside(planned.ranging(num_ranges), points_m @ level.T)
+
+
+def _inside(planned: PlannedSurvey, points_m: Array) -> PlannedSurvey:
+    """Return the plan with walls around path, anchors and points (n, 3), and below a ceiling if one was photographed.
+
+    Nobody can say where there is room for an anchor outside of what the photos show.
+    """
+    if not len(points_m):
+        return planned
+    low, high = np.quantile(points_m, _MOST_OF_POINTS, axis=0)
+    places = np.vstack([planned.places_m, [low, high]])
+    (left, front, lowest), (right, back, highest) = places.min(axis=0) - _BEHIND_M, places.max(axis=0) + _BEHIND_M
+    corners = np.array([[left, front], [right, front], [right, back], [left, back], [left, front]])
+    is_below_ceiling = high[2] > planned.trajectory.centers[:, 2].max()
+    return replace(planned, walls_m=(corners,), heights_m=(lowest, highest if is_below_ceiling else np.inf))
 
 
 def _frame(frame: str, *, is_known: bool) -> str:
