@@ -143,6 +143,18 @@ def test_where_there_are_no_locks_it_goes_on_in_silence(tmp_path: Path, monkeypa
     assert os.listdir(tmp_path) == []
 
 
+def test_interrupted_as_soon_as_it_has_the_lock_it_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt() -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rangesfm.files.output_folder._own_name", interrupt)
+    with pytest.raises(KeyboardInterrupt), sole_writer(tmp_path / "out"):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
 def test_a_folder_made_for_nothing_is_gone_again(tmp_path: Path) -> None:
     with sole_writer(tmp_path / "a" / "b"):
         pass

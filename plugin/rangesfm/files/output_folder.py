@@ -198,16 +198,21 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
     Raises:
         InputError: another process (or thread) writes there, or the folder cannot be written to.
     """
+    from filelock import FileLock
+
     key = real_path(folder)
     if key in _held.get():
         yield _held.get()[key]
         return
     private = key / PRIVATE_NAME
     made = [path for path in (private, key, *key.parents) if not os.path.lexists(path)]
+    lock = FileLock(key / LOCK_NAME)
     make_output_folder(folder)
     try:
-        lock = _lock(folder, private, max_wait_s)
+        _acquire(lock, folder, private, max_wait_s)
     except BaseException:
+        if lock.is_locked:  # Ctrl-C came when the lock had just been acquired
+            _release(lock, private)
         _remove_empty(made)
         raise
     try:
@@ -219,10 +224,8 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
             _held.reset(token)
             held.close()
     finally:
-        with suppress(OSError):  # Windows does not remove an open file
-            (key / LOCK_NAME).unlink()  # before the release, after which the file may be another process's lock
-        lock.release()
-        _remove_empty([private, *made])
+        _release(lock, private)
+        _remove_empty(made)
 
 
 @contextmanager
@@ -295,9 +298,9 @@ def _rename(source: Path, target: Path, done: list[tuple[Path, Path]]) -> None:
     os.rename(source, target)
 
 
-def _lock(folder: Path, private: Path, max_wait_s: float) -> BaseFileLock:
-    """Acquire and return the lock of a folder; it is not held where the file system has no locks."""
-    from filelock import FileLock, Timeout
+def _acquire(lock: BaseFileLock, folder: Path, private: Path, max_wait_s: float) -> None:
+    """Acquire the lock of a folder; it is not held where the file system has no locks."""
+    from filelock import Timeout
 
     try:
         private.mkdir(exist_ok=True)
@@ -308,7 +311,6 @@ def _lock(folder: Path, private: Path, max_wait_s: float) -> BaseFileLock:
     path = private / "lock"
     if os.path.lexists(path) and not _is_lock(path):
         raise InputError("is not a lock file of rangesfm's: move it away, or give another output path", path)
-    lock = FileLock(path)
     for _ in range(_NUM_TRIES):
         try:
             lock.acquire(timeout=max_wait_s, poll_interval=_MAX_WAIT_S / 4)
@@ -322,7 +324,14 @@ def _lock(folder: Path, private: Path, max_wait_s: float) -> BaseFileLock:
         break
     with suppress(OSError):  # on Windows a locked file cannot be written, and others are not told who holds the lock
         path.write_text(_own_name(), encoding="utf-8")
-    return lock
+
+
+def _release(lock: BaseFileLock, private: Path) -> None:
+    """Remove and release the lock of a folder, and remove the private folder if it is empty."""
+    with suppress(OSError):  # Windows does not remove an open file
+        (private / "lock").unlink()  # before the release, after which the file may be another process's lock
+    lock.release()
+    _remove_empty([private])
 
 
 def _is_lock(path: Path) -> bool:
