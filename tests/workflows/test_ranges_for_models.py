@@ -13,7 +13,7 @@ from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 from rangesfm.progress import SilentProgress
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.ranges_for_models import ranges_of_survey
-from rangesfm.workflows.run import metric_map_of, scale_model
+from rangesfm.workflows.run import run_survey, scale_model
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey
@@ -47,7 +47,7 @@ def survey(walked_survey: WalkedSurvey, tmp_path: Path) -> Survey:
 def test_a_model_has_one_scale_by_a_survey_whoever_asks(survey: Survey) -> None:
     path = survey.given_model_path
     scaled = scale_model(survey, progress=SilentProgress()).summary
-    assert metric_map_of(survey, progress=SilentProgress()).summary.scale.value == scaled.scale.value
+    assert run_survey(survey, progress=SilentProgress()).summary.scale.value == scaled.scale.value
     sfm = pycolmap.Reconstruction(path)
     compared = ranges_of_survey(survey, sfm, path)
     centers = {image.name: image.projection_center() for image in sfm.images.values()}
