@@ -64,7 +64,7 @@ def test_what_people_would_notice_limits_what_no_test_sees() -> None:
 
 
 def test_redundancy_is_the_share_of_a_mistake_that_the_residuals_show(problem: Linearized) -> None:
-    """By the residuals themselves: with all unknowns adapting to it, against a map that is known."""
+    """The residuals themselves are compared: with all unknowns adapting to the mistake, and on a map that is known."""
     silent = replace(problem, residual_m=0 * problem.residual_m, prior_residual=0 * problem.prior_residual)
     inverse = np.linalg.inv(problem.errors.covariance_m2)
     for test in results_of(problem):

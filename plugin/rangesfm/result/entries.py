@@ -369,7 +369,7 @@ class MistakeEntry(Record):
 
 
 class ReliabilityEntry(Record):
-    """How far the scale may be off even if one mistake was made and not found; see ``scale_bound``.
+    """Largest error of the scale, even if one mistake was made and not found; see ``scale_bound``.
 
     Attributes:
         scale_within: largest relative error of the scale; null without a limit, or where a mistake was found.
