@@ -85,7 +85,7 @@ def test_redundancy_is_the_share_of_a_mistake_that_the_residuals_show(problem: L
 
 def test_what_two_anchors_alone_are_given_is_untested(problem: Linearized) -> None:
     """Three coordinates of each of two anchors determine the map, and nothing is left to check them."""
-    few = np.isin(problem.cells.anchor_index, problem.heard[:2])
+    few = np.isin(problem.bins.anchor_index, problem.heard[:2])
     loose = np.where(few[:, None] & few, problem.errors.covariance_m2, 0.0) + 1e8 * np.diag(~few)
     lonely = replace(problem, errors=replace(problem.errors, covariances_m2=loose[None]))
     places = {test.hypothesis.subject: test for test in results_of(lonely) if test.hypothesis.name == "anchor place"}

@@ -51,7 +51,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     # The anchor must be within its ranges of the path, wherever its coordinates put it.
     most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.bins.anchor_index == k]))
 
-    seen = np.where((problem.cells.anchor_index == k)[:, None], problem.gradient.by_tag, 0.0)
+    seen = np.where((problem.bins.anchor_index == k)[:, None], problem.gradient.by_tag, 0.0)
 
     def unknown(_: Array) -> Correction:
         return Correction({name: None})
