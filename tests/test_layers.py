@@ -24,7 +24,7 @@ LAYERS = (
     "survey",
     "survey_discovery",
     "refine",
-    "join",
+    "join loops",
     "diagnostics",
     "planning",
     "result",

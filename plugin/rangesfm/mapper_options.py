@@ -47,6 +47,9 @@ class MapperOptions(Options, table="mapper"):
     pipeline: dict[str, Any] = Field(default_factory=dict)
     """Passed through to the options of pycolmap's mapper: IncrementalPipelineOptions, GlobalPipelineOptions or
     HierarchicalPipelineOptions."""
+    close_loops: bool = True
+    """Match photos of distant times that the refined map predicts to see the same, and refine again with these matches.
+    Only where neighbours in time alone were matched, and with refine where database_path gives the matches."""
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)],
         KeyMeta(expected="1 or more up to 4096, or -1 for all cores"),

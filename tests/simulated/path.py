@@ -121,7 +121,7 @@ def lap_path(
         corner_radius_m: of the turns.
         height_m: of the camera.
         unevenness_m: how far the ground goes up and down.
-        share: of the lap.
+        share: of the lap; more than 1 goes around again.
     """
     sides = [size - 2 * corner_radius_m for size in size_m] * 2
     corner = 0.5 * np.pi * corner_radius_m
@@ -133,7 +133,7 @@ def lap_path(
     plan = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]) - [0.5 * sides[0], 0.5 * size_m[1]]
     times = np.linspace(0.0, duration_s, max(8, round(duration_s)))
     at = share * ends[-1] * times / duration_s
-    x, y, turn = (np.interp(at, way, values) for values in (plan[:, 0], plan[:, 1], heading))
+    x, y, turn = (np.interp(at % ends[-1], way, values) for values in (plan[:, 0], plan[:, 1], heading))
     wave = at / corner_radius_m
     centers = np.column_stack([x, y, height_m + unevenness_m * np.sin(wave)])
     climb = unevenness_m / corner_radius_m * np.cos(wave)

@@ -47,7 +47,12 @@ def compare(
 
 
 def papers_table(
-    scaled: Trajectory, refined: Trajectory | None, reference: Reference, *, frame: str = "site"
+    scaled: Trajectory,
+    refined: Trajectory | None,
+    reference: Reference,
+    *,
+    frame: str = "site",
+    loops_open: Trajectory | None = None,
 ) -> tuple[ComparisonRow, ...]:
     """Return the table of the 2018 paper: with the true scale, with the estimated scale and, if there is one, refined.
 
@@ -56,9 +61,12 @@ def papers_table(
         refined: metric path after it; None without one.
         reference: as in ``compare``.
         frame: as in ``compare``.
+        loops_open: the refined path before its loops were closed, which gives a further row; None without loops.
     """
     paths = {"true scale": with_true_scale(scaled, reference, frame=frame), "estimated scale": scaled}
-    return compare(paths if refined is None else {**paths, "refined": refined}, reference, frame=frame)
+    further = {"refined, loops open": loops_open, "refined": refined}
+    paths |= {name: path for name, path in further.items() if path is not None}
+    return compare(paths, reference, frame=frame)
 
 
 def with_true_scale(path: Trajectory, reference: Reference, *, frame: str = "site") -> Trajectory:

@@ -54,6 +54,7 @@ class OutputFolder:
         self.private = path / PRIVATE_NAME
         self._manifest = Manifest(path, self.private)
         self._deferred: dict[Path, Path] = {}
+        self._emptied: set[Path] = set()
         self._clear_parts()
         self._finish_moves()
 
@@ -89,8 +90,16 @@ class OutputFolder:
         return os.path.lexists(path) and self._manifest.foreign_file(path) is None
 
     def defer(self, new: Mapping[Path, Path]) -> None:
-        """Add files and folders, by their places, to the next ``publish`` that replaces a whole result."""
+        """Add files and folders, by their places, to the next ``publish`` that replaces a whole result.
+
+        Their folders are removed then.
+        """
         self._deferred.update(new)
+        self._emptied.update(source.parent for source in new.values())
+
+    def newest(self, place: Path) -> Path:
+        """Return the file that the next whole result will have at this place, as far as it is known."""
+        return self._deferred.get(place, place)
 
     def publish(self, new: Mapping[Path, Path], removed: Sequence[Path] = (), *, last: Path | None = None) -> None:
         """Move files and folders into the places of earlier ones: all of them, or none if that fails.
@@ -134,6 +143,10 @@ class OutputFolder:
             self._manifest.save()
             raise
         self._settle([target for _, target in moves])
+        if last is not None:
+            for folder in self._emptied:
+                remove(folder)
+            self._emptied = set()
 
     def close(self) -> None:
         """Remove unfinished files, and the record if it is empty and nothing else is in the private folder."""

@@ -20,6 +20,7 @@ from rangesfm.refine.keyframe_graph import GraphSolution, GraphState, KeyframeGr
 from rangesfm.refine.radio import moved_anchors
 from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import (
+    LoopPoses,
     Observations,
     Poses,
     VisionInformation,
@@ -62,7 +63,9 @@ class Presolved:
     num_steps: int
 
 
-def presolve(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Presolved:
+def presolve(
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, loops: LoopPoses | None = None
+) -> Presolved:
     """Solve the keyframe graph and move the model accordingly, in place.
 
     The errors are estimated again with every solution. While the drift is large, the residuals and their standard
@@ -72,10 +75,13 @@ def presolve(problem: RefinementProblem, rays: Observations, errors: RangeErrors
 
     Args:
         rays: all observations of the photos. errors: of the ranges that take part.
+        loops: by indices in ``problem.frame_ids``; None without any.
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Presolved(errors, 0.0, problem.radio.anchors, 0.0, 0)
     graph = _graph(problem, rays, errors, problem.radio.anchors)
+    if loops is not None:
+        graph = replace(graph, vision=graph.vision.with_loops(loops))
     fit, errors = _solve_with_own_errors(graph)
     _move(problem, rays, graph.vision, fit.state.poses, errors)
     return Presolved(

@@ -24,7 +24,7 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.refine.bundle_adjustment import farthest, still_to_come
 from rangesfm.refine.radio import Antennas
-from rangesfm.refine.vision_information import Poses, VisionInformation
+from rangesfm.refine.vision_information import Poses, VisionInformation, relative_poses
 
 _MAX_NUM_STEPS = 60
 _INITIAL_DAMPING = 1e-8
@@ -255,8 +255,8 @@ def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, spa
     scale.
     """
     r, k = vision.reference, vision.frame
-    turn, shift = _relative(poses, r, k)
-    turn_before, shift_before = _relative(vision.origin, r, k)
+    turn, shift = relative_poses(poses, r, k)
+    turn_before, shift_before = vision.measured()
     scale = _local_scale(vision, shift, shift_before)[r][:, None]
     angles = Rotation.from_matrix(np.swapaxes(turn_before, 1, 2) @ turn).as_rotvec()
     residuals = np.concatenate([angles, shift / scale - shift_before], axis=1)
@@ -273,18 +273,11 @@ def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, spa
     return residuals.ravel(), sparse.bsr_array((blocks, columns, starts), shape=(6 * len(r), 6 * len(poses)))
 
 
-def _relative(poses: Poses, reference: Indices, frame: Indices) -> tuple[Array, Array]:
-    """Return turn and shift of keyframes relative to others."""
-    to_reference = np.swapaxes(poses.world_from_rig[reference], 1, 2)
-    shift = np.einsum("uij,uj->ui", to_reference, poses.centers[frame] - poses.centers[reference])
-    return to_reference @ poses.world_from_rig[frame], shift
-
-
 def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -> Array:
-    """Return the (n,) growth of the map around each keyframe."""
-    n = len(vision.origin)
-    now = np.bincount(vision.reference, np.sum(shift**2, axis=1), minlength=n)
-    before = np.bincount(vision.reference, np.sum(shift_before**2, axis=1), minlength=n)
+    """Return the (n,) growth of the map around each keyframe, where loops do not count."""
+    n, near = len(vision.origin), slice(vision.num_from_points)
+    now = np.bincount(vision.reference[near], np.sum(shift[near] ** 2, axis=1), minlength=n)
+    before = np.bincount(vision.reference[near], np.sum(shift_before[near] ** 2, axis=1), minlength=n)
     least = rounding_of(vision.origin.centers) ** 2  # keyframes in one place have no scale
     known = (now > least) & (before > least)
     return np.sqrt(np.divide(now, before, where=known, out=np.ones(n)))
@@ -292,8 +285,8 @@ def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -
 
 def local_scales(vision: VisionInformation, poses: Poses) -> Array:
     """Return the (n,) scale of the map around each keyframe relative to the origin, from its neighbours."""
-    _, shift = _relative(poses, vision.reference, vision.frame)
-    _, shift_before = _relative(vision.origin, vision.reference, vision.frame)
+    _, shift = relative_poses(poses, vision.reference, vision.frame)
+    _, shift_before = vision.measured()
     return _local_scale(vision, shift, shift_before)
 
 

@@ -88,6 +88,23 @@ class Observations:
 
 
 @dataclass(frozen=True)
+class LoopPoses:
+    """Measured poses of l keyframes relative to keyframes of another pass, in whose maps they were found again.
+
+    Attributes:
+        reference, frame: (l,) indices of the keyframe whose surroundings are known, and of the one found in them.
+        turn, shift: (l, 3, 3), (l, 3) pose of ``frame`` in the frame of ``reference``.
+        information: (l, 6, 6) on the turn in the frame of ``frame`` and the shift.
+    """
+
+    reference: Indices
+    frame: Indices
+    turn: Array
+    shift: Array
+    information: Array
+
+
+@dataclass(frozen=True)
 class VisionInformation:
     """Gaussian information on u relative poses (6 numbers each: turn, shift), linearised at ``origin``.
 
@@ -95,12 +112,46 @@ class VisionInformation:
         origin: the poses of linearisation, at which the photos fit best.
         reference, frame: (u,) pose of keyframe ``frame`` relative to keyframe ``reference``.
         matrix: (6 u, 6 u) sparse information, in blocks of 6 by 6.
+        loops: the last of the relative poses, which are not as at the origin; None without any.
     """
 
     origin: Poses
     reference: Indices
     frame: Indices
     matrix: sparse.bsr_array
+    loops: LoopPoses | None = None
+
+    def with_loops(self, loops: LoopPoses) -> VisionInformation:
+        """Return a copy with further relative poses."""
+        starts = np.arange(len(loops.information) + 1)
+        size = 6 * len(loops.information)
+        further = sparse.bsr_array((loops.information, starts[:-1], starts), shape=(size, size))
+        return VisionInformation(
+            self.origin,
+            np.concatenate([self.reference, loops.reference]),
+            np.concatenate([self.frame, loops.frame]),
+            sparse.block_diag([self.matrix, further], format="bsr"),
+            loops,
+        )
+
+    @property
+    def num_from_points(self) -> int:
+        """Return the number of relative poses that are not loops."""
+        return len(self.reference) - (0 if self.loops is None else len(self.loops.reference))
+
+    def measured(self) -> tuple[Array, Array]:
+        """Return the (u, 3, 3) turns and (u, 3) shifts of the relative poses that fit the photos best."""
+        turn, shift = relative_poses(self.origin, self.reference, self.frame)
+        if self.loops is not None:
+            turn[self.num_from_points :], shift[self.num_from_points :] = self.loops.turn, self.loops.shift
+        return turn, shift
+
+
+def relative_poses(poses: Poses, reference: Indices, frame: Indices) -> tuple[Array, Array]:
+    """Return turns and shifts of keyframes relative to others, in the frames of these."""
+    to_reference = np.swapaxes(poses.world_from_rig[reference], 1, 2)
+    shift = np.einsum("uij,uj->ui", to_reference, poses.centers[frame] - poses.centers[reference])
+    return to_reference @ poses.world_from_rig[frame], shift
 
 
 def model_poses(metric: pycolmap.Reconstruction, frame_ids: Iterable[int]) -> Poses:

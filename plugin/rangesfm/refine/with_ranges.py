@@ -32,7 +32,13 @@ from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remo
 from rangesfm.refine.graph_presolve import SAME_ERRORS, Presolved, presolve, presolve_again
 from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
 from rangesfm.refine.refinement_problem import RefinementProblem
-from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
+from rangesfm.refine.vision_information import (
+    LoopPoses,
+    Observations,
+    misplaced_points,
+    model_observations,
+    model_poses,
+)
 
 # Largest number of solutions of the full problem, between which the errors of ranges and pixels are estimated again.
 _MAX_NUM_ROUNDS = 3
@@ -136,6 +142,19 @@ class Learnt:
 Learn = Callable[[AtRest], Learnt]
 
 
+@dataclass(frozen=True)
+class LoopClosing:
+    """What closes the loops of a map.
+
+    Attributes:
+        loops: measured relative poses, by ids of frames in place of indices.
+        merge_tracks: merges the points that are one, in place, once the poses have moved.
+    """
+
+    loops: LoopPoses
+    merge_tracks: Callable[[pycolmap.Reconstruction], None]
+
+
 @with_one_blas_thread
 def refine_with_ranges(
     reconstruction: pycolmap.Reconstruction,
@@ -152,6 +171,7 @@ def refine_with_ranges(
     options: RefineOptions | None = None,
     tape: Tape | None = None,
     learn: Learn | None = None,
+    closing: LoopClosing | None = None,
     num_threads: int = -1,
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
     """Refine a scaled model by bundle adjustment with range residuals.
@@ -172,6 +192,7 @@ def refine_with_ranges(
         gravity: the upward direction in the first camera; used if its pose is not fixed.
         tape: taped distances, of which the control ones are fitted; ranges between anchors in the log are fitted too.
         learn: estimates the ranges' errors at the refined map, for its covariance; None: those in ``errors`` are used.
+        closing: loops to be closed before; None without any.
 
     Returns:
         the refined model and the summary.
@@ -186,13 +207,12 @@ def refine_with_ranges(
         raise InputError("[refine] time_offset_stddev_s needs a log with times, this one names photos")
     metric = pycolmap.Reconstruction(reconstruction)
     tape = (tape or Tape()).control()
-    marker_ids = add_marker_points(metric, tape)
     ranges, radio = radio_as_given(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors)
     problem = RefinementProblem(
         metric,
         ranges,
         radio,
-        MeasuredDistances(_between_anchors(observations, anchors, errors), tape, marker_ids),
+        MeasuredDistances(_between_anchors(observations, anchors, errors), tape, {}),
         camera or CameraOptions(),
         options,
         first_pose_is_fixed,
@@ -200,7 +220,12 @@ def refine_with_ranges(
         num_threads,
     )
     with at_most(num_threads):
-        summary = _refine(problem, _errors_to_begin_with(problem, errors, metric_from_sfm.scale), learn)
+        to_begin_with = _errors_to_begin_with(problem, errors, metric_from_sfm.scale)
+        if closing is not None:
+            problem = _with_closed_loops(problem, to_begin_with, closing)
+        marker_ids = add_marker_points(metric, tape)
+        problem = replace(problem, distances=replace(problem.distances, marker_ids=marker_ids))
+        summary = _refine(problem, to_begin_with, learn)
     remove_marker_points(metric, marker_ids)
     return metric, summary
 
@@ -232,12 +257,31 @@ def _between_anchors(
 
 def _refine(problem: RefinementProblem, errors: RangeErrors, learn: Learn | None) -> RefineSummary:
     """Remove drift from the map, then solve the full problem, both without the misplaced points."""
+    problem, bundle, rays = _without_misplaced(problem)
+    return _adjust(problem, bundle, presolve(problem, rays, errors), learn)
+
+
+def _without_misplaced(problem: RefinementProblem) -> tuple[RefinementProblem, BundleAdjustment, Observations]:
+    """Return the problem without the misplaced points, its bundle adjustment, and the observations of all points."""
     frame_ids = problem.frame_ids
     rays = model_observations(problem.metric, frame_ids)
     misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
     problem = replace(problem, left_out_ids=frozenset(rays.point_ids[misplaced].tolist()))
     bundle = problem.of_photos(problem.options.max_num_iterations)
-    return _adjust(problem, bundle, presolve(problem, rays.with_pixel_stddev(bundle.pixel_stddev), errors), learn)
+    return problem, bundle, rays.with_pixel_stddev(bundle.pixel_stddev)
+
+
+def _with_closed_loops(problem: RefinementProblem, errors: RangeErrors, closing: LoopClosing) -> RefinementProblem:
+    """Move the model so that its loops close, merge its tracks, and return the problem with the anchors moved along."""
+    place = {frame_id: k for k, frame_id in enumerate(problem.frame_ids.tolist())}
+    reference, frame = (
+        np.array([place[frame_id] for frame_id in ids.tolist()], dtype=np.int64)
+        for ids in (closing.loops.reference, closing.loops.frame)
+    )
+    seen, _, rays = _without_misplaced(problem)
+    moved = presolve(seen, rays, errors, replace(closing.loops, reference=reference, frame=frame))
+    closing.merge_tracks(problem.metric)
+    return replace(problem, radio=replace(problem.radio, anchors=moved.anchors))
 
 
 @dataclass(frozen=True)

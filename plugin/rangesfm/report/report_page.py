@@ -17,6 +17,7 @@ from rangesfm.report.chart import ASSETS, css, page_charts
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
 from rangesfm.report.facts import facts_of
+from rangesfm.report.figures_loops import loops_figure
 from rangesfm.report.plot import Figure
 from rangesfm.report.scene import scene_of, view_of
 
@@ -50,7 +51,7 @@ _FOUND = ("found", "Mistakes that the ranges show")
 _SECTIONS: dict[tuple[str, str], tuple[_Maker, ...]] = {
     _FOUND: (report_tables.mistakes_found,),
     ("path", "Path"): (
-        *(figures_path.trajectory_views, figures_path.map_views, figures_path.local_scale),
+        *(figures_path.trajectory_views, figures_path.map_views, loops_figure, figures_path.local_scale),
         report_tables.comparison,
     ),
     ("scale", "Scale and clocks"): (

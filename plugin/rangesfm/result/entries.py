@@ -296,6 +296,37 @@ class PlaceEntry(Record):
     worst_keyframe_stddev_m: Number
 
 
+class LoopsEntry(Record):
+    """Summary of the closing of loops; see LoopClosure. ``loops.csv`` names the pairs.
+
+    Attributes:
+        num_proposed: pairs of photos that the refined map predicted to see the same.
+        num_verified: pairs of these that match.
+        num_closed: pairs of these that fit the ranges and were used.
+        num_contradicted: pairs of these that the ranges contradict.
+        moved_m: root mean square movement of the keyframes.
+    """
+
+    num_proposed: Count
+    num_verified: Count
+    num_closed: Count
+    num_contradicted: Count
+    moved_m: Number
+
+    @classmethod
+    def of(cls, found: MetricResult) -> LoopsEntry | None:
+        loops = found.loops
+        if loops is None:
+            return None
+        return cls(
+            num_proposed=loops.num_proposed,
+            num_verified=loops.num_verified,
+            num_closed=len(loops.closed),
+            num_contradicted=len(loops.contradicted),
+            moved_m=loops.moved_m,
+        )
+
+
 class RefineEntry(Record):
     """Summary of the refinement; see RefineSummary. What was not estimated is null.
 

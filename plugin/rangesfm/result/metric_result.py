@@ -20,6 +20,7 @@ from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.join_models import ModelVerdict
+from rangesfm.loops.loop_closure import LoopClosure
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.clock.time_offset import TimeOffset
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
@@ -68,6 +69,7 @@ class MetricResult:
         rivals: other likely time offsets; None without any.
         on_map: the ranges on the scaled map; None where that map is only the start of a refinement, or without ranges.
         refined_with_ranges: the refined map with the ranges on it; None without one.
+        loops: the loops that were closed in the refined map; None where none were looked for.
     """
 
     trajectory: Trajectory
@@ -87,6 +89,7 @@ class MetricResult:
     rivals: Rivals | None = None
     on_map: RangesOnMap | None = None
     refined_with_ranges: MapWithRanges | None = None
+    loops: LoopClosure | None = None
 
     @property
     def final(self) -> pycolmap.Reconstruction:
@@ -180,6 +183,7 @@ class MetricResult:
             scaled=rescale(self.scaled, shift),
             refined=None if self.refined is None else rescale(self.refined, shift),
             refinement=refinement,
+            loops=self.loops and self.loops.moved(offset_m),
         )
 
     def doubted(self, reasons: Sequence[str], advice: Sequence[str] = ()) -> MetricResult:

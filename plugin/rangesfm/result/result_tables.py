@@ -307,5 +307,37 @@ class TimeOffsetCurve(TableFile):
         return None if curve is None else cls(curve.offsets_s, curve.costs_m)
 
 
-_OF_A_RUN = (RangesAsUsed, PhotoTimes, CenterCovariances, ScaleCandidates, ScaleConsensus, TimeOffsetCurve, TagCorners)
+@dataclass(frozen=True)
+class LoopPairs(TableFile):
+    """Content of ``loops.csv``: pairs of photos of distant times that match, and what became of each.
+
+    Attributes:
+        image_name, other_image_name: names of the two photos.
+        status: "closed", or "contradicted" where the ranges exclude that they show the same place.
+    """
+
+    NAME: ClassVar[str] = "loops.csv"
+    image_name: Texts
+    other_image_name: Texts
+    status: Texts
+
+    @classmethod
+    def of(cls, found: MetricResult) -> LoopPairs | None:
+        if found.loops is None:
+            return None
+        kinds = {"closed": found.loops.closed, "contradicted": found.loops.contradicted}
+        rows = [(*pair, kind) for kind, pairs in kinds.items() for pair in pairs]
+        first, second, status = zip(*rows) if rows else ((), (), ())
+        return cls(first, second, status)
+
+    def pairs(self, status: str) -> list[tuple[str, str]]:
+        """Return the names of the pairs with this status."""
+        rows = zip(self.image_name, self.other_image_name, self.status, strict=True)
+        return [(first, second) for first, second, of_pair in rows if of_pair == status]
+
+
+_OF_A_RUN = (
+    *(RangesAsUsed, PhotoTimes, CenterCovariances, LoopPairs),
+    *(ScaleCandidates, ScaleConsensus, TimeOffsetCurve, TagCorners),
+)
 RESULT_TABLES: tuple[type[TableFile], ...] = _OF_A_RUN

@@ -34,6 +34,7 @@ class ResultSummary(Record):
         frame: of the metric models.
         anchors: by id.
         refine: null without a refinement.
+        loops: null where no loops were looked for.
         models: all models that were to be joined to this one; empty where there was only one.
         tests: of mistakes that may have been made; those that were found come first.
         reliability: of the scale with one unfound mistake; null where no mistakes were tested.
@@ -57,6 +58,7 @@ class ResultSummary(Record):
     ranges: entries.RangesEntry
     check_ranges: entries.CheckRangesEntry
     refine: entries.RefineEntry | None
+    loops: entries.LoopsEntry | None = None
     models: tuple[entries.ModelEntry, ...]
     tests: tuple[entries.MistakeEntry, ...] = ()
     reliability: entries.ReliabilityEntry | None = None
@@ -99,6 +101,7 @@ class ResultSummary(Record):
             ranges=entries.RangesEntry.of(found),
             check_ranges=entries.CheckRangesEntry.of(found),
             refine=entries.RefineEntry.of(found),
+            loops=entries.LoopsEntry.of(found),
             tests=tuple(map(entries.MistakeEntry.model_validate, found.diagnosis.tests if found.diagnosis else ())),
             reliability=entries.ReliabilityEntry.of(found),
             models=tuple(entries.ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
@@ -130,6 +133,8 @@ class ResultSummary(Record):
             yield _refined(self.refine)
         if self.reliability is not None and self.reliability.scale_within is not None:
             yield _reliable(self.reliability)
+        if self.loops is not None:
+            yield _closed(self.loops)
         rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
         residuals = f"; they differ from the map by {rms} m (rms), half of them by less than {median} m"
         if self.has_ranges:
@@ -162,6 +167,15 @@ def _reliable(reliability: entries.ReliabilityEntry) -> str:
     limited = f" (worst: {reliability.limited_by})" if reliability.limited_by else ""
     unchecked = f"; untested: {', '.join(reliability.unchecked)}" if reliability.unchecked else ""
     return f"reliability: scale within {within}, one unfound mistake included{limited}{unchecked}"
+
+
+def _closed(loops: entries.LoopsEntry) -> str:
+    """Return the line that says which loops were closed."""
+    moved = f", which moved the map by {loops.moved_m:.2g} m (rms)" if loops.num_closed else ""
+    return (
+        f"loops: {loops.num_proposed} pairs proposed by the map, {loops.num_verified} match,"
+        f" {loops.num_closed} closed{moved}; {loops.num_contradicted} contradict the ranges"
+    )
 
 
 def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:

@@ -69,6 +69,11 @@ class MatchingOptions:
         return not (isinstance(self.pairing, pycolmap.SequentialPairingOptions) and self.pairing.loop_detection)
 
     @property
+    def is_in_time_only(self) -> bool:
+        """Return whether only neighbours in time are matched."""
+        return isinstance(self.pairing, pycolmap.SequentialPairingOptions) and not self.pairing.loop_detection
+
+    @property
     def pairing_inputs(self) -> list[Any]:
         """Plain values that differ whenever other pairs of the same photos would be matched."""
         if isinstance(self.pairing, tuple):
@@ -110,7 +115,14 @@ def match_features(
     Raises:
         ReconstructionError: no two photos match.
     """
-    pairs = pairs_to_match(database_path, photos, options.pairing)
+    match_pairs(database_path, pairs_to_match(database_path, photos, options.pairing), options, log, progress)
+    _require_matches(database_path, photos)
+
+
+def match_pairs(
+    database_path: Path, pairs: Sequence[tuple[int, int]], options: MatchingOptions, log: Path, progress: Progress
+) -> None:
+    """Match those of the pairs (ids of photos, smaller first) that have not been matched yet."""
     with pycolmap.Database.open(database_path) as database:
         missing = [pair for pair in pairs if not database.exists_two_view_geometry(*pair)]
     num_there, num_all = len(pairs) - len(missing), len(pairs)
@@ -123,7 +135,6 @@ def match_features(
         _match_shares(
             shares, database_path, options.num_processes, log, lambda num: progress.update(num_there + num, num_all)
         )
-    _require_matches(database_path, photos)
 
 
 def verify_matches(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:

@@ -16,6 +16,7 @@ from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.given_database import opened
+from rangesfm.vision.loop_database import forget_loops
 from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_mapped_models
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
@@ -139,10 +140,16 @@ def _map(
             "mapping",
             inputs,
             space.models / "0",
-            space.remove_old_models,
+            lambda: _begin_mapping(space),
             lambda: map_photos(space, photos, mapping_options(camera, mapper, rigs, seed, space.database)),
             unfinished=space.snapshots,
         )
+
+
+def _begin_mapping(space: Workspace) -> None:
+    """Remove old models, and the matches of the loops that were found by them."""
+    space.remove_old_models()
+    forget_loops(space.steps, space.database)
 
 
 def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions) -> None:

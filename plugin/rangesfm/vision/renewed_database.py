@@ -25,6 +25,7 @@ from rangesfm.vision.database import (
 )
 from rangesfm.vision.features import extract_features
 from rangesfm.vision.given_database import GivenDatabase
+from rangesfm.vision.loop_database import forget_loops
 from rangesfm.vision.matching import MatchingOptions, match_features, verify_matches
 from rangesfm.vision.pairs import pairs_to_match
 from rangesfm.vision.photo_files import Photos, exif_position
@@ -108,6 +109,7 @@ class RenewedDatabase:
                 space.progress.message(f"features: those of {num_taken} photos are taken over from an earlier run")
             # SQLite would take files that it kept beside the old database for parts of the new one.
             remove_database(space.database)
+        forget_loops(space.steps)
         self._write_note()
 
     def _begin_matching(self) -> None:
@@ -115,6 +117,7 @@ class RenewedDatabase:
         self.space.remove_old_models()
         # A process that was killed may have left the photos under the temporary names that sequential matching needs.
         name_photos(self.space.database, self.photos.names)
+        forget_loops(self.space.steps, self.space.database)
         if self.space.steps.notes.get(_NOTE, {}).get("matches") != self.match_inputs:
             clear_matches(self.space.database)
         self._write_note()

@@ -28,13 +28,14 @@ from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.refine.photo_bending import bending_of_model, by_photos
 from rangesfm.refine.radio import ranges_predicted_by_model
-from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, RefineSummary, refine_with_ranges
+from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, LoopClosing, RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult, Rivals
 from rangesfm.scale.at_map import MapWithRanges, estimate_at
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_verdict import refuse_unknown
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.workflows.close_loops import closed, find_loops
 
 # Two likely time offsets whose scales differ by more than this fraction leave the scale undetermined, ...
 _MAX_SPREAD = 0.03
@@ -87,6 +88,10 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
     if refine:
         with run.journal.stage("refinement"):
             metric = refine_map(run, metric)
+        if (found := find_loops(run, metric)) is not None:
+            with run.journal.stage("refinement"):
+                again = metric if found.closing is None else refine_map(run, metric, found.closing)
+            metric = closed(run, found, metric, again)
     with run.journal.timed("judgement"):
         return judge_map(run, metric, of_pieces)
 
@@ -225,8 +230,13 @@ def scale_by_rivals(run: SurveyRun, path: PathOfModel, offset: TimeOffset, scale
     return Rivals(tuple(doubts), max(float(np.sqrt(variance)), farthest / NORMAL_95))
 
 
-def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:
+def refine_map(run: SurveyRun, metric: MetricResult, closing: LoopClosing | None = None) -> MetricResult:
     """Refine a scaled map with its ranges. Where the refinement breaks the map, the scaled map stays the result.
+
+    Args:
+        run: the survey.
+        metric: the scaled map, or the refined one.
+        closing: loops to be closed in the refined map; None where it is refined for the first time.
 
     Raises:
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
@@ -249,7 +259,7 @@ def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:
 
     estimate = metric.estimate
     has_ranges = estimate.problem is not None
-    refined, summary = _refined(run, metric, tape, learn if has_ranges else None)
+    refined, summary = _refined(run, metric, tape, learn if has_ranges else None, closing)
     if survey.refine.covariance and summary.covariance is None:
         run.journal.warn(
             "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
@@ -271,16 +281,16 @@ def refine_map(run: SurveyRun, metric: MetricResult) -> MetricResult:
 
 
 def _refined(
-    run: SurveyRun, metric: MetricResult, tape: Tape, learn: Learn | None
+    run: SurveyRun, metric: MetricResult, tape: Tape, learn: Learn | None, closing: LoopClosing | None
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
     """Call ``refine_with_ranges`` with the options of a survey and the results of the scale stage."""
     survey, estimate = run.survey, metric.estimate
     return refine_with_ranges(
-        metric.scaled,
+        metric.scaled if closing is None else metric.final,
         metric.trajectory,
         estimate.observations,
         estimate.metric_from_sfm,
-        estimate.anchors,
+        metric.anchors,
         estimate.errors,
         tag_in_cam_m=run.inputs.tag_in_cam_m,
         first_pose_is_fixed=estimate.frame != "site",
@@ -289,6 +299,7 @@ def _refined(
         options=survey.refine,
         tape=tape,
         learn=learn,
+        closing=closing,
         num_threads=survey.mapper.num_threads,
     )
 

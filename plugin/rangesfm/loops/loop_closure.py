@@ -1,0 +1,55 @@
+"""The loops of a map: what was proposed, found, contradicted by the ranges, and by how much the map moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.similarity import rmse
+from rangesfm.geometry.trajectory import Trajectory
+
+NamedPair = tuple[str, str]
+"""Names of two photos."""
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """Outcome of the closing of loops.
+
+    Attributes:
+        num_proposed: pairs of photos that the map predicted to see the same.
+        num_verified: pairs of these that match.
+        closed: pairs of these that were used.
+        contradicted: pairs of these that the ranges contradict.
+        before, after: keyframes of the refined map before and after, metres.
+    """
+
+    num_proposed: int
+    num_verified: int
+    closed: tuple[NamedPair, ...]
+    contradicted: tuple[NamedPair, ...]
+    before: Trajectory
+    after: Trajectory
+
+    @property
+    def moved_m(self) -> float:
+        """Return the root mean square movement of the keyframes."""
+        return rmse(self.after.centers - self.before.centers)
+
+    @property
+    def warning(self) -> str | None:
+        """Return a line that names the pairs that the ranges contradict; None if there are none."""
+        if not self.contradicted:
+            return None
+        first = " and ".join(self.contradicted[0])
+        return (
+            f"{len(self.contradicted)} pairs of photos look alike, but by the ranges they do not show the same place:"
+            f" they are not used; the first are {first}, all are in loops.csv"
+        )
+
+    def moved(self, offset_m: Array) -> LoopClosure:
+        """Return the same in a world whose coordinates are larger by ``offset_m`` (3,)."""
+        before, after = (path.transformed(1.0, np.eye(3), offset_m) for path in (self.before, self.after))
+        return replace(self, before=before, after=after)

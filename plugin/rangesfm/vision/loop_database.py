@@ -1,0 +1,148 @@
+"""Matches of loops, in a copy of a reconstruction's database that takes its place once the result is complete.
+
+The record of the reconstruction's steps notes these pairs, because a mapping that is done again starts without them.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import defaultdict
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from rangesfm.arrays import Indices
+from rangesfm.colmap.colmap_log import colmap_log
+from rangesfm.colmap.pieces import MIN_NUM_SHARED
+from rangesfm.files.manifest import content_hash
+from rangesfm.files.output_folder import OutputFolder, remove
+from rangesfm.progress import Progress, SilentProgress
+from rangesfm.vision.matching import MatchingOptions, match_pairs
+from rangesfm.vision.steps import DATABASE_NAME, LOG_NAME, RECORD_NAME, Steps
+
+Pair = tuple[int, int]
+"""Ids of two photos, the smaller one first."""
+_FOLDER_NAME, _SOURCE_NAME, _NOTE = "loops", "source.txt", "loops"
+
+
+def forget_loops(steps: Steps, path: Path | None = None) -> None:
+    """Remove the matches of all loops that a reconstruction's record notes from its database, and the note.
+
+    Args:
+        path: of the database; None: it has just been made without loops.
+    """
+    if pairs := _noted(steps):
+        if path is not None:
+            _forget(path, pairs)
+        steps.note(_NOTE, {})
+
+
+def _noted(steps: Steps) -> list[Pair]:
+    return [(first, second) for first, second in steps.notes.get(_NOTE, {}).get("pairs", [])]
+
+
+def _forget(path: Path, pairs: Collection[Pair]) -> None:
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for pair in pairs:
+            database.delete_matches(*pair)
+            database.delete_two_view_geometry(*pair)
+
+
+@dataclass(frozen=True)
+class LoopDatabase:
+    """A copy of a database, in a folder of its own, to which matches of loops are added.
+
+    Attributes:
+        folder: private folder of the output folder. It also has a copy of the record, which notes all pairs that were
+            tried as loops.
+        has_record: whether that record belongs to a reconstruction in the output folder.
+    """
+
+    folder: Path
+    has_record: bool
+
+    @classmethod
+    def of(cls, source: Path, output: OutputFolder) -> LoopDatabase:
+        """Copy a database, unless an interrupted run has copied the same one and added matches to it."""
+        folder, record = output.private / _FOLDER_NAME, output.newest(output.path / RECORD_NAME)
+        has_record = record.is_file() and source == output.newest(output.path / DATABASE_NAME)
+        made_from = f"{content_hash(source)} {content_hash(record) if has_record else ''}"
+        mark = folder / _SOURCE_NAME
+        if not (mark.is_file() and mark.read_text() == made_from and (folder / DATABASE_NAME).is_file()):
+            remove(folder)
+            folder.mkdir()
+            shutil.copyfile(source, folder / DATABASE_NAME)
+            if (log := source.with_name(source.name + "-wal")).is_file():
+                shutil.copyfile(log, folder / log.name.replace(source.name, DATABASE_NAME))
+            if has_record:
+                shutil.copyfile(record, folder / RECORD_NAME)
+            mark.write_text(made_from)
+        return cls(folder, has_record)
+
+    @property
+    def path(self) -> Path:
+        return self.folder / DATABASE_NAME
+
+    @property
+    def log(self) -> Path:
+        """File with COLMAP's messages."""
+        return self.folder / LOG_NAME
+
+    def why_unfit(self, model: pycolmap.Reconstruction) -> str | None:
+        """Return why the photos of a model cannot be matched by this database; None if they can."""
+        with pycolmap.Database.open(self.path) as database:
+            name_of = {image.image_id: image.name for image in database.read_all_images()}
+            for image_id in model.reg_image_ids():
+                image = model.image(image_id)
+                same_features = database.num_keypoints_for_image(image_id) == image.num_points2D()
+                if name_of.get(image_id) != image.name or not same_features:
+                    return f"{image.name} has other features in the model, expected the database it was made from"
+                if not database.exists_descriptors(image_id):
+                    return f"{image.name} has no descriptors in the database"
+        return None
+
+    def known(self) -> dict[int, set[int]]:
+        """Return the photos that each photo was matched with by the mapping, by its id."""
+        known: dict[int, set[int]] = defaultdict(set)
+        with pycolmap.Database.open(self.path) as database:
+            pairs = {*map(pycolmap.pair_id_to_image_pair, database.read_num_matches()[0])}
+        for first, second in pairs - set(self._tried()):
+            known[first].add(second)
+            known[second].add(first)
+        return known
+
+    def match(self, pairs: list[Pair], options: MatchingOptions, progress: Progress) -> dict[Pair, Indices]:
+        """Match pairs, and return the matches (m, 2) of those that are verified by a two-view geometry."""
+        self._note({*self._tried(), *pairs})
+        with colmap_log(self.log):
+            match_pairs(self.path, pairs, options, self.log, progress)
+        verified: dict[Pair, Indices] = {}
+        with pycolmap.Database.open(self.path) as database:
+            for pair in pairs:
+                matches = np.asarray(database.read_two_view_geometry(*pair).inlier_matches, dtype=np.int64)
+                if len(matches) >= MIN_NUM_SHARED:
+                    verified[pair] = matches
+        return verified
+
+    def keep(self, proposed: Collection[Pair], verified: Collection[Pair], accepted: Collection[Pair]) -> None:
+        """Forget the matches of all pairs that were tried as loops, except those that are accepted or do not match."""
+        tried, right = set(self._tried()), {*accepted, *(set(proposed) - set(verified))}
+        _forget(self.path, tried - right)
+        self._note(right)
+
+    def publish(self, output: OutputFolder) -> None:
+        """Let the database, and the record that notes its loops, take their places with the next whole result."""
+        names = (DATABASE_NAME, RECORD_NAME) if self.has_record else (DATABASE_NAME,)
+        output.defer({output.path / name: self.folder / name for name in names})
+
+    def _record(self) -> Steps:
+        return Steps(self.folder / RECORD_NAME, SilentProgress())
+
+    def _tried(self) -> list[Pair]:
+        return _noted(self._record())
+
+    def _note(self, pairs: Collection[Pair]) -> None:
+        self._record().note(_NOTE, {"pairs": sorted(pairs)})

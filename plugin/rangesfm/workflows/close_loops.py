@@ -1,0 +1,116 @@
+"""Closing of loops by the options of a survey: the refined map proposes pairs, which are matched, tested and used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import pycolmap
+
+from rangesfm.colmap.colmap_log import colmap_log
+from rangesfm.errors import InputError
+from rangesfm.files.output_folder import OutputFolder, sole_writer
+from rangesfm.loops.loop_closure import LoopClosure
+from rangesfm.loops.loop_finder import LoopFinder
+from rangesfm.loops.merge import merge_tracks
+from rangesfm.progress import Journal
+from rangesfm.refine.with_ranges import LoopClosing
+from rangesfm.result.metric_result import MetricResult
+from rangesfm.survey.settings import Survey
+from rangesfm.vision.loop_database import LoopDatabase, Pair
+from rangesfm.vision.matching import MatchingOptions, matching_options
+from rangesfm.vision.steps import DATABASE_NAME
+
+# Pairs that one photo proposes at most. Sequential matching pairs a photo with 10 neighbours by default.
+_MAX_NUM_PAIRS = 5
+
+
+@dataclass(frozen=True)
+class FoundLoops:
+    """Loops of a map, with the database that has their matches.
+
+    Attributes:
+        closing: for the refinement; None if there are no loops.
+        outcome: for the result, with the map as it is before they are closed.
+    """
+
+    closing: LoopClosing | None
+    outcome: LoopClosure
+
+
+def find_loops(survey: Survey, metric: MetricResult, journal: Journal) -> FoundLoops | None:
+    """Match the pairs that a refined map proposes, and test those that match; None where loops are not to be closed.
+
+    Raises:
+        InputError: the given database does not belong to the given model.
+    """
+    is_given, summary = survey.images.model is not None, metric.kept_refinement
+    if not survey.mapper.close_loops or not len(metric.observations.log) or summary is None:
+        return None
+    options = matching_options(survey.mapper, len(metric.trajectory), survey.output.seed)
+    with sole_writer(survey.output.path) as output:
+        source = survey.mapper.database_path if is_given else output.newest(output.path / DATABASE_NAME)
+        if source is None or not source.is_file() or not (is_given or options.is_in_time_only):
+            return None
+        if metric.map_errors is None:
+            journal.warn("loops are not closed, because the covariance of the poses is not known")
+            return None
+        with journal.stage("loops"):
+            database = LoopDatabase.of(source, output)
+            if why_not := database.why_unfit(metric.final):
+                if is_given:
+                    raise InputError(why_not, source)
+                return None
+            return _found(survey, metric, database, options, output, journal)
+
+
+def _found(
+    survey: Survey,
+    metric: MetricResult,
+    database: LoopDatabase,
+    options: MatchingOptions,
+    output: OutputFolder,
+    journal: Journal,
+) -> FoundLoops:
+    model, summary = metric.final, metric.kept_refinement
+    assert summary is not None
+    assert metric.map_errors is not None
+    loops = LoopFinder.of(model, metric.trajectory, metric.map_errors, summary.pixel_stddev, survey.output.seed)
+    proposed = loops.propose(database.known(), max_num=_MAX_NUM_PAIRS)
+    verified = database.match(proposed, options, journal.progress)
+    found, contradicted = loops.tested(verified)
+    accepted = [loop.image_ids for loop in found]
+    database.keep(proposed, verified, accepted)
+    database.publish(output)
+    outcome = LoopClosure(
+        len(proposed),
+        len(verified),
+        _named(model, accepted),
+        _named(model, contradicted),
+        loops.path,
+        loops.path,
+    )
+    journal.warn(*filter(None, [outcome.warning]))
+
+    def merge(metric: pycolmap.Reconstruction) -> None:
+        with colmap_log(database.log):
+            merge_tracks(metric, database.path, seed=survey.output.seed)
+
+    return FoundLoops(LoopClosing(loops.relative_poses(found), merge) if found else None, outcome)
+
+
+def _named(model: pycolmap.Reconstruction, pairs: Sequence[Pair]) -> tuple[tuple[str, str], ...]:
+    return tuple((model.image(first).name, model.image(second).name) for first, second in pairs)
+
+
+def closed(found: FoundLoops, metric: MetricResult, refined: MetricResult, journal: Journal) -> MetricResult:
+    """Return the map refined with its loops, with what was found; the map without them if it broke.
+
+    Args:
+        metric: the map before. refined: the map after.
+    """
+    outcome = found.outcome
+    if refined.why_broken:
+        journal.warn(f"loops are left open, because the map broke: {'; '.join(refined.why_broken)}")
+        refined, outcome = metric, replace(outcome, closed=())
+    return replace(refined, loops=replace(outcome, after=refined.trajectory.as_in(refined.final)))

@@ -1,0 +1,59 @@
+"""Loops of simulated surveys: proposed by the refined map, tested against the ranges, closed by merging of tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.simulated.looped import Closed, LoopedSurvey, close, two_aisles, two_laps
+from tests.studies.simulated_survey import range_log
+
+from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+
+
+def error_m(survey: LoopedSurvey, model: pycolmap.Reconstruction) -> float:
+    """Return the root mean square error of the keyframes after the best rigid motion."""
+    truth = survey.survey.model
+    path = trajectory_from_reconstruction(model, truth.timestamps_s)
+    return rmse(align_points(path.centers, truth.centers_m, with_scale=False).apply(path.centers) - truth.centers_m)
+
+
+@pytest.fixture(scope="module")
+def laps() -> LoopedSurvey:
+    return two_laps(60, size_m=(24.0, 16.0), num_observations=100)
+
+
+@pytest.fixture(scope="module")
+def closed(laps: LoopedSurvey, tmp_path_factory: pytest.TempPathFactory) -> Closed:
+    return close(laps, laps.chain(), range_log(laps.survey, 1), tmp_path_factory.mktemp("laps"))
+
+
+def test_the_map_proposes_pairs_of_both_laps_that_see_the_same(closed: Closed, laps: LoopedSurvey) -> None:
+    far = [pair for pair in closed.proposed if pair[1] - pair[0] > laps.max_track_length]
+    assert len(far) >= len(laps.truth.images) // 2
+    assert np.mean([pair in laps.matches for pair in far]) > 0.5
+
+
+def test_closed_loops_tie_the_laps_together(closed: Closed, laps: LoopedSurvey) -> None:
+    assert len(closed.loops) > 10
+    assert not closed.contradicted
+    assert error_m(laps, closed.after) < 0.5 * error_m(laps, closed.before)
+    longest = max(
+        max(element.image_id for element in point.track.elements)
+        - min(element.image_id for element in point.track.elements)
+        for point in closed.after.points3D.values()
+    )
+    assert longest > 20
+
+
+def test_pairs_that_look_alike_in_two_aisles_are_contradicted_by_the_ranges(tmp_path: Path) -> None:
+    survey = two_aisles(num_keyframes=12, length_m=5.0)
+    chain = survey.looped.chain()
+    found = close(survey.looped, chain, range_log(survey.looped.survey, 1), tmp_path, matches=survey.alike)
+    assert not found.loops
+    loops, contradicted = found.finder.tested(survey.alike)
+    assert not loops
+    assert len(contradicted) > 0.9 * len(survey.alike) > 10

@@ -1,0 +1,300 @@
+"""Simulated surveys that come back to places: the map a mapper makes of neighbours in time, and all true matches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+from tests.simulated.model import SyntheticModel, _Frames, _reconstruction, synthetic_model
+from tests.simulated.path import lap_path, look_at
+from tests.studies.simulated_survey import RANGE_MODEL, SITE_ANCHORS_M, TAG_IN_CAM_M, Survey
+
+from rangesfm.colmap.pieces import MIN_NUM_SHARED
+from rangesfm.colmap.transform import rescale
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.loops.loop_finder import LoopFinder
+from rangesfm.loops.merge import merge_tracks
+from rangesfm.loops.resection import Loop
+from rangesfm.options import CameraOptions
+from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.association import associate
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.refine.with_ranges import LoopClosing, RefineSummary, refine_with_ranges
+from rangesfm.scale.initialize import initialize_scale
+from rangesfm.vision.database import create_database
+
+Pair = tuple[int, int]
+Matches = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class LoopedSurvey:
+    """A survey with all its true tracks.
+
+    Attributes:
+        survey: its model has every point with all photos that see it, in the metric world, with noisy features.
+        max_track_length: photos after one another in which the mapper finds a point; later ones make another point.
+    """
+
+    survey: Survey
+    max_track_length: int
+
+    @property
+    def truth(self) -> pycolmap.Reconstruction:
+        return self.survey.model.reconstruction
+
+    def chain(self) -> pycolmap.Reconstruction:
+        """Return the map that a mapper makes by neighbours in time alone: COLMAP's adjustment of the cut tracks."""
+        chain = pycolmap.Reconstruction(self.truth)
+        for point_id, point in sorted(self.truth.points3D.items()):
+            chain.delete_point3D(point_id)
+            seen = sorted((element.image_id, element.point2D_idx) for element in point.track.elements)
+            for piece in _pieces(seen, self.max_track_length):
+                chain.add_point3D(point.xyz, pycolmap.Track([pycolmap.TrackElement(*one) for one in piece]))
+        return adjusted(chain)
+
+    @cached_property
+    def matches(self) -> dict[Pair, Matches]:
+        """Features (m, 2) of the same points in two photos, for all pairs that have enough of them."""
+        found: dict[Pair, list[Pair]] = {}
+        for _, point in sorted(self.truth.points3D.items()):
+            seen = sorted((element.image_id, element.point2D_idx) for element in point.track.elements)
+            for k, (first, place) in enumerate(seen):
+                for second, other in seen[k + 1 :]:
+                    found.setdefault((first, second), []).append((place, other))
+        return {pair: np.array(of) for pair, of in found.items() if len(of) >= MIN_NUM_SHARED}
+
+
+def _pieces(seen: list[Pair], max_length: int) -> Iterable[list[Pair]]:
+    cuts = [k for k, ((a, _), (b, _)) in enumerate(pairwise(seen), 1) if b - a > 1]
+    for begin, end in pairwise([0, *cuts, len(seen)]):
+        for start in range(begin, end, max_length):
+            if len(piece := seen[start : min(start + max_length, end)]) > 1:
+                yield piece
+
+
+def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Adjust a model in place by its features alone, and return it."""
+    pycolmap.ObservationManager(model).filter_points3D_with_small_triangulation_angle(1.5, set(model.point3D_ids()))
+    options = pycolmap.BundleAdjustmentOptions(
+        print_summary=False, refine_focal_length=False, refine_extra_params=False
+    )
+    solver = options.ceres.solver_options
+    solver.num_threads, solver.max_num_iterations, solver.initial_trust_region_radius = 1, 200, 1e8
+    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-10
+    options.ceres.solver_options = solver
+    config = pycolmap.BundleAdjustmentConfig()
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
+    return model
+
+
+def write_matches(path: Path, model: pycolmap.Reconstruction, matches: dict[Pair, Matches]) -> None:
+    """Write a database with the features of a model and these matches, which are taken for verified."""
+    image_ids = sorted(model.reg_image_ids())
+    (camera,) = model.cameras.values()
+    names = [model.image(image_id).name for image_id in image_ids]
+    create_database(path, names, [pycolmap.Camera(camera.todict())], [0] * len(names))
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for image_id in image_ids:
+            pixels = np.array([point.xy for point in model.image(image_id).points2D], dtype=np.float32)
+            database.write_keypoints(image_id, pixels.reshape(-1, 2))
+        for pair, of_pair in matches.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = of_pair.astype(np.uint32)
+            database.write_matches(*pair, of_pair.astype(np.uint32))
+            database.write_two_view_geometry(*pair, geometry)
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A refined survey before and after its loops are closed.
+
+    Attributes:
+        scaled, before, after: the maps. finder: of the loops in the map before.
+        proposed: pairs that the map proposes. loops: those that match and fit the ranges.
+        contradicted: those that match and do not fit.
+    """
+
+    scaled: pycolmap.Reconstruction
+    before: pycolmap.Reconstruction
+    after: pycolmap.Reconstruction
+    finder: LoopFinder
+    proposed: list[Pair]
+    loops: list[Loop]
+    contradicted: list[Pair]
+
+
+def close(
+    looped: LoopedSurvey,
+    chain: pycolmap.Reconstruction,
+    log: RangeLog,
+    folder: Path,
+    *,
+    matches: dict[Pair, Matches] | None = None,
+    max_num: int = 5,
+) -> Closed:
+    """Scale and refine a chain, then close its loops.
+
+    Args:
+        folder: for the database.
+        matches: of pairs that match, in place of the true ones.
+    """
+    survey, matches = looped.survey, looped.matches if matches is None else matches
+    times = survey.model.timestamps_s
+    trajectory = trajectory_from_reconstruction(chain, times)
+    observations = associate(log, trajectory, TAG_IN_CAM_M)
+    anchors = [Anchor(name, position) for name, position in survey.anchors_m.items()]
+    estimate = initialize_scale(
+        observations, trajectory, anchors, anchor_frame=survey.anchor_frame, range_model=RANGE_MODEL
+    )
+    scaled = rescale(chain, estimate.metric_from_sfm)
+
+    def refined(
+        start: pycolmap.Reconstruction, closing: LoopClosing | None
+    ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
+        return refine_with_ranges(
+            start,
+            trajectory,
+            estimate.observations,
+            estimate.metric_from_sfm,
+            estimate.anchors,
+            estimate.errors,
+            tag_in_cam_m=TAG_IN_CAM_M,
+            first_pose_is_fixed=survey.is_in_first_camera,
+            camera=CameraOptions(refine_intrinsics=False),
+            closing=closing,
+            num_threads=1,
+        )
+
+    before, summary = refined(scaled, None)
+    assert summary.covariance is not None
+    finder = LoopFinder.of(before, trajectory, summary.covariance.errors, summary.pixel_stddev, seed=0)
+    neighbours = {pair: of for pair, of in looped.matches.items() if pair[1] - pair[0] < looped.max_track_length}
+    known: dict[int, set[int]] = {}
+    for first, second in neighbours:
+        known.setdefault(first, set()).add(second)
+        known.setdefault(second, set()).add(first)
+    proposed = finder.propose(known, max_num=max_num)
+    loops, contradicted = finder.tested({pair: matches[pair] for pair in proposed if pair in matches})
+    accepted = {loop.image_ids: matches[loop.image_ids] for loop in loops}
+    path = folder / "database.db"
+    write_matches(path, before, neighbours | accepted)
+    closing = (
+        LoopClosing(finder.relative_poses(loops), lambda model: merge_tracks(model, path, seed=0)) if loops else None
+    )
+    after = before if closing is None else refined(before, closing)[0]
+    return Closed(scaled, before, after, finder, proposed, loops, contradicted)
+
+
+def two_laps(
+    num_keyframes: int,
+    *,
+    size_m: tuple[float, float],
+    num_observations: int = 60,
+    pixel_stddev: float = 0.5,
+    max_track_length: int = 8,
+    seed: int = 0,
+) -> LoopedSurvey:
+    """Two laps of a rover around a field, looking ahead, with one anchor that is known in the first camera's frame.
+
+    Args:
+        num_keyframes: of both laps together.
+        size_m: of the field.
+        num_observations: features in a keyframe.
+        pixel_stddev: of a coordinate of a feature.
+        seed: of points and noise.
+    """
+    times = np.arange(num_keyframes, dtype=np.float64)
+    path = lap_path(times[-1], size_m=size_m, corner_radius_m=min(8.0, 0.2 * min(size_m)), share=2.0)
+    centers, turns = path.centers(times), path.world_from_cam(times)
+    model = synthetic_model(
+        times,
+        (centers - centers[0]) @ turns[0],
+        turns[0].T @ turns,
+        num_observations=num_observations,
+        depth_range_m=(4.0, 25.0),
+        pixel_stddev=pixel_stddev,
+        metric_from_sfm=IDENTITY,
+        seed=seed,
+    )
+    anchor = (np.array([0.1 * size_m[0], -0.4 * size_m[1], 4.0]) - centers[0]) @ turns[0]
+    return LoopedSurvey(Survey(model, {"A1": anchor}, "first_camera", 0.1), max_track_length)
+
+
+@dataclass(frozen=True)
+class RepeatingSurvey:
+    """A walk along two aisles whose shelves are exactly alike.
+
+    Attributes:
+        looped: the survey. Its true matches tie each aisle to itself and to the way between them.
+        alike: matches of photos in one aisle with photos in the other, which show the same and are not.
+    """
+
+    looped: LoopedSurvey
+    alike: dict[Pair, Matches]
+
+
+def two_aisles(
+    *, num_keyframes: int = 30, length_m: float = 10.0, apart_m: float = 3.0, pixel_stddev: float = 0.5, seed: int = 0
+) -> RepeatingSurvey:
+    """Simulate a walk along an aisle, over to the next one and back, looking at the shelves, with four anchors.
+
+    Args:
+        num_keyframes: in each aisle.
+        length_m: of the aisles.
+        apart_m: distance between the aisles.
+        pixel_stddev: of a coordinate of a feature.
+        seed: of points and noise.
+    """
+    rng = np.random.default_rng(seed)
+    along, over = np.linspace(0.0, length_m, num_keyframes), np.arange(0.4, apart_m - 0.2, 0.4)
+    x = np.concatenate([along, np.full(len(over), length_m), along[::-1]])
+    y = -np.concatenate([0 * along, over, np.full(num_keyframes, apart_m)])
+    height = 1.6 + 0.1 * np.sin(np.arange(len(x)))
+    centers = np.column_stack([x, y, height])
+    centers[-num_keyframes:, 2] = centers[:num_keyframes, 2][::-1]
+    sway = 0.1 * np.sin(0.7 * x)
+    turns = look_at(centers, centers + np.column_stack([sway, np.ones(len(x)), 0 * x]))
+    num = 60 * num_keyframes
+    shelf = rng.uniform([-2.0, 1.4, 0.0], [length_m + 2.0, 1.9, 3.0], (num, 3))
+    clutter = rng.uniform([length_m - 1.5, -apart_m - 1, 0], [length_m + 2, 3.5, 3], (num // 2, 3))
+    points = np.concatenate([shelf, shelf - [0.0, apart_m, 0.0], clutter])
+    frames = _Frames(centers, turns, 500.0, (960, 640))
+    numbers = np.arange(len(x))
+    depth = np.einsum("fi,pfi->pf", turns[:, :, 2], points[:, None] - centers)
+    sees = frames.sees(points, numbers, 0.5) & (depth < 3.5)
+    in_first, in_second = numbers < num_keyframes, numbers >= len(x) - num_keyframes
+    sees[:num] &= ~in_second
+    sees[num : 2 * num] &= ~in_first
+    seen_by = [np.flatnonzero(row) for row in sees]
+    keep = np.array([len(by) > 1 for by in seen_by])
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=960, height=640, params=[500, 500, 480, 320])
+    names = [f"frame_{k:05d}.jpg" for k in numbers]
+    kept = [by for by, is_kept in zip(seen_by, keep, strict=True) if is_kept]
+    model = _reconstruction(frames, names, camera, points[keep], kept, pixel_stddev, IDENTITY, rng)
+    times = dict(zip(names, numbers.astype(np.float64).tolist(), strict=True))
+    anchors = {name: np.array(at) for name, at in SITE_ANCHORS_M.items()}
+    survey = Survey(SyntheticModel(model, IDENTITY, times, centers, turns), anchors, "site", 0.1)
+    of_point = dict(zip(np.flatnonzero(keep).tolist(), sorted(model.point3D_ids()), strict=True))
+    alike: dict[Pair, list[Pair]] = {}
+    for k in range(num):
+        if k in of_point and num + k in of_point:
+            one, other = (model.point3D(of_point[row]).track.elements for row in (k, num + k))
+            for first in one:
+                for second in other:
+                    if in_first[first.image_id - 1] and in_second[second.image_id - 1]:
+                        pair = first.image_id, second.image_id
+                        alike.setdefault(pair, []).append((first.point2D_idx, second.point2D_idx))
+    enough = {pair: np.array(of) for pair, of in alike.items() if len(of) >= MIN_NUM_SHARED}
+    return RepeatingSurvey(LoopedSurvey(survey, 8), enough)
