@@ -21,6 +21,9 @@ from rangesfm.refine.vision_information import LoopPoses
 MAX_CHANCE = 1e-4
 """Probability by chance of a difference between photos and ranges from which on a loop is taken for a wrong one."""
 
+# Largest error of a match, in pixels: that of COLMAP's two-view geometries, which these matches have passed.
+_MAX_ERROR_PX = pycolmap.TwoViewGeometryOptions().ransac.max_error
+
 
 @dataclass(frozen=True)
 class Loop:
@@ -91,13 +94,10 @@ class Resection:
             return None
         points = np.array([self.model.point3D(id_).xyz for id_ in ids.tolist()])
         options = pycolmap.AbsolutePoseEstimationOptions()
-        options.ransac.random_seed = self.seed
-        found = pycolmap.estimate_and_refine_absolute_pose(
-            np.array([image.points2D[k].xy for k in places.tolist()]),
-            points,
-            self.model.camera(image.camera_id),
-            options,
-        )
+        options.ransac.random_seed, options.ransac.max_error = self.seed, _MAX_ERROR_PX
+        pixels = np.array([image.points2D[k].xy for k in places.tolist()])
+        camera = self.model.camera(image.camera_id)
+        found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, options)
         if found is None or int(found["num_inliers"]) < MIN_NUM_SHARED:
             return None
         fits = np.asarray(found["inlier_mask"])
@@ -110,7 +110,9 @@ class Resection:
         center = -world_from_cam @ found["cam_from_world"].translation
         by_point = _pixels_by_points(points[fits] - center, world_from_cam[None], self.views.focal_px[row])
         shift = _center(after) - _center(before)
-        frames, by_frame, noise = self._dependence(ids[fits], points[fits], by_point, _center(after))
+        in_cam = (points[fits] - center) @ world_from_cam
+        residuals_px = np.asarray(camera.img_from_cam(in_cam)) - pixels[fits]
+        frames, by_frame, noise = self._dependence(ids[fits], points[fits], by_point, residuals_px, _center(after))
         return Loop(image_ids, self._frame_of(held), self._frame_of(moved), turn, shift, frames, by_frame, noise)
 
     def _seen(self, image_id: int, matches: Indices) -> Indices:
@@ -122,12 +124,15 @@ class Resection:
     def _frame_of(self, image_id: int) -> int:
         return int(self.views.frame[self.views.row_of[image_id]])
 
-    def _dependence(self, ids: Indices, points: Array, by_point: Array, center: Array) -> tuple[Indices, Array, Array]:
+    def _dependence(
+        self, ids: Indices, points: Array, by_point: Array, residuals_px: Array, center: Array
+    ) -> tuple[Indices, Array, Array]:
         """Return how the pose by k points errs.
 
         Args:
             ids, points: (k,), (k, 3) of the points.
-            by_point: (k, 2, 3) derivatives of the placed photo's pixels.
+            by_point: (k, 2, 3) derivatives of the placed photo's pixels. residuals_px: (k, 2) their residuals, which
+                show how well features are found again from far away.
             center: (3,) origin of the placed rig.
 
         Returns:
@@ -144,6 +149,8 @@ class Resection:
         by_pose = _pixels_by_pose(by_point, points - center)
         weighted = np.swapaxes(by_pose, 1, 2) @ np.linalg.inv(noise)
         covariance = np.linalg.inv(np.sum(weighted @ by_pose, axis=0))
+        squared = np.einsum("ki,kij,kj", residuals_px, np.linalg.inv(noise), residuals_px)
+        variance = max(float(squared) / (residuals_px.size - len(covariance)), 1.0)
         to_pose = -covariance @ weighted @ by_point
         frame = views.frame[row]
         to_points = inverse[point] @ np.swapaxes(seen, 1, 2)
@@ -151,7 +158,7 @@ class Resection:
         frames, place = np.unique(frame, return_inverse=True)
         by_frame = np.zeros((len(frames), 6, 6))
         np.add.at(by_frame, place, -to_pose[point] @ by_seen)
-        return frames, by_frame, covariance
+        return frames, by_frame, variance * covariance
 
 
 def loop_poses(
