@@ -98,8 +98,16 @@ def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return model
 
 
-def write_matches(path: Path, model: pycolmap.Reconstruction, matches: dict[Pair, Matches]) -> None:
-    """Write a database with the features of a model and these matches, which are taken for verified."""
+def write_matches(
+    path: Path, model: pycolmap.Reconstruction, matches: dict[Pair, Matches], *, with_descriptors: bool = False
+) -> None:
+    """Write a database with the features of a model and these matches, which are taken for verified.
+
+    Args:
+        with_descriptors: whether to write a random descriptor for each point, by which COLMAP matches its features.
+    """
+    rng = np.random.default_rng(0)
+    of_point = rng.integers(0, 90, (1 + max(model.point3D_ids()), 128), dtype=np.uint8) if with_descriptors else None
     image_ids = sorted(model.reg_image_ids())
     (camera,) = model.cameras.values()
     names = [model.image(image_id).name for image_id in image_ids]
@@ -108,6 +116,10 @@ def write_matches(path: Path, model: pycolmap.Reconstruction, matches: dict[Pair
         for image_id in image_ids:
             pixels = np.array([point.xy for point in model.image(image_id).points2D], dtype=np.float32)
             database.write_keypoints(image_id, pixels.reshape(-1, 2))
+            if of_point is not None:
+                ids = [point.point3D_id for point in model.image(image_id).points2D]
+                sift = pycolmap.FeatureExtractorType.SIFT
+                database.write_descriptors(image_id, pycolmap.FeatureDescriptors(type=sift, data=of_point[ids]))
         for pair, of_pair in matches.items():
             geometry = pycolmap.TwoViewGeometry()
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED

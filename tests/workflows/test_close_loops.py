@@ -1,0 +1,146 @@
+"""Loops of a given model are closed by the matches of its database, which are added to a copy of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+import pytest
+from tests.outputs import names_in
+from tests.simulated.looped import two_laps, write_matches
+from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
+
+from rangesfm.errors import InputError
+from rangesfm.files.manifest import content_hash
+from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.progress import SilentProgress
+from rangesfm.ranging.readers import write_ranges_csv
+from rangesfm.result.result_tables import LoopPairs
+from rangesfm.result.summary import ResultSummary
+from rangesfm.survey.settings import Survey
+from rangesfm.vision.loop_database import LoopDatabase
+from rangesfm.workflows.run import refine_model
+
+
+class Listener(SilentProgress):
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+        self.counts: list[tuple[int, int | None]] = []
+
+    def stage(self, name: str) -> None:
+        self.stages.append(name)
+
+    def update(self, num_done: int, num_total: int | None = None) -> None:
+        if self.stages[-1:] == ["loops"]:
+            self.counts.append((num_done, num_total))
+
+
+@dataclass(frozen=True)
+class Laps:
+    """Files of a survey of two laps, whose model and database tie neighbours in time only. Tests must not change them.
+
+    Attributes:
+        survey: with the model and its database.
+        database: path of the database.
+    """
+
+    survey: Survey
+    database: Path
+
+
+@pytest.fixture(scope="module")
+def laps(tmp_path_factory: pytest.TempPathFactory) -> Laps:
+    folder, looped = tmp_path_factory.mktemp("laps"), two_laps(60, size_m=(24.0, 16.0), num_observations=100)
+    truth, chain = looped.survey.model, looped.chain()
+    (folder / "sparse").mkdir()
+    chain.write_binary(folder / "sparse")
+    neighbours = {pair: of for pair, of in looped.matches.items() if pair[1] - pair[0] < looped.max_track_length}
+    write_matches(folder / "database.db", looped.truth, neighbours, with_descriptors=True)
+    write_ranges_csv(range_log(looped.survey, 1, num_each=4), folder / "uwb.csv")
+    times = "".join(f"{name},{time}\n" for name, time in truth.timestamps_s.items())
+    (folder / "images.csv").write_text(f"image_name,timestamp_s\n{times}")
+    (anchor,) = looped.survey.anchors_m.values()
+    (folder / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\nA1,{},{},{}\n".format(*anchor))
+    reference = Reference(truth.centers_m, image_names=tuple(truth.timestamps_s), world_from_cam=truth.world_from_cam)
+    write_reference(reference, folder / "reference.csv")
+    survey = Survey().changed(
+        {
+            "images.model": folder / "sparse",
+            "images.times": folder / "images.csv",
+            "ranges.path": folder / "uwb.csv",
+            "ranges.time_offset": 0.0,
+            "anchors.path": folder / "anchors.csv",
+            "anchors.frame": "first_camera",
+            "tag.tag_in_cam_m": tuple(TAG_IN_CAM_M.tolist()),
+            "camera.refine_intrinsics": False,
+            "mapper.database_path": folder / "database.db",
+            "report.reference": folder / "reference.csv",
+            "output.path": folder / "out",
+        }
+    )
+    return Laps(survey, folder / "database.db")
+
+
+@pytest.fixture(scope="module")
+def closed(laps: Laps) -> ResultSummary:
+    before = content_hash(laps.database)
+    summary = refine_model(laps.survey, progress=SilentProgress()).summary
+    assert content_hash(laps.database) == before
+    return summary
+
+
+def num_pairs(path: Path) -> int:
+    with pycolmap.Database.open(path) as database:
+        return len(database.read_two_view_geometry_num_inliers()[0])
+
+
+def test_a_model_with_its_database_has_its_loops_closed(closed: ResultSummary, laps: Laps) -> None:
+    assert closed.loops is not None
+    assert closed.loops.num_proposed >= closed.loops.num_verified >= closed.loops.num_closed > 20
+    error_m = {row.name: row.rmse_se3_m for row in closed.comparison}
+    before_m, after_m = error_m["refined, loops open"], error_m["refined"]
+    assert before_m is not None
+    assert after_m is not None
+    assert after_m < 0.5 * before_m
+    out = laps.survey.output.path
+    table = LoopPairs.read(out)
+    assert table is not None
+    assert len(table.pairs("closed")) == closed.loops.num_closed
+    assert num_pairs(out / "database.db") == num_pairs(laps.database) + closed.loops.num_closed
+    assert set(names_in(out / ".rangesfm")) == {"manifest.json"}
+    assert 'id="loops"' in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_an_interrupted_run_goes_on_with_the_matches_that_it_has(
+    closed: ResultSummary, laps: Laps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    survey = laps.survey.changed({"output.path": tmp_path / "out", "report.enabled": False})
+    with monkeypatch.context() as patch:
+        patch.setattr(LoopDatabase, "keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            refine_model(survey, progress=SilentProgress())
+    listener = Listener()
+    again = refine_model(survey, progress=listener).summary
+    assert closed.loops is not None
+    assert listener.counts == [(closed.loops.num_proposed, closed.loops.num_proposed)]
+    assert again.loops == closed.loops
+
+
+def test_loops_stay_open_where_that_is_asked_for(laps: Laps, tmp_path: Path) -> None:
+    # The ranges alone hardly determine the scale of a chain that is bent as much as this one.
+    values = {"mapper.close_loops": False, "scale.max_relative_stddev": 10.0, "output.path": tmp_path / "out"}
+    survey = laps.survey.changed(values)
+    listener = Listener()
+    assert refine_model(survey, progress=listener).summary.loops is None
+    assert "loops" not in listener.stages
+
+
+def test_a_database_of_another_model_is_refused(laps: Laps, tmp_path: Path) -> None:
+    other = tmp_path / "other.db"
+    looped = two_laps(60, size_m=(24.0, 16.0), num_observations=20)
+    write_matches(other, looped.truth, {})
+    survey = laps.survey.changed({"mapper.database_path": other, "output.path": tmp_path / "out"})
+    with pytest.raises(InputError, match=r"frame_00001\.jpg has other features in the model"):
+        refine_model(survey, progress=SilentProgress())
+    assert not (tmp_path / "out" / "result.json").exists()
