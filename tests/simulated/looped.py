@@ -17,8 +17,8 @@ from tests.studies.simulated_survey import RANGE_MODEL, SITE_ANCHORS_M, TAG_IN_C
 
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.colmap.transform import rescale
-from rangesfm.geometry.similarity import IDENTITY
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.geometry.similarity import IDENTITY, rmse
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.resection import Loop
@@ -28,7 +28,9 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.refine.with_ranges import LoopClosing, RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.vision.database import create_database
+from rangesfm.workflows.close_loops import MAX_NUM_PAIRS
 
 Pair = tuple[int, int]
 Matches = npt.NDArray[np.int64]
@@ -52,13 +54,17 @@ class LoopedSurvey:
 
     def chain(self) -> pycolmap.Reconstruction:
         """Return the map that a mapper makes by neighbours in time alone: COLMAP's adjustment of the cut tracks."""
+        return adjusted(self.cut())
+
+    def cut(self) -> pycolmap.Reconstruction:
+        """Return the true map with its tracks cut."""
         chain = pycolmap.Reconstruction(self.truth)
         for point_id, point in sorted(self.truth.points3D.items()):
             chain.delete_point3D(point_id)
             seen = sorted((element.image_id, element.point2D_idx) for element in point.track.elements)
             for piece in _pieces(seen, self.max_track_length):
                 chain.add_point3D(point.xyz, pycolmap.Track([pycolmap.TrackElement(*one) for one in piece]))
-        return adjusted(chain)
+        return chain
 
     @cached_property
     def matches(self) -> dict[Pair, Matches]:
@@ -70,6 +76,20 @@ class LoopedSurvey:
                 for second, other in seen[k + 1 :]:
                     found.setdefault((first, second), []).append((place, other))
         return {pair: np.array(of) for pair, of in found.items() if len(of) >= MIN_NUM_SHARED}
+
+    @property
+    def neighbours(self) -> dict[Pair, Matches]:
+        """Matches of photos that the mapper matches."""
+        return {pair: of for pair, of in self.matches.items() if pair[1] - pair[0] < self.max_track_length}
+
+    @property
+    def known(self) -> dict[int, set[int]]:
+        """Photos that each photo is matched with by the mapper, by its id."""
+        known: dict[int, set[int]] = {}
+        for first, second in self.neighbours:
+            known.setdefault(first, set()).add(second)
+            known.setdefault(second, set()).add(first)
+        return known
 
 
 def _pieces(seen: list[Pair], max_length: int) -> Iterable[list[Pair]]:
@@ -129,6 +149,54 @@ def write_matches(
 
 
 @dataclass(frozen=True)
+class ScaledMap:
+    """A simulated map after the scale stage, ready to be refined.
+
+    Attributes:
+        scaled: the map, in metres. trajectory, estimate: as the refinement needs them.
+    """
+
+    survey: Survey
+    scaled: pycolmap.Reconstruction
+    trajectory: Trajectory
+    estimate: ScaleEstimate
+
+    @classmethod
+    def of(cls, survey: Survey, sfm: pycolmap.Reconstruction, log: RangeLog) -> ScaledMap:
+        trajectory = trajectory_from_reconstruction(sfm, survey.model.timestamps_s)
+        observations = associate(log, trajectory, TAG_IN_CAM_M)
+        anchors = [Anchor(name, position) for name, position in survey.anchors_m.items()]
+        estimate = initialize_scale(
+            observations, trajectory, anchors, anchor_frame=survey.anchor_frame, range_model=RANGE_MODEL
+        )
+        return cls(survey, rescale(sfm, estimate.metric_from_sfm), trajectory, estimate)
+
+    def refined(
+        self, start: pycolmap.Reconstruction | None = None, closing: LoopClosing | None = None
+    ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
+        """Refine the scaled map, or another map in metres."""
+        estimate = self.estimate
+        return refine_with_ranges(
+            self.scaled if start is None else start,
+            self.trajectory,
+            estimate.observations,
+            estimate.metric_from_sfm,
+            estimate.anchors,
+            estimate.errors,
+            tag_in_cam_m=TAG_IN_CAM_M,
+            first_pose_is_fixed=self.survey.is_in_first_camera,
+            camera=CameraOptions(refine_intrinsics=False),
+            closing=closing,
+            num_threads=1,
+        )
+
+    def error_m(self, model: pycolmap.Reconstruction) -> float:
+        """Return the root mean square error of the keyframes, without alignment."""
+        truth = self.survey.model
+        return rmse(trajectory_from_reconstruction(model, truth.timestamps_s).centers - truth.centers_m)
+
+
+@dataclass(frozen=True)
 class Closed:
     """A refined survey before and after its loops are closed.
 
@@ -138,7 +206,7 @@ class Closed:
         contradicted: those that match and do not fit.
     """
 
-    scaled: pycolmap.Reconstruction
+    scaled: ScaledMap
     before: pycolmap.Reconstruction
     after: pycolmap.Reconstruction
     finder: LoopFinder
@@ -153,59 +221,26 @@ def close(
     log: RangeLog,
     folder: Path,
     *,
-    matches: dict[Pair, Matches] | None = None,
-    max_num: int = 5,
+    alike: dict[Pair, Matches] | None = None,
 ) -> Closed:
     """Scale and refine a chain, then close its loops.
 
     Args:
         folder: for the database.
-        matches: of pairs that match, in place of the true ones.
+        alike: matches of further pairs, which do not show the same place.
     """
-    survey, matches = looped.survey, looped.matches if matches is None else matches
-    times = survey.model.timestamps_s
-    trajectory = trajectory_from_reconstruction(chain, times)
-    observations = associate(log, trajectory, TAG_IN_CAM_M)
-    anchors = [Anchor(name, position) for name, position in survey.anchors_m.items()]
-    estimate = initialize_scale(
-        observations, trajectory, anchors, anchor_frame=survey.anchor_frame, range_model=RANGE_MODEL
-    )
-    scaled = rescale(chain, estimate.metric_from_sfm)
-
-    def refined(
-        start: pycolmap.Reconstruction, closing: LoopClosing | None
-    ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-        return refine_with_ranges(
-            start,
-            trajectory,
-            estimate.observations,
-            estimate.metric_from_sfm,
-            estimate.anchors,
-            estimate.errors,
-            tag_in_cam_m=TAG_IN_CAM_M,
-            first_pose_is_fixed=survey.is_in_first_camera,
-            camera=CameraOptions(refine_intrinsics=False),
-            closing=closing,
-            num_threads=1,
-        )
-
-    before, summary = refined(scaled, None)
+    scaled = ScaledMap.of(looped.survey, chain, log)
+    before, summary = scaled.refined()
     assert summary.covariance is not None
-    finder = LoopFinder.of(before, trajectory, summary.covariance.errors, summary.pixel_stddev, seed=0)
-    neighbours = {pair: of for pair, of in looped.matches.items() if pair[1] - pair[0] < looped.max_track_length}
-    known: dict[int, set[int]] = {}
-    for first, second in neighbours:
-        known.setdefault(first, set()).add(second)
-        known.setdefault(second, set()).add(first)
-    proposed = finder.propose(known, max_num=max_num)
+    finder = LoopFinder.of(before, scaled.trajectory, summary.covariance.errors, summary.pixel_stddev, seed=0)
+    proposed = finder.propose(looped.known, max_num=MAX_NUM_PAIRS)
+    matches = looped.matches | (alike or {})
     loops, contradicted = finder.tested({pair: matches[pair] for pair in proposed if pair in matches})
-    accepted = {loop.image_ids: matches[loop.image_ids] for loop in loops}
-    path = folder / "database.db"
-    write_matches(path, before, neighbours | accepted)
-    closing = (
-        LoopClosing(finder.relative_poses(loops), lambda model: merge_tracks(model, path, seed=0)) if loops else None
-    )
-    after = before if closing is None else refined(before, closing)[0]
+    path, after = folder / "database.db", before
+    write_matches(path, before, looped.neighbours | {loop.image_ids: matches[loop.image_ids] for loop in loops})
+    if loops:
+        closing = LoopClosing(finder.relative_poses(loops), lambda model: merge_tracks(model, path, seed=0))
+        after, _ = scaled.refined(before, closing)
     return Closed(scaled, before, after, finder, proposed, loops, contradicted)
 
 

@@ -13,7 +13,7 @@ from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import lap_path, loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.ceres.covariance import joint_covariance
+from rangesfm.ceres.covariance import JointCovariance, joint_covariance
 from rangesfm.colmap.transform import rescale
 from rangesfm.costs import add_residual_block, joint_prior_cost, range_cost
 from rangesfm.demo.simulated_radio import CameraPath, Radio
@@ -271,11 +271,18 @@ def rmse_bound_m(survey: Survey, pixel_stddev: float, *, with_ranges: bool = Tru
     scale.
     """
     truth = pycolmap.Reconstruction(survey.model.reconstruction)
+    covariance = covariance_at_truth(survey, truth, pixel_stddev, with_ranges=with_ranges)
+    return float(np.sqrt(np.mean(np.trace(covariance.centers, axis1=1, axis2=2))))
+
+
+def covariance_at_truth(
+    survey: Survey, truth: pycolmap.Reconstruction, pixel_stddev: float, *, with_ranges: bool = True
+) -> JointCovariance:
+    """Return the covariance of a model that has the truth's poses, as ``rmse_bound_m`` needs it."""
     adjuster, anchors, biases = _adjuster(survey, truth), _anchor_blocks(survey), _bias_blocks(survey)
     if with_ranges:
         _add_ranges(adjuster, truth, survey, true_ranges_m(survey), anchors, biases, pixel_stddev)
-    covariance = joint_covariance(adjuster.problem, truth, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
-    return float(np.sqrt(np.mean(np.trace(covariance.centers, axis1=1, axis2=2))))
+    return joint_covariance(adjuster.problem, truth, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
 
 
 def likeliest_path(survey: Survey, pixel_errors: Array, log: RangeLog, *, pixel_stddev: float) -> Trajectory:

@@ -55,8 +55,7 @@ def laps(tmp_path_factory: pytest.TempPathFactory) -> Laps:
     truth, chain = looped.survey.model, looped.chain()
     (folder / "sparse").mkdir()
     chain.write_binary(folder / "sparse")
-    neighbours = {pair: of for pair, of in looped.matches.items() if pair[1] - pair[0] < looped.max_track_length}
-    write_matches(folder / "database.db", looped.truth, neighbours, with_descriptors=True)
+    write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
     write_ranges_csv(range_log(looped.survey, 1, num_each=4), folder / "uwb.csv")
     times = "".join(f"{name},{time}\n" for name, time in truth.timestamps_s.items())
     (folder / "images.csv").write_text(f"image_name,timestamp_s\n{times}")

@@ -48,7 +48,8 @@ def add_stages_commands(commands: Commands) -> None:
     scale = commands.add("scale", _scale, "estimate the scale of a COLMAP model from ranges, with a verdict")
     add_survey_arguments(scale, *_SCALE_KEYS)
     refine = commands.add("refine", _refine, "make a refined metric model from a COLMAP model and ranges")
-    add_survey_arguments(refine, *_SCALE_KEYS, "camera.refine_intrinsics", "refine")
+    of_loops = ("mapper.database_path", "mapper.close_loops")
+    add_survey_arguments(refine, *_SCALE_KEYS, "camera.refine_intrinsics", *of_loops, "refine")
     join = commands.add(
         "join", _join, "join several surveys of one site to one metric map, through the anchors that they share"
     )

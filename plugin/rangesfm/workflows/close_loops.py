@@ -21,8 +21,8 @@ from rangesfm.vision.loop_database import LoopDatabase, Pair
 from rangesfm.vision.matching import MatchingOptions, matching_options
 from rangesfm.vision.steps import DATABASE_NAME
 
-# Pairs that one photo proposes at most. Sequential matching pairs a photo with 10 neighbours by default.
-_MAX_NUM_PAIRS = 5
+MAX_NUM_PAIRS = 5
+"""Pairs that one photo proposes at most. Sequential matching pairs a photo with 10 neighbours by default."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _found(
     assert summary is not None
     assert metric.map_errors is not None
     loops = LoopFinder.of(model, metric.trajectory, metric.map_errors, summary.pixel_stddev, survey.output.seed)
-    proposed = loops.propose(database.known(), max_num=_MAX_NUM_PAIRS)
+    proposed = loops.propose(database.known(), max_num=MAX_NUM_PAIRS)
     verified = database.match(proposed, options, journal.progress)
     found, contradicted = loops.tested(verified)
     accepted = [loop.image_ids for loop in found]

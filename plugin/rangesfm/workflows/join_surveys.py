@@ -262,6 +262,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress 
     as_joined = survey.changed(
         {
             "images.path": _images_path(finished),
+            "mapper.close_loops": False,  # the surveys have no common database
             "ranges.time_offset": 0.0,
             "tag.lever_arms_m": {tag_id: tuple(arm.tolist()) for tag_id, arm in arms.items()},
         }
