@@ -45,8 +45,8 @@ class LoopClosure:
             return None
         first = " and ".join(self.contradicted[0])
         return (
-            f"{len(self.contradicted)} pairs of photos look alike, but by the ranges they do not show the same place:"
-            f" they are not used; the first are {first}, all are in loops.csv"
+            f"{len(self.contradicted)} pairs of photos match but contradict the ranges, and are not used; the first"
+            f" is {first}, and loops.csv has all"
         )
 
     def moved(self, offset_m: Array) -> LoopClosure:

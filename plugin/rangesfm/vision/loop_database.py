@@ -138,6 +138,10 @@ class LoopDatabase:
         names = (DATABASE_NAME, RECORD_NAME) if self.has_record else (DATABASE_NAME,)
         output.defer({output.path / name: self.folder / name for name in names})
 
+    def discard(self) -> None:
+        """Remove the copy."""
+        remove(self.folder)
+
     def _record(self) -> Steps:
         return Steps(self.folder / RECORD_NAME, SilentProgress())
 

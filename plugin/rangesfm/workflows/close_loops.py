@@ -47,10 +47,12 @@ def find_loops(survey: Survey, metric: MetricResult, journal: Journal) -> FoundL
     is_given, summary = survey.images.model is not None, metric.kept_refinement
     if not survey.mapper.close_loops or not len(metric.observations.log) or summary is None:
         return None
-    options = matching_options(survey.mapper, len(metric.trajectory), survey.output.seed)
     with sole_writer(survey.output.path) as output:
         source = survey.mapper.database_path if is_given else output.newest(output.path / DATABASE_NAME)
-        if source is None or not source.is_file() or not (is_given or options.is_in_time_only):
+        if source is None or not source.is_file():
+            return None
+        options = matching_options(survey.mapper, metric.final.num_images(), survey.output.seed)
+        if not (is_given or options.is_in_time_only):
             return None
         if metric.map_errors is None:
             journal.warn("loops are not closed, because the covariance of the poses is not known")
@@ -58,6 +60,7 @@ def find_loops(survey: Survey, metric: MetricResult, journal: Journal) -> FoundL
         with journal.stage("loops"):
             database = LoopDatabase.of(source, output)
             if why_not := database.why_unfit(metric.final):
+                database.discard()
                 if is_given:
                     raise InputError(why_not, source)
                 return None
@@ -83,12 +86,7 @@ def _found(
     database.keep(proposed, verified, accepted)
     database.publish(output)
     outcome = LoopClosure(
-        len(proposed),
-        len(verified),
-        _named(model, accepted),
-        _named(model, contradicted),
-        loops.path,
-        loops.path,
+        len(proposed), len(verified), _named(model, accepted), _named(model, contradicted), loops.path, loops.path
     )
     journal.warn(*filter(None, [outcome.warning]))
 
