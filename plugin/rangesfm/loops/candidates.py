@@ -26,7 +26,7 @@ _MAX_ANGLE_DEG, _MAX_SIZE_RATIO = 45.0, 2.0
 
 @dataclass(frozen=True)
 class Views:
-    """What n photos of a metric map see, in the order of their keyframes.
+    """Views of n photos in a metric map, in the order of their keyframes.
 
     Attributes:
         image_ids, frame: (n,) ids of the photos, and indices of their keyframes.

@@ -144,7 +144,7 @@ Learn = Callable[[AtRest], Learnt]
 
 @dataclass(frozen=True)
 class LoopClosing:
-    """What closes the loops of a map.
+    """Means that close the loops of a map.
 
     Attributes:
         loops: measured relative poses, by ids of frames in place of indices.
