@@ -9,14 +9,14 @@ import pycolmap
 
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import InputError
-from rangesfm.files.output_folder import OutputFolder, sole_writer
+from rangesfm.files.output_folder import sole_writer
 from rangesfm.loops.loop_closure import LoopClosure
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
 from rangesfm.progress import Journal
 from rangesfm.refine.with_ranges import LoopClosing
 from rangesfm.result.metric_result import MetricResult
-from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.loop_database import LoopDatabase, Pair
 from rangesfm.vision.matching import MatchingOptions, matching_options
 from rangesfm.vision.steps import DATABASE_NAME
@@ -38,14 +38,15 @@ class FoundLoops:
     outcome: LoopClosure
 
 
-def find_loops(survey: Survey, metric: MetricResult, journal: Journal) -> FoundLoops | None:
+def find_loops(run: SurveyRun, metric: MetricResult) -> FoundLoops | None:
     """Match the pairs that a refined map proposes, and test those that match; None where loops are not to be closed.
 
     Raises:
         InputError: the given database does not belong to the given model.
     """
-    is_given, summary = survey.images.model is not None, metric.kept_refinement
-    if not survey.mapper.close_loops or not len(metric.observations.log) or summary is None:
+    survey, is_given = run.survey, run.survey.images.model is not None
+    is_wanted = survey.mapper.close_loops and not (is_given and survey.mapper.database_path is None)
+    if not is_wanted or not len(metric.observations.log) or metric.kept_refinement is None:
         return None
     with sole_writer(survey.output.path) as output:
         source = survey.mapper.database_path if is_given else output.newest(output.path / DATABASE_NAME)
@@ -55,60 +56,57 @@ def find_loops(survey: Survey, metric: MetricResult, journal: Journal) -> FoundL
         if not (is_given or options.is_in_time_only):
             return None
         if metric.map_errors is None:
-            journal.warn("loops are not closed, because the covariance of the poses is not known")
+            run.journal.warn("loops are not closed, because the covariance of the poses is not known")
             return None
-        with journal.stage("loops"):
+        with run.journal.stage("loops"):
             database = LoopDatabase.of(source, output)
             if why_not := database.why_unfit(metric.final):
                 database.discard()
                 if is_given:
                     raise InputError(why_not, source)
                 return None
-            return _found(survey, metric, database, options, output, journal)
+            finder = LoopFinder.of(
+                metric.final,
+                metric.trajectory,
+                metric.map_errors,
+                metric.kept_refinement.pixel_stddev,
+                survey.output.seed,
+            )
+            found = _found(finder, database, options, run.journal)
+            database.publish(output)
+            return found
 
 
-def _found(
-    survey: Survey,
-    metric: MetricResult,
-    database: LoopDatabase,
-    options: MatchingOptions,
-    output: OutputFolder,
-    journal: Journal,
-) -> FoundLoops:
-    model, summary = metric.final, metric.kept_refinement
-    assert summary is not None
-    assert metric.map_errors is not None
-    loops = LoopFinder.of(model, metric.trajectory, metric.map_errors, summary.pixel_stddev, survey.output.seed)
-    proposed = loops.propose(database.known(), max_num=MAX_NUM_PAIRS)
+def _found(finder: LoopFinder, database: LoopDatabase, options: MatchingOptions, journal: Journal) -> FoundLoops:
+    proposed = finder.propose(database.known(), max_num=MAX_NUM_PAIRS)
     verified = database.match(proposed, options, journal.progress)
-    found, contradicted = loops.tested(verified)
-    accepted = [loop.image_ids for loop in found]
+    loops, contradicted = finder.tested(verified)
+    accepted = [loop.image_ids for loop in loops]
     database.keep(proposed, verified, accepted)
-    database.publish(output)
-    outcome = LoopClosure(
-        len(proposed), len(verified), _named(model, accepted), _named(model, contradicted), loops.path, loops.path
-    )
+    closed_pairs, others = (_named(finder.model, pairs) for pairs in (accepted, contradicted))
+    outcome = LoopClosure(len(proposed), len(verified), closed_pairs, others, finder.path, finder.path)
     journal.warn(*filter(None, [outcome.warning]))
 
-    def merge(metric: pycolmap.Reconstruction) -> None:
+    def merge(model: pycolmap.Reconstruction) -> None:
         with colmap_log(database.log):
-            merge_tracks(metric, database.path, seed=survey.output.seed)
+            merge_tracks(model, database.path, seed=finder.seed)
 
-    return FoundLoops(LoopClosing(loops.relative_poses(found), merge) if found else None, outcome)
+    return FoundLoops(LoopClosing(finder.relative_poses(loops), merge) if loops else None, outcome)
 
 
 def _named(model: pycolmap.Reconstruction, pairs: Sequence[Pair]) -> tuple[tuple[str, str], ...]:
     return tuple((model.image(first).name, model.image(second).name) for first, second in pairs)
 
 
-def closed(found: FoundLoops, metric: MetricResult, refined: MetricResult, journal: Journal) -> MetricResult:
+def closed(run: SurveyRun, found: FoundLoops, metric: MetricResult, refined: MetricResult) -> MetricResult:
     """Return the map refined with its loops, with what was found; the map without them if it broke.
 
     Args:
+        run: the survey. found: its loops.
         metric: the map before. refined: the map after.
     """
     outcome = found.outcome
     if refined.why_broken:
-        journal.warn(f"loops are left open, because the map broke: {'; '.join(refined.why_broken)}")
+        run.journal.warn(f"loops are left open, because the map broke: {'; '.join(refined.why_broken)}")
         refined, outcome = metric, replace(outcome, closed=())
     return replace(refined, loops=replace(outcome, after=refined.trajectory.as_in(refined.final)))
