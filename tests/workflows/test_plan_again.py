@@ -66,7 +66,7 @@ def test_a_doubtful_survey_is_told_what_its_plan_would_change(
 
 
 def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None:
-    """In a room of 8 x 6 x 2.6 m there is no place farther out or above, and in a yard there is."""
+    """A room of 8 x 6 x 2.6 m has no place farther out or above, and a yard has."""
     times = np.linspace(0.0, 40.0, 41)
     centers = np.column_stack([2 * np.cos(times / 6), 1.5 * np.sin(times / 6), 1.5 + 0.1 * np.sin(times)])
     names = tuple(f"{k:02d}.jpg" for k in range(41))

@@ -1,4 +1,4 @@
-"""What a client asks first about a map: what was done, when, by whom, and in which coordinates it is."""
+"""First questions of a client about a map: what was done, when, by whom, and in which coordinates it is."""
 
 from __future__ import annotations
 
