@@ -63,8 +63,9 @@ def test_docstrings_begin_with_no_fragment() -> None:
     assert found == []
 
 
-def test_no_two_files_of_the_package_share_a_name() -> None:
-    names = Counter(path.name for path in PACKAGE_FILES if path.name != "__init__.py")
+@pytest.mark.parametrize("files", [PACKAGE_FILES, sorted(ROOT.glob("tests/**/*.py"))], ids=["package", "tests"])
+def test_no_two_files_share_a_name(files: list[Path]) -> None:
+    names = Counter(path.name for path in files if path.name not in {"__init__.py", "conftest.py"})
     assert [name for name, num in names.items() if num > 1] == []
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planning.surveys import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned, turned_out
+from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned, turned_out
 
 from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.errors import GeometryError

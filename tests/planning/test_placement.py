@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.planning.surveys import loop, planned
+from tests.planning.plans import loop, planned
 
 from rangesfm.errors import GeometryError
 from rangesfm.planning.expected import expect

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planning.surveys import FIVE_ANCHORS_M, loop, planned
+from tests.planning.plans import FIVE_ANCHORS_M, loop, planned
 
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.planning.surveys import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
+from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
 from rangesfm.planning.expected import expect
 from rangesfm.planning.survey_plan import SurveyPlan, plan_survey

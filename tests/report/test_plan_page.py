@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planning.surveys import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
+from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
 from rangesfm.planning.survey_plan import SurveyPlan, plan_survey
 from rangesfm.report.plan_page import accuracy_views, render_plan

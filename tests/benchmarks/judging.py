@@ -1,6 +1,6 @@
 """Measure what the tests of mistakes cost beside the refinement, in a hall with six surveyed anchors.
 
-    python -m tests.benchmarks.mistakes [--num_keyframes 600] [--num_ranges 60000]
+    python -m tests.benchmarks.judging [--num_keyframes 600] [--num_ranges 60000]
 
 Prints the processor time of both for three surveys: a clean one, one with an anchor's coordinate typed wrong by a
 metre, and one whose ranges to an anchor are half a metre too long in the second half of the time. There is no limit on

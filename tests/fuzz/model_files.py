@@ -1,6 +1,6 @@
 """Damaged COLMAP models: each must be refused, or be usable for everything that is done with models; prints a table.
 
-    python -m tests.fuzz.models --num 10000 --output_path /tmp/fuzz_models
+    python -m tests.fuzz.model_files --num 10000 --output_path /tmp/fuzz_models
 
 Each model is read and used in a child process, so that a crash is noticed and the campaign continues. Models that did
 harm are kept in the output folder. ``--first N --num 1`` repeats model N.
