@@ -37,6 +37,10 @@ def test_the_interval_is_not_missed_by_rounding_of_times_since_1970() -> None:
     assert select(photos_at(*times), min_interval_s=0.2) == [0, 2, 4, 6, 8]
 
 
+def test_an_interval_of_next_to_nothing_keeps_each_photo_once() -> None:
+    assert select(photos_at(0.0, 0.4, 1.0), min_interval_s=1e-300) == [0, 1, 2]
+
+
 def test_too_many_are_thinned_evenly_with_both_ends_kept() -> None:
     assert select(photos_at(*range(101)), max_num_keyframes=5) == [0, 25, 50, 75, 100]
     assert select(photos_at(*range(4)), max_num_keyframes=5) == [0, 1, 2, 3]

@@ -45,7 +45,7 @@ def select_keyframes(photos: ImageTimes | Sequence[str], options: KeyframeOption
 
 def _far_enough_apart(timestamps_s: Array, min_interval_s: float) -> list[int]:
     kept = [0]
-    for index, time in enumerate(timestamps_s.tolist()):
+    for index, time in enumerate(timestamps_s[1:].tolist(), 1):
         if time - timestamps_s[kept[-1]] >= min_interval_s - ROUNDING_S:
             kept.append(index)
     return kept
