@@ -1,7 +1,7 @@
 """Measure the stages from photos to a model, beside the same calls of pycolmap with all its threads.
 
 python -m tests.benchmarks.reconstruction PHOTOS[:EVERY_NTH] ... [--num_threads 2] [--num_rounds 3] [--seed 0]
-    [--camera_model OPENCV --camera_params 377,432,...]
+    [--camera_model OPENCV --camera_params 377,432,...] [--only stages|matching|mapping]
 
 PHOTOS are folders, for example ``DATA/room_env1/images:3 DATA/fountain/images plugin/rangesfm/demo/photos``. The photos
 of a folder are taken in the order of their names and matched sequentially. Each round measures both programs. Printed
@@ -9,15 +9,21 @@ are the medians of the wall-clock seconds and of the processor seconds (user and
 load on the machine disturbs these less), their ratios within each round (median, smallest and largest), and the
 machine's load. "all" is the whole call, from reading the photos to reading the models.
 
-The last table is about matching alone, on the same features: by one process bound to one core, by one that is not, by
+The second table is about matching alone, on the same features: by one process bound to one core, by one that is not, by
 ``--num_threads`` processes and by twice as many. It gives how many cores each keeps busy, and whether the matches are
 the same, row for row. A process matches in one thread and verifies in another, so on two cores it is not much slower
 than two processes. Compare with the process bound to one core to see how matching scales.
+
+The third table is about incremental mapping alone, from the same matches: by rangesfm, which maps in one thread, and
+by rangesfm and pycolmap with ``--num_threads``. "Caller" are the processor seconds of the thread that calls the mapper:
+the wall-clock time on a machine without other load, if the other threads never keep it waiting. The last column gives
+how many different models the rounds have given.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import resource
 import shutil
@@ -29,6 +35,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import pycolmap
 from tests.vision.matches import content_of
@@ -38,6 +45,8 @@ from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.database import clear_matches
 from rangesfm.vision.image_times import list_images
+from rangesfm.vision.incremental_mapping import incremental_mapping
+from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matching import match_features, matching_options
 from rangesfm.vision.photo_files import usable_photos
 from rangesfm.vision.reconstruct import reconstruct
@@ -134,6 +143,59 @@ def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes
         return effort_of(lambda: match_features(database, usable, options, log, SilentProgress()))
 
 
+@dataclass(frozen=True)
+class Mapped:
+    """One mapping from given matches.
+
+    Attributes:
+        caller_s: processor seconds of the thread that called the mapper.
+        content: hash of all models.
+    """
+
+    effort: Effort
+    caller_s: float
+    content: str
+
+
+def map_anew(photos: Path, database: Path, is_ours: bool, num_threads: int, seed: int) -> Mapped:
+    """Map the photos from their matches by rangesfm or by pycolmap, from the same seed."""
+    models: list[pycolmap.Reconstruction] = []
+    mapper = MapperOptions(pipeline={"num_threads": num_threads})
+    ours = pipeline_options(CameraOptions(), mapper, seed)
+    assert isinstance(ours, pycolmap.IncrementalPipelineOptions)
+    theirs = pycolmap.IncrementalPipelineOptions(num_threads=num_threads, random_seed=seed)
+    with tempfile.TemporaryDirectory() as scratch, colmap_log(Path(scratch) / "mapper.log"):
+
+        def work() -> None:
+            if is_ours:
+                models.extend(incremental_mapping(database, photos, options=ours))
+            else:
+                models.extend(pycolmap.incremental_mapping(database, photos, scratch, theirs).values())
+
+        begin_s = time.thread_time()
+        effort = effort_of(work)
+        caller_s, content = time.thread_time() - begin_s, hashlib.sha256()
+        for model in models:
+            model.write_binary(scratch)
+            for name in ("cameras.bin", "images.bin", "points3D.bin"):
+                content.update((Path(scratch) / name).read_bytes())
+    return Mapped(effort, caller_s, content.hexdigest())
+
+
+def compare_mappings(photos: Path, database: Path, num_threads: int, num_rounds: int, seed: int) -> None:
+    ways = (("rangesfm", 1), ("rangesfm", num_threads), ("pycolmap", num_threads))
+    found: list[list[Mapped]] = [[] for _ in ways]
+    for _ in range(num_rounds):
+        for of_way, (program, num) in zip(found, ways, strict=True):
+            of_way.append(map_anew(photos, database, program == "rangesfm", num, seed))
+    print(f"{'mapping alone':20}{'clock':>9} {'processors':>10} {'caller':>9}   models ({load()})")
+    for of_way, (program, num) in zip(found, ways, strict=True):
+        clock_s = median(one.effort.clock_s for one in of_way)
+        processor_s, caller_s = median(one.effort.processor_s for one in of_way), median(one.caller_s for one in of_way)
+        line = f"{f'{program}, threads: {num}':20}{clock_s:8.1f}s {processor_s:9.1f}s {caller_s:8.1f}s"
+        print(f"{line}   {len({one.content for one in of_way})} of {num_rounds}", flush=True)
+
+
 @contextmanager
 def on_cores(num: int) -> Iterator[None]:
     """Restrict this thread, and the processes that it starts, to this number of cores."""
@@ -201,6 +263,7 @@ def main() -> None:
     parser.add_argument("--camera_model")
     parser.add_argument("--camera_params", type=lambda text: tuple(map(float, text.split(","))))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=("stages", "matching", "mapping"), help="one table (default: all)")
     arguments = parser.parse_args()
     camera = CameraOptions(model=arguments.camera_model, params=arguments.camera_params)
     num, seed = arguments.num_threads, arguments.seed
@@ -209,17 +272,22 @@ def main() -> None:
         photos = Path(folder)
         names = list_images(photos)[:: int(every_nth or 1)]
         print(f"\n{photos}: {len(names)} photos, {num} threads, {load()}", flush=True)
-        theirs: list[list[Effort]] = []
-        ours: list[list[Effort]] = []
+        tables = [arguments.only] if arguments.only else ["stages", "matching", "mapping"]
+        programs = (by_pycolmap, by_rangesfm) if "stages" in tables else (by_rangesfm,)
+        efforts: dict[Any, list[list[Effort]]] = {run: [] for run in programs}
         with tempfile.TemporaryDirectory() as scratch:
-            for number in range(arguments.num_rounds):
-                for found, run in ((theirs, by_pycolmap), (ours, by_rangesfm)):
+            for number in range(arguments.num_rounds if "stages" in tables else 1):
+                for run, found in efforts.items():
                     output = Path(scratch) / f"{run.__name__}{number}"
                     output.mkdir()
                     found.append(run(photos, names, output, camera, num, seed))
-            compare_stages(theirs, ours)
-            features = Path(scratch) / "by_rangesfm0" / "database.db"
-            compare_processes(photos, names, features, num, arguments.num_rounds, seed)
+            database = Path(scratch) / "by_rangesfm0" / "database.db"
+            if "stages" in tables:
+                compare_stages(*(efforts[run] for run in programs))
+            if "matching" in tables:
+                compare_processes(photos, names, database, num, arguments.num_rounds, seed)
+            if "mapping" in tables:
+                compare_mappings(photos, database, num, arguments.num_rounds, seed)
 
 
 if __name__ == "__main__":

@@ -29,9 +29,9 @@ from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot
 from rangesfm.vision.steps import Workspace
 
-# With several threads Ceres adds up in the order in which they end, and the search for an initial pair is a race: every
-# run would give another map. They save little time: the incremental mapper took 46 s of processor time for 145 photos
-# with two threads and 42 s with one, the global mapper 46 s and 33 s. [mapper.pipeline] num_threads overrides this.
+# With several threads Ceres adds up in the order in which they finish, also with a fixed number of threads: every run
+# would give another map. Two threads would save 7 to 21 % of the mapping's time (see "One thread for the
+# mapping" in examples/measured.md). [mapper.pipeline] num_threads overrides this.
 _NUM_THREADS = 1
 PipelineOptions = pycolmap.IncrementalPipelineOptions | WholePipelineOptions
 
