@@ -46,8 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             from rangesfm.installed_versions import check_versions
 
             check_versions()
-        # sys.stderr is None where the shell has closed it.
-        with _sigterm_as_ctrl_c(), terminal_progress(sys.stderr or io.StringIO(), quiet=args.quiet) as progress:
+        with _sigterm_as_ctrl_c(), terminal_progress(sys.stderr, quiet=args.quiet) as progress:
             outcome: Outcome = args.execute(args, progress)
         _print(outcome.lines)
         return outcome.status
@@ -60,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         try:
             text = "\n  ".join([failure.message, *failure.advice])
-            print("rangesfm: error:", text, file=sys.stderr or io.StringIO(), flush=True)
+            print("rangesfm: error:", text, file=sys.stderr, flush=True)
         except OSError:  # the exit status says enough
             discard_output(sys.stderr)
         return failure.exit_status
@@ -70,12 +69,15 @@ def _open_closed_streams() -> None:
     """Let standard streams that the shell has closed lead nowhere.
 
     Otherwise the first file that is opened gets the number of such a stream, and with it what libraries print there.
+    Python has None for such a stream; numpy 2.0 and others expect a file.
     """
-    for number in range(3):
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # gets the smallest free number
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False))
 
 
 def _print(texts: Sequence[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import re
 import sys
 import time
@@ -86,7 +85,7 @@ def _batch(args: argparse.Namespace, progress: Progress) -> Outcome:
     output_path = Path(args.output_path)
     jobs = read_jobs(args.surveys, overrides_from_arguments(args), output_path)
     options = BatchOptions(args.scheduler, args.num_workers, args.num_threads, args.memory_limit, args.restart)
-    terminal = BatchTerminal(sys.stderr or io.StringIO(), quiet=args.quiet)
+    terminal = BatchTerminal(sys.stderr, quiet=args.quiet)
     batch_state = run_batch(jobs, options, output_path, terminal)
     lines = [
         *format_rows(batch_state.rows).splitlines(),
