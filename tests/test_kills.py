@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pytest
 from tests.studies import kills
 
 if TYPE_CHECKING:
@@ -73,21 +72,17 @@ def test_killed_in_step_after_step_it_ends_as_if_nothing_had_been(
     assert_whole(output, photo_run.output_path)
 
 
-@pytest.mark.parametrize("moment", [AMONG_TABLES, BEFORE_THE_REPORT, AMONG_RENAMES])
 def test_killed_while_it_replaces_a_result_it_leaves_the_old_one_or_what_completes_the_new_one(
-    moment: tuple[str, str, int],
-    photo_run: PhotoRun,
-    rangesfm_command: Command,
-    tmp_path: Path,
+    photo_run: PhotoRun, rangesfm_command: Command, tmp_path: Path
 ) -> None:
     output, folder = shutil.copytree(photo_run.output_path, tmp_path / "out"), photo_run.survey.folder
     flags = (*photo_run.flags, "--output_path", str(output))
-    killed(moment, *flags, "--check_share", "0.2", cwd=folder)
-    if moment is AMONG_RENAMES:
-        assert not (output / "result.json").exists()
-        rangesfm_command("report", str(output), cwd=folder)
-        assert json.loads((output / "result.json").read_text())["check_ranges"]["num"] > 0
-    else:
+    for moment in (AMONG_TABLES, BEFORE_THE_REPORT):
+        killed(moment, *flags, "--check_share", "0.2", cwd=folder)
         assert_whole(output, photo_run.output_path)
+    killed(AMONG_RENAMES, *flags, "--check_share", "0.2", cwd=folder)
+    assert not (output / "result.json").exists()
+    rangesfm_command("report", str(output), cwd=folder)
+    assert json.loads((output / "result.json").read_text())["check_ranges"]["num"] > 0
     rangesfm_command("run", *flags, cwd=folder)
     assert_whole(output, photo_run.output_path)
