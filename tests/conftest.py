@@ -19,6 +19,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -41,6 +42,10 @@ TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 TIME_OFFSET_S = 2.0
 ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
 
+
+# On a busy machine any example may take longer than the 0.2 s that hypothesis allows.
+hypothesis.settings.register_profile("tests", deadline=None)
+hypothesis.settings.load_profile("tests")
 
 # Background jobs of a shell ignore Ctrl-C, and the commands that tests start from there would ignore it too.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -229,7 +229,7 @@ class TestFastWay:
                 answers.append(str(error))
         return answers
 
-    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(st.lists(st.lists(CELLS, min_size=3, max_size=3), min_size=1), st.sampled_from(",;\t"), st.data())
     def test_is_that_of_all_tables(
         self, tmp_path: Path, rows: list[list[str]], separator: str, data: st.DataObject

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rangesfm.ranging.errors.noise import estimate_noise_m, find_quantization_m
@@ -127,7 +127,6 @@ def test_too_few_ranges_have_no_noise() -> None:
     assert estimate_noise_m(np.arange(21.0), np.arange(21.0)) is None
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.floats(-1e300, 1e300), st.floats(1e-300, 1e300)) | st.just((0.0, 1.0)), min_size=22, max_size=40

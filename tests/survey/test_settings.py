@@ -329,7 +329,7 @@ def test_missing_survey_is_refused(tmp_path: Path) -> None:
     assert "no such file" in str(refusal(tmp_path / "none.toml"))
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.one_of(
         st.binary(max_size=100),

@@ -14,9 +14,7 @@ from rangesfm.errors import InputError
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import read_ranges, reader_names, write_ranges_csv
 
-any_bytes_in_one_folder = settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+any_bytes_in_one_folder = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def write(folder: Path, content: str | bytes) -> Path:
