@@ -99,15 +99,28 @@ def test_an_anchor_away_from_where_it_was_surveyed_is_named(estimate: ScaleEstim
     assert doubts(with_anchor(estimate, 3, position_m=place_m - [0.0, 0.06, 0.01])) == []
 
 
+def with_residuals(estimate: ScaleEstimate, stddev_m: Array) -> ScaleEstimate:
+    """Return the estimate with residuals of these standard deviations, (k,) for the ranges of its problem."""
+    solution = known(estimate.solution)
+    residuals_m = stddev_m * np.random.default_rng(1).normal(size=len(stddev_m))
+    return replace(estimate, solution=replace(solution, fit=replace(solution.fit, residuals_m=residuals_m)))
+
+
 def test_noise_that_no_radio_has_is_said_unless_somebody_said_it_first(estimate: ScaleEstimate) -> None:
-    errors = estimate.errors
-    noisy = replace(estimate, errors=replace(errors, stddev_m=np.full_like(errors.stddev_m, 0.55)))
+    index = estimate.observations.log.anchor_index[known(estimate.problem).rows]
+    noisy = with_residuals(estimate, np.full(len(index), 0.55))
     (reason,) = doubts(noisy)
-    assert reason == "the ranges scatter by 0.55 m; UWB radios scatter by 0.02 to 0.3 m"
+    scatter_m = float(reason.removeprefix("the ranges scatter by ").split(" m;")[0])
+    assert scatter_m == pytest.approx(0.55, rel=0.25)
     assert doubts(noisy, noise_is_given=True) == []
-    of_one = np.where(estimate.observations.log.anchor_index == 4, 4.2, errors.stddev_m)
-    (reason,) = doubts(replace(estimate, errors=replace(errors, stddev_m=of_one)))
-    assert reason.startswith("the ranges to E scatter by 4.20 m")
+    (reason,) = doubts(with_residuals(estimate, np.where(index == 4, 4.2, 0.06)))
+    assert reason.startswith("the ranges to E scatter by ")
+
+
+def test_a_weight_is_not_told_as_the_scatter_of_ranges(estimate: ScaleEstimate) -> None:
+    """The standard deviations of weights contain what ranges of one length share, and the places between photos."""
+    errors = estimate.errors
+    assert doubts(replace(estimate, errors=replace(errors, stddev_m=np.full_like(errors.stddev_m, 0.52)))) == []
 
 
 def test_points_that_are_not_of_the_photos_are_said(estimate: ScaleEstimate) -> None:

@@ -55,6 +55,18 @@ def test_a_lever_arm_that_nobody_gave_is_told_and_one_of_zero_is_not(survey: Sur
     assert not list(notes_before_work(by_tag, inputs))
 
 
+def test_a_lever_arm_that_no_camera_carries_is_told(complete: Survey) -> None:
+    for arm_m, is_told in (((0.0, 2.2, 0.0), False), ((0.03, -9.0, 0.05), True)):
+        given = complete.changed({"tag.tag_in_cam_m": arm_m})
+        notes = list(notes_before_work(given, read_ranging_inputs(given)))
+        assert len(notes) == is_told
+        assert all("is 9 m long, more than a camera carries" in note for note in notes)
+
+
+def test_an_anchor_that_was_left_out_on_purpose_is_not_told_to_have_no_ranges(complete: Survey) -> None:
+    assert read_ranging_inputs(complete.changed({"anchors.use": ("A2",)})).notes == ()
+
+
 @pytest.mark.parametrize("height_m", [0.0, 1.5])
 def test_heights_that_are_all_the_same_are_told(complete: Survey, height_m: float) -> None:
     level = with_heights(read_ranging_inputs(complete), [height_m] * 4)

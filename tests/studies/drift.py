@@ -244,7 +244,8 @@ def runs_at_level(lap: Lap, arguments: argparse.Namespace) -> list[Drift]:
             print(f"{level:6} {seed:>6} refused: {reason}", flush=True)
             continue
         runs.append(run)
-        note = "; ".join(run.summary.misfits) or ("" if run.summary.converged else "not converged")
+        misfits = "; ".join(misfit.reason for misfit in run.summary.misfits)
+        note = misfits or ("" if run.summary.converged else "not converged")
         print_row(level, str(seed), values_of([run])[0], note)
     return runs
 

@@ -72,6 +72,11 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
             "check the photos' times, or the order that they were given in",
             Correction(time_shift_s=times.min() + times.max() - 2 * times),
         )
+    yield from lever_arms_in_other_axes(on_map)
+
+
+def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
+    """Yield other readings of the lever arms: with the wrong sign, or along other axes."""
     arms = _lever_arms_m(on_map)
     for words, axes in _AXES_OF_LEVER_ARM.items():
         moves = {tag: axes @ arm - arm for tag, arm in arms.items()}

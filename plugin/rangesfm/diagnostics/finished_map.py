@@ -18,7 +18,7 @@ from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.ranging.errors.noise import NORMAL_95, robust_stddev
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.scale_estimate import ScaleEstimate
@@ -85,12 +85,11 @@ def doubts_of_map(
         noise_is_given: whether the user gave the scatter of the ranges.
     """
     stage = estimate if summary is None else summary
-    noise_m = np.full(len(stage.observations.log), np.nan) if noise_is_given else stage.errors.stddev_m
     return (
         *_of_fit(summary, points),
         *_of_say(stage.observations),
         *_of_positions(stage.anchors),
-        *_of_noise(stage.observations, noise_m),
+        *(() if noise_is_given else _of_noise(stage.observations, _residuals_m(estimate, summary))),
     )
 
 
@@ -127,7 +126,7 @@ def _of_fit(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doub
         remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
         yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
     for misfit in () if summary is None else summary.misfits:
-        yield Doubt(f"after the refinement {misfit}", "check clocks, lever arm and anchors")
+        yield Doubt(f"after the refinement {misfit.reason}", misfit.remedy)
 
 
 def _of_say(observations: RangeObservations) -> Iterator[Doubt]:
@@ -151,13 +150,24 @@ def _of_positions(anchors: Sequence[AnchorEstimate]) -> Iterator[Doubt]:
             yield Doubt(reason, _CHECK_ANCHOR)
 
 
-def _of_noise(observations: RangeObservations, noise_m: Array) -> Iterator[Doubt]:
-    log = observations.log
-    used = (observations.status < RangeStatus.OUTLIER) & np.isfinite(noise_m)
+def _residuals_m(estimate: ScaleEstimate, summary: RefineSummary | None) -> Array:
+    """Return predicted minus measured ranges (n,), NaN for ranges without a place on the path."""
+    if summary is not None:
+        return summary.predicted_m - summary.observations.log.range_m
+    residuals_m = np.full(len(estimate.observations.log), np.nan)
+    if estimate.problem is not None and estimate.solution is not None:
+        residuals_m[estimate.problem.rows] = estimate.solution.fit.residuals_m
+    return residuals_m
+
+
+def _of_noise(observations: RangeObservations, residuals_m: Array) -> Iterator[Doubt]:
+    """Yield a doubt if single ranges scatter more than those of radios, compared with the ranges before and after."""
+    log, order = observations.log, observations.log.own_order
+    order = order[((observations.status < RangeStatus.OUTLIER) & np.isfinite(residuals_m))[order]]
     of_anchors = {
-        anchor_id: float(np.median(noise_m[rows]))
+        anchor_id: robust_stddev(np.diff(residuals_m[rows])) / float(np.sqrt(2))
         for k, anchor_id in enumerate(log.anchor_ids)
-        if (rows := used & (log.anchor_index == k)).sum() >= _MIN_RANGES
+        if len(rows := order[log.anchor_index[order] == k]) >= _MIN_RANGES
     }
     noisy = {anchor_id: stddev_m for anchor_id, stddev_m in of_anchors.items() if stddev_m > _MAX_NOISE_M}
     if not noisy:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives
+from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives, lever_arms_in_other_axes
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.hypothesis import Correction, Effect, Hypothesis, corrected, of_bins
 from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
@@ -24,6 +24,9 @@ _NUM_TRIED, _NUM_OF_KIND, _NUM_NEARLY = 6, 2, 3
 _NUM_FITTED = 12
 # Smallest difference of scores (twice a log-likelihood, less a penalty) that tells two explanations apart.
 _AS_LIKELY = 6.0
+# The same for alternatives where no test exceeds its threshold. By Markov's inequality a likelihood ratio is as large by
+# chance in one of 100 surveys at most: the mean of each ratio is 1, and the penalty counts the alternatives.
+_BEYOND_CHANCE = 2 * float(np.log(100))
 _SAME = 0.95
 _MAX_NUM_RIVALS = 2
 _NUM_SETTLING, _SETTLED = 6, 0.05
@@ -121,8 +124,11 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
         if is_found and gain > enough:
             causes.append(_cause(replace(again, threshold=test.threshold), state, gain, penalty))
     if not causes and not is_sure:
-        return []
-    causes += _alternatives(problem, before)
+        # A lever arm is so short that one with the wrong sign may change the ranges less than the other tests can see.
+        arms = list(lever_arms_in_other_axes(problem.on_map))
+        causes += [cause for cause in _alternatives(problem, before, arms) if cause.score > _BEYOND_CHANCE]
+    else:
+        causes += _alternatives(problem, before, list(alternatives(problem.on_map)))
     causes.sort(key=lambda cause: -cause.score)
     likeliest = [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)]
     return [_narrowed(problem, cause, before) for cause in likeliest[: 1 + _MAX_NUM_RIVALS]]
@@ -253,10 +259,9 @@ def _cause(test: Test, state: RangeState, gain: float, penalty: float) -> Cause:
     return Cause(h.name, h.subject, h.words(test.sizes), h.remedy, adoption, gain, penalty, state, test)
 
 
-def _alternatives(problem: Linearized, before: float) -> Iterator[Cause]:
-    """Yield the alternatives that make the ranges likelier than chance would."""
+def _alternatives(problem: Linearized, before: float, tried: Sequence[Alternative]) -> Iterator[Cause]:
+    """Yield those of the alternatives that make the ranges likelier than chance would."""
     on_map = problem.on_map
-    tried = list(alternatives(on_map))
     if not tried:
         return
     refits = Refits(on_map, problem.scatter_m)

@@ -24,6 +24,8 @@ _FAR_M, _FAR_SHARE = 300.0, 0.95
 # An anchor is stuck if one value makes up the first share of its ranges, while in the other anchors' ranges (median)
 # the commonest value stays below the second share. If the tag stands still, all anchors repeat their values.
 _STUCK_SHARE, _MOVING_SHARE, _MIN_RANGES = 0.5, 0.2, 20
+# Length of a lever arm, metres, above which it is doubted. A pole that somebody carries is 2 m long.
+_LONG_ARM_M = 2.5
 # A gap between photos longer than this many median gaps is a pause between two walks.
 _PAUSE = 30.0
 # Clocks that count seconds since 1970 show more than this.
@@ -56,6 +58,12 @@ def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
             "the tag's place on the camera is not given, so it is taken to be at the lens: ranges are wrong by up to "
             "its distance from there; measure from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
         )
+    for tag_id, arm_m in zip(inputs.log.tag_ids, np.linalg.norm(inputs.tag_in_cam_m, axis=1), strict=True):
+        if arm_m > _LONG_ARM_M:
+            yield (
+                f"the lever arm of {tag_id or 'the tag'} is {arm_m:.3g} m long, more than a camera carries: give it in "
+                "metres from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
+            )
     yield from _on_ranges(inputs.log)
     if inputs.anchor_frame == "unknown":
         return

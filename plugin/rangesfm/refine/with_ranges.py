@@ -24,7 +24,7 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.learned import LearnedErrors
-from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors, misfits
+from rangesfm.ranging.errors.range_errors import Misfit, RangeErrors, fit_with_own_errors, misfits
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, SolverRun, solve_bundle_adjustment, solve_until_still
@@ -89,7 +89,7 @@ class RefineSummary:
     seconds: float
     converged: bool
     message: str
-    misfits: tuple[str, ...]
+    misfits: tuple[Misfit, ...]
     anchors: tuple[AnchorEstimate, ...]
     tags_in_cam_m: Array
     time_shift_s: float | None

@@ -322,7 +322,10 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
 
 
 def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_are_of_log: bool) -> list[str]:
-    silent = [anchor.anchor_id for anchor in anchors if anchor.anchor_id not in log.anchor_ids]
+    # With use_anchors, the ranges to other anchors were left out on purpose.
+    silent = [
+        anchor.anchor_id for anchor in anchors if not survey.anchors.use and anchor.anchor_id not in log.anchor_ids
+    ]
     notes = [*([f"no ranges to anchor {', '.join(silent)}"] if silent else [])]
     silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []

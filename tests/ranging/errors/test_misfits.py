@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from tests.ranging.errors.test_range_errors import NUM_EACH, make_errors, noise
 
@@ -15,18 +17,30 @@ def test_noise_is_no_misfit() -> None:
 
 def test_residuals_far_beyond_their_stddev_are_told() -> None:
     reasons = misfits(make_errors(0.01), noise((0.1, 0.1, 0.1)), np.arange(3.0 * NUM_EACH))
-    assert any("times their stddev" in reason for reason in reasons)
+    assert any("times their stddev" in misfit.reason for misfit in reasons)
 
 
 def test_a_stretch_that_is_off_is_told() -> None:
     residuals = noise((0.1, 0.1, 0.1))
     residuals[300:360] += 1.0
     (reason,) = misfits(make_errors(0.1), residuals, np.arange(3.0 * NUM_EACH))
-    assert "in 3 of 60 stretches" in reason
+    assert "in 3 of 60 stretches" in reason.reason
+    assert reason.remedy == "check clocks, lever arm and anchors"
 
 
 def test_drift_that_is_left_is_told_even_where_the_noise_was_estimated_with_it() -> None:
     drift = 3.0 * np.sin(np.arange(3 * NUM_EACH) / 150)
     errors = make_errors(loss=CAUCHY).seen_by_bending_map(noise((0.1, 0.1, 0.1)) + drift, 0.0)
     reasons = misfits(errors, noise((0.1, 0.1, 0.1)) + drift, np.arange(3.0 * NUM_EACH))
-    assert any("far larger than the ranges' scatter" in reason for reason in reasons)
+    (reason,) = (misfit for misfit in reasons if "far larger than the ranges' scatter" in misfit.reason)
+    assert reason.remedy == "check clocks, lever arm and anchors"
+
+
+def test_photos_too_far_apart_are_told_where_ranges_fit_only_near_them() -> None:
+    """Photos every 40 ranges, and a path between them that is off by up to half a metre."""
+    between = np.abs(np.sin(np.arange(3 * NUM_EACH) * np.pi / 40))
+    errors = replace(make_errors(0.4), placing_m=0.4 * between)
+    reasons = misfits(errors, noise((0.02, 0.02, 0.02)) + 0.5 * between, np.arange(3.0 * NUM_EACH))
+    (reason,) = (misfit for misfit in reasons if "far larger than the ranges' scatter" in misfit.reason)
+    assert reason.reason.endswith("the photos are too far apart")
+    assert "use more of the photos" in reason.remedy

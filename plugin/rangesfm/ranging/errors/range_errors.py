@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +46,12 @@ _MIN_BLOCK = 5
 _MAX_STDDEV_OVER_SCATTER = 5.0
 _MIN_SCATTER_M = 0.01
 _MIN_DIFFERENCES = 20
+# If the residuals of this share of the ranges, those nearest to the photos, are smaller than all by this factor, the
+# path between the photos is the reason.
+_NEAREST, _AT_PHOTOS = 0.2, 0.5
+_MORE_PHOTOS = (
+    "use more of the photos (every_nth, min_interval_s), or only ranges that are near to one (max_interpolation_gap_s)"
+)
 
 
 @dataclass(frozen=True)
@@ -305,7 +311,14 @@ def fit_with_own_errors(
     return fitted, errors, seen
 
 
-def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple[str, ...]:
+class Misfit(NamedTuple):
+    """Why ranges fit a map worse than their noise suggests, and what to do about it."""
+
+    reason: str
+    remedy: str = "check clocks, lever arm and anchors"
+
+
+def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple[Misfit, ...]:
     """Return reasons why the ranges fit worse than their noise suggests; empty if they do not.
 
     Args:
@@ -317,18 +330,25 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
     stated = residuals_m / errors.stddev_m
     typical = robust_stddev(stated)
     if len(stated) >= _MIN_DIFFERENCES and typical > _MAX_BLOCK_STDDEVS:
-        reasons.append(f"range residuals are typically {typical:.1f} times their stddev")
+        reasons.append(Misfit(f"range residuals are typically {typical:.1f} times their stddev"))
     off = [np.median(stated[rows]) for rows in _by_group(errors.group) if len(rows) >= _MIN_BLOCK]
     num_off = int(np.sum(np.abs(off) > _MAX_BLOCK_STDDEVS))
     if num_off:
-        reasons.append(f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole")
+        told = f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole"
+        reasons.append(Misfit(told))
     order = np.lexsort((time_order, errors.anchor_index))
     steps = np.diff(residuals_m[order])[np.diff(errors.anchor_index[order]) == 0]
     if len(steps) >= _MIN_DIFFERENCES:
         scatter = max(robust_stddev(steps) / np.sqrt(2), _MIN_SCATTER_M)
         size = robust_stddev(residuals_m)
         if size > _MAX_STDDEV_OVER_SCATTER * scatter:
-            reasons.append(f"range residuals ({size:.2f} m) are far larger than the ranges' scatter ({scatter:.2f} m)")
+            told = f"range residuals ({size:.2f} m) are far larger than the ranges' scatter ({scatter:.2f} m)"
+            at_photos_m = robust_stddev(residuals_m[errors.placing_m <= np.quantile(errors.placing_m, _NEAREST)])
+            if at_photos_m < _AT_PHOTOS * size:
+                told += f", but not those nearest to the photos ({at_photos_m:.2f} m): the photos are too far apart"
+                reasons.append(Misfit(told, _MORE_PHOTOS))
+            else:
+                reasons.append(Misfit(told))
     return tuple(reasons)
 
 
