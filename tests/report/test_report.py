@@ -226,6 +226,35 @@ def test_only_mistakes_that_were_found_stand_above_the_appendix(make_result: Mak
     assert "found" not in page_of(clean).ids
 
 
+def test_appendix_says_what_checks_what_was_given_and_bounds_the_scale(make_result: MakeResult) -> None:
+    test = {
+        "name": "anchor place",
+        "statistic": 0.2,
+        "threshold": 16.4,
+        "size": 0.1,
+        "stddev": 0.1,
+        "unit": "m",
+        "smallest_detectable": 0.41,
+        "effect_on_scale": 0.0042,
+        "effect_on_place_m": 0.1,
+        "rejected": False,
+        "words": "w",
+        "remedy": "r",
+    }
+    tests = [
+        {**test, "subject": "A10", "redundancy": 0.35, "is_checked": True},
+        {**test, "subject": "A9", "redundancy": 0.001, "is_checked": False},
+        {**test, "subject": "A8"},  # its redundancy is not known
+    ]
+    bound = {"scale_within": 0.034, "risk": 1e-4, "limited_by": "lever arm", "unchecked": ["anchor place A9"]}
+    changes = {"tests": tests, "reliability": bound}
+    texts = page_of(make_result(num_keyframes=5, num_ranges_per_anchor=5, changes=changes)).texts
+    first = texts.index("What checks what was given")
+    told = " ".join(texts[first:]).replace("\u00a0", " ")
+    assert "anchor A9: place untested 0.41 m 0.42 % anchor A10: place 35 % 0.41 m 0.42 % Checked" in told
+    assert "(the worst is lever arm), the scale is off by more than 3.4 % with a probability of 0.0001 at most." in told
+
+
 def test_no_stddev_stands_above_the_appendix(make_result: MakeResult) -> None:
     """A reader compares spreads, so all of them are half of a 95 % interval."""
     texts = page_of(make_result(num_keyframes=5, num_ranges_per_anchor=5)).texts

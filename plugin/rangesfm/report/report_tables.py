@@ -13,6 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from rangesfm.diagnostics.scale_bound import CHECKED_KINDS
+from rangesfm.files.folders import natural_order
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.content import Content, in_natural_order
@@ -151,7 +152,10 @@ def _note_on_not_found(tests: Sequence[MistakeEntry]) -> str:
 
 
 def reliability(content: Content) -> ReportTable:
-    """Return the table of how much of each given thing the others check."""
+    """Return the table of how much of each given thing the others check, with the bound on the scale below it."""
+    kinds, bound = list(CHECKED_KINDS), content.summary.reliability
+    given = [test for test in content.summary.tests if test.name in kinds and test.redundancy is not None]
+    given.sort(key=lambda test: (kinds.index(test.name), natural_order(test.subject)))
     rows = [
         [
             mistake(test.name, test.subject),
@@ -159,14 +163,19 @@ def reliability(content: Content) -> ReportTable:
             percent(test.smallest_detectable) if test.unit == "1" else rough(test.smallest_detectable, test.unit),
             percent(test.effect_on_scale),
         ]
-        for test in content.summary.tests
-        if test.name in CHECKED_KINDS
+        for test in given
     ]
     note = (
         "Checked: how much of an error the other observations show (redundancy number); the rest would move the map. "
         "Untested: they show no error that is possible. Found from: smallest error that is found in four cases of "
         "five, and how it would change the scale if it was not."
     )
+    if bound is not None and bound.scale_within is not None:
+        worst = f" (the worst is {bound.limited_by})" if bound.limited_by else ""
+        note += (
+            f" Whichever one mistake was made and not found{worst}, the scale is off by more than "
+            f"{percent(bound.scale_within)} with a probability of {bound.risk:g} at most."
+        )
     return ReportTable("What checks what was given", ["", "checked", "found from", "then the scale"], rows, note)
 
 
