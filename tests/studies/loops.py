@@ -53,7 +53,7 @@ def study_aisles(num_seeds: int) -> None:
     print("seed  alike  taken for loops  contradicted   refined  closed (m)")
     num_without = 0
     for seed in range(num_seeds):
-        survey = two_aisles(seed=seed)
+        survey = two_aisles(num_keyframes=15, length_m=6.0, seed=seed)
         log = range_log(survey.looped.survey, seed)
         with TemporaryDirectory() as folder:
             found = close(survey.looped, survey.looped.chain(), log, Path(folder), alike=survey.alike)
