@@ -20,6 +20,7 @@ LAYERS = (
     "colmap ceres",
     "ranging",
     "distances sources",
+    "positions",
     "vision scale export",
     "survey",
     "survey_discovery",

@@ -108,4 +108,18 @@ inline Eigen::Matrix3Xd Vector3ForEachRange(const std::string& name, const Array
   return columns;
 }
 
+// Returns three columns for each of n matrices (n, 3, 3).
+inline Eigen::Matrix3Xd Matrix3ForEach(const std::string& name, const Array& array, Eigen::Index num) {
+  if (array.ndim() != 3 || array.shape(0) != num || array.shape(1) != 3 || array.shape(2) != 3) {
+    FailOnShape(name, array, "3 x 3 numbers for each of " + std::to_string(num) + " positions");
+  }
+  Eigen::Matrix3Xd columns(3, 3 * num);
+  for (Eigen::Index i = 0; i < num; ++i) {
+    // The array is in C order, so that Eigen's columns are its rows.
+    columns.middleCols<3>(3 * i) = Eigen::Map<const Eigen::Matrix3d>(array.data() + 9 * i).transpose();
+  }
+  CheckEach(name, columns.reshaped(), Finite);
+  return columns;
+}
+
 }  // namespace rangesfm

@@ -24,6 +24,7 @@
 #include "rangesfm/distance_cost.h"
 #include "rangesfm/elimination_order.h"
 #include "rangesfm/joint_prior_cost.h"
+#include "rangesfm/position_cost.h"
 #include "rangesfm/range_cost.h"
 #include "rangesfm/robust_loss.h"
 #include "rangesfm/tag_place.h"
@@ -162,6 +163,57 @@ ceres::CostFunction* MakeDistanceCost(double distance_m, double stddev_m, const 
   return a_in_cam_m ? from(CamEnd(FiniteVector3("a_in_cam_m", *a_in_cam_m))) : from(PointEnd());
 }
 
+constexpr auto kPositionCostDoc = R"(Make the cost of known positions of an antenna at one keyframe, or between two.
+
+The error of a position is ``r = whitening (p - position)``, with the antenna at ``p = R^T (tag_in_cam - t)``, or
+between two keyframes as in ``interpolated_range_cost``. The squared length of its three residuals is the robust loss of
+the length of r times the position's share. Metres throughout. Parameter blocks: rig_from_world (7,) as
+[qx qy qz qw tx ty tz], or those before and after. Then, in this order and as far as they are estimated: tag_in_cam
+(3,); time shift (1,), only between two keyframes.
+
+Args:
+    position_m: (n, 3) known positions.
+    whitening: (n, 3, 3) matrices such that ``whitening^T whitening`` is the inverse of a position's covariance.
+    tag_in_cam_m: (3,) lever arm, the antenna in the rig frame; None makes it a parameter block.
+    weight: (n,) interpolation weights between two keyframes, as in ``interpolated_range_cost``; None: at a keyframe.
+    offset_in_world_m: (3,) or (n, 3) deviation of a curved path from the straight line between two keyframes; None: 0.
+    interval_s: as in ``interpolated_range_cost``.
+    share: factor of the loss of all positions, or (n,) of each, positive.
+    loss_scale: scale of Geman and McClure's loss (see ``range_cost``) in standard deviations, positive; infinity means
+        least squares.
+
+Raises:
+    ValueError: see ``range_cost``.
+)";
+
+ceres::CostFunction* MakePositionCost(const Array& position_m, const Array& whitening,
+                                      const OptionalArray& tag_in_cam_m, const OptionalArray& weight,
+                                      const OptionalArray& offset_in_world_m, std::optional<double> interval_s,
+                                      const Array& share, double loss_scale) {
+  if (position_m.ndim() != 2 || position_m.shape(0) == 0) {
+    FailOnShape("position_m", position_m, "3 numbers for each of one position or more");
+  }
+  const Eigen::Index num = position_m.shape(0);
+  KnownPositions known = {Vector3ForEachRange("position_m", position_m, num),
+                          Matrix3ForEach("whitening", whitening, num), ForEachRange("share", share, num, Positive)};
+  std::optional<Eigen::Vector3d> tag_in_cam;
+  if (tag_in_cam_m) {
+    tag_in_cam = FiniteVector3("tag_in_cam_m", *tag_in_cam_m);
+  }
+  const RobustLoss loss = Loss(loss_scale, true);
+  if (!weight) {
+    return new PositionCost<KeyframePlace>(KeyframePlace(), std::move(known), tag_in_cam, false, loss);
+  }
+  Eigen::Matrix3Xd offset = Eigen::Matrix3Xd::Zero(3, num);
+  if (offset_in_world_m) {
+    offset = Vector3ForEachRange("offset_in_world_m", *offset_in_world_m, num);
+  }
+  InterpolatedPlace place(ForEachRange("weight", *weight, num, Weight), std::move(offset),
+                          Positive("interval_s", interval_s.value_or(1.0)));
+  return new PositionCost<InterpolatedPlace>(std::move(place), std::move(known), tag_in_cam, interval_s.has_value(),
+                                             loss);
+}
+
 constexpr auto kDirectionCostDoc = R"(Make the cost of a direction in the world that was measured in a camera's frame.
 
 An example is the vertical. The three residuals are ``(R direction_in_world - direction_in_cam) / stddev``, with two
@@ -239,6 +291,10 @@ PYBIND11_MODULE(_cpp, m) {
   m.def("distance_cost", &rangesfm::MakeDistanceCost, kOwn, rangesfm::kDistanceCostDoc, py::kw_only(),
         arg("distance_m"), arg("stddev_m"), arg("a_in_cam_m") = py::none(), arg("b_in_cam_m") = py::none(),
         arg("has_bias") = false, arg("loss_scale") = kLeastSquares);
+  m.def("position_cost", &rangesfm::MakePositionCost, kOwn, rangesfm::kPositionCostDoc, py::kw_only(),
+        arg("position_m"), arg("whitening"), arg("tag_in_cam_m"), arg("weight") = py::none(),
+        arg("offset_in_world_m") = py::none(), arg("interval_s") = py::none(), arg("share") = 1.0,
+        arg("loss_scale") = kLeastSquares);
   m.def("direction_cost", &rangesfm::MakeDirectionCost, kOwn, rangesfm::kDirectionCostDoc, py::kw_only(),
         arg("direction_in_world"), arg("direction_in_cam"), arg("stddev_rad"));
   m.def("joint_prior_cost", &rangesfm::MakeJointPriorCost, kOwn, rangesfm::kJointPriorCostDoc, py::kw_only(),

@@ -55,6 +55,8 @@ inline Block PoseBlock(const Eigen::Quaterniond& cam_from_world, const Eigen::Ve
   return {cam_from_world.x(), cam_from_world.y(), cam_from_world.z(), cam_from_world.w(), t.x(), t.y(), t.z()};
 }
 
+inline Block RandomPose(Random& random, double extent) { return PoseBlock(random.Rotation(), random.Vector(extent)); }
+
 inline std::vector<const double*> Pointers(const std::vector<Block>& blocks) {
   std::vector<const double*> pointers;
   pointers.reserve(blocks.size());

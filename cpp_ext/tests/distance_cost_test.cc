@@ -8,8 +8,6 @@
 namespace rangesfm {
 namespace {
 
-Block RandomPose(Random& random, double extent) { return PoseBlock(random.Rotation(), random.Vector(extent)); }
-
 TEST(DistanceCost, ResidualIsTheHandComputedOne) {
   // One camera is at (1, 2, 0), rotated by 180 degrees about z, with its end 1 m along its x axis, at (0, 2, 0). The
   // other camera and its end are at the origin. The ends are 2 m apart. With a bias of 0.25 m, a measured distance

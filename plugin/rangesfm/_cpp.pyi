@@ -44,6 +44,17 @@ def joint_prior_cost(
 def padded_manifold(
     *, size: typing.SupportsInt | typing.SupportsIndex, tangent_size: typing.SupportsInt | typing.SupportsIndex
 ) -> pyceres.Manifold: ...
+def position_cost(
+    *,
+    position_m: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    whitening: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    tag_in_cam_m: typing.Annotated[numpy.typing.ArrayLike, numpy.float64] | None,
+    weight: typing.Annotated[numpy.typing.ArrayLike, numpy.float64] | None = None,
+    offset_in_world_m: typing.Annotated[numpy.typing.ArrayLike, numpy.float64] | None = None,
+    interval_s: typing.SupportsFloat | typing.SupportsIndex | None = None,
+    share: typing.Annotated[numpy.typing.ArrayLike, numpy.float64] = 1.0,
+    loss_scale: typing.SupportsFloat | typing.SupportsIndex = ...,
+) -> pyceres.CostFunction: ...
 def range_cost(
     *,
     range_m: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],

@@ -1,4 +1,4 @@
-"""Range and distance residuals alone, for users who write their own bundle adjustment.
+"""Range, distance and position residuals alone, for users who write their own bundle adjustment.
 
 ``examples/own_problem.py`` shows how. Each function describes its parameter blocks, units and errors. A cost is a
 ``pyceres.CostFunction``. Importing this module raises ``SolverError`` where the compiled part does not fit the
@@ -16,6 +16,7 @@ from rangesfm.ceres import (
     interpolated_range_cost,
     joint_prior_cost,
     keep_from_elimination,
+    position_cost,
     range_cost,
 )
 
@@ -30,5 +31,6 @@ __all__ = [
     "interpolated_range_cost",
     "joint_prior_cost",
     "keep_from_elimination",
+    "position_cost",
     "range_cost",
 ]

@@ -309,6 +309,74 @@ class AnchorOptions(Options, table="anchors"):
     """Ids of the anchors whose ranges are used (default: all)."""
 
 
+class PointOptions(Options, table="points"):
+    """Marks in the photos whose coordinates are known: control points and check points."""
+
+    path: Annotated[Path | None, KeyMeta(flag="points", role="file", is_common=True)] = None
+    """CSV marker,x_m,y_m,z_m[,stddev_m,kind] with coordinates of marks in the site, or another table of points, or
+    ODM's gcp_list.txt. A control point holds the map, a check point is only compared with it. The photos that show them
+    are in the file of markers in [scale], in gcp_list.txt, or found (printed tags)."""
+    columns: Annotated[dict[str, str], KeyMeta(flag="point_columns", metavar="QUANTITY=NAME,..")] = Field(
+        default_factory=dict
+    )
+    """Names of the columns of the file (numbers, where they have no names) for marker, x, y, z, stddev and kind; x is
+    east and y north, if they are such (default: recognised)."""
+    unit: Annotated[_LengthUnit | None, KeyMeta(flag="point_unit")] = None
+    """Unit of the coordinates (default: that in the names of the columns, else m)."""
+    crs: Annotated[str | None, KeyMeta(flag="point_crs")] = None
+    """Coordinate reference system of the points, such as EPSG:2056 (default: that of gcp_list.txt, else the frame of
+    the anchors)."""
+    stddev_m: Annotated[_Positive, KeyMeta(flag="point_stddev_m")] = 0.01
+    """Standard deviation of each coordinate of a point for which the file has none. Its order of magnitude is enough,
+    as it is estimated with the map."""
+
+
+class PositionOptions(Options, table="positions"):
+    """Positions of an antenna on the camera: by satellites, by a radio that hands out positions, or a total station."""
+
+    path: Annotated[Path | None, KeyMeta(flag="positions", role="file", is_common=True)] = None
+    """CSV timestamp_s,x_m,y_m,z_m[,stddev_m] (or image_name in place of timestamp_s; stddev_x_m, stddev_y_m and
+    stddev_z_m, or a covariance cov_xx_m2, cov_xy_m2, ..), another table, a TUM trajectory, NMEA sentences, a solution
+    of RTKLIB, or a log of Marvelmind's dashboard."""
+    format: Annotated[str | None, KeyMeta(flag="positions_format")] = None
+    """Format of the file: table, tum, nmea, rtklib or marvelmind (default: recognised by content)."""
+    columns: Annotated[dict[str, str], KeyMeta(flag="position_columns", metavar="QUANTITY=NAME,..")] = Field(
+        default_factory=dict
+    )
+    """Names of the columns of a table (numbers, where they have no names) for timestamp or image_name, x, y, z, and
+    possibly stddev (or stddev_x, stddev_y, stddev_z) and tag_id (default: recognised)."""
+    timestamp_unit: Annotated[_TimeUnit | None, KeyMeta(flag="position_time_unit")] = None
+    """Unit of the times, as timestamp_unit in [ranges] (default: by column name or values)."""
+    unit: Annotated[_LengthUnit | None, KeyMeta(flag="position_unit")] = None
+    """Unit of the coordinates (default: that in the names of the columns, else m)."""
+    crs: Annotated[str | None, KeyMeta(flag="position_crs")] = None
+    """Coordinate reference system of the positions, such as EPSG:2056 (default: that of the format, else the frame of
+    anchors and points)."""
+    tag_id: Annotated[str | None, KeyMeta(flag="position_tag_id")] = None
+    """Id of the tag on the camera, for a file with positions of several."""
+    antenna_in_cam_m: Annotated[_LeverArm, KeyMeta(flag="antenna_in_cam", metavar="X,Y,Z")] = (0.0, 0.0, 0.0)
+    """Lever arm: position of the antenna, or of the prism, in the camera frame (right, down, forward), metres."""
+    time_offset: Annotated[
+        Literal["auto"] | _Time,
+        KeyMeta(
+            flag="positions_time_offset",
+            metavar="auto|SECONDS",
+            expected='"auto" or seconds, at most 1e+10 of them',
+        ),
+    ] = "auto"
+    """Time offset between the clocks: image time = time of the position + offset. auto: it is searched for."""
+    stddev_m: Annotated[_Positive | None, KeyMeta(flag="position_stddev_m")] = None
+    """Standard deviation of each coordinate of the positions, in place of what the file says of it (default: as the
+    file says; in both cases it is estimated with the map)."""
+    lasting_s: Annotated[Annotated[float, Field(ge=1e-2, le=1e5)] | None, KeyMeta(flag="position_lasting_s")] = None
+    """Time for which an error of the positions lasts (default: a mixture of 3, 30 and 300 s, learnt with the map)."""
+
+    @property
+    def time_offset_s(self) -> float | None:
+        """Return the given time offset, or None where it is to be searched for."""
+        return None if self.time_offset == "auto" else self.time_offset
+
+
 class TagOptions(Options, table="tag"):
     """The radio tag on the camera, or several tags."""
 
@@ -355,14 +423,8 @@ class ScaleOptions(Options, table="scale"):
     distances: Annotated[Path | None, KeyMeta(role="file", is_common=True)] = None
     """CSV from,to,distance_m[,stddev_m,kind] with taped distances."""
     markers: Annotated[Path | None, KeyMeta(role="file")] = None
-    """CSV marker,image_name,x_px,y_px with the places in photos of the marks between which distances were taped."""
-
-    @model_validator(mode="after")
-    def _markers_are_of_distances(self) -> ScaleOptions:
-        if self.markers is not None and self.distances is None:
-            why = "expected distances beside it: marks are only the ends of taped distances"
-            raise self.refused("markers", f"is '{self.markers}', {why}")
-        return self
+    """CSV marker,image_name,x_px,y_px with the places in photos of the marks between which distances were taped, or
+    whose coordinates are in [points]."""
 
 
 class MarkerOptions(Options, table="markers"):

@@ -804,7 +804,7 @@ def told_of_shared_errors(survey: Survey, noise_m: float) -> RangeErrors:
         log.anchor_index, log.tag_index, each.astype(float), apart, turns, np.ones(len(log)), np.ones(9)
     )
     covariance = noise_m**2 * np.eye(len(log)) + shared_covariance(survey)
-    learned = LearnedErrors(of_all, each, ("all",), np.ones(1), covariance[None])
+    learned = LearnedErrors(("all",), np.ones(1), covariance[None], of_all, each)
     return replace(known_errors(survey.observations, noise_m), learned=learned)
 
 

@@ -46,7 +46,9 @@ def main() -> None:
     args = parser.parse_args()
     sets = json.loads(Path(__file__).with_name("real_logs.json").read_text(encoding="utf-8"))
     start = components({name: (size, OF_WHITE if name == "white" else SPREAD) for name, size in START.items()})
-    likeliest = patch("rangesfm.ranging.errors.learned._Likelihood.mean_stddevs", lambda self, logs: np.exp(logs))
+    likeliest = patch(
+        "rangesfm.ranging.errors.learned.ComponentLikelihood.mean_stddevs", lambda self, logs: np.exp(logs)
+    )
     with patch("rangesfm.ranging.errors.learned.COMPONENTS", start), likeliest:
         for name, described in sets.items():
             found = shown(args.data, described)

@@ -33,7 +33,14 @@ from rangesfm.ceres.adjuster_problem import (
 from rangesfm.ceres.installation_checks import check_compatibility
 
 if TYPE_CHECKING:
-    from rangesfm._cpp import direction_cost, distance_cost, interpolated_range_cost, joint_prior_cost, range_cost
+    from rangesfm._cpp import (
+        direction_cost,
+        distance_cost,
+        interpolated_range_cost,
+        joint_prior_cost,
+        position_cost,
+        range_cost,
+    )
 
 __all__ = [
     "PlacedRanges",
@@ -49,6 +56,7 @@ __all__ = [
     "joint_prior_cost",
     "keep_from_elimination",
     "num_columns",
+    "position_cost",
     "range_cost",
     "solve_adjuster",
     "tangent_jacobian",

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 _SCALE_KEYS = (
     *("images.path", "images.model", "images.times", "images.rig_config", "images.baseline_stddev_m"),
-    *("ranges", "anchors", "tag", "mapper.num_threads", "scale", "markers", "export", "report", "output"),
+    *("ranges", "anchors", "tag", "points", "positions", "mapper.num_threads", "scale", "markers", "export", "report"),
+    "output",
 )
 _DEMO_FOLDER = "rangesfm_demo"
 _NUM_PHOTOS = range(10, 41)  # fewer photos do not make a map, and the package has no more

@@ -72,7 +72,7 @@ class MapPoints:
             image = self._images[name]
             return MapPoint(name, image.projection_center(), self._errors_of_photo(image))
         if name in self.markers:
-            return self._marked(name)
+            return self.find_marker(name)
         if corners := [corner for k in range(NUM_CORNERS) if (corner := f"{name}.{k}") in self.markers]:
             return self._middle(name, corners)
         if name in self.anchors_m:
@@ -98,7 +98,8 @@ class MapPoints:
             by_part[view.sensor] = -world_from_cam @ by_sensor
         return MapPointErrors(by_part, np.zeros((3, 3)))
 
-    def _marked(self, name: str) -> MapPoint:
+    def find_marker(self, name: str) -> MapPoint:
+        """Return the marker of that name; errors as for ``triangulate_marker``."""
         marker = self.markers[name]
         at = triangulate_marker(name, marker, self._images, self.markers_path)
         images = [self._images[photo] for photo in marker.image_names if photo in self._images]
@@ -109,7 +110,7 @@ class MapPoints:
         if len(corners) < NUM_CORNERS:
             known = f"{len(corners)} of {NUM_CORNERS} corners"
             raise InputError(f"tag {name!r} has {known} in the map: give one of them, such as {corners[0]}")
-        found = [self._marked(corner) for corner in corners]
+        found = [self.find_marker(corner) for corner in corners]
         parts = dict.fromkeys(part for corner in found for part in corner.errors.by_part)
         by_part = {
             part: np.sum([of.errors.by_part[part] for of in found if part in of.errors.by_part], axis=0) / NUM_CORNERS

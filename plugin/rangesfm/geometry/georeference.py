@@ -58,6 +58,15 @@ class Georeference:
         """Return the coordinates in ``crs`` (east or longitude first) of points in the map's world, both (n, 3)."""
         return _apply(_geographic_from(self.crs), self.geographic(points), inverse=True)
 
+    def local(self, coordinates: Array, crs: str) -> Array:
+        """Return points in the map's world, given in a coordinate system, both (n, 3).
+
+        Raises:
+            InputError: the coordinate system is unknown, or is not valid at these points.
+        """
+        geographic = _geographic_of(coordinates, crs)
+        return self.enu_from_world.inverse().apply(_apply(self._enu_from_geographic, geographic))
+
     @cached_property
     def _enu_from_geographic(self) -> Transformer:
         pipeline = _ENU.format(lon_deg=self.lon_deg, lat_deg=self.lat_deg, height_m=self.height_m)
@@ -74,12 +83,17 @@ def georeference_at(coordinates: Array, crs: str) -> tuple[Georeference, Array]:
     Raises:
         InputError: the coordinate system is unknown, or is not valid at these points.
     """
-    geographic = _apply(_geographic_from(crs), coordinates)
-    if not _holds_at(crs, geographic[np.isfinite(coordinates).all(axis=1)]):
-        raise InputError(f"coordinates lie outside the area in which {crs} is valid: are they east, north, height?")
+    geographic = _geographic_of(coordinates, crs)
     lon_deg, lat_deg, height_m = np.nanmean(geographic, axis=0).tolist()
     georeference = Georeference(lat_deg, lon_deg, height_m, crs)
     return georeference, _apply(georeference._enu_from_geographic, geographic)
+
+
+def _geographic_of(coordinates: Array, crs: str) -> Array:
+    geographic = _apply(_geographic_from(crs), coordinates)
+    if not _holds_at(crs, geographic[np.isfinite(coordinates).all(axis=1)]):
+        raise InputError(f"coordinates lie outside the area in which {crs} is valid: are they east, north, height?")
+    return geographic
 
 
 def georeference_of_anchor(

@@ -143,7 +143,7 @@ class Reference:
 def is_reference_file(head: str) -> bool:
     """Return whether a file with this beginning is a reference: positions by photo or time, or a TUM trajectory."""
     names = header_names(head)
-    if _are_numbers(names):
+    if is_tum_row(names):
         return abs(float(np.linalg.norm([float(name) for name in names[-4:]])) - 1.0) <= QUATERNION_TOLERANCE
     return any(has_columns(head, [key, *POSITION_COLUMNS]) for key in ("image_name", "timestamp_s"))
 
@@ -160,7 +160,7 @@ def read_reference(path: str | Path) -> Reference:
     """
     path = Path(path)
     names = header_names(read_head(path))
-    if path.suffix == ".tum" or _are_numbers(names):
+    if path.suffix == ".tum" or is_tum_row(names):
         return _from_table(_read_tum(path), "timestamp_s")
     if names and not {"image_name", "timestamp_s"} & set(names):
         found = printable(", ".join(names))
@@ -183,8 +183,8 @@ def write_reference(reference: Reference, path: Path) -> Path:
     return path
 
 
-def _are_numbers(cells: list[str]) -> bool:
-    """Return whether the first row holds a TUM pose rather than names."""
+def is_tum_row(cells: Sequence[str]) -> bool:
+    """Return whether a row holds a TUM pose rather than names."""
     try:
         return len([float(cell) for cell in cells]) == 1 + len(POSITION_COLUMNS) + len(QUATERNION_COLUMNS)
     except ValueError:

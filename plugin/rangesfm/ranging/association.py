@@ -89,11 +89,11 @@ def associate(
         lever[placed] = np.einsum("nij,nj->ni", trajectory.world_from_cam[b], tags_in_cam_m[placed])
     else:
         is_bridged = ~is_too_long(np.diff(trajectory.timestamps_s), options)
-        lever[placed], arm_stddev_m[placed] = _interpolated_lever_arms(
+        lever[placed], arm_stddev_m[placed] = interpolated_lever_arms(
             trajectory, tags_in_cam_m[placed], b, w, is_bridged
         )
-        offsets[placed], stddev[placed] = _interpolated_centers(trajectory, b, w, is_bridged)
-        stddev[placed] = np.hypot(stddev[placed], _timing_stddev(log, trajectory, b, a, w, options))
+        offsets[placed], stddev[placed] = interpolated_centers(trajectory, b, w, is_bridged)
+        stddev[placed] = np.hypot(stddev[placed], timing_stddev(log.time_resolution_s, trajectory, b, a, w, options))
     linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
     centers[placed] = linear + offsets[placed]
     return RangeObservations(log, status, before, after, fraction, centers, offsets, lever, stddev, arm_stddev_m)
@@ -235,7 +235,7 @@ def _deviations(values: Array) -> Array:
     return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
 
 
-def _interpolated_centers(
+def interpolated_centers(
     trajectory: Trajectory, before: Indices, fraction: Array, is_bridged: Mask
 ) -> tuple[Array, Array]:
     """Return the offsets (n, 3) of the centres from the straight lines between keyframes, in model units.
@@ -250,7 +250,7 @@ def _interpolated_centers(
     return offsets, stddev
 
 
-def _interpolated_lever_arms(
+def interpolated_lever_arms(
     trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, fraction: Array, is_bridged: Mask
 ) -> tuple[Array, Array]:
     """Return the lever arms (n, 3) in the world, and the standard deviation (n,) of each coordinate, metres.
@@ -274,15 +274,20 @@ def _interpolated_lever_arms(
     return np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms), stddev_m
 
 
-def _timing_stddev(
-    log: RangeLog, trajectory: Trajectory, before: Indices, after: Indices, fraction: Array, options: AssociationOptions
+def timing_stddev(
+    log_resolution_s: float,
+    trajectory: Trajectory,
+    before: Indices,
+    after: Indices,
+    fraction: Array,
+    options: AssociationOptions,
 ) -> Array:
     """Return the standard deviation (n,) of each coordinate due to rounded times of photos and ranges, in model units.
 
     Uniform rounding to a step has the standard deviation step / sqrt(12). It is independent for each time.
     """
     times, centers = trajectory.timestamps_s, trajectory.centers
-    log_stddev_s, photo_stddev_s = (each.time_resolution_s / np.sqrt(12) for each in (log, trajectory))
+    log_stddev_s, photo_stddev_s = log_resolution_s / np.sqrt(12), trajectory.time_resolution_s / np.sqrt(12)
     if times is None or len(times) < 2 or not log_stddev_s + photo_stddev_s > 0:
         return np.zeros(len(before))
     gaps = np.diff(times)

@@ -10,8 +10,13 @@ import pycolmap
 
 from rangesfm import ceres
 from rangesfm.arrays import Array
-from rangesfm.distances.locate_lengths import LocatedDistances, images_by_name, triangulate_markers
-from rangesfm.distances.tape import Tape
+from rangesfm.distances.locate_lengths import (
+    LocatedDistances,
+    images_by_name,
+    triangulate_marker,
+    triangulate_markers,
+)
+from rangesfm.distances.tape import Marker, Tape
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
@@ -33,24 +38,33 @@ class MeasuredDistances:
     marker_ids: Mapping[str, int]
 
 
-def add_marker_points(model: pycolmap.Reconstruction, tape: Tape) -> dict[str, int]:
-    """Add each marker to the model as a 3-D point, with its marks as features; return the points' ids by name.
+def add_marker_points(
+    model: pycolmap.Reconstruction, tape: Tape, more: Mapping[str, Marker] | None = None
+) -> dict[str, int]:
+    """Add markers to the model as 3-D points, with their marks as features; return the points' ids by name.
+
+    Args:
+        tape: whose ends are added. more: further markers to add, by name.
 
     Raises:
         InputError: as in ``locate_distances``.
     """
-    places, images = triangulate_markers(tape, model), images_by_name(model)
+    places, images, markers = triangulate_markers(tape, model), images_by_name(model), {**tape.markers, **(more or {})}
+    places |= {
+        name: triangulate_marker(name, marker, images, tape.markers_path)
+        for name, marker in (more or {}).items()
+        if name not in places
+    }
     ids = {}
-    for name, marker in tape.markers.items():
-        if name not in places:
-            continue
+    for name, place in places.items():
+        marker = markers[name]
         track = pycolmap.Track()
         for image_name, pixel in zip(marker.image_names, marker.pixels, strict=True):
             if image_name in images:
                 image = images[image_name]
                 image.points2D.append(pycolmap.Point2D(pixel))
                 track.add_element(image.image_id, len(image.points2D) - 1)
-        ids[name] = int(model.add_point3D(places[name], track, np.zeros(3, dtype=np.uint8)))
+        ids[name] = int(model.add_point3D(place, track, np.zeros(3, dtype=np.uint8)))
     return ids
 
 

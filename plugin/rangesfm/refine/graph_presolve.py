@@ -120,7 +120,7 @@ def _graph(
         range_m=ranges.observations.log.range_m[ranges.rows],
         errors=errors,
         anchors=anchors,
-        held_frame=0 if problem.first_pose_is_fixed else None,
+        held_frame=problem.held_frame,
         gravity=problem.gravity,
     )
 
@@ -130,7 +130,7 @@ def _move(
 ) -> None:
     """Move the model: as a whole, which photos do not notice, or keyframe by keyframe if it bends."""
     metric, before = problem.metric, vision.origin
-    whole = _as_a_whole(before, after, 0 if problem.first_pose_is_fixed else None)
+    whole = _as_a_whole(before, after, problem.held_frame)
     if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(errors.stddev_m)):
         carry_model(metric, problem.frame_ids, rays, before, after, local_scales(vision, after))
         return

@@ -53,12 +53,15 @@ class PhotoBending:
     is_at_optimum: bool
 
     def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
-        functions = without_similarity(averaged(bins, by_pose, len(self.path)), self.path, frame_is_free=frame_is_free)
-        parts = functions.reshape(len(bins), -1, 6)
+        return self.of_functions(averaged(bins, by_pose, len(self.path)), frame_is_free=frame_is_free)
+
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+        functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)
+        parts = functions.reshape(len(by_pose), -1, 6)
         by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
         covariance, shift_m = self.photos.of_functions(self.frame_ids, parts[:, :, :3], by_center)
         found = component_of("bending", covariance, _FACTOR, _SPREAD)
-        shift_m = np.zeros(len(bins)) if self.is_at_optimum else shift_m
+        shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else shift_m
         return BendingOfBins(() if found is None else (found,), covariance, shift_m)
 
 

@@ -19,6 +19,7 @@ from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.refine.distances import MeasuredDistances, add_distances
+from rangesfm.refine.positions import HeldPositions, add_positions
 from rangesfm.refine.radio import (
     AddedRadio,
     RadioEstimate,
@@ -38,7 +39,7 @@ class RefinementProblem:
     Attributes:
         metric: the model.
         ranges: those that take part. radio: anchors and tags as given, the means of their priors.
-        distances: measured ones, which are fitted too.
+        distances: measured ones, which are fitted too. positions: known ones, too.
         first_pose_is_fixed: the gauge.
         gravity: the upward direction in the first camera; None if unknown, or if that camera's pose is fixed.
         left_out_ids: 3-D points that do not take part.
@@ -48,6 +49,7 @@ class RefinementProblem:
     ranges: RadioRanges
     radio: RadioEstimate
     distances: MeasuredDistances
+    positions: HeldPositions
     camera: CameraOptions
     options: RefineOptions
     first_pose_is_fixed: bool
@@ -60,6 +62,12 @@ class RefinementProblem:
         """Ids of the frames of the trajectory, then of those without a time."""
         timed = self.ranges.trajectory.frame_ids
         return np.concatenate([timed, np.setdiff1d(np.array(self.metric.reg_frame_ids(), dtype=np.int64), timed)])
+
+    @property
+    def held_frame(self) -> int | None:
+        """Index of the frame that is held while only ranges place the map; None where surveyed anchors do."""
+        is_placed = any(np.isfinite(anchor.prior_position_stddev_m) for anchor in self.radio.anchors)
+        return 0 if self.first_pose_is_fixed or not is_placed else None
 
     @property
     def first_frame_id(self) -> int:
@@ -82,6 +90,13 @@ class RefinementProblem:
         blocks = radio_blocks(radio, self.metric, self.ranges.trajectory, self.options)
         rows = add_range_residuals(bundle, self.ranges, errors, blocks)
         others = add_distances(bundle, self.distances, radio.anchors, blocks.anchors, errors)
+        others += add_positions(
+            bundle,
+            self.positions,
+            self.distances.marker_ids,
+            lever_arm_stddev_m=self.options.lever_arm_stddev_m,
+            loss_scale=self.options.range_loss_scale,
+        )
         add_radio_priors(bundle, radio, self.radio.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
         add_calibration(bundle, self.camera)
         if self.gravity is not None:  # measured upward direction in the first camera; its stddev is scaled to pixels

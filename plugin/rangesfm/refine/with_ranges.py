@@ -30,6 +30,7 @@ from rangesfm.ranging.range_observations import RangeObservations, status_by_wei
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, SolverRun, solve_bundle_adjustment, solve_until_still
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
 from rangesfm.refine.graph_presolve import SAME_ERRORS, Presolved, presolve, presolve_again
+from rangesfm.refine.positions import HeldPositions
 from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
 from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import (
@@ -73,6 +74,8 @@ class RefineSummary:
         covariance: of poses, anchors and scale; None if not asked for, if the model is too large, or if ranges and
             photos leave something undetermined.
         bending_factor: learnt bending over the bending that the photos' residuals suggest; 1 if unknown.
+        antenna_in_cam_m: (3,) lever arm of the antenna whose positions are known; None without any.
+        position_time_shift_s: how much later than assumed its positions were taken; None if not estimated.
         observations: with status by the final weight of each range.
         predicted_m: (n,) ranges predicted by the refined model; NaN without a place.
         weights: (n,) robust weights in [0, 1]; NaN without a place.
@@ -96,6 +99,8 @@ class RefineSummary:
     short_range_error_m: float | None
     covariance: JointCovariance | None
     bending_factor: float
+    antenna_in_cam_m: Array | None
+    position_time_shift_s: float | None
     observations: RangeObservations
     predicted_m: Array
     weights: Array
@@ -170,6 +175,7 @@ def refine_with_ranges(
     camera: CameraOptions | None = None,
     options: RefineOptions | None = None,
     tape: Tape | None = None,
+    positions: HeldPositions | None = None,
     learn: Learn | None = None,
     closing: LoopClosing | None = None,
     num_threads: int = -1,
@@ -191,6 +197,7 @@ def refine_with_ranges(
             frame.
         gravity: the upward direction in the first camera; used if its pose is not fixed.
         tape: taped distances, of which the control ones are fitted; ranges between anchors in the log are fitted too.
+        positions: known positions in the metric world, which are fitted; None without any.
         learn: estimates the ranges' errors at the refined map, for its covariance; None: those in ``errors`` are used.
         closing: loops to be closed before; None without any.
 
@@ -206,13 +213,14 @@ def refine_with_ranges(
     if options.time_offset_stddev_s and trajectory.timestamps_s is None:
         raise InputError("[refine] time_offset_stddev_s needs a log with times, this one names photos")
     metric = pycolmap.Reconstruction(reconstruction)
-    tape = (tape or Tape()).control()
+    tape, positions = (tape or Tape()).control(), positions or HeldPositions()
     ranges, radio = radio_as_given(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors)
     problem = RefinementProblem(
         metric,
         ranges,
         radio,
         MeasuredDistances(_between_anchors(observations, anchors, errors), tape, {}),
+        positions,
         camera or CameraOptions(),
         options,
         first_pose_is_fixed,
@@ -223,7 +231,7 @@ def refine_with_ranges(
         to_begin_with = _errors_to_begin_with(problem, errors, metric_from_sfm.scale)
         if closing is not None:
             problem = _with_closed_loops(problem, to_begin_with, closing)
-        marker_ids = add_marker_points(metric, tape)
+        marker_ids = add_marker_points(metric, tape, positions.markers)
         problem = replace(problem, distances=replace(problem.distances, marker_ids=marker_ids))
         summary = _refine(problem, to_begin_with, learn)
     remove_marker_points(metric, marker_ids)
@@ -344,8 +352,8 @@ def _at_rest(problem: RefinementProblem, radio: RadioEstimate, errors: RangeErro
 
 
 def _tolerance_m(problem: RefinementProblem, errors: RangeErrors) -> float:
-    of_lengths = [taped.stddev_m for taped in problem.distances.tape.distances]
-    return _MAX_LAST_MOVEMENT * float(np.min(errors.stddev_m if len(errors.stddev_m) else of_lengths))
+    of_others = [*(taped.stddev_m for taped in problem.distances.tape.distances), *problem.positions.stddevs_m]
+    return _MAX_LAST_MOVEMENT * float(np.min(errors.stddev_m if len(errors.stddev_m) else of_others))
 
 
 def _covariance(
@@ -394,7 +402,7 @@ def _summary(
     weights[rows] = errors.robust_weights(residuals_m[rows])
     status[rows] = status_by_weight(weights[rows])
     times = observations.before + observations.fraction if log.timestamp_s is None else log.timestamp_s
-    last = done.solutions[-1]
+    last, antenna = done.solutions[-1], problem.positions.antenna
     return RefineSummary(
         num_iterations=sum(solution.num_iterations for solution in done.solutions),
         num_graph_steps=start.num_steps,
@@ -414,6 +422,8 @@ def _summary(
         short_range_error_m=radio.short_range_error_m if options.short_range_stddev_m else None,
         covariance=covariance,
         bending_factor=bending_factor,
+        antenna_in_cam_m=None if antenna is None else antenna.antenna_in_cam_m[1],
+        position_time_shift_s=float(antenna.time_shift_s[0]) if antenna and antenna.time_shift_stddev_s else None,
         observations=replace(observations, status=status),
         predicted_m=residuals_m + log.range_m,
         weights=weights,

@@ -63,6 +63,7 @@ _SECTIONS: dict[tuple[str, str], tuple[_Maker, ...]] = {
         *(report_tables.range_statuses, report_tables.ranges_per_anchor),
     ),
     ("anchors", "Anchors and measured lengths"): (report_tables.anchors, report_tables.distances),
+    ("points", "Known points and positions"): (report_tables.control_points, report_tables.positions_used),
 }
 _APPENDIX: dict[tuple[str, str], tuple[_Maker, ...]] = {
     ("mistakes", "Mistakes that were tested for and not found"): (

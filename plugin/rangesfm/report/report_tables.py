@@ -45,6 +45,19 @@ _REFINEMENT = {
     "short_range_error_m": "error of short ranges, m",
 }
 
+_POSITIONS = {
+    "num": "in the file",
+    "num_used": "used",
+    "num_rejected": "on the path that do not fit",
+    "rms_m": "RMS residual, m",
+    "rms_by_axis_m": "by coordinate, m",
+    "stddev_m": "learnt stddev of a coordinate, m",
+    "inflation": "factor on the stddev of a mean, for errors that last",
+    "time_offset_s": "time offset, s",
+    "time_offset_stddev_s": "its stddev by the search, s",
+    "antenna_in_cam_m": "lever arm, m",
+}
+
 
 @dataclass(frozen=True)
 class ReportTable:
@@ -253,6 +266,36 @@ def distances(content: Content) -> ReportTable:
     ]
     header = ["distance", "kind", "by tape m", "± m (95 %)", "in the map m", "difference m"]
     return ReportTable("Control and check distances", header, rows)
+
+
+def positions_used(content: Content) -> ReportTable:
+    """Return the table of the positions of an antenna: how many are used, and how they fit."""
+    given = content.summary.positions
+    values = {} if given is None else given.to_json()
+    rows = [
+        [_POSITIONS[name], keyed(f"positions.{name}", value, plain(value))]
+        for name, value in values.items()
+        if value is not None
+    ]
+    return ReportTable("Positions of the antenna", [], rows, is_narrow=True)
+
+
+def control_points(content: Content) -> ReportTable:
+    """Return the table of control and check points: known and found coordinates, and the root mean square of both."""
+    given, rows = content.summary.points, []
+    for i, row in enumerate(() if given is None else given.points):
+        off = row.residual_m or (None,) * 3
+        known = [keyed(f"points.points.{i}.known_m.{axis}", x, fixed(x, 3)) for axis, x in enumerate(row.known_m)]
+        cells = _cells(f"points.points.{i}", row, {"stddev_m": partial(fixed, decimals=3)})
+        rows.append([row.marker, row.kind, *known, *cells, *(signed(x, 3) for x in off), fixed(row.distance_m, 3)])
+    for kind in ("control", "check") if given is not None else ():
+        errors = getattr(given, kind)
+        if errors.rmse_m is not None:
+            axes = [fixed(x, 3) for x in errors.rmse_m]
+            rows.append([f"RMSE of {errors.num}", kind, "", "", "", "", *axes, fixed(errors.rmse_3d_m, 3)])
+    header = ["point", "kind", "x m", "y m", "z m", "stddev m", "Δx m", "Δy m", "Δz m", "distance m"]
+    note = "Δ: in the map minus known. Control points hold the map; check points take no part in it."
+    return ReportTable("Control and check points", header, rows, note)
 
 
 def intrinsics(content: Content) -> ReportTable:

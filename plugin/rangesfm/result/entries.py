@@ -379,6 +379,53 @@ class RefineEntry(Record):
         return cls.model_validate({**vars(summary), **others})
 
 
+class PositionsEntry(Record):
+    """Positions of an antenna on the camera, and their residuals in the final map.
+
+    Attributes:
+        num: in the file. num_used: that fit. num_rejected: on the path, that do not fit; the others are not on it.
+        rms_m: length of the residuals of those used. rms_by_axis_m: of each coordinate.
+        stddev_m: learnt standard deviation of a coordinate.
+        inflation: of the standard deviation of a mean, by errors that last.
+        time_offset_s: image time = time of the position + this; null where the file names photos.
+        antenna_in_cam_m: lever arm, as given or estimated.
+    """
+
+    num: Count
+    num_used: Count
+    num_rejected: Count
+    rms_m: NumberOrNull
+    rms_by_axis_m: VectorOrNull
+    stddev_m: NumberOrNull
+    inflation: NumberOrNull
+    time_offset_s: NumberOrNull
+    time_offset_stddev_s: NumberOrNull
+    antenna_in_cam_m: Vector
+
+    @classmethod
+    def of(cls, found: MetricResult) -> PositionsEntry | None:
+        track, scale = found.positions.antenna, found.by_positions
+        if track is None or scale is None:
+            return None
+        mine, used = ~scale.known.is_mark, ~scale.known.is_mark & scale.is_used
+        off_m = scale.known.misclosures_m(scale.site_from_model)[used]
+        summary = found.kept_refinement
+        shift_s = (summary and summary.position_time_shift_s) or 0.0
+        refined_m = None if summary is None else summary.antenna_in_cam_m
+        return cls(
+            num=len(track.log),
+            num_used=int(used.sum()),
+            num_rejected=int((mine & ~used).sum()),
+            rms_m=rms(np.linalg.norm(off_m, axis=1)),
+            rms_by_axis_m=(rms(off_m[:, 0]), rms(off_m[:, 1]), rms(off_m[:, 2])) if len(off_m) else None,
+            stddev_m=median(scale.stddev_m[used]),
+            inflation=scale.inflation,
+            time_offset_s=None if track.log.timestamp_s is None else (track.offset_s or 0.0) + shift_s,
+            time_offset_stddev_s=None if track.log.timestamp_s is None else track.offset_stddev_s,
+            antenna_in_cam_m=(track.antenna_in_cam_m if refined_m is None else refined_m).tolist(),
+        )
+
+
 class MistakeEntry(Record):
     """A mistake that may have been made, and what the ranges say about it; see MistakeTest."""
 

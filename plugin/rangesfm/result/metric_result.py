@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -21,11 +21,13 @@ from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.join_models import ModelVerdict
 from rangesfm.loops.loop_closure import LoopClosure
+from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.clock.time_offset import TimeOffset
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.at_map import MapWithRanges
+from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.scale.scale_diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
@@ -66,6 +68,8 @@ class MetricResult:
         models: all models that were to be joined to this one; empty where there was only one.
         diagnosis: result of the tests of mistakes on the final map.
         tape: the measured lengths, with those left out that cannot be in the map; None without any.
+        positions: the known positions, with those left out that contradict the others.
+        positions_at_refined: what they say of the refined map; None without a refinement, or with ranges.
         rivals: other likely time offsets; None without any.
         on_map: the ranges on the scaled map; None where that map is only the start of a refinement, or without ranges.
         refined_with_ranges: the refined map with the ranges on it; None without one.
@@ -86,6 +90,8 @@ class MetricResult:
     models: tuple[ModelVerdict, ...] = ()
     diagnosis: Diagnosis | None = None
     tape: Tape | None = None
+    positions: SurveyedPositions = field(default_factory=SurveyedPositions)
+    positions_at_refined: PositionScale | None = None
     rivals: Rivals | None = None
     on_map: RangesOnMap | None = None
     refined_with_ranges: MapWithRanges | None = None
@@ -100,6 +106,11 @@ class MetricResult:
     def kept_refinement(self) -> RefineSummary | None:
         """Return the summary of the refinement; None where the final model is the scaled one."""
         return None if self.why_broken else self.refinement
+
+    @property
+    def by_positions(self) -> PositionScale | None:
+        """Return what the known positions say of the final map; None if they do not determine its place."""
+        return (self.kept_refinement and self.positions_at_refined) or self.estimate.positions
 
     @property
     def _stage(self) -> ScaleEstimate | RefineSummary:
@@ -182,6 +193,7 @@ class MetricResult:
             estimate=estimate,
             scaled=rescale(self.scaled, shift),
             refined=None if self.refined is None else rescale(self.refined, shift),
+            positions=self.positions.moved(offset_m),
             refinement=refinement,
             loops=self.loops and self.loops.moved(offset_m),
         )

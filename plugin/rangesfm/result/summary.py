@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal
 from rangesfm.distances.tape import CONTROL, DistanceRow
 from rangesfm.errors import number_text
 from rangesfm.files.records import NumberOrNull, Record, Text
+from rangesfm.positions.surveyed_positions import PointsEntry
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.result import entries
 from rangesfm.result.metric_result import MetricResult
@@ -38,6 +39,8 @@ class ResultSummary(Record):
         models: all models that were to be joined to this one; empty where there was only one.
         tests: of mistakes that may have been made; those that were found come first.
         reliability: of the scale with one unfound mistake; null where no mistakes were tested.
+        positions: of an antenna; null without any.
+        points: control and check points; null without any, or where the frame is that of the first camera.
         distances: lengths that were taped, or are known between cameras of a rig.
         comparison: empty without a reference.
         georeference: null if the anchors do not give one.
@@ -63,6 +66,8 @@ class ResultSummary(Record):
     tests: tuple[entries.MistakeEntry, ...] = ()
     reliability: entries.ReliabilityEntry | None = None
     distances: tuple[DistanceRow, ...]
+    positions: entries.PositionsEntry | None = None
+    points: PointsEntry | None = None
     comparison: tuple[entries.ComparisonRow, ...] = ()
     georeference: entries.GeoreferenceEntry | None
     versions: dict[Text, Text]
@@ -78,8 +83,8 @@ class ResultSummary(Record):
 
     @property
     def has_ranges(self) -> bool:
-        """Return whether ranges were used; otherwise the scale comes from measured lengths alone."""
-        return self.scale.method != "lengths"
+        """Return whether there are ranges; otherwise the scale comes from measured lengths or known positions alone."""
+        return self.ranges.num > 0
 
     @classmethod
     def of(cls, found: MetricResult, **others: Any) -> ResultSummary:
@@ -102,6 +107,7 @@ class ResultSummary(Record):
             check_ranges=entries.CheckRangesEntry.of(found),
             refine=entries.RefineEntry.of(found),
             loops=entries.LoopsEntry.of(found),
+            positions=entries.PositionsEntry.of(found),
             tests=tuple(map(entries.MistakeEntry.model_validate, found.diagnosis.tests if found.diagnosis else ())),
             reliability=entries.ReliabilityEntry.of(found),
             models=tuple(entries.ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
@@ -143,6 +149,11 @@ class ResultSummary(Record):
             held = [abs(row.residual_m) for row in self.distances if row.kind == CONTROL and row.residual_m is not None]
             worst = f"; the map differs from these by {max(held):.3f} m at most" if held else ""
             yield f"measured lengths: {len(held)} of {len(self.distances)} used for the scale{worst}"
+        if self.positions is not None:
+            num, rms = f"{self.positions.num_used} of {self.positions.num}", _text(self.positions.rms_m, ".3f")
+            yield f"positions: {num} used, rms {rms} m, {_text(self.positions.time_offset_s, '+.3f')} s time offset"
+        if self.points is not None:
+            yield from self.points.lines()
         if offset.estimated:
             value, within = _text(offset.value_s, "+.3f"), _text(_within_95(offset.stddev_s), ".3f")
             yield f"time offset: image time = range time {value} s, within {within} s (95 %)"

@@ -17,10 +17,12 @@ from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
+from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
+from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from
-from rangesfm.scale.scale_verdict import judge
+from rangesfm.scale.scale_verdict import judge, judge_positions
 from rangesfm.scale.solution import Solution, weighted
 from rangesfm.scale.uncertainty import KnownMap, bending_of_bins, known_refined_map, learned_errors
 
@@ -57,6 +59,7 @@ class MapWithRanges:
         biases_m: Array,
         errors: RangeErrors,
         bending: MapBending,
+        placement: PlacementPrior | None = None,
     ) -> MapWithRanges:
         """Transfer the ranges of a scale estimate to another map.
 
@@ -65,6 +68,7 @@ class MapWithRanges:
             scale: of the other map, metres per unit of the unscaled model.
             tags_m, centers_m: (k, 3) positions of tag and camera at each of the k ranges.
             anchors_m: (m, 3). biases_m: (m,). errors: of the k ranges, as weighted.
+            placement: what known positions say of the other map's first camera; None without any.
         """
         assert start.problem is not None, "a map with ranges"
         trajectory = trajectory_m.transformed(1 / scale, np.eye(3), np.zeros(3))
@@ -74,6 +78,7 @@ class MapWithRanges:
             start.problem.ranges,
             centers=placed.inverse().apply(centers_m),
             tag_from_center=(tags_m - centers_m) @ placed.rotation,
+            placement=placement,
         )
         posed = replace(start.problem, ranges=problem, first_camera_from_sfm=from_map)
         state = RangeState(placed, anchors_m, biases_m)
@@ -139,6 +144,29 @@ def estimate_at(
         placement=placement,
         errors=replace(start.errors, learned=learned.spread(on_map.posed.rows, len(start.observations.log))),
         noise_stddev_m=on_map.solution.noise_stddev_m,
+    )
+
+
+def estimate_by_positions_at(
+    positions: PositionScale, value: float | None, start: ScaleEstimate, options: ScaleOptions
+) -> ScaleEstimate:
+    """Return the scale estimate of a map that was refined with known positions alone, judged at that map.
+
+    Args:
+        positions: at the refined map. value: its scale. start: the estimate before the refinement.
+
+    Raises:
+        GeometryError: as for ``estimate_at``.
+    """
+    judged = judge_positions(positions, positions.uncertainty, options)
+    return replace(
+        start,
+        refined_value=value,
+        uncertainty=positions.uncertainty,
+        verdict=judged.verdict,
+        reasons=(*judged.reasons, *start.remarks),
+        advice=judged.advice,
+        placement=positions.covariance,
     )
 
 

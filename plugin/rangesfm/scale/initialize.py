@@ -14,6 +14,7 @@ from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.processes.threads import both, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
@@ -23,9 +24,10 @@ from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, 
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
+from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.scale.scale_estimate import ScaleByKind, ScaleEstimate, ScaleSensitivity, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from, scale_problem
-from rangesfm.scale.scale_verdict import judge, judge_lengths, levelled_places
+from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, levelled_places
 from rangesfm.scale.sensitivity import cutoff_test, scale_sensitivity
 from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
@@ -42,10 +44,12 @@ def initialize_scale(
     options: ScaleOptions | None = None,
     range_model: RangeModelOptions | None = None,
     distances: LocatedDistances | None = None,
+    positions: KnownPositions | None = None,
+    lasting_s: Sequence[float] = LASTING_S,
     bending: MapBending | None = None,
     seed: int = 0,
 ) -> ScaleEstimate:
-    """Estimate scale and frame of an unscaled path from ranges, measured lengths, or both.
+    """Estimate scale and frame of an unscaled path from ranges, measured lengths, known positions, or several of them.
 
     Args:
         observations: ranges on ``trajectory``; may be empty if there are measured lengths.
@@ -55,6 +59,8 @@ def initialize_scale(
             first keyframe's camera frame, metres) or "unknown" (positions are ignored; the map stays in the first
             camera's frame).
         distances: measured ones, located in the model of ``trajectory``; those that are only checks are not used.
+        positions: known in the site and located in the model of ``trajectory``.
+        lasting_s: for how long errors of an antenna's positions last.
         bending: how the map is bent; None: it drifts as a map of poses does.
 
     Raises:
@@ -63,14 +69,29 @@ def initialize_scale(
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     lengths = scale_by_lengths(distances, trajectory.centers)
+    bending = bending or WalkBending(in_first_camera(trajectory))
+    by_positions, remarks = None, tuple[str, ...]()
+    try:
+        if positions is not None:
+            by_positions = scale_by_positions(positions, trajectory, bending, lasting_s=lasting_s)
+    except GeometryError as error:
+        if not len(observations.log) and lengths is None:
+            raise GeometryError(f"the scale is not determined: {error}") from None
+        remarks = (f"the known positions are not used: {error}",)
     if not len(observations.log):
+        if by_positions is not None:
+            return _by_positions_alone(
+                by_positions, lengths, observations, trajectory, bending, lasting_s, range_model, options
+            )
         if lengths is None:
             raise GeometryError("the scale is not determined: no measured length has both its ends in the map")
-        return _by_lengths_alone(lengths, observations, trajectory, range_model, options)
+        alone = _by_lengths_alone(lengths, observations, trajectory, range_model, options)
+        return replace(alone, reasons=(*alone.reasons, *remarks), remarks=remarks)
     if lengths is not None and distances is not None:
         distances = lengths.beside_ranges(distances)
     gravity = gravity_of(options.up_in_first_camera)
-    given = (observations, trajectory, anchors, anchor_frame, range_model, distances, gravity)
+    placement = None if by_positions is None else by_positions.prior(trajectory, first_camera_from(trajectory))
+    given = (observations, trajectory, anchors, anchor_frame, range_model, distances, gravity, placement)
     problem, open_place = scale_problem(*given), tuple[str, ...]()
     try:
         solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
@@ -80,7 +101,6 @@ def initialize_scale(
         solution = solution_from(problem, error.in_first_camera)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
-    bending = bending or WalkBending(in_first_camera(trajectory))
     learned, (per_anchor, tests) = both(
         lambda: learned_errors(
             problem, solution, observations, rotations, camera_velocities(observations, trajectory, problem), bending
@@ -93,7 +113,7 @@ def initialize_scale(
     covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
-    verdict, remarks = judged.verdict, open_place
+    verdict, remarks = judged.verdict, (*open_place, *remarks)
     if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
         remarks = (*remarks, *levelled_places(gravity, anchors, found))
     reasons = (*judged.reasons, *remarks)
@@ -125,7 +145,8 @@ def initialize_scale(
         placement=placement_covariance(solution, covariance),
         remarks=remarks,
         lengths=lengths,
-        by_kind={} if lengths is None else {"ranges": _by_ranges(problem, solution, learned), **_by_lengths(lengths)},
+        positions=by_positions,
+        by_kind=_by_kinds(problem, solution, learned, lengths, by_positions),
     )
 
 
@@ -139,15 +160,28 @@ def _by_lengths_alone(
     """Return the estimate in the first camera's frame from measured lengths; everything about ranges stays empty."""
     uncertainty = ScaleUncertainty(lengths.relative_stddev, lengths.components)
     judged = judge_lengths(lengths, uncertainty, options)
-    first_camera_from_sfm = first_camera_from(trajectory)
-    return ScaleEstimate(
-        metric_from_sfm=replace(IDENTITY, scale=lengths.value) @ first_camera_from_sfm,
-        frame="first_camera",
-        method="lengths",
+    return replace(
+        _without_ranges(observations, range_model),
+        metric_from_sfm=replace(IDENTITY, scale=lengths.value) @ first_camera_from(trajectory),
         uncertainty=uncertainty,
         verdict=judged.verdict,
         reasons=judged.reasons,
         advice=judged.advice,
+        lengths=lengths,
+        by_kind=_by_lengths(lengths),
+    )
+
+
+def _without_ranges(observations: RangeObservations, range_model: RangeModelOptions) -> ScaleEstimate:
+    """Return an estimate about whose ranges nothing is known, as there are none; the rest is to be filled in."""
+    return ScaleEstimate(
+        metric_from_sfm=IDENTITY,
+        frame="first_camera",
+        method="lengths",
+        uncertainty=ScaleUncertainty(np.inf, {}),
+        verdict="doubtful",
+        reasons=(),
+        advice=(),
         cutoff_test=(),
         sensitivity=ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0)),
         per_anchor={},
@@ -156,8 +190,42 @@ def _by_lengths_alone(
         observations=observations,
         errors=RangeErrors.begin(observations, observations.placed_rows, range_model),
         noise_stddev_m=np.nan,
+    )
+
+
+def _by_positions_alone(
+    alone: PositionScale,
+    lengths: LengthScale | None,
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    bending: MapBending,
+    lasting_s: Sequence[float],
+    range_model: RangeModelOptions,
+    options: ScaleOptions,
+) -> ScaleEstimate:
+    """Return the estimate in the site's frame from known positions and measured lengths; nothing is said of ranges.
+
+    Args:
+        alone: what the positions say without the lengths.
+    """
+    found, by_kind = alone, dict[str, ScaleByKind]()
+    if lengths is not None:
+        found = scale_by_positions(alone.known, trajectory, bending, lengths=lengths, lasting_s=lasting_s)
+        by_kind = {**_by_positions(alone), **_by_lengths(lengths)}
+    judged = judge_positions(found, found.uncertainty, options)
+    return replace(
+        _without_ranges(observations, range_model),
+        metric_from_sfm=found.site_from_model,
+        frame="site",
+        method="positions",
+        uncertainty=found.uncertainty,
+        verdict=judged.verdict,
+        reasons=judged.reasons,
+        advice=judged.advice,
+        placement=found.covariance,
+        positions=found,
         lengths=lengths,
-        by_kind=_by_lengths(lengths),
+        by_kind=by_kind,
     )
 
 
@@ -176,18 +244,40 @@ def _by_lengths(lengths: LengthScale) -> dict[str, ScaleByKind]:
     return {"lengths": ScaleByKind(lengths.value, lengths.value * lengths.relative_stddev)}
 
 
+def _by_positions(positions: PositionScale) -> dict[str, ScaleByKind]:
+    return {"positions": ScaleByKind(positions.value, positions.value * positions.uncertainty.empirical)}
+
+
+def _by_kinds(
+    problem: ScaleProblem,
+    solution: Solution,
+    learned: LearnedErrors,
+    lengths: LengthScale | None,
+    positions: PositionScale | None,
+) -> dict[str, ScaleByKind]:
+    """Return the scale by each kind of measurement alone; empty where there are only ranges."""
+    others = {
+        **({} if lengths is None else _by_lengths(lengths)),
+        **({} if positions is None else _by_positions(positions)),
+    }
+    return {"ranges": _by_ranges(problem, solution, learned), **others} if others else {}
+
+
 def _by_ranges(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleByKind:
-    """Estimate the scale again without lengths between points, starting from the solution."""
-    posed = replace(posed, ranges=_without_lengths(posed.ranges))
-    problem = _without_lengths(solution.problem)
+    """Estimate the scale again without lengths between points and known positions, starting from the solution."""
+    posed = replace(posed, ranges=_ranges_alone(posed.ranges))
+    problem = _ranges_alone(solution.problem)
     alone = replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
     value = alone.fit.state.metric_from_model.scale
     return ScaleByKind(value, value * known_map(posed, alone, learned).uncertainty.empirical)
 
 
-def _without_lengths(problem: RangeProblem) -> RangeProblem:
-    distances = problem.distances
-    return problem if distances is None else replace(problem, distances=distances.subset(~distances.is_between_points))
+def _ranges_alone(problem: RangeProblem) -> RangeProblem:
+    distances = None if problem.distances is None else problem.distances.subset(~problem.distances.is_between_points)
+    if problem.placement is None:
+        return replace(problem, distances=distances)
+    is_placed = bool(np.isfinite(problem.anchor_stddev_m).any())
+    return replace(problem, distances=distances, placement=None, frame_is_free=is_placed)
 
 
 def placement_covariance(solution: Solution, covariance: Array) -> Array | None:

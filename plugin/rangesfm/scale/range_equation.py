@@ -27,6 +27,7 @@ from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.scale_by_lengths import distance_jacobian, distance_residuals
 
 
@@ -46,6 +47,7 @@ class RangeProblem:
         common_bias_stddev_m: prior of the bias that all free biases share, such as the tag's own delay.
         frame_is_free: whether rotation and translation are estimated; otherwise they stay as started.
         gravity: the upward direction, if given and the frame is free; None otherwise.
+        placement: what known positions say of the frame, if it is free; None without any.
         distances: measured ones to fit; they refer to anchors by index, like ``anchor_index``.
         share: (n,) factor on the cost of each range, below 1 where ranges from one place err alike; None: 1.
     """
@@ -63,6 +65,7 @@ class RangeProblem:
     frame_is_free: bool
     distances: LocatedDistances | None = None
     gravity: Gravity | None = None
+    placement: PlacementPrior | None = None
     share: Array | None = None
 
     @property
@@ -420,7 +423,7 @@ def _left_of_step(start: RangeState, state: RangeState) -> Array:
 
 
 def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) -> Array:
-    """Return the (r,) residuals of anchors, biases, distances and gravity, in standard deviations."""
+    """Return the (r,) residuals of anchors, biases, distances, gravity and known positions, in standard deviations."""
     anchors, biases = problem.uncertain
     off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
     off_bias = problem.bias_whitening @ (state.bias_m - problem.bias_mean_m)[biases]
@@ -429,6 +432,8 @@ def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) 
         priors.append(distance_residuals(problem.distances, state.metric_from_model.scale, state.anchors_m))
     if problem.gravity is not None and columns.frame >= 0:
         priors.append(problem.gravity.residuals(state.metric_from_model.rotation))
+    if problem.placement is not None and columns.frame >= 0:
+        priors.append(problem.placement.residuals(state.metric_from_model))
     return np.concatenate(priors)
 
 
@@ -455,6 +460,11 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
         block = np.zeros((3, columns.num))
         turn = problem.gravity.jacobian(similarity.rotation, _left_of_step(start, state))
         block[:, columns.frame : columns.frame + 3] = turn
+        blocks.append(block)
+    if problem.placement is not None and columns.frame >= 0:
+        block = np.zeros((7, columns.num))
+        of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
+        block[:, of_map] = problem.placement.jacobian(similarity, _left_of_step(start, state))
         blocks.append(block)
     return np.concatenate(blocks)
 

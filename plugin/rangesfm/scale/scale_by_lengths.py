@@ -8,7 +8,7 @@ along its way. The size of this variation is estimated from how the lengths disa
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
@@ -64,6 +64,10 @@ class LengthScale:
     def statistic(self) -> Array:
         """(m,) squared excess of each length, in standard deviations."""
         return (self.too_long_m / self.stddev_m) ** 2
+
+    def at_scale(self, metres_per_unit: float) -> LengthScale:
+        """Return the lengths for a map whose unit is ``metres_per_unit`` of this one's."""
+        return replace(self, value=self.value / metres_per_unit, by_metre=self.by_metre)
 
     def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
         """Return the distances with all lengths between points replaced by one that gives the same scale.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
+
+if TYPE_CHECKING:  # the scale by positions has a ScaleUncertainty itself
+    from rangesfm.scale.scale_by_positions import PositionScale
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ class ScaleEstimate:
     Attributes:
         metric_from_sfm: similarity from the world of the unscaled model to the metric world.
         frame: the metric world: "site" or "first_camera".
-        method: "robust", "two-candidate" or "lengths".
+        method: "robust", "two-candidate", "lengths" or "positions".
         uncertainty: relative standard deviations of the scale.
         verdict: "good" or "doubtful" (a refused scale is a GeometryError).
         reasons: why, in words.
@@ -125,9 +129,10 @@ class ScaleEstimate:
         placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
             first camera, from all error components; None in the first camera's frame.
         lengths: what the measured lengths alone say; None without lengths between points of the map.
+        positions: what the known positions say; None if they do not determine the map's place.
         remarks: those of the reasons that a refinement does not change.
         refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
-        by_kind: scale by "ranges" and by "lengths", as far as available, where measured lengths were used.
+        by_kind: scale by "ranges", "lengths" and "positions", as far as available, where several of them were used.
     """
 
     metric_from_sfm: Similarity
@@ -149,6 +154,7 @@ class ScaleEstimate:
     solution: Solution | None = None
     placement: Array | None = None
     lengths: LengthScale | None = None
+    positions: PositionScale | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     refined_value: float | None = None

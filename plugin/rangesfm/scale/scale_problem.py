@@ -20,6 +20,7 @@ from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import is_line, is_steep
+from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeProblem
 
 _MIN_RANGES = 8
@@ -69,6 +70,7 @@ def scale_problem(
     range_model: RangeModelOptions,
     distances: LocatedDistances | None = None,
     gravity: Gravity | None = None,
+    placement: PlacementPrior | None = None,
     *,
     place_is_open: bool = False,
 ) -> ScaleProblem:
@@ -78,6 +80,7 @@ def scale_problem(
         distances: measured ones, with the anchors of the log in its order; distances measured by radio between anchors
             are added from the log.
         gravity: the upward direction, as given by the user.
+        placement: what known positions say of the map's place, for the first camera's frame; None without any.
         place_is_open: whether the map has more than one possible place in the site. Then only the distances between
             surveyed anchors are used, not their positions.
 
@@ -91,6 +94,8 @@ def scale_problem(
     rows, heard = _usable_ranges(observations, given)
     known, notes = _usable_positions(in_log, given & heard, anchor_frame, gravity is not None)
     known &= not place_is_open
+    if placement is not None:  # any number of surveyed anchors helps a map that has its place
+        known, notes = given & heard, []
     # A surveyed anchor whose ranges are all held out keeps its position, so that they can be checked against it.
     placed = known | (given & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
@@ -116,9 +121,10 @@ def scale_problem(
         bias_mean_m=bias_m,
         bias_stddev_m=np.where(heard, bias_stddev_m, 0.0),
         common_bias_stddev_m=common_stddev_m,
-        frame_is_free=anchor_frame == "site" and bool(known.any()),
+        frame_is_free=placement is not None or (anchor_frame == "site" and bool(known.any())),
         distances=_control(functools.reduce(LocatedDistances.joined, measured), heard | placed),
         gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
+        placement=placement,
     )
     frame = "site" if ranges.frame_is_free else "first_camera"
     return ScaleProblem(

@@ -16,6 +16,7 @@ from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, PositionScale
 from rangesfm.scale.scale_estimate import CutoffTest, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.sensitivity import scale_drift
@@ -92,6 +93,18 @@ def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: 
         doubts.append(_Doubt(reason, another))
     if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
         doubts.append(_Doubt("the lengths are short for their standard deviations", "measure more and longer lengths"))
+    return _verdict(doubts, [], uncertainty.half_width_95, options)
+
+
+def judge_positions(positions: PositionScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
+    """Return the verdict on a scale that was found from known positions, perhaps with measured lengths."""
+    doubts, num = [], int(np.count_nonzero(positions.is_used))
+    if num == MIN_NUM_POSITIONS and not positions.known.is_check.any():
+        reason = f"the map rests on {num} known positions, so that nothing tells which of them is wrong if one is"
+        doubts.append(_Doubt(reason, "survey a fourth control point, far from the others"))
+    if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+        reason = "the known positions are close together for their standard deviations"
+        doubts.append(_Doubt(reason, "survey control points at the ends of the site, or walk farther"))
     return _verdict(doubts, [], uncertainty.half_width_95, options)
 
 

@@ -105,6 +105,9 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
         GeometryError: nothing fits, or two different maps fit (OpenPlaceError: they have the same scale).
     """
     problem, errors = posed.ranges, posed.errors
+    if problem.placement is not None:  # known positions say where the map is, so that there is nothing to search for
+        start = RangeState(problem.placement.mean, problem.anchor_mean_m.copy(), problem.bias_mean_m.copy())
+        return solution_from(posed, complete_unknown_anchors(problem, start))
     camera_side = camera_side if problem.frame_is_free else None
     fits = on_side(problem, _distinct_fits(problem, posed.anchors_are_known, seed), camera_side)
     starts = [fit.state for fit in fits]
@@ -225,6 +228,7 @@ def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
     priors get more weight instead, by the square of the inflation.
     """
     distances, gravity, inflation = problem.distances, problem.gravity, errors.inflation
+    placement = problem.placement
     return replace(
         problem,
         stddev_m=errors.stddev_m,
@@ -233,6 +237,7 @@ def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
         common_bias_stddev_m=problem.common_bias_stddev_m / inflation,
         distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
         gravity=None if gravity is None else replace(gravity, stddev_rad=gravity.stddev_rad / inflation),
+        placement=None if placement is None else replace(placement, whitening=placement.whitening * inflation),
     )
 
 

@@ -11,7 +11,7 @@ from scipy.linalg import cho_factor, cho_solve
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, by_poses
 from rangesfm.ranging.errors.components import CLOCKS, GIVEN, PLACES, REWEIGHTING
-from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors, LearnedErrors, learn_errors
+from rangesfm.ranging.errors.learned import ROUNDING, ErrorParts, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisiness, range_bins
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.range_equation import (
@@ -208,7 +208,7 @@ class LinearMap:
     columns: Columns
 
     def known(
-        self, learned: LearnedErrors, formal: float, variance_by_others: Array, change_by_others: Array | None = None
+        self, learned: ErrorParts, formal: float, variance_by_others: Array, change_by_others: Array | None = None
     ) -> KnownMap:
         """Combine the estimate with the best weights for the errors and the estimate with other weights.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +18,14 @@ from rangesfm.files.folders import walk
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
+from rangesfm.positions.antenna_track import AntennaTrack
+from rangesfm.positions.control_points import read_control_points
+from rangesfm.positions.known_positions import LASTING_S
+from rangesfm.positions.position_formats import read_positions
+from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
 from rangesfm.ranging.anchors.anchor_file import AnchorList, read_anchor_list
-from rangesfm.ranging.anchors.site import Site, local_site
+from rangesfm.ranging.anchors.site import Site, local_site, site_of
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
@@ -62,6 +67,7 @@ class RangingInputs:
         reference: true positions; None if not given.
         notes: lines that the user should know.
         assumed: lines about how log and anchor file were read.
+        positions: known positions of marks, in the frame of the anchors.
     """
 
     log: RangeLog
@@ -73,6 +79,12 @@ class RangingInputs:
     reference: Reference | None
     notes: tuple[str, ...]
     assumed: tuple[str, ...] = ()
+    positions: SurveyedPositions = field(default_factory=SurveyedPositions)
+
+    @property
+    def needs_times(self) -> bool:
+        """Whether the photos' times are needed, for ranges or positions by time."""
+        return self.log.image_name is None or self.positions.needs_times
 
 
 def read_ranging_inputs(survey: Survey) -> RangingInputs:
@@ -98,6 +110,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     _check_anchors_known(log, anchors, survey)
     frame = survey.anchors.frame or default_anchor_frame(anchors)
     site, anchors = local_site(anchors, frame, survey.anchors.crs, survey.anchors.path)
+    site, positions = _surveyed_positions(survey, site, anchors, frame)
     if frame != "unknown" and all(anchor.position_m is None for anchor in anchors):
         raise InputError(
             f"anchor frame {frame!r} needs anchor positions and there are none: give anchors.csv, or frame unknown",
@@ -112,15 +125,53 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_reference(survey.report.reference)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
-    assumed = (*log.notes, *(() if listed is None else listed.notes))
+    assumed = (*log.notes, *(() if listed is None else listed.notes), *positions.notes)
     log = log.in_time_order()
-    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed)
+    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions)
 
 
 def _listed_anchors(survey: Survey) -> AnchorList | None:
     """Return the content of the anchor file, or None if there is none."""
     anchors = survey.anchors
     return None if anchors.path is None else read_anchor_list(anchors.path, columns=anchors.columns, unit=anchors.unit)
+
+
+def _surveyed_positions(
+    survey: Survey, site: Site, anchors: Sequence[Anchor], frame: str
+) -> tuple[Site, SurveyedPositions]:
+    """Return the known positions in the site's local frame, and that frame, which is theirs where no anchor has one.
+
+    Raises:
+        InputError: a file is wrong, or only one of anchors and points has a coordinate system.
+    """
+    points, log, asked = (
+        read_control_points(survey.points, survey.scale.markers),
+        read_positions(survey.positions),
+        survey.positions,
+    )
+    if points is None and log is None:
+        return site, SurveyedPositions()
+    if frame == "first_camera":
+        table, path = ("points", survey.points.path) if points is not None else ("positions", asked.path)
+        raise InputError(f"[{table}] are in the site, expected [anchors] frame to be site as well", path)
+    is_placed = frame == "site" and any(anchor.position_m is not None for anchor in anchors)
+
+    def local(coordinates: Array, crs: str | None, path: Path | None) -> Array:
+        nonlocal site, is_placed
+        if is_placed:
+            return site.local(coordinates, crs, path)
+        is_placed, (site, moved) = True, site_of(coordinates, crs, path)
+        return moved
+
+    if points is not None:
+        points = points.moved_to(local(points.positions_m, survey.points.crs or points.crs, points.path))
+    if log is None:
+        return site, SurveyedPositions(points)
+    if asked.stddev_m is not None:
+        log = replace(log, covariance_m2=np.tile(asked.stddev_m**2 * np.eye(3), (len(log), 1, 1)))
+    log = log.moved_to(local(log.position_m, asked.crs or log.crs, log.path))
+    antenna = AntennaTrack(log, np.array(asked.antenna_in_cam_m), asked.time_offset_s, survey.ranges)
+    return site, SurveyedPositions(points, antenna, (asked.lasting_s,) if asked.lasting_s else LASTING_S)
 
 
 def _check_rigs_are_metric(survey: Survey) -> None:
@@ -130,7 +181,8 @@ def _check_rigs_are_metric(survey: Survey) -> None:
         InputError: it has none.
     """
     is_measured = survey.scale.distances or survey.markers.side_m or survey.ranges.path
-    if is_measured is None and not read_rigs(survey.images.rig_config).are_metric:
+    is_placed = survey.points.path or survey.positions.path
+    if is_measured is None and is_placed is None and not read_rigs(survey.images.rig_config).are_metric:
         raise InputError(
             "gives no distance between cameras of a rig, and there are no ranges and no lengths: expected "
             "cam_from_rig_translation in metres, or a radio's log (--ranges LOG)",

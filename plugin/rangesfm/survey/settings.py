@@ -22,6 +22,8 @@ from rangesfm.options import (
     MapperOptions,
     MarkerOptions,
     OutputOptions,
+    PointOptions,
+    PositionOptions,
     RangesOptions,
     RefineOptions,
     ReportOptions,
@@ -93,6 +95,8 @@ class Survey(BaseModel):
     ranges: RangesOptions = RangesOptions()
     anchors: AnchorOptions = AnchorOptions()
     tag: TagOptions = TagOptions()
+    points: PointOptions = PointOptions()
+    positions: PositionOptions = PositionOptions()
     mapper: MapperOptions = MapperOptions()
     scale: ScaleOptions = ScaleOptions()
     markers: MarkerOptions = MarkerOptions()
@@ -145,7 +149,8 @@ class Survey(BaseModel):
         Raises:
             InputError: it has nothing, or only printed tags of unknown size.
         """
-        if self.scale.distances is not None or self.markers.side_m is not None:
+        given = (self.scale.distances, self.markers.side_m, self.points.path, self.positions.path)
+        if any(each is not None for each in given):
             return
         if self.markers.dictionary is not None:
             raise InputError(
@@ -155,7 +160,8 @@ class Survey(BaseModel):
         if self.ranges.path is None and self.images.rig_config is None:
             raise InputError(
                 "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), "
-                "the size of printed tags (--marker_side_m), or a rig with known poses (--rig_config_path JSON)"
+                "control points (--points CSV), positions (--positions FILE), the size of printed tags "
+                "(--marker_side_m), or a rig with known poses (--rig_config_path JSON)"
             )
 
     def to_dict(self) -> dict[str, Any]:

@@ -100,6 +100,9 @@ def survey_from_tables(
         given["camera"] |= {"others": other_cameras} if other_cameras else {}
         options: dict[str, Any] = {name: model(**given[name]) for name, model in SURVEY_TABLES.items()}
         survey = Survey(**options, source=source)
+        if survey.scale.markers is not None and survey.scale.distances is None and survey.points.path is None:
+            why = "expected distances beside it, or [points]: marks are ends of taped distances, or have coordinates"
+            raise survey.scale.refused("markers", f"is '{survey.scale.markers}', {why}")
         _require_files(survey)
     return survey
 

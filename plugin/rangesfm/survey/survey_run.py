@@ -125,6 +125,8 @@ class SurveyRun:
             options=survey.scale,
             range_model=survey.ranges,
             distances=distances,
+            positions=inputs.positions.located(path.sfm, path.trajectory),
+            lasting_s=inputs.positions.lasting_s,
             bending=bending,
             seed=survey.output.seed,
         )

@@ -19,12 +19,15 @@ from rangesfm.files.bags import is_bag, is_bag_folder
 from rangesfm.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
 from rangesfm.files.text_tables import has_columns, read_head
 from rangesfm.geometry.reference import is_reference_file
+from rangesfm.positions.control_points import is_point_file
+from rangesfm.positions.position_formats import is_of_satellites
 from rangesfm.ranging.anchors import anchor_file
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.ranging.readers.layout import Layout, find_layout
 from rangesfm.ranging.readers.lists import UnclearListError
 from rangesfm.ranging.readers.table import TABLE
+from rangesfm.ranging.readers.vocabulary import words_of
 from rangesfm.sources.bag import has_images
 from rangesfm.sources.source import is_video
 from rangesfm.survey_discovery.calibration_files import CameraCalibration, read_calibrations
@@ -32,6 +35,9 @@ from rangesfm.vision import photo_list
 from rangesfm.vision.photo_files import MIN_NUM_PHOTOS
 
 PHOTOS, MODEL, LOG, TIMES, ANCHORS = "images.path", "images.model", "ranges.path", "images.times", "anchors.path"
+POINTS, POSITIONS, REFERENCE = "points.path", "positions.path", "report.reference"
+# Words in the name of a file whose positions are measured, not true ones to compare with.
+_MEASURED = frozenset({"position", "positions", "gps", "gnss", "rtk", "ppk", "pozyx", "marvelmind"})
 _NOT_READ = {
     ".insv": "extract plain photos with their times from these 360 degree videos",
     **dict.fromkeys((".heic", ".heif", ".dng", ".cr2", ".nef", ".arw"), "convert them to JPEG"),
@@ -55,8 +61,9 @@ _TABLE_EXTENSIONS = (
 _TABLES: dict[str, Callable[[str], bool]] = {
     "scale.markers": partial(has_columns, required=MARKER_COLUMNS),
     "scale.distances": partial(has_columns, required=DISTANCE_COLUMNS),
+    POINTS: is_point_file,
     "ranges.error_curve": is_error_curve_file,
-    "report.reference": is_reference_file,
+    REFERENCE: is_reference_file,
     ANCHORS: anchor_file.is_canonical_anchor_file,
     TIMES: photo_list.is_canonical_photo_list,
 }
@@ -174,6 +181,8 @@ def _key_of(path: Path) -> str | None:
     head = read_head(path)
     if not head.strip() or "\0" in head:
         return None
+    if is_of_satellites(head):
+        return POSITIONS
     unsure = None
     try:
         reader = find_log_reader(path)
@@ -185,7 +194,7 @@ def _key_of(path: Path) -> str | None:
     if unsure is None:  # columns that look like those of a log may be those of a list
         return _list_like_log(path) or LOG
     if key := next((key for key, is_such in _TABLES.items() if is_such(head)), None):
-        return key
+        return POSITIONS if key == REFERENCE and not _MEASURED.isdisjoint(words_of(path.stem)) else key
     with nullcontext() if is_table else suppress(UnclearListError):
         if key := _list_of(path):
             return key

@@ -18,7 +18,7 @@ from rangesfm.ranging.readers.lists import UnclearListError
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, Survey
 from rangesfm.survey.survey_reader import survey_from_tables
-from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, Found, look_into, short_path
+from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, POINTS, POSITIONS, Found, look_into, short_path
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.photo_files import usable_photos
 
@@ -28,6 +28,8 @@ _USUAL_NAMES = {
     LOG: ("uwb", "ranges"),
     "images.times": ("images", "times", "image_times", "timestamps"),
     "anchors.path": ("anchors",),
+    POSITIONS: ("positions", "gnss", "gps"),
+    POINTS: ("points", "control_points", "gcp_list"),
     "report.reference": ("reference", "groundtruth", "ground_truth", "truth"),
     "camera": ("camera", "cameras"),
 }
@@ -79,8 +81,8 @@ def understand(
         key, paths = item.dotted, found.paths.get(item.dotted, [])
         if not paths:
             continue
-        if key in values or (key == "scale.markers" and "scale.distances" not in values):
-            why = f"--{item.flag} names another" if key in values else "marks are the ends of taped distances"
+        if key in values or (key == "scale.markers" and not {"scale.distances", POINTS} & values.keys()):
+            why = f"--{item.flag} names another" if key in values else "marks are ends of distances, or known points"
             notes.append(f"not used: {', '.join(short_path(path, folders) for path in paths)} ({why})")
             continue
         paths = _tops(paths, folders) if key == PHOTOS else paths
@@ -111,7 +113,7 @@ def understand(
         for path in found.models
         if path != values.get(MODEL)
     ]
-    if not {PHOTOS, LOG, "scale.distances"} & values.keys():
+    if not {PHOTOS, LOG, "scale.distances", POINTS, POSITIONS} & values.keys():
         raise InputError("found no photos, no radio log and no lengths in it", folders[0], advice=notes)
     _add_camera(values, found, notes)
     return Understood(values, tuple(notes))

@@ -88,7 +88,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
             sfm = read_registered(model, journal)
             checked.facts.append(f"model: {sfm.num_reg_images()} photos and {sfm.num_points3D()} points in {model}")
             keyframes = tuple(image.name for image in sfm.images.values())
-            times = times_of_model(survey, sfm, model) if inputs.log.timestamp_s is not None else None
+            times = times_of_model(survey, sfm, model) if inputs.needs_times else None
         _tell_of_times(survey, inputs, keyframes, times, checked)
         if photos is not None:
             _check_mapper(survey, photos.of(keyframes), checked)
@@ -173,6 +173,7 @@ def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     if inputs.tape is not None:
         only = "" if len(inputs.log) else ", which alone determine the scale (no ranges)"
         yield f"taped distances: {len(inputs.tape.distances)}{only}"
+    yield from inputs.positions.facts()
     if survey.markers.dictionary is not None:
         side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
         yield f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos"
@@ -185,6 +186,10 @@ def _tell_of_times(
     survey: Survey, inputs: RangingInputs, keyframes: Sequence[str], times: ImageTimes | None, checked: CheckedSurvey
 ) -> None:
     radio_s = inputs.log.timestamp_s
+    if times is not None and radio_s is None and inputs.positions.needs_times:
+        first_s, last_s = times.timestamps_s[[0, -1]]
+        checked.facts.append(f"times: {len(keyframes)} keyframes from {first_s:.3f} to {last_s:.3f} s ({times.source})")
+        return
     if times is None or radio_s is None:
         why = "the ranges name their photos" if len(inputs.log) else "there are no ranges"
         checked.facts.append(f"times: none are needed for {len(keyframes)} keyframes, {why}")

@@ -16,22 +16,28 @@ from rangesfm.diagnostics.diagnosis import Diagnosis, causes_in_words, diagnose_
 from rangesfm.diagnostics.finished_map import Doubt, doubts_of_map, doubts_of_pieces, place_of_map, why_broken
 from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
+from rangesfm.diagnostics.position_tests import diagnose_positions
 from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import gravity_of
+from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.join.join_models import ModelVerdict, join_models
+from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.refine.photo_bending import bending_of_model, by_photos
+from rangesfm.refine.positions import HeldPositions
 from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, LoopClosing, RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult, Rivals
-from rangesfm.scale.at_map import MapWithRanges, estimate_at
+from rangesfm.scale.at_map import MapWithRanges, estimate_at, estimate_by_positions_at
+from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.scale.scale_problem import first_camera_from
 from rangesfm.scale.scale_verdict import refuse_unknown
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
@@ -115,6 +121,8 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     try:
         estimate = run.changed({"scale.max_relative_stddev": limit}).estimate_scale(path, bending)
     except GeometryError as error:
+        if doubts := "; ".join(inputs.positions.doubts_of_clock()):
+            raise GeometryError(f"{error}; {doubts}") from None
         raise _refused_with_cause(error, run, path) from None
     on_map, rivals = None, None
     if not is_a_start and (on_map := _ranges_on_scaled(estimate, path.trajectory, bending)) is not None:
@@ -135,9 +143,10 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     tape = inputs.tape
     if tape is not None and (lengths := estimate.lengths) is not None:
         tape = tape.without(lengths.rows[~lengths.is_kept].tolist())
+    known = inputs.positions.without(() if estimate.positions is None else estimate.positions.names_left_out)
     return MetricResult(
-        path.trajectory, offset, offset_s, estimate, scaled, predicted, weights, tape=tape, rivals=rivals,
-        on_map=on_map,
+        path.trajectory, offset, offset_s, estimate, scaled, predicted, weights, tape=tape, positions=known,
+        rivals=rivals, on_map=on_map,
     )  # fmt: skip
 
 
@@ -250,16 +259,25 @@ def refine_map(run: SurveyRun, metric: MetricResult, closing: LoopClosing | None
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
     at_rest: list[MapWithRanges] = []
+    placed: list[PositionScale] = []
+    held = HeldPositions.of(metric.estimate.positions, metric.positions, metric.trajectory)
+
+    def learn_of_positions(rest: AtRest) -> Learnt:
+        placed.append(_positions_at_rest(metric, held.refined(metric.positions), rest))
+        return Learnt(None, placed[0].bending_factor)
 
     def learn(rest: AtRest) -> Learnt:
-        at_rest.append(_at_rest(metric, rest))
+        if metric.estimate.positions is not None:
+            placed.append(_positions_at_rest(metric, held.refined(metric.positions), rest))
+        at_rest.append(_at_rest(metric, rest, placed[0] if placed else None))
         learned = at_rest[0].learned()
         factor = at_rest[0].bending_factor(learned)
         return Learnt(learned.without(CLOCKS) if survey.refine.time_offset_stddev_s else learned, factor)
 
     estimate = metric.estimate
-    has_ranges = estimate.problem is not None
-    refined, summary = _refined(run, metric, tape, learn if has_ranges else None, closing)
+    learn_of_others = None if estimate.positions is None else learn_of_positions
+    learn_of_all = learn if estimate.problem is not None else learn_of_others
+    refined, summary = _refined(run, metric, tape, held, learn_of_all, closing)
     if survey.refine.covariance and summary.covariance is None:
         run.journal.warn(
             "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
@@ -277,11 +295,17 @@ def refine_map(run: SurveyRun, metric: MetricResult, closing: LoopClosing | None
         refinement=summary,
         why_broken=broken,
         refined_with_ranges=at_rest[0] if at_rest else None,
+        positions_at_refined=placed[0] if placed else None,
     )
 
 
 def _refined(
-    run: SurveyRun, metric: MetricResult, tape: Tape, learn: Learn | None, closing: LoopClosing | None
+    run: SurveyRun,
+    metric: MetricResult,
+    tape: Tape,
+    positions: HeldPositions,
+    learn: Learn | None,
+    closing: LoopClosing | None,
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
     """Call ``refine_with_ranges`` with the options of a survey and the results of the scale stage."""
     survey, estimate = run.survey, metric.estimate
@@ -298,13 +322,35 @@ def _refined(
         camera=survey.camera,
         options=survey.refine,
         tape=tape,
+        positions=positions,
         learn=learn,
         closing=closing,
         num_threads=survey.mapper.num_threads,
     )
 
 
-def _at_rest(metric: MetricResult, rest: AtRest) -> MapWithRanges:
+def _positions_at_rest(metric: MetricResult, surveyed: SurveyedPositions, rest: AtRest) -> PositionScale:
+    known = surveyed.located(rest.photos.metric, rest.trajectory_m)
+    assert known is not None, "the positions placed the map"
+    try:
+        bending: MapBending = by_photos(rest.photos, rest.trajectory_m, 1.0, is_at_optimum=False)
+    except GeometryError:
+        bending = WalkBending(in_first_camera(rest.trajectory_m))
+    lengths = metric.estimate.lengths
+    return scale_by_positions(
+        known,
+        rest.trajectory_m,
+        bending,
+        lengths=lengths and lengths.at_scale(rest.scale),
+        refined=IDENTITY,
+        lasting_s=surveyed.lasting_s,
+    )
+
+
+def _at_rest(metric: MetricResult, rest: AtRest, positions: PositionScale | None) -> MapWithRanges:
+    path = rest.trajectory_m
+    # The model's frame is that of the first camera, in the unit of the unscaled model.
+    model_from_map = replace(IDENTITY, scale=1 / rest.scale) @ first_camera_from(path)
     try:
         bending: MapBending = by_photos(rest.photos, rest.trajectory_m, rest.scale, is_at_optimum=False)
     except GeometryError:
@@ -319,6 +365,7 @@ def _at_rest(metric: MetricResult, rest: AtRest) -> MapWithRanges:
         np.array([anchor.range_bias_m for anchor in rest.anchors]),
         rest.errors,
         bending,
+        None if positions is None else positions.prior(path, model_from_map),
     )
 
 
@@ -333,6 +380,7 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     survey, journal = run.survey, run.journal
     metric, on_map = _estimated(survey, metric)
     diagnosis = diagnose_lengths(metric.estimate, metric.tape)
+    diagnosis = _diagnose_positions(metric).with_more(diagnosis)
     try:
         if (of_ranges := _diagnose(survey, on_map)) is not None:
             diagnosis = of_ranges.with_more(diagnosis)
@@ -350,6 +398,8 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
         point_errors(metric.final),
         noise_is_given=survey.ranges.range_stddev_m is not None or bool(np.isfinite(log.range_stddev_m).any()),
     )
+    advice = "let the offset be searched for ([positions] time_offset)"
+    doubts += [Doubt(reason, advice) for reason in metric.positions.doubts_of_clock()]
     journal.warn(*(doubt.reason for doubt in doubts), *by_rivals)
     doubts += known_doubts
     centers_m = metric.trajectory.as_in(metric.final).centers
@@ -358,6 +408,12 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     judged = replace(metric, place=place, diagnosis=diagnosis).doubted(by_rivals)
     judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
     return judged.doubted(diagnosis.reasons)
+
+
+def _diagnose_positions(metric: MetricResult) -> Diagnosis:
+    start = metric.estimate.positions
+    left_out = () if start is None else start.names_left_out
+    return diagnose_positions(metric.by_positions, left_out)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
@@ -375,6 +431,8 @@ def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, Rang
     try:
         if at is not None and learned is not None:
             estimate = estimate_at(at, learned.subset(at.posed.rows), start, survey.scale)
+        elif metric.positions_at_refined is not None and metric.kept_refinement is not None:
+            estimate = estimate_by_positions_at(metric.positions_at_refined, metric.refined_scale, start, survey.scale)
         else:
             refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)
             estimate = replace(start, refined_value=None if metric.kept_refinement is None else metric.refined_scale)

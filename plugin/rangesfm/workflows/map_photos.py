@@ -54,8 +54,7 @@ def checked_keyframes(run: SurveyRun) -> tuple[tuple[str, ...], ImageTimes | Non
     Raises:
         InputError: they do not.
     """
-    names_photos = run.inputs.log.image_name is not None
-    keyframes, times = find_keyframes(run.survey, run.journal, log_names_photos=names_photos)
+    keyframes, times = find_keyframes(run.survey, run.journal, log_names_photos=not run.inputs.needs_times)
     n, timestamps_s = len(keyframes), None if times is None else times.timestamps_s
     nowhere = Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
     check_times(run, nowhere)
@@ -169,12 +168,13 @@ def with_tags(run: SurveyRun, names: Sequence[str]) -> SurveyRun:
         message = (
             f"no tag of {wanted.dictionary} in {len(names)} photos: is it another dictionary ([markers] dictionary)?"
         )
-        if not len(inputs.log) and survey.scale.distances is None:
+        if not len(inputs.log) and survey.scale.distances is None and survey.points.path is None:
             raise InputError(message, folder)
         journal.warn(message)
     journal.progress.message(f"tags: {len(found.tags)} of {wanted.dictionary} in {found.num_photos} photos")
     sides = () if wanted.side_m is None else found.sides(wanted.side_m, wanted.side_stddev_m)
-    return replace(run, inputs=replace(inputs, tape=(inputs.tape or Tape()).with_more(sides, found.markers)))
+    tape, positions = (inputs.tape or Tape()).with_more(sides, found.markers), inputs.positions
+    return replace(run, inputs=replace(inputs, tape=tape, positions=positions.with_more_markers(found.markers)))
 
 
 def map_keyframes(

@@ -123,7 +123,7 @@ def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) 
         As ``map_in_metres``.
     """
     times = None
-    if run.inputs.log.image_name is None:
+    if run.inputs.needs_times:
         times = times_of_model(run.survey, sfm, run.survey.given_model_path)
         run.journal.warn(*times.notes)
         tell_of_times(run, times)
@@ -150,7 +150,10 @@ def map_in_metres(
         images = run.survey.images
         baselines = read_rigs(images.rig_config).baselines(path.sfm, images.baseline_stddev_m)
         tape = (run.inputs.tape or Tape()).with_more(baselines)
-        run = replace(run, inputs=replace(run.inputs, tape=locatable(tape, path.sfm) if tape.distances else None))
+        positions = run.inputs.positions.on_path(path.trajectory)
+        run.journal.warn(*positions.notes_on(path.sfm))
+        tape_in_map = locatable(tape, path.sfm) if tape.distances else None
+        run = replace(run, inputs=replace(run.inputs, tape=tape_in_map, positions=positions))
     # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(run, path, refine=refine), models=verdicts)
     return with_likeliest_cause(run, path, made) if run.survey.scale.adopt else (run, made)

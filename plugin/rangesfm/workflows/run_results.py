@@ -14,6 +14,7 @@ from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
 from rangesfm.export import COVARIANCE_FORMATS
 from rangesfm.geometry.reference import write_reference
+from rangesfm.positions.surveyed_positions import PointsEntry
 from rangesfm.report import write_report_of
 from rangesfm.report.content import Content
 from rangesfm.result.entries import ComparisonRow
@@ -85,6 +86,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
         summary = ResultSummary.of(
             metric,
             distances=distances,
+            points=_points(metric),
             **({"comparison": comparison} if comparison else {}),
             georeference=georeference,
             versions=recorded_versions(),
@@ -113,6 +115,12 @@ def _distances(metric: MetricResult) -> list[DistanceRow]:
     located = locate_distances(metric.tape, metric.final, [anchor.anchor_id for anchor in metric.anchors])
     anchors_m = np.array([anchor.position_m for anchor in metric.anchors]).reshape(-1, 3)
     return distance_rows(metric.tape, located.lengths_m(1.0, anchors_m))
+
+
+def _points(metric: MetricResult) -> PointsEntry | None:
+    if metric.estimate.frame != "site":
+        return None
+    return PointsEntry.of(metric.positions, metric.final, metric.trajectory.as_in(metric.final))
 
 
 def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:

@@ -28,6 +28,24 @@ class Site:
     offset_m: Array
     georeference: Georeference | None = None
 
+    def local(self, coordinates: Array, crs: str | None, path: Path | None = None) -> Array:
+        """Return (n, 3) further coordinates in the local frame.
+
+        Args:
+            crs: their coordinate system; None: the same frame as the anchors'. path: their file, for messages.
+
+        Raises:
+            InputError: only one of the site and the coordinates has a coordinate system.
+        """
+        if (crs is None) != (self.georeference is None):
+            which = ("these coordinates", "the anchors") if crs else ("the anchors", "these coordinates")
+            raise InputError(
+                f"{which[0]} have a coordinate system and {which[1]} have none, expected both or none", path
+            )
+        if crs is None or self.georeference is None:
+            return coordinates - self.offset_m
+        return self.georeference.local(coordinates, crs)
+
 
 def local_site(
     anchors: tuple[Anchor, ...], frame: str, crs: str | None, path: Path | None = None
@@ -46,19 +64,31 @@ def local_site(
     """
     given = np.array([np.full(3, np.nan) if a.position_m is None else a.position_m for a in anchors]).reshape(-1, 3)
     known = np.isfinite(given).all(axis=1)
-    if crs is not None:
-        if frame != "site" or not known.any():
+    if frame != "site" or not known.any():
+        if crs is not None:
             what = "no anchor has a position" if frame == "site" or not known.any() else f"the frame is {frame!r}"
             raise InputError(f"[anchors] crs is {crs}, which is for anchors surveyed in a site frame, but {what}", path)
+        return Site(np.zeros(3)), anchors
+    site, local = site_of(given, crs, path)
+    return site, _at(anchors, local)
+
+
+def site_of(coordinates: Array, crs: str | None, path: Path | None = None) -> tuple[Site, Array]:
+    """Return a local frame for coordinates (n, 3) of a site, and the coordinates in it; NaN rows stay NaN.
+
+    Raises:
+        InputError: the coordinate system is not valid at these points.
+    """
+    if crs is not None:
         try:
-            georeference, local = georeference_at(given, crs)
+            georeference, local = georeference_at(coordinates, crs)
         except InputError as error:
             raise InputError(str(error), path) from None
-        return Site(np.zeros(3), georeference), _at(anchors, local)
-    middle = given[known].mean(axis=0) if frame == "site" and known.any() else np.zeros(3)
+        return Site(np.zeros(3), georeference), local
+    middle = coordinates[np.isfinite(coordinates).all(axis=1)].mean(axis=0)
     # The offset is in whole metres, so that adding it again restores every digit.
     offset = np.round(middle) if np.linalg.norm(middle) > _FAR_M else np.zeros(3)
-    return Site(offset), _at(anchors, given - offset)
+    return Site(offset), coordinates - offset
 
 
 def _at(anchors: tuple[Anchor, ...], positions: Array) -> tuple[Anchor, ...]:

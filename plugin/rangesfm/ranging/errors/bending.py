@@ -90,6 +90,15 @@ class MapBending(Protocol):
         """
         ...
 
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+        """Return the bending of c functions of the path, such as coordinates; arguments as for ``of_bins``.
+
+        Args:
+            by_pose: (c, 6 k) derivatives.
+            frame_is_free: as for ``of_bins``.
+        """
+        ...
+
 
 def component_of(name: str, covariance: Array, factor: float, spread: float) -> Component | None:
     """Return a component in metres with ``factor`` as the median of its size; None if the bins are not affected.
@@ -162,19 +171,25 @@ class WalkBending:
     frame_is_free: bool = False
 
     def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
-        nothing = np.zeros((len(bins), len(bins)))
-        factors = self.factors(bins, by_pose, frame_is_free=frame_is_free)
-        shift_m = np.zeros(len(bins)) if self.steps is None else -np.einsum("csi,si->c", factors, self.steps)
+        return self.of_functions(averaged(bins, by_pose, len(self.path)), frame_is_free=frame_is_free)
+
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+        num = len(by_pose)
+        factors = self._factors(by_pose, frame_is_free=frame_is_free)
+        shift_m = np.zeros(num) if self.steps is None else -np.einsum("csi,si->c", factors, self.steps)
         found = []
         for name, which in _OF_STEP.items():
-            own = factors[:, :, which].reshape(len(bins), -1)
+            own = factors[:, :, which].reshape(num, -1)
             found.append(component_of(name, own @ own.T, _OF_PATH[name], _SPREAD))
-        return BendingOfBins(tuple(each for each in found if each is not None), nothing, shift_m)
+        return BendingOfBins(tuple(each for each in found if each is not None), np.zeros((num, num)), shift_m)
 
     def factors(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> Array:
         """Return the (c, s, 7) derivatives of the bins by each step."""
+        return self._factors(averaged(bins, by_pose, len(self.path)), frame_is_free=frame_is_free)
+
+    def _factors(self, by_pose: Array, *, frame_is_free: bool) -> Array:
         path = self.path
-        functions = without_similarity(averaged(bins, by_pose, len(path)), path, frame_is_free=frame_is_free)
+        functions = without_similarity(by_pose, path, frame_is_free=frame_is_free)
         starts, unit = self._steps_of_path
         return np.asarray(_after(functions, path, starts) * unit)
 

@@ -7,6 +7,7 @@ learns its own standard deviations, with the population as prior.
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
@@ -231,7 +232,15 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
         REWEIGHTING: "what the best weights for these errors would change",
         CLOCKS: "the clocks' offset, as far as the motion leaves it open",
         PLACES: "the camera's places at and between the photos",
+        "points": "coordinates of the control points",
+        "positions": "noise of the positions",
         "tape": "how the lengths were measured",
-        "marks": "where their ends are in the photos",
+        "marks": "where marks are in the photos",
     }
-    return {name: words[name] for name in names}
+    lasting = re.compile(r"positions_(.+)s")
+    return {
+        name: f"errors of the positions that last for {found[1]} s"
+        if (found := lasting.fullmatch(name))
+        else words[name]
+        for name in names
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import lapack
@@ -27,26 +28,22 @@ _DEPENDENT = 1e-7
 # Share of a covariance's trace that is added to its diagonal, as rounding may leave it singular.
 ROUNDING = 1e-12
 
+_Parts = TypeVar("_Parts", bound="ErrorParts")
+
 
 @dataclass(frozen=True)
-class LearnedErrors:
-    """Errors of c bins of ranges.
+class ErrorParts:
+    """Errors of c observations, by component.
 
     Attributes:
-        bins: of the ranges.
-        of_range: (n,) bin of each range; -1 for a range that did not take part.
         names, stddevs: of the components, in metres (``slope``: share of the distance). For covariances that were not
-            learnt, the root mean square over bins.
+            learnt, the root mean square over observations.
         covariances_m2: (k, c, c) contribution of each.
-        unlikeliness: -2 times the logarithm of the prior probability of these standard deviations.
     """
 
-    bins: RangeBins
-    of_range: Indices
     names: tuple[str, ...]
     stddevs: Array
     covariances_m2: Array
-    unlikeliness: float = 0.0
 
     @property
     def covariance_m2(self) -> Array:
@@ -58,7 +55,7 @@ class LearnedErrors:
         """Standard deviation of each component, by name."""
         return dict(zip(self.names, self.stddevs.tolist(), strict=True))
 
-    def without(self, *names: str) -> LearnedErrors:
+    def without(self: _Parts, *names: str) -> _Parts:
         """Return the errors without some components."""
         kept = [row for row, each in enumerate(self.names) if each not in names]
         return replace(
@@ -67,6 +64,26 @@ class LearnedErrors:
             stddevs=self.stddevs[kept],
             covariances_m2=self.covariances_m2[kept],
         )
+
+    def stddev_of_bins(self, of_bins: Array) -> dict[str, float]:
+        """Return the effect of each component on a number that changes by (c,) ``of_bins`` per metre of each."""
+        variances = np.einsum("i,kij,j->k", of_bins, self.covariances_m2, of_bins)
+        return dict(zip(self.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class LearnedErrors(ErrorParts):
+    """Errors of c bins of ranges.
+
+    Attributes:
+        bins: of the ranges.
+        of_range: (n,) bin of each range; -1 for a range that did not take part.
+        unlikeliness: -2 times the logarithm of the prior probability of these standard deviations.
+    """
+
+    bins: RangeBins
+    of_range: Indices
+    unlikeliness: float = 0.0
 
     def subset(self, rows: Indices) -> LearnedErrors:
         """Return the errors of some of the ranges."""
@@ -81,11 +98,6 @@ class LearnedErrors:
     def stddev_of(self, influence: Array) -> dict[str, float]:
         """Return the effect of each component on a number that changes by (n,) ``influence`` per metre of a range."""
         return self.stddev_of_bins(self.bins.total(influence))
-
-    def stddev_of_bins(self, of_bins: Array) -> dict[str, float]:
-        """Return the effect of each component on a number that changes by (c,) ``of_bins`` per metre of a bin."""
-        variances = np.einsum("i,kij,j->k", of_bins, self.covariances_m2, of_bins)
-        return dict(zip(self.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
 
 
 def learn_errors(
@@ -185,13 +197,13 @@ class ExpectedErrors:
         # Bending does not depend on the radio, and the noise is measured itself.
         widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
         widened = [1.0 if c.name in (*BENDS, "white") else widening**2 for c in self.components]
-        likelihood = _Likelihood(
+        likelihood = ComponentLikelihood(
             np.array(widened)[:, None, None] * self.of_components if widening > 1 else self.of_components,
             np.log([_median(component, self.is_calibrated) for component in self.components]),
             np.array([component.spread for component in self.components]),
             np.sum([*self.known.values(), np.zeros((len(self.bins), len(self.bins)))], axis=0),
             off_m - self.shift_m,
-            *_independent(design, prior_design),
+            *independent_unknowns(design, prior_design),
         )
         stddevs = likelihood.mean_stddevs(likelihood.most_likely(most_unusual))
         off_expected = [
@@ -205,11 +217,11 @@ class ExpectedErrors:
         """Return the errors with the covariances that are not learnt added."""
         names = (*(component.name for component in self.components), *self.known)
         return LearnedErrors(
-            self.bins,
-            self.bins.of_range,
             names,
             np.append(stddevs, [np.sqrt(np.trace(m) / len(m)) for m in self.known.values()]),
             np.concatenate([covariances, *(m[None] for m in self.known.values())]),
+            self.bins,
+            self.bins.of_range,
         )
 
 
@@ -220,8 +232,16 @@ def _median(component: Component, is_calibrated: bool) -> float:
 
 
 @dataclass(frozen=True)
-class _Likelihood:
-    """Posterior likelihood of the logarithms of k standard deviations, given c bins."""
+class ComponentLikelihood:
+    """Posterior likelihood of the logarithms of the standard deviations of k components, given c observations.
+
+    Attributes:
+        of_components: (k, c, c) covariances for a standard deviation of 1.
+        log_medians, spreads: (k,) lognormal priors.
+        known: (c, c) covariance that is not learnt.
+        off_m: (c,) measured minus predicted.
+        design, prior_design: (c, p), (r, p) derivatives of observations and priors by the unknowns.
+    """
 
     of_components: Array
     log_medians: Array
@@ -231,7 +251,7 @@ class _Likelihood:
     design: Array
     prior_design: Array
 
-    def most_likely(self, most_unusual: float) -> Array:
+    def most_likely(self, most_unusual: float = np.inf) -> Array:
         """Return the (k,) most likely logarithms, at most ``most_unusual`` spreads above their medians."""
         above = np.minimum(most_unusual * self.spreads, _FARTHEST_ABOVE)
         bounds = np.column_stack([self.log_medians - _FARTHEST_BELOW, self.log_medians + above])
@@ -290,7 +310,7 @@ def _inverse_of(lower: Array) -> Array:
     return np.asarray(below + np.tril(below, -1).T)
 
 
-def _independent(design: Array, prior_design: Array) -> tuple[Array, Array]:
+def independent_unknowns(design: Array, prior_design: Array) -> tuple[Array, Array]:
     """Return the designs in a basis of independent unknowns.
 
     If several unknowns have the same effect, such as a turn of the map and of all its anchors, the normal equations are

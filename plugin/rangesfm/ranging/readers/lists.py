@@ -6,6 +6,7 @@ row of a list counts: a line that is not a row of the table is an error.
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,14 +44,31 @@ class UnclearListError(InputError):
     """
 
     def __init__(self, what: str, path: Path, layout: Layout, why: Sequence[str], choices: Sequence[Choice]):
-        self.what, self.choices = what, tuple(choices)
+        self.what, self.choices, self._layout, self._why = what, tuple(choices), layout, tuple(why)
         self.about = (f"found: {', '.join(described(layout.columns))}", f"not sure: {'; '.join(why)}")
         self.message = f"a table of {what} whose columns are not known for sure"
         super().__init__(self.message, path, advice=[*self.about, *map(str, self.choices)])
 
+    def about_other(self, what: str, quantities: Mapping[str, str], flags: Mapping[str, str]) -> UnclearListError:
+        """Return the same error about another kind of list, with its quantities and flags in place of these."""
+        choices = [
+            Choice(choice.when, tuple(_renamed(flag, quantities, flags) for flag in choice.flags))
+            for choice in self.choices
+        ]
+        assert self.path is not None
+        return UnclearListError(what, Path(self.path), self._layout, self._why, choices)
+
     def asking(self, questions: Sequence[str]) -> InputError:
         """Return an error with the same text and other advice."""
         return InputError(self.message, self.path, advice=questions)
+
+
+def _renamed(text: str, quantities: Mapping[str, str], flags: Mapping[str, str]) -> str:
+    for old, new in flags.items():
+        text = new + text.removeprefix(old) if text.startswith(old) else text
+    for old, new in quantities.items():
+        text = re.sub(rf"(^|,){old}=", rf"\g<1>{new}=", text)
+    return text
 
 
 def columns_flag(flag: str, columns: Mapping[str, str]) -> tuple[str, str]:

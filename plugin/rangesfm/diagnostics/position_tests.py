@@ -1,0 +1,137 @@
+"""Tests of known positions: each control point against all others, and positions against measured lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import special
+
+from rangesfm.diagnostics.diagnosis import Diagnosis
+from rangesfm.diagnostics.hypothesis import in_axes
+from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
+from rangesfm.processes.threads import with_one_blas_thread
+from rangesfm.scale.scale_by_positions import (
+    MIN_NUM_POSITIONS,
+    POINT_FALSE_ALARM_RATE,
+    MistakeInPositions,
+    PositionScale,
+    at_point,
+)
+
+_LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
+_POINT, _ARM, _CLOCK, _DATUM = "control point", "antenna's lever arm", "antenna's clock", "datum shift"
+# Words, remedy, largest possible size and unit of the mistakes of an antenna's positions. No camera carries its antenna
+# farther than 20 m; clocks that differ by more than seconds do not show as a shift of the positions alone.
+_OF_ANTENNA = {
+    _ARM: (
+        "the antenna sits elsewhere on the camera, by {} (right, down, forward)",
+        "measure from lens to antenna again ([positions] antenna_in_cam_m)",
+        20.0,
+        "m",
+    ),
+    _CLOCK: (
+        "the times of the positions are {} LATE",
+        "look for leap seconds, or let the offset be searched for ([positions] time_offset)",
+        20.0,
+        "s",
+    ),
+    _DATUM: (
+        "the positions and the control points have frames that are shifted by {}",
+        "look which coordinate system and which height each of them has",
+        np.inf,
+        "m",
+    ),
+}
+
+
+@with_one_blas_thread
+def diagnose_positions(positions: PositionScale | None, left_out: Collection[str]) -> Diagnosis:
+    """Return the tests of known positions; empty if there are none.
+
+    Args:
+        left_out: names of control points that contradict the others.
+    """
+    if positions is None:
+        return Diagnosis((), ())
+    rows = [*_of_points(positions, left_out), *_of_antenna(positions)]
+    reasons = [
+        f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}; it is left out"
+        for row in rows
+        if row.rejected and row.subject in left_out
+    ]
+    reasons += [
+        f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in _likeliest(rows)
+    ]
+    if doubted := [row.words for row in rows if row.rejected and row.name == _POINT and row.subject not in left_out]:
+        reasons.append(f"either {'; or '.join(doubted)}: {_LOOK_AGAIN}")
+    rows.sort(key=lambda row: row.threshold - row.statistic)
+    return Diagnosis(tuple(rows), tuple(reasons))
+
+
+def _of_points(positions: PositionScale, left_out: Collection[str]) -> Iterator[MistakeTest]:
+    known = positions.known
+    for row in np.flatnonzero(known.is_mark).tolist():
+        if known.is_check[row] and known.names[row] not in left_out:
+            continue
+        found = positions.equations.of_mistake(at_point(known, row))
+        name, off_m = known.names[row], found.sizes
+        words = f"the control point {name} is {np.linalg.norm(off_m):.2f} m from its coordinates ({in_axes(-off_m)})"
+        yield row_of_mistake(_POINT, name, found, positions.threshold, words, _LOOK_AGAIN)
+
+
+def _likeliest(rows: Sequence[MistakeTest]) -> Sequence[MistakeTest]:
+    """Return the mistake of the antenna with the largest statistic, if any was found."""
+    found = [row for row in rows if row.rejected and row.name in _OF_ANTENNA]
+    return sorted(found, key=lambda row: -row.statistic)[:1]
+
+
+def _of_antenna(positions: PositionScale) -> Iterator[MistakeTest]:
+    """Yield the tests of mistakes that change all positions of an antenna."""
+    known, rotation = positions.known, positions.site_from_model.rotation
+    is_antenna = ~known.is_mark & positions.is_used
+    if not is_antenna.any():
+        return
+    shown = is_antenna[:, None, None]
+    columns = {_ARM: np.where(shown, rotation @ known.world_from_cam, 0.0)}
+    if known.velocity.any():
+        moves = positions.site_from_model.scale * known.velocity @ rotation.T
+        columns[_CLOCK] = np.where(shown, moves[:, :, None], 0.0)
+    if (known.is_mark & positions.is_used).sum() >= MIN_NUM_POSITIONS:
+        columns[_DATUM] = np.where(shown, np.eye(3), 0.0)
+    for name, of_all in columns.items():
+        by = of_all.reshape(3 * len(known), -1)
+        found = positions.equations.with_mistake_learnt(by).of_mistake(by)
+        threshold = float(special.chdtri(max(found.root.shape[1], 1), POINT_FALSE_ALARM_RATE / len(columns)))
+        words, remedy, most, unit = _OF_ANTENNA[name]
+        if np.linalg.norm(found.sizes) > most:
+            found = replace(found, statistic=0.0)
+        said = words.format(in_axes(found.sizes) if len(found.sizes) == 3 else f"{abs(found.sizes[0]):.2f} s")
+        if name == _CLOCK:
+            said = said.replace("LATE", "late" if found.sizes[0] < 0 else "early")
+        yield row_of_mistake(name, "", found, threshold, said, remedy, unit)
+
+
+def row_of_mistake(
+    name: str, subject: str, found: MistakeInPositions, threshold: float, words: str, remedy: str, unit: str = "m"
+) -> MistakeTest:
+    """Return the row of the table for a mistake in known positions."""
+    worst, effect = np.inf, np.inf
+    if found.is_seen and found.root.size:
+        needed = noncentrality(found.root.shape[1])
+        worst = float(np.sqrt(needed) * np.linalg.norm(found.root, 2))
+        effect = float(np.sqrt(needed) * np.linalg.norm(found.by_unknowns[0] @ found.root))
+    return MistakeTest(
+        name,
+        subject,
+        found.statistic,
+        threshold,
+        words,
+        remedy,
+        unit,
+        size=float(np.linalg.norm(found.sizes)) if found.is_seen else None,
+        stddev=finite(float(np.linalg.norm(found.root))) if found.is_seen else None,
+        smallest_detectable=finite(worst),
+        effect_on_scale=finite(effect),
+    )

@@ -1,0 +1,238 @@
+"""An antenna's known positions on the camera's path: the time offset between the clocks, and the place of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.similarity import align_points, are_apart
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import AssociationOptions
+from rangesfm.positions.known_positions import KnownPositions
+from rangesfm.positions.position_log import PositionLog
+from rangesfm.ranging.association import (
+    interpolated_centers,
+    interpolated_lever_arms,
+    is_too_long,
+    timing_stddev,
+)
+
+# An offset that puts fewer positions on the path than this share of the largest possible number is not tried.
+_MIN_COVERAGE = 0.5
+_MIN_NUM = 5
+# Largest number of positions for the search, and of offsets that are tried; the best is then refined with all.
+_NUM_SEARCHED, _MAX_NUM_TRIED = 200, 4000
+# Step between offsets, as a share of the median time between keyframes: the motion hardly changes within it.
+_STEP = 0.25
+_MOST_OUTLYING = 0.2
+_NUM_REFINED = 12
+# A given offset is wrong if the residuals with it are at least so many times those with another one.
+_MUCH_WORSE = 3.0
+
+
+@dataclass(frozen=True)
+class AntennaTrack:
+    """Positions of an antenna on the camera.
+
+    Attributes:
+        log: in the site's frame.
+        antenna_in_cam_m: (3,) lever arm.
+        offset_s: image time minus time of the positions; None: not known yet. offset_stddev_s: its standard deviation.
+        association: how positions are placed between keyframes.
+        other_offset_s: offset with which the positions fit the path much better than with the given one; None: none.
+    """
+
+    log: PositionLog
+    antenna_in_cam_m: Array
+    offset_s: float | None
+    association: AssociationOptions
+    offset_stddev_s: float = 0.0
+    other_offset_s: float | None = None
+
+    def with_offset(self, path: Trajectory) -> AntennaTrack:
+        """Return the track with its time offset, which is searched for if it is not given.
+
+        Raises:
+            InputError: the positions are by time and the photos have none.
+            GeometryError: too few positions and keyframes have a moment in common.
+        """
+        if self.log.timestamp_s is None:
+            return self
+        if path.timestamps_s is None:
+            raise InputError("the positions have times but the photos have none: give image times", self.log.path)
+        given_s, times_s, at_m = self.offset_s, self.log.timestamp_s, self.log.position_m
+        try:
+            offset_s, stddev_s = _search(times_s, at_m, path, path.timestamps_s)
+        except GeometryError:
+            if given_s is None:
+                raise
+            return self
+        if given_s is None:
+            return replace(self, offset_s=offset_s, offset_stddev_s=stddev_s)
+        misfits = [_misfit_m(times_s + s, at_m, path.timestamps_s, path.centers) for s in (given_s, offset_s)]
+        return replace(self, other_offset_s=offset_s) if misfits[0] > _MUCH_WORSE * misfits[1] else self
+
+    def located(self, path: Trajectory) -> KnownPositions:
+        """Return the positions that have a place on a path; the others are left out."""
+        rows, before, after, weight = self._places(path)
+        k, n, arms = len(rows), len(path), np.tile(self.antenna_in_cam_m, (len(rows), 1))
+        turned = np.einsum("kij,kj->ki", path.world_from_cam[before], arms)
+        offsets, stddev, arm_stddev_m = np.zeros((k, 3)), np.zeros(k), np.zeros(k)
+        velocity, times_s = np.zeros((k, 3)), np.full(k, np.nan)
+        if path.timestamps_s is not None and n > 1:
+            is_bridged = ~is_too_long(np.diff(path.timestamps_s), self.association)
+            offsets, stddev = interpolated_centers(path, before, weight, is_bridged)
+            turned, arm_stddev_m = interpolated_lever_arms(path, arms, before, weight, is_bridged)
+            stddev = np.hypot(stddev, timing_stddev(0.0, path, before, after, weight, self.association))
+            velocity = _velocities(path.timestamps_s, path.centers, before)
+            times_s = path.timestamps_s[before] if self.log.timestamp_s is None else self._times_s[rows]
+        names = self._names
+        on_line = (1 - weight)[:, None] * path.centers[before] + weight[:, None] * path.centers[after]
+        return KnownPositions(
+            names=tuple(names[row] for row in rows.tolist()),
+            is_mark=np.zeros(k, dtype=bool),
+            is_check=np.zeros(k, dtype=bool),
+            position_m=self.log.position_m[rows],
+            covariance_m2=self.log.covariance_m2[rows],
+            is_stated=np.asarray(np.isfinite(self.log.covariance_m2[rows]).all(axis=(1, 2))),
+            places=on_line + offsets,
+            arms_m=turned,
+            own_covariance=stddev[:, None, None] ** 2 * np.eye(3),
+            arm_stddev_m=arm_stddev_m,
+            time_s=times_s,
+            velocity=velocity,
+            world_from_cam=path.world_from_cam[np.where(weight < 0.5, before, after)],
+            by_pose=_by_shifts(before, after, weight, n),
+            arms_by_pose=_by_turns(path, self.antenna_in_cam_m, before, after, weight),
+            on_path=np.column_stack([before, after]),
+            weight=weight,
+            from_line=offsets,
+        )
+
+    @property
+    def _times_s(self) -> Array:
+        assert self.log.timestamp_s is not None, "positions by time"
+        return self.log.timestamp_s + (self.offset_s or 0.0)
+
+    @property
+    def _names(self) -> list[str]:
+        if self.log.image_name is not None:
+            return [*self.log.image_name]
+        assert self.log.timestamp_s is not None, "positions by time"
+        return [f"{time:.3f} s" for time in self.log.timestamp_s.tolist()]
+
+    def _places(self, path: Trajectory) -> tuple[Indices, Indices, Indices, Array]:
+        """Return the rows of the log that have a place, and the keyframes before and after each with its weight."""
+        log, options = self.log, self.association
+        if log.image_name is not None:
+            index_of = {name: index for index, name in enumerate(path.image_names)}
+            at = np.array([index_of.get(name, -1) for name in log.image_name], dtype=np.int64)
+            rows = np.flatnonzero(at >= 0)
+            return rows, at[rows], at[rows], np.zeros(len(rows))
+        if path.timestamps_s is None:
+            raise InputError("the positions have times but the photos have none: give image times", log.path)
+        times, known = self._times_s, path.timestamps_s
+        after = np.clip(np.searchsorted(known, times), min(1, len(known) - 1), len(known) - 1)
+        before = np.maximum(after - 1, 0)
+        gap = known[after] - known[before]
+        weight = np.clip((times - known[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+        is_between: Mask = (times >= known[0]) & (times <= known[-1]) & (gap > 0) & ~is_too_long(gap, options)
+        nearest = np.where(weight < 0.5, before, after)
+        is_at = ~is_between & (np.abs(times - known[nearest]) <= options.max_time_difference_s)
+        before, after = np.where(is_at, nearest, before), np.where(is_at, nearest, after)
+        rows = np.flatnonzero(is_between | is_at)
+        return rows, before[rows], after[rows], np.where(is_at, 0.0, weight)[rows]
+
+
+def _velocities(times_s: Array, centers: Array, before: Indices) -> Array:
+    """Return (k, 3) velocities along the path from each keyframe to the next; of the last two at the end."""
+    steps = np.diff(centers, axis=0) / np.diff(times_s)[:, None]
+    return np.asarray(steps[np.minimum(before, len(steps) - 1)])
+
+
+def _by_shifts(before: Indices, after: Indices, weight: Array, num: int) -> csr_array:
+    """Return the (3 k, 6 n) derivatives of the places by shifts of the poses."""
+    rows, axes = 3 * np.arange(len(before))[:, None] + np.arange(3), 3 + np.arange(3)
+    parts = [(1 - weight, before), (weight, after)]
+    values = np.concatenate([np.repeat(share, 3) for share, _ in parts])
+    columns = np.concatenate([(6 * pose[:, None] + axes).ravel() for _, pose in parts])
+    return coo_array((values, (np.tile(rows.ravel(), 2), columns)), shape=(3 * len(before), 6 * num)).tocsr()
+
+
+def _by_turns(path: Trajectory, arm_m: Array, before: Indices, after: Indices, weight: Array) -> csr_array:
+    """Return the (3 k, 6 n) derivatives of the lever arms by turns of the poses in their own frames."""
+    cross = -cross_matrices(arm_m[None])[0]
+    rows = 3 * np.arange(len(before))[:, None, None] + np.arange(3)[:, None] + np.zeros(3, dtype=np.int64)
+    values, columns = [], []
+    for share, pose in ((1 - weight, before), (weight, after)):
+        values.append((share[:, None, None] * (path.world_from_cam[pose] @ cross)).ravel())
+        columns.append((6 * pose[:, None, None] + np.zeros((3, 1), dtype=np.int64) + np.arange(3)).ravel())
+    shape = (3 * len(before), 6 * len(path))
+    return coo_array((np.concatenate(values), (np.tile(rows.ravel(), 2), np.concatenate(columns))), shape=shape).tocsr()
+
+
+def _search(times_s: Array, position_m: Array, path: Trajectory, photo_times_s: Array) -> tuple[float, float]:
+    """Return the time offset with the best fit of a similarity, and its standard deviation.
+
+    Raises:
+        GeometryError: too few positions and keyframes have a moment in common, or the antenna did not move.
+    """
+    if len(times_s) < _MIN_NUM or len(path) < _MIN_NUM or not (are_apart(path.centers) and are_apart(position_m)):
+        raise GeometryError(
+            f"the time offset of the positions is not determined: {len(times_s)} positions, {len(path)} keyframes"
+        )
+    some = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _NUM_SEARCHED)).astype(np.int64))
+    low, high = photo_times_s[0] - times_s[-1], photo_times_s[-1] - times_s[0]
+    step = max(_STEP * float(np.median(np.diff(photo_times_s))), (high - low) / _MAX_NUM_TRIED)
+
+    def misfit(offset_s: float, rows: Indices) -> float:
+        return _misfit_m(times_s[rows] + offset_s, position_m[rows], photo_times_s, path.centers)
+
+    offsets = np.arange(low, high, step)
+    most = max(_num_on(times_s[some] + offset, photo_times_s) for offset in offsets.tolist())
+    enough = max(_MIN_COVERAGE * most, _MIN_NUM)
+    costs = np.array(
+        [
+            misfit(offset, some) if _num_on(times_s[some] + offset, photo_times_s) >= enough else np.inf
+            for offset in offsets.tolist()
+        ]
+    )
+    if not np.isfinite(costs).any():
+        raise GeometryError(
+            "the time offset of the positions is not determined: hardly any lie within the photos' times"
+        )
+    best, everything = float(offsets[int(np.argmin(costs))]), np.arange(len(times_s))
+    for _ in range(_NUM_REFINED):
+        around = best + step * np.array([-1.0, 0.0, 1.0])
+        values = np.array([misfit(offset, everything) for offset in around.tolist()])
+        curvature = values[0] - 2 * values[1] + values[2]
+        moved = 0.5 * step * (values[0] - values[2]) / curvature if curvature > 0 else 0.0
+        best, step = best + float(np.clip(moved, -step, step)), step / 2
+    # Half the mean square residual grows with the speed of the camera; the residuals that are left limit the offset.
+    speed = float(np.median(np.linalg.norm(np.diff(position_m, axis=0), axis=1) / np.diff(times_s)))
+    return best, misfit(best, everything) / max(speed, 1e-6) / np.sqrt(max(len(times_s) / 3, 1.0))
+
+
+def _num_on(times_s: Array, photo_times_s: Array) -> int:
+    return int(np.count_nonzero((times_s >= photo_times_s[0]) & (times_s <= photo_times_s[-1])))
+
+
+def _misfit_m(times_s: Array, position_m: Array, photo_times_s: Array, centers: Array) -> float:
+    """Return the root mean square distance of positions from a similar path, without a share of the farthest ones."""
+    on = (times_s >= photo_times_s[0]) & (times_s <= photo_times_s[-1])
+    if on.sum() < _MIN_NUM:
+        return np.inf
+    places = np.column_stack([np.interp(times_s[on], photo_times_s, centers[:, axis]) for axis in range(3)])
+    targets = position_m[on]
+    fit = align_points(places, targets)
+    off = np.linalg.norm(fit.apply(places) - targets, axis=1)
+    near = off <= np.quantile(off, 1 - _MOST_OUTLYING)
+    if near.sum() >= _MIN_NUM:
+        fit = align_points(places[near], targets[near])
+        off = np.sort(np.linalg.norm(fit.apply(places) - targets, axis=1))[: int(near.sum())]
+    return float(np.sqrt(np.mean(off**2)))

@@ -1,0 +1,268 @@
+"""Marks with known coordinates: control points, which hold the map in the site, and check points, which test it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.distances.locate_lengths import images_by_name
+from rangesfm.distances.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker, read_markers
+from rangesfm.errors import InputError
+from rangesfm.files.text_tables import TextTable, has_columns, read_head, read_table, read_text, repeated
+from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
+from rangesfm.ranging.anchors.anchor_file import find_anchor_columns
+from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
+from rangesfm.ranging.readers.lists import UnclearListError, check_columns, read_list
+from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
+
+POINT_COLUMNS = ("marker", "x_m", "y_m", "z_m")
+QUANTITIES = ("marker", "x", "y", "z", "stddev", "kind")
+_AXES = ("x", "y", "z")
+_KINDS = (CONTROL, CHECK)
+_KIND_WORDS = frozenset({"kind", "role", "type", "use"})
+_EXPECTED = f"expected a table with {','.join(POINT_COLUMNS)}"
+# First line of ODM's gcp_list.txt: the coordinate system, by number, by PROJ's parameters, or as a zone of UTM.
+_CRS = re.compile(r"\s*(?:(EPSG:\d+)|(\+(?:proj|init)=.+)|WGS ?84\s+UTM\s+(\d{1,2})\s*([NS])\w*)\s*", re.IGNORECASE)
+_NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
+
+
+@dataclass(frozen=True)
+class ControlPoint:
+    """A mark whose coordinates are known.
+
+    Attributes:
+        name: of its marker.
+        position_m: (3,) in the site's frame, metres.
+        stddev_m: standard deviation of each coordinate.
+        kind: "control" (it holds the map), "check" (it is compared with the result) or "left out".
+        line: in the file.
+    """
+
+    name: str
+    position_m: Array
+    stddev_m: float
+    kind: str
+    line: int
+
+
+@dataclass(frozen=True)
+class ControlPoints:
+    """Marks with known coordinates, and where they are seen.
+
+    Attributes:
+        points: in the order of the file.
+        markers: marks in photos, by name; a point without any is in no photo.
+        stddevs_are_given: whether the file gives the standard deviations.
+        crs: coordinate system named in the file; None if there is none.
+        path, markers_path: the files, for messages.
+        notes: lines for the user about how the file was read.
+    """
+
+    points: tuple[ControlPoint, ...]
+    markers: Mapping[str, Marker] = field(default_factory=dict)
+    stddevs_are_given: bool = True
+    crs: str | None = None
+    path: Path | None = None
+    markers_path: Path | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def positions_m(self) -> Array:
+        """(k, 3) coordinates of all points."""
+        return np.array([point.position_m for point in self.points]).reshape(-1, 3)
+
+    def moved_to(self, positions_m: Array) -> ControlPoints:
+        """Return the points with other coordinates (k, 3)."""
+        moved = (replace(point, position_m=at) for point, at in zip(self.points, positions_m, strict=True))
+        return replace(self, points=tuple(moved))
+
+    def with_more(self, markers: Mapping[str, Marker]) -> ControlPoints:
+        """Return the points with more markers; their own are kept where a new one has an equal name."""
+        return replace(self, markers={**markers, **self.markers})
+
+    def without(self, names: Sequence[str]) -> ControlPoints:
+        """Return the points with those of these names marked as left out."""
+        points = (replace(point, kind="left out") if point.name in names else point for point in self.points)
+        return replace(self, points=tuple(points))
+
+
+def read_control_points(options: PointOptions, markers_path: Path | None) -> ControlPoints | None:
+    """Read ``marker,x_m,y_m,z_m[,stddev_m,kind]`` or another table of points, or ODM's ``gcp_list.txt``.
+
+    A point without a kind is a control point.
+
+    Args:
+        options: which name the file.
+        markers_path: file of the marks in photos; None: those of ``gcp_list.txt``, or printed tags.
+
+    Raises:
+        UnclearListError: the columns are not known for sure; the advice says what to type.
+        InputError: a file is not valid; the error gives the line.
+    """
+    path = options.path
+    if path is None:
+        return None
+    head = read_head(path)
+    if not head.strip():
+        raise InputError(f"the file is empty, {_EXPECTED}", path)
+    markers = {} if markers_path is None else read_markers(markers_path)
+    read = _gcp_list if is_gcp_list(head) else _table
+    found = replace(read(path, options, head), markers_path=markers_path)
+    return found.with_more(markers)
+
+
+def is_gcp_list(head: str) -> bool:
+    """Return whether a file with this beginning is ODM's list of ground control points."""
+    first, *rows = [line for line in head.split("\n") if line.strip() and not line.startswith("#")] or [""]
+    return _CRS.fullmatch(first) is not None and any(len(row.split()) > _NUM_GCP_NUMBERS for row in rows)
+
+
+def is_point_file(head: str) -> bool:
+    """Return whether a file with this beginning holds coordinates of marks."""
+    return has_columns(head, POINT_COLUMNS) or is_gcp_list(head)
+
+
+def _table(path: Path, options: PointOptions, head: str) -> ControlPoints:
+    if not options.columns and options.unit is None and has_columns(head, POINT_COLUMNS):
+        table = read_table(path, POINT_COLUMNS, ["stddev_m", "kind"], separator=None)
+        names = {quantity: f"{quantity}_m" if quantity in (*_AXES, "stddev") else quantity for quantity in QUANTITIES}
+        return _points(table, names, dict.fromkeys(QUANTITIES, "m"), ("",), options, [])
+    layout = find_layout(path)
+    if layout is None:
+        raise InputError(f"no table, {_EXPECTED}", path)
+    columns = _columns_by_user(options.columns, layout, path) if options.columns else _found_columns(path, layout)
+    table, notes = read_list(layout, columns)
+    by_name = {column.name: column.unit for column in layout.columns}
+    own = {quantity: named_length_unit(f"{name} {by_name[name]}") for quantity, name in columns.items()}
+    units = {quantity: (options.unit if quantity in _AXES else None) or unit or "m" for quantity, unit in own.items()}
+    return _points(table, columns, units, MISSING, options, notes)
+
+
+def _found_columns(path: Path, layout: Layout) -> dict[str, str]:
+    """Return the name of the column of each quantity, recognized as in a table of anchors."""
+    try:
+        found = find_anchor_columns(path, layout)
+    except UnclearListError as error:
+        raise error.about_other("points", {"anchor_id": "marker"}, {"--anchor_": "--point_"}) from None
+    if found is None:
+        raise InputError(f"no columns of points; found {', '.join(layout.units)}; {_EXPECTED}", path)
+    own = {"anchor_id": "marker", "position_stddev": "stddev"}
+    columns = {own.get(quantity, quantity): name for quantity, name in found.items() if "bias" not in quantity}
+    kinds = [
+        column.name
+        for column in layout.columns
+        if {*column.words} & _KIND_WORDS and {cell.strip().lower() for cell in column.cells} <= {*_KINDS, ""}
+    ]
+    return columns | ({"kind": kinds[0]} if len(kinds) == 1 else {})
+
+
+def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
+    check_columns(columns, QUANTITIES, layout, path)
+    if missing := [quantity for quantity in ("marker", *_AXES) if quantity not in columns]:
+        raise InputError(f"columns do not name {', '.join(missing)}, expected marker, x, y and z", path)
+    return {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
+
+
+def _points(
+    table: TextTable,
+    names: Mapping[str, str],
+    units: Mapping[str, str],
+    missing: Sequence[str],
+    options: PointOptions,
+    notes: Sequence[str],
+) -> ControlPoints:
+    """Return the points of a table, given the column and the unit of each quantity."""
+    if not len(table):
+        raise InputError("names no point, expected one per line", table.path)
+    markers = table.text(names["marker"])
+    if again := repeated(markers):
+        raise table.error(again[0], names["marker"], "each point once")
+
+    def metres(quantity: str) -> Array:
+        per_metre = UNITS_PER_METRE[units[quantity]]
+        values = table.numbers(names[quantity], expected=str(COORDINATE_M)) / per_metre
+        table.refuse(~COORDINATE_M.hold(values), names[quantity], str(COORDINATE_M))
+        return values
+
+    positions = np.column_stack([metres(axis) for axis in _AXES])
+    stddevs, is_given = np.full(len(table), options.stddev_m), names.get("stddev", "") in table
+    if is_given:
+        per_metre = UNITS_PER_METRE[units["stddev"]]
+        stddevs = table.numbers(names["stddev"], empty=options.stddev_m * per_metre, missing=missing) / per_metre
+        table.refuse(~STDDEV_M.hold(stddevs), names["stddev"], str(STDDEV_M))
+    kinds = [CONTROL] * len(table)
+    if names.get("kind", "") in table:
+        kinds = [kind.lower() for kind in table.text(names["kind"], empty=CONTROL)]
+        table.refuse(np.array([kind not in _KINDS for kind in kinds]), names["kind"], f"{CONTROL} or {CHECK}")
+    rows = zip(markers, positions, stddevs.tolist(), kinds, table.line.tolist(), strict=True)
+    points = tuple(ControlPoint(*row) for row in rows)
+    told = tuple(f"{table.path.name}: {note}" for note in notes)
+    return ControlPoints(points, {}, is_given, None, table.path, None, told)
+
+
+def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
+    """Read ODM's ``gcp_list.txt``: the coordinate system, then lines of a point and its pixel in one photo.
+
+    A point without a name is known by its coordinates.
+    """
+    crs, points, marks = None, dict[str, ControlPoint](), dict[str, list[tuple[str, list[float], int]]]()
+    for line, text in enumerate(read_text(path).split("\n"), 1):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        if crs is None:
+            crs = _crs_of(text)
+            continue
+        numbers, image_name, rest = _cells_of_gcp(text, path, line)
+        name = rest or next(
+            (known.name for known in points.values() if known.position_m.tolist() == numbers[:3]),
+            f"point {len(points) + 1}",
+        )
+        point = ControlPoint(name, np.array(numbers[:3]), options.stddev_m, CONTROL, line)
+        if points.setdefault(name, point).position_m.tolist() != numbers[:3]:
+            message = f"point {name} has other coordinates than in line {points[name].line}, expected the same"
+            raise InputError(message, path, line)
+        marks.setdefault(name, []).append((image_name, numbers[3:], line))
+    markers = {name: _marker(name, seen, path) for name, seen in marks.items()}
+    return ControlPoints(tuple(points.values()), markers, False, crs, path)
+
+
+def _crs_of(text: str) -> str:
+    found = _CRS.fullmatch(text)
+    assert found is not None, "the first line was recognized"
+    number, parameters, zone, half = found.groups()
+    return number or parameters or f"EPSG:{(326 if half.upper() == 'N' else 327) * 100 + int(zone)}"
+
+
+def _cells_of_gcp(text: str, path: Path, line: int) -> tuple[list[float], str, str]:
+    """Return the five numbers, the photo and the name (may be empty) of a line of ``gcp_list.txt``."""
+    cells = text.split("\t") if text.count("\t") >= _NUM_GCP_NUMBERS else text.split()
+    cells = [cell.strip() for cell in cells]
+    check: Sequence[Callable[[float], bool]] = [COORDINATE_M.hold] * 3 + [PIXEL.hold] * 2
+    try:
+        numbers = [float(cell) for cell in cells[:_NUM_GCP_NUMBERS]]
+        is_right = len(cells) > _NUM_GCP_NUMBERS and all(holds(x) for holds, x in zip(check, numbers, strict=True))
+    except ValueError:
+        is_right = False
+    if not is_right:
+        raise InputError(f"is no line of a point, expected {_GCP_COLUMNS}", path, line)
+    return numbers, cells[_NUM_GCP_NUMBERS], cells[_NUM_GCP_NUMBERS + 1] if len(cells) > _NUM_GCP_NUMBERS + 1 else ""
+
+
+def _marker(name: str, seen: Sequence[tuple[str, list[float], int]], path: Path) -> Marker:
+    photos, pixels, lines = zip(*seen, strict=True)
+    if again := repeated(photos):
+        raise InputError(f"point {name} is twice in {photos[again[0]]}, expected once", path, lines[again[0]])
+    return Marker(photos, np.array(pixels), lines, CLICKED_STDDEV_PX)
+
+
+def marks_seen(points: ControlPoints, model: pycolmap.Reconstruction) -> Mask:
+    """Return which points (k,) are marked in two photos of a model or more."""
+    images = images_by_name(model)
+    photos = (points.markers[point.name].image_names if point.name in points.markers else () for point in points.points)
+    return np.array([sum(photo in images for photo in of_point) >= 2 for of_point in photos], dtype=bool)

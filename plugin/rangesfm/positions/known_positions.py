@@ -1,0 +1,155 @@
+"""Positions known in the site, found in a model: of marks that its photos show, and of an antenna on its path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.sparse import csr_array, vstack
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.distances.map_points import MapPoint, MapPoints
+from rangesfm.distances.tape import CONTROL
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.positions.control_points import ControlPoints, marks_seen
+
+LASTING_S = (3.0, 30.0, 300.0)
+"""Times for which errors of an antenna's positions last, seconds: those of filters and reflections for seconds, those
+of the troposphere, of satellites and of echoes in a hall for minutes. A mixture follows any time between."""
+
+
+@dataclass(frozen=True)
+class KnownPositions:
+    """k positions in the site, each with the place of the same thing in a model.
+
+    In the site the place is ``scale * R c + R a + t``, with c the place in the model, a the lever arm and
+    (scale, R, t) the similarity from the model's world to the site.
+
+    Attributes:
+        names: of marks; the photo or the time of an antenna's positions.
+        is_mark: (k,) whether it is a mark; otherwise it is the antenna.
+        is_check: (k,) positions that do not take part in the estimate.
+        position_m: (k, 3) in the site. covariance_m2: (k, 3, 3) of these; NaN where it is unknown.
+        is_stated: (k,) whether the covariance was given with the position, and not assumed.
+        places: (k, 3) in the model's world and unit. arms_m: (k, 3) lever arms in the axes of the model's world.
+        own_covariance: (k, 3, 3) of the places, in the model's world and unit, without errors of the poses.
+        arm_stddev_m: (k,) of each coordinate of the arms.
+        time_s: (k,) on the photos' clock; NaN without a time.
+        velocity: (k, 3) of the antenna, model units per second; 0 for marks.
+        world_from_cam: (k, 3, 3) rotations of the camera; 0 for marks.
+        by_pose, arms_by_pose: (3 k, 6 n) sparse derivatives of places and arms by the n poses of a path: for each, a
+            turn in its own frame and a shift, in the model's world and unit.
+        on_path: (k, 2) keyframes before and after; -1 for marks. weight: (k,) of the later one.
+        from_line: (k, 3) deviation of the curved path from the straight line between them, in the model's unit.
+    """
+
+    names: tuple[str, ...]
+    is_mark: Mask
+    is_check: Mask
+    position_m: Array
+    covariance_m2: Array
+    is_stated: Mask
+    places: Array
+    arms_m: Array
+    own_covariance: Array
+    arm_stddev_m: Array
+    time_s: Array
+    velocity: Array
+    world_from_cam: Array
+    by_pose: csr_array
+    arms_by_pose: csr_array
+    on_path: Indices
+    weight: Array
+    from_line: Array
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def subset(self, rows: Indices) -> KnownPositions:
+        """Return some of the positions."""
+        chosen: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAYS}
+        coordinates = (3 * rows[:, None] + np.arange(3)).ravel()
+        chosen |= {name: getattr(self, name)[coordinates] for name in _SPARSE}
+        return KnownPositions(names=tuple(self.names[row] for row in rows.tolist()), **chosen)
+
+    def joined(self, others: KnownPositions | None) -> KnownPositions:
+        """Return these positions followed by others in the same model."""
+        if others is None:
+            return self
+        both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(others, name)]) for name in _ARRAYS}
+        both |= {name: vstack([getattr(self, name), getattr(others, name)], format="csr") for name in _SPARSE}
+        return KnownPositions(names=self.names + others.names, **both)
+
+    def predicted_m(self, site_from_model: Similarity) -> Array:
+        """Return the (k, 3) positions in the site."""
+        return np.asarray(site_from_model.apply(self.places) + self.arms_m @ site_from_model.rotation.T)
+
+    def misclosures_m(self, site_from_model: Similarity) -> Array:
+        """Return the (k, 3) differences: in the map minus known."""
+        return self.predicted_m(site_from_model) - self.position_m
+
+
+_SPARSE = ("by_pose", "arms_by_pose")
+_ARRAYS = tuple(field.name for field in fields(KnownPositions) if field.name not in ("names", *_SPARSE))
+
+
+def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions:
+    """Find the marks of control and check points in a model; points that fewer than two photos show are left out.
+
+    Args:
+        points: in the site. model: in any world. path: of its keyframes, in the same world.
+
+    Raises:
+        InputError: the marks of a point are not of one point, or are seen from one direction only.
+    """
+    seen = [point for point, is_seen in zip(points.points, marks_seen(points, model), strict=True) if is_seen]
+    finder, k = MapPoints(model, {}, points.markers, np.nan, points.markers_path or points.path), len(seen)
+    found = [finder.find_marker(point.name) for point in seen]
+    stddev_m = np.array([point.stddev_m for point in seen])
+    return KnownPositions(
+        names=tuple(point.name for point in seen),
+        is_mark=np.ones(k, dtype=bool),
+        is_check=np.array([point.kind != CONTROL for point in seen], dtype=bool),
+        position_m=np.array([point.position_m for point in seen]).reshape(-1, 3),
+        covariance_m2=stddev_m[:, None, None] ** 2 * np.eye(3),
+        is_stated=np.full(k, points.stddevs_are_given),
+        places=np.array([each.position_m for each in found]).reshape(-1, 3),
+        arms_m=np.zeros((k, 3)),
+        own_covariance=np.array([each.errors.own_m2 for each in found]).reshape(-1, 3, 3),
+        arm_stddev_m=np.zeros(k),
+        time_s=np.full(k, np.nan),
+        velocity=np.zeros((k, 3)),
+        world_from_cam=np.zeros((k, 3, 3)),
+        by_pose=vstack([csr_array((0, 6 * len(path))), *(_by_pose(each, path) for each in found)], format="csr"),
+        arms_by_pose=csr_array((3 * k, 6 * len(path))),
+        on_path=np.full((k, 2), -1, dtype=np.int64),
+        weight=np.zeros(k),
+        from_line=np.zeros((k, 3)),
+    )
+
+
+def _by_pose(point: MapPoint, path: Trajectory) -> csr_array:
+    """Return the (3, 6 n) derivatives of a mark by the poses of a path; other parts of the map are held fixed."""
+    row_of = {frame_id: row for row, frame_id in enumerate(path.frame_ids.tolist())}
+    slopes = np.zeros((3, len(path), 6))
+    for (kind, number), by in point.errors.by_part.items():
+        if kind == "frame" and (row := row_of.get(number)) is not None:
+            # A turn about the camera's own axes is a turn about those of the world, turned by its rotation.
+            slopes[:, row, :3] = by[:, :3] @ path.world_from_cam[row]
+            slopes[:, row, 3:] = by[:, 3:]
+    return csr_array(slopes.reshape(3, -1))
+
+
+def joined_positions(parts: Sequence[KnownPositions | None]) -> KnownPositions | None:
+    """Return the positions of several kinds together; None if there are none."""
+    known = [part for part in parts if part is not None and len(part)]
+    if not known:
+        return None
+    first, *others = known
+    for part in others:
+        first = first.joined(part)
+    return first

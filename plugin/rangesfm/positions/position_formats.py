@@ -1,0 +1,446 @@
+"""Readers of positions: tables of any layout, TUM trajectories, NMEA, RTKLIB's solutions, and Marvelmind's dashboard.
+
+Each is a function that returns a PositionLog, and one that recognises the beginning of a file. Pozyx and other systems
+write tables with names of columns, which are recognised like those of range logs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.errors import InputError, nearest_known, printable
+from rangesfm.files.text_tables import TextTable, has_columns, header_names, read_head, read_table, read_text
+from rangesfm.geometry.reference import is_tum_row, read_reference
+from rangesfm.option_model import Bounds
+from rangesfm.options import COORDINATE_M, STDDEV_M, TIME_S, PositionOptions
+from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.ranging.readers import vocabulary as terms
+from rangesfm.ranging.readers.columns import read_timestamps
+from rangesfm.ranging.readers.guess import Guess, find_time
+from rangesfm.ranging.readers.layout import ColumnSample, Layout, find_layout
+from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns, columns_flag
+from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
+
+_AXES = ("x", "y", "z")
+_STDDEVS = tuple(f"stddev_{axis}" for axis in _AXES)
+_COVARIANCES = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+QUANTITIES = ("timestamp", "date", "nanoseconds", "image_name", *_AXES, "stddev", *_STDDEVS, *_COVARIANCES, "tag_id")
+_CANONICAL = {
+    "timestamp": "timestamp_s",
+    "image_name": "image_name",
+    **{name: f"{name}_m" for name in (*_AXES, "stddev", *_STDDEVS)},
+    **{name: f"{name}_m2" for name in _COVARIANCES},
+}
+POSITION_COLUMNS = tuple(_CANONICAL[axis] for axis in _AXES)
+_EXPECTED = f"expected a table with timestamp_s or image_name, and {','.join(POSITION_COLUMNS)}"
+DEGREES = Bounds(-360, 360, "degrees")
+_SLOWEST_S = 120.0
+_GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
+_SECONDS_OF_DAY = 86400.0
+# Standard deviations of positions by the quality that NMEA's GGA reports, metres: autonomous, differential, fixed RTK,
+# float RTK. Receivers that send GST sentences say it themselves.
+_NMEA_STDDEVS_M = {1: 3.0, 2: 1.0, 4: 0.02, 5: 0.3}
+_NMEA = re.compile(r"\$(?:[A-Z]{2})(GGA|RMC|GST|ZDA),([^*\r\n]*)(?:\*([0-9A-Fa-f]{2}))?\s*")
+
+Reader = Callable[[Path, PositionOptions], PositionLog]
+
+
+def read_positions(options: PositionOptions) -> PositionLog | None:
+    """Read the positions that a survey names; None if it names none.
+
+    Raises:
+        UnclearListError: the columns are not known for sure; the advice says what to type.
+        InputError: the file is not valid; the error gives the line.
+    """
+    path = options.path
+    if path is None:
+        return None
+    if options.format is not None:
+        if options.format not in POSITION_READERS:
+            near = nearest_known(options.format, POSITION_READERS)
+            raise InputError(f"unknown format of positions '{printable(options.format)}'; the nearest is '{near}'")
+        return POSITION_READERS[options.format][1](path, options)
+    head = read_head(path)
+    if not head.strip():
+        raise InputError(f"the file is empty, {_EXPECTED}", path)
+    read = next((read for is_it, read in POSITION_READERS.values() if is_it(head)), _read_table)
+    return read(path, options)
+
+
+def is_of_satellites(head: str) -> bool:
+    """Return whether a file with this beginning holds positions by satellites, which no log of ranges looks like."""
+    return _is_nmea(head) or _is_rtklib(head)
+
+
+def _is_canonical(head: str) -> bool:
+    return any(has_columns(head, [_CANONICAL[key], *POSITION_COLUMNS]) for key in ("timestamp", "image_name"))
+
+
+def _read_canonical(path: Path, options: PositionOptions) -> PositionLog:
+    if options.columns or options.unit or options.timestamp_unit or not _is_canonical(read_head(path)):
+        return _read_table(path, options)
+    key = "timestamp" if has_columns(read_head(path), [_CANONICAL["timestamp"]]) else "image_name"
+    optional = [name for quantity, name in _CANONICAL.items() if quantity not in (key, *_AXES)]
+    text = ["image_name"]
+    table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, text=text, separator=None)
+    names = {quantity: name for quantity, name in _CANONICAL.items() if name in table}
+    times = table.numbers(names["timestamp"], bounds=TIME_S) if key == "timestamp" else None
+    return _log_of_table(table, names, dict.fromkeys(QUANTITIES, "m"), times, path, [], options)
+
+
+def _read_table(path: Path, options: PositionOptions) -> PositionLog:
+    layout = find_layout(path)
+    if layout is None:
+        raise InputError(f"no table, {_EXPECTED}", path)
+    columns, notes = (
+        (_columns_by_user(options.columns, layout, path), []) if options.columns else _found_columns(path, layout)
+    )
+    table, more = layout.read()
+    notes += more
+    times = None
+    if "timestamp" in columns:
+
+        def ask(units: Sequence[str], why: str) -> InputError:
+            choices = [Choice(f"if they are {one}", ("--position_time_unit", one)) for one in units]
+            return UnclearListError("positions", path, layout, [f"the times have {why}"], choices)
+
+        said = options.timestamp_unit
+        times, _ = read_timestamps(table, columns, layout.units, said, notes, ask, slowest_s=_SLOWEST_S)
+    by_name = {column.name: column.unit for column in layout.columns}
+    named = {quantity: named_length_unit(f"{name} {by_name[name]}") for quantity, name in columns.items()}
+    units = {quantity: (options.unit if quantity in _AXES else None) or unit or "m" for quantity, unit in named.items()}
+    others = sorted({units[axis] for axis in _AXES} - {"m"})
+    notes += [f"coordinates are in {' and '.join(others)}"] if others else []
+    return _log_of_table(table, columns, units, times, path, notes, options)
+
+
+def _log_of_table(
+    table: TextTable,
+    names: Mapping[str, str],
+    units: Mapping[str, str],
+    times: Array | None,
+    path: Path,
+    notes: list[str],
+    options: PositionOptions,
+) -> PositionLog:
+    """Return the log of a table, given the column and the unit of each quantity."""
+    degrees = {axis for axis in ("x", "y") if terms.DEGREES[axis] & {*terms.words_of(names[axis])}}
+    kept = _of_one_tag(table, names, options.tag_id, path)
+    bounds = {axis: DEGREES if axis in degrees else COORDINATE_M for axis in _AXES}
+    per_metre = {axis: 1.0 if axis in degrees else UNITS_PER_METRE[units[axis]] for axis in _AXES}
+    columns = [table.numbers(names[axis], empty=np.nan, expected=str(bounds[axis])) / per_metre[axis] for axis in _AXES]
+    for axis, values in zip(_AXES, columns, strict=True):
+        table.refuse(~(np.isnan(values) | bounds[axis].hold(values)), names[axis], str(bounds[axis]))
+    position = np.column_stack(columns)
+    kept = kept & np.isfinite(position).all(axis=1)
+    image_name = None if times is not None else [name for name, k in zip(table.text(names["image_name"]), kept) if k]
+    return PositionLog.of(
+        path,
+        "table",
+        position[kept],
+        table.line[kept],
+        times_s=None if times is None else times[kept],
+        image_name=image_name,
+        covariance_m2=_covariances(table, names, units)[kept],
+        crs=GEOGRAPHIC if len(degrees) == 2 else None,
+        notes=notes,
+    )
+
+
+def _of_one_tag(table: TextTable, names: Mapping[str, str], tag_id: str | None, path: Path) -> Mask:
+    """Return which rows (n,) are of the wanted tag."""
+    if "tag_id" not in names:
+        return np.ones(len(table), dtype=bool)
+    ids = np.array(table.text(names["tag_id"], empty=""), dtype=str)
+    found = sorted(set(ids.tolist()))
+    if tag_id is None and len(found) > 1:
+        raise InputError(
+            f"has positions of several tags ({', '.join(found)}): say which it is (--position_tag_id)", path
+        )
+    if tag_id is not None and tag_id not in found:
+        raise InputError(f"has no position of tag {tag_id!r}, found {', '.join(found)}", path)
+    return np.asarray(ids == (found[0] if tag_id is None else tag_id))
+
+
+def _covariances(table: TextTable, names: Mapping[str, str], units: Mapping[str, str]) -> Array:
+    """Return (n, 3, 3) covariances, NaN where the table has none: as a matrix, by axis, or of any coordinate."""
+    covariances = np.full((len(table), 3, 3), np.nan)
+    if set(_COVARIANCES) <= names.keys():
+        rows, columns = np.triu_indices(3)
+        for name, i, j in zip(_COVARIANCES, rows, columns, strict=True):
+            covariances[:, i, j] = covariances[:, j, i] = table.numbers(names[name], empty=np.nan)
+        is_valid = np.isnan(covariances).any(axis=(1, 2)) | (np.linalg.eigvalsh(np.nan_to_num(covariances))[:, 0] > 0)
+        table.refuse(~is_valid, names["cov_xx"], "a positive definite covariance")
+        return covariances
+    for axis, own in enumerate(_STDDEVS):
+        if (name := own if own in names else "stddev") in names:
+            stddev = table.numbers(names[name], empty=np.nan) / UNITS_PER_METRE[units[name]]
+            table.refuse(~(np.isnan(stddev) | STDDEV_M.hold(stddev)), names[name], f"{STDDEV_M}, or nothing")
+            covariances[:, axis] = 0.0
+            covariances[:, axis, axis] = stddev**2
+    covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
+    return covariances
+
+
+def _found_columns(path: Path, layout: Layout) -> tuple[dict[str, str], list[str]]:
+    """Return the column of each quantity by the names of the columns.
+
+    Raises:
+        UnclearListError: it may be several.
+    """
+    guess = Guess()
+    free = find_time([*layout.columns], guess) if layout.has_names else []
+    columns = dict(guess.columns)
+    if photos := [column for column in layout.columns if column.names_photos]:
+        columns = {"image_name": photos[0].name} | {key: name for key, name in columns.items() if key != "image_name"}
+    doubts = [] if {"timestamp", "image_name"} & columns.keys() else ["no column seems to be the time or the photo"]
+    for axis in _AXES:
+        found = [column for column in free if _is_axis(column, axis)]
+        if len(found) == 1:
+            columns[axis] = found[0].name
+        else:
+            doubts.append(f"{'no column seems' if not found else 'several columns seem'} to be {axis}")
+    for column in free:
+        words = {*column.words} - terms.LENGTH_UNIT
+        if words & terms.STDDEV:
+            of_axes = [f"stddev_{axis}" for axis in _AXES if words & terms.COORDINATES[axis]]
+            columns.setdefault(of_axes[0] if of_axes else "stddev", column.name)
+        elif words & terms.TAG and words <= terms.TAG | terms.ID:
+            columns.setdefault("tag_id", column.name)
+    if doubts:
+        unknown = {quantity: "NAME" for quantity in ("timestamp", *_AXES) if quantity not in columns}
+        choice = Choice("with the names of the columns", columns_flag("position_columns", columns | unknown))
+        raise UnclearListError("positions", path, layout, doubts, [choice])
+    return columns, guess.notes
+
+
+def _is_axis(column: ColumnSample, axis: str) -> bool:
+    words = {*column.words} - terms.BESIDE_COORDINATE - terms.TAG
+    names = terms.COORDINATES[axis] | terms.DEGREES.get(axis, frozenset())
+    return column.kind == "numbers" and bool(words) and words <= names
+
+
+def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
+    check_columns(columns, QUANTITIES, layout, path)
+    missing = [quantity for quantity in _AXES if quantity not in columns]
+    if missing or not {"timestamp", "image_name"} & columns.keys():
+        message = "columns do not name all of x, y, z and one of timestamp and image_name"
+        raise InputError(message, path)
+    return {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
+
+
+def _is_tum(head: str) -> bool:
+    return is_tum_row(header_names(head))
+
+
+def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
+    poses = read_reference(path)
+    line = np.arange(1, len(poses) + 1)
+    return PositionLog.of(path, "tum", poses.positions_m, line, times_s=poses.timestamps_s)
+
+
+def _is_marvelmind(head: str) -> bool:
+    """Return whether lines are those of Marvelmind's dashboard: UNIX time in ms, two intervals, address, x, y, z."""
+    rows = [line.split(",") for line in head.split("\n")[:5] if line.strip()]
+    try:
+        return bool(rows) and all(
+            len(row) >= 9 and len(row) % 2 and 1e12 < float(row[0]) < 4e12 and float(row[3]).is_integer()
+            for row in rows
+        )
+    except ValueError:
+        return False
+
+
+def _read_marvelmind(path: Path, options: PositionOptions) -> PositionLog:
+    """Read the dashboard's CSV (operation manual, "CSV format")."""
+    rows, lines, ids = [], [], []
+    for line, text in enumerate(read_text(path).split("\n"), 1):
+        cells = text.strip().split(",")
+        if cells == [""]:
+            continue
+        try:
+            numbers = [float(cell) for cell in (cells[0], *cells[4:7])]
+        except (ValueError, IndexError):
+            raise InputError("is no line of Marvelmind's dashboard, expected time, ..., x, y, z", path, line) from None
+        if not (TIME_S.hold(numbers[0] / 1e3) and all(map(COORDINATE_M.hold, numbers[1:])) and len(numbers) == 4):
+            raise InputError("has no time and place, expected time in ms, ..., x, y, z in metres", path, line)
+        rows.append(numbers)
+        lines.append(line)
+        ids.append(cells[3].strip())
+    wanted = options.tag_id or (ids[0] if len(set(ids)) == 1 else "")
+    if wanted not in ids:
+        raise InputError(f"has positions of {', '.join(sorted(set(ids)))}: say which it is (--position_tag_id)", path)
+    kept = np.array(ids) == wanted
+    values = np.array(rows)[kept]
+    return PositionLog.of(path, "marvelmind", values[:, 1:], np.array(lines)[kept], times_s=values[:, 0] / 1e3)
+
+
+def _is_nmea(head: str) -> bool:
+    return any(_NMEA.fullmatch(line.strip()) for line in head.split("\n")[:50])
+
+
+def _read_nmea(path: Path, _options: PositionOptions) -> PositionLog:
+    """Read GGA sentences, with dates from RMC or ZDA and standard deviations from GST, if they are there.
+
+    The height is above the ellipsoid: that above the sea plus the separation of the geoid. Times are UTC.
+    """
+    rows, lines, stddevs, num_broken = list[list[float]](), list[int](), list[Array](), 0
+    day_s, last_s, errors = 0.0, -np.inf, dict[float, Array]()
+    for line, text in enumerate(read_text(path, errors="replace").split("\n"), 1):
+        found = _NMEA.fullmatch(text.strip())
+        if found is None:
+            continue
+        kind, body, checksum = found.groups()
+        cells = body.split(",")
+        try:
+            if checksum is not None and _checksum(text) != int(checksum, 16):
+                raise ValueError
+            if kind in ("RMC", "ZDA"):
+                day_s = _day_of_nmea(kind, cells)
+            elif kind == "GST":
+                errors[_seconds_of_day(cells[0])] = np.array([float(cells[6]), float(cells[5]), float(cells[7])])
+            elif int(cells[5]) > 0:
+                second = _seconds_of_day(cells[0])
+                day_s += _SECONDS_OF_DAY if second < last_s - _SECONDS_OF_DAY / 2 else 0.0
+                last_s = second
+                height_m = float(cells[8]) + float(cells[10] or 0.0)
+                rows.append([day_s + second, _degrees(cells[3], cells[4]), _degrees(cells[1], cells[2]), height_m])
+                lines.append(line)
+                usual = _NMEA_STDDEVS_M.get(int(cells[5]), 10.0) * np.array([1.0, 1.0, 2.0])
+                stddevs.append(errors.get(second, usual))
+        except (ValueError, IndexError):
+            num_broken += 1
+    notes = [f"{num_broken} broken sentences are left out"] if num_broken else []
+    values = np.array(rows).reshape(-1, 4)
+    covariances = np.array([np.diag(stddev**2) for stddev in stddevs]).reshape(-1, 3, 3)
+    return PositionLog.of(
+        path, "nmea", values[:, 1:], lines, times_s=values[:, 0], covariance_m2=covariances, crs=GEOGRAPHIC, notes=notes
+    )
+
+
+def _checksum(text: str) -> int:
+    total = 0
+    for character in text.strip()[1 : text.strip().index("*")]:
+        total ^= ord(character)
+    return total
+
+
+def _seconds_of_day(cell: str) -> float:
+    return 3600 * int(cell[:2]) + 60 * int(cell[2:4]) + float(cell[4:])
+
+
+def _day_of_nmea(kind: str, cells: Sequence[str]) -> float:
+    """Return the seconds from 1970 to the beginning of the day of an RMC or ZDA sentence."""
+    if kind == "RMC":
+        day, month, year = int(cells[8][:2]), int(cells[8][2:4]), 2000 + int(cells[8][4:6])
+    else:
+        day, month, year = int(cells[1]), int(cells[2]), int(cells[3])
+    return datetime(year, month, day, tzinfo=timezone.utc).timestamp()
+
+
+def _degrees(cell: str, half: str) -> float:
+    minutes_at = cell.index(".") - 2
+    degrees = float(cell[:minutes_at]) + float(cell[minutes_at:]) / 60
+    return -degrees if half in ("S", "W") else degrees
+
+
+def _is_rtklib(head: str) -> bool:
+    return _rtklib_header(head.split("\n")) is not None
+
+
+def _rtklib_header(lines: Sequence[str]) -> list[str] | None:
+    """Return the names of the columns of an RTKLIB solution; None if it is not one."""
+    for line in lines:
+        names = line.lstrip("% ").split()
+        if line.startswith("%") and names and names[0] in ("GPST", "UTC", "JST") and "Q" in names:
+            return names
+    return None
+
+
+def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
+    """Read a solution (.pos) of RTKLIB: latitude and longitude, or east, north and up from a base, with covariances.
+
+    Source: RTKLIB manual 2.4.2, appendix B.1. The off-diagonal columns are signed roots of covariances.
+    """
+    lines = read_text(path).split("\n")
+    names = _rtklib_header(lines)
+    if names is None:
+        raise InputError("has no header row of an RTKLIB solution (% GPST ...)", path)
+    is_geographic, is_enu = "latitude(deg)" in names, "e-baseline(m)" in names
+    if not (is_geographic or is_enu):
+        raise InputError(
+            "an RTKLIB solution with these columns is not read, expected latitude, longitude, height", path
+        )
+    rows, at_lines = list[list[float]](), list[int]()
+    for line, text in enumerate(lines, 1):
+        cells = text.split()
+        if not cells or text.startswith("%"):
+            continue
+        try:
+            numbers = [float(cell) for cell in cells[2:13]]
+            rows.append([_time_of_rtklib(cells[0], cells[1]), *numbers])
+        except (ValueError, IndexError):
+            rows.append([])
+        if len(rows[-1]) < 12:
+            raise InputError(
+                "is no row of an RTKLIB solution, expected date, time, 3 coordinates, Q, ns, 6 stddevs", path, line
+            )
+        at_lines.append(line)
+    values = np.array(rows).reshape(-1, 12)
+    north_first = values[:, [2, 1, 3]] if is_geographic else values[:, 1:4]
+    notes = ["times are GPS time, which is ahead of UTC by leap seconds"] if names[0] == "GPST" else []
+    return PositionLog.of(
+        path,
+        "rtklib",
+        north_first,
+        at_lines,
+        times_s=values[:, 0],
+        covariance_m2=_covariance_of_rtklib(values[:, 6:12], is_geographic),
+        crs=GEOGRAPHIC if is_geographic else None,
+        notes=notes,
+    )
+
+
+def _time_of_rtklib(first: str, second: str) -> float:
+    """Return seconds since 1970 of a date and a time, or of a GPS week and its seconds."""
+    if "/" in first:
+        day = datetime.strptime(first, "%Y/%m/%d").replace(tzinfo=timezone.utc)
+        hours, minutes, seconds = second.split(":")
+        return day.timestamp() + 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+    return (_GPS_EPOCH + timedelta(weeks=int(first))).timestamp() + float(second)
+
+
+def _covariance_of_rtklib(roots: Array, is_geographic: bool) -> Array:
+    """Return (n, 3, 3) covariances east, north, up from sdn, sde, sdu, sdne, sdeu, sdun; sde, sdn, .. of baselines."""
+    north, east, up = (0, 1, 2) if is_geographic else (1, 0, 2)
+    squares = np.sign(roots) * roots**2
+    covariances = np.zeros((len(roots), 3, 3))
+    covariances[:, 0, 0], covariances[:, 1, 1], covariances[:, 2, 2] = (
+        squares[:, east],
+        squares[:, north],
+        squares[:, up],
+    )
+    east_up, up_north = (4, 5) if is_geographic else (5, 4)
+    for (i, j), column in (((0, 1), 3), ((0, 2), east_up), ((1, 2), up_north)):
+        covariances[:, i, j] = covariances[:, j, i] = squares[:, column]
+    # Rounded to tenths of millimetres, a matrix may lose its definiteness: then its diagonal is taken.
+    is_bad = np.linalg.eigvalsh(covariances)[:, 0] <= 0
+    diagonals = np.einsum("nii->ni", covariances)
+    covariances[is_bad] = np.maximum(diagonals[is_bad], 1e-8)[:, :, None] * np.eye(3)
+    return covariances
+
+
+POSITION_READERS: dict[str, tuple[Callable[[str], bool], Reader]] = {
+    "nmea": (_is_nmea, _read_nmea),
+    "rtklib": (_is_rtklib, _read_rtklib),
+    "tum": (_is_tum, _read_tum),
+    "marvelmind": (_is_marvelmind, _read_marvelmind),
+    "table": (_is_canonical, _read_canonical),
+}
+"""Formats by name: whether a file begins like one, and its reader."""

@@ -1,0 +1,199 @@
+"""All that is known of positions in a site, and its comparison with the map."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+
+from rangesfm.arrays import Array
+from rangesfm.distances.tape import CHECK, CONTROL, Marker
+from rangesfm.files.records import Number, NumberOrNull, Record, Text, Vector, VectorOrNull
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.positions.antenna_track import AntennaTrack
+from rangesfm.positions.control_points import ControlPoints, marks_seen
+from rangesfm.positions.known_positions import LASTING_S, KnownPositions, joined_positions, locate_points
+
+
+@dataclass(frozen=True)
+class SurveyedPositions:
+    """Positions in the site's frame: of marks, and of an antenna.
+
+    Attributes:
+        points: control and check points; None without any.
+        antenna: positions of an antenna on the camera; None without any.
+        lasting_s: for how long errors of the antenna's positions last, seconds.
+    """
+
+    points: ControlPoints | None = None
+    antenna: AntennaTrack | None = None
+    lasting_s: tuple[float, ...] = LASTING_S
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines for the user about how the files were read."""
+        of_points = () if self.points is None else self.points.notes
+        return (*of_points, *(() if self.antenna is None else self.antenna.log.notes))
+
+    def facts(self) -> Iterator[str]:
+        """Yield lines that say what is known, before any map is made."""
+        if self.points is not None:
+            nums = Counter(point.kind for point in self.points.points)
+            kinds = " and ".join(f"{num} {kind}" for kind, num in nums.items())
+            num = sum(point.name in self.points.markers for point in self.points.points)
+            yield f"known points: {kinds}, {num} of them with marks in photos so far"
+        if self.antenna is not None:
+            log = self.antenna.log
+            name = "" if log.path is None else f" in {log.path.name}"
+            yield f"positions: {len(log)}{name} ({log.format})"
+
+    @property
+    def needs_times(self) -> bool:
+        """Whether the photos' times are needed."""
+        return self.antenna is not None and self.antenna.log.timestamp_s is not None
+
+    def on_path(self, path: Trajectory) -> SurveyedPositions:
+        """Return the positions with the time offset between the antenna's clock and that of the photos of a path.
+
+        Raises:
+            InputError: the photos have no times. GeometryError: the motion does not determine the offset.
+        """
+        return self if self.antenna is None else replace(self, antenna=self.antenna.with_offset(path))
+
+    def located(self, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions | None:
+        """Find the positions in a model; None if none of them is there.
+
+        Args:
+            model: in any world. path: of its keyframes.
+
+        Raises:
+            InputError: the marks of a point are not of one point, or are seen from one direction only.
+        """
+        marks = None if self.points is None else locate_points(self.points, model, path)
+        return joined_positions([marks, None if self.antenna is None else self.antenna.located(path)])
+
+    def with_more_markers(self, markers: Mapping[str, Marker]) -> SurveyedPositions:
+        """Return the positions with more marks in photos."""
+        return self if self.points is None else replace(self, points=self.points.with_more(markers))
+
+    def without(self, names: Iterable[str]) -> SurveyedPositions:
+        """Return the positions with the points of these names marked as left out."""
+        return self if self.points is None else replace(self, points=self.points.without([*names]))
+
+    def doubts_of_clock(self) -> Iterator[str]:
+        """Yield the reason to doubt the given time offset of the antenna's positions, if there is one."""
+        track = self.antenna
+        if track is not None and track.other_offset_s is not None and track.offset_s is not None:
+            ahead_s = track.offset_s - track.other_offset_s
+            yield (
+                f"the positions fit the photos' path at a time offset of {track.other_offset_s:+.2f} s, not at the "
+                f"given {track.offset_s:+.2f} s: their clock is {abs(ahead_s):.1f} s "
+                f"{'ahead' if ahead_s > 0 else 'behind'}, as by leap seconds, or a time zone"
+            )
+
+    def notes_on(self, model: pycolmap.Reconstruction) -> Iterator[str]:
+        """Yield a line for the user about points that a model does not show."""
+        if self.points is None:
+            return
+        points, is_seen = self.points.points, marks_seen(self.points, model)
+        unseen = [point.name for point, seen in zip(points, is_seen, strict=True) if not seen]
+        if unseen:
+            yield (
+                f"{len(unseen)} of {len(points)} known points are left out, as fewer than two photos of the map have "
+                f"marks of them: {', '.join(unseen)}"
+            )
+
+    def moved(self, offset_m: Array) -> SurveyedPositions:
+        """Return the positions in a frame whose coordinates are larger by ``offset_m`` (3,)."""
+        points, antenna = self.points, self.antenna
+        if points is not None:
+            points = points.moved_to(points.positions_m + offset_m)
+        if antenna is not None:
+            antenna = replace(antenna, log=antenna.log.moved_to(antenna.log.position_m + offset_m))
+        return replace(self, points=points, antenna=antenna)
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks of the points in photos, by name."""
+        return {} if self.points is None else self.points.markers
+
+
+class PointRow(Record):
+    """One control or check point, in the frame of the metric models.
+
+    Attributes:
+        kind: "control", "check" or "left out".
+        estimated_m: by the marks in the final map; null where fewer than two of its photos have them.
+        residual_m: in the map minus known. distance_m: its length.
+    """
+
+    marker: Text
+    kind: Text
+    known_m: Vector
+    stddev_m: Number
+    estimated_m: VectorOrNull
+    residual_m: VectorOrNull
+    distance_m: NumberOrNull
+
+
+class PointErrors3d(Record):
+    """Root mean square of the residuals of some points.
+
+    Attributes:
+        num: of points that are in the map. rmse_m: of each coordinate. rmse_3d_m: of the distances.
+    """
+
+    num: int
+    rmse_m: VectorOrNull
+    rmse_3d_m: NumberOrNull
+
+
+class PointsEntry(Record):
+    """Control and check points, compared with the final map."""
+
+    control: PointErrors3d
+    check: PointErrors3d
+    points: tuple[PointRow, ...]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines that the user sees at the end of a run."""
+        for kind, errors in (("control", self.control), ("check", self.check)):
+            if errors.rmse_m is not None:
+                axes = ", ".join(f"{value:.3f}" for value in errors.rmse_m)
+                yield f"{kind} points: {errors.num}, RMSE {errors.rmse_3d_m:.3f} m (x, y, z: {axes} m)"
+
+    @classmethod
+    def of(cls, surveyed: SurveyedPositions, model: pycolmap.Reconstruction, path: Trajectory) -> PointsEntry | None:
+        """Compare points with a model in the site's frame; None without any points."""
+        if surveyed.points is None:
+            return None
+        located = locate_points(surveyed.points, model, path)
+        places = dict(zip(located.names, located.predicted_m(IDENTITY), strict=True))
+        rows = []
+        for point in surveyed.points.points:
+            at = places.get(point.name)
+            off = None if at is None else at - point.position_m
+            rows.append(
+                PointRow(
+                    marker=point.name,
+                    kind=point.kind,
+                    known_m=point.position_m.tolist(),
+                    stddev_m=point.stddev_m,
+                    estimated_m=None if at is None else at.tolist(),
+                    residual_m=None if off is None else off.tolist(),
+                    distance_m=None if off is None else float(np.linalg.norm(off)),
+                )
+            )
+        return cls(control=_rmse(rows, CONTROL), check=_rmse(rows, CHECK), points=tuple(rows))
+
+
+def _rmse(rows: Iterable[PointRow], kind: str) -> PointErrors3d:
+    off: Array = np.array([row.residual_m for row in rows if row.kind == kind and row.residual_m is not None])
+    if not len(off):
+        return PointErrors3d(num=0, rmse_m=None, rmse_3d_m=None)
+    squares = np.mean(off**2, axis=0)
+    return PointErrors3d(num=len(off), rmse_m=np.sqrt(squares).tolist(), rmse_3d_m=float(np.sqrt(squares.sum())))

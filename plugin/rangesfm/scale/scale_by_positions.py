@@ -1,0 +1,583 @@
+"""The similarity from a map to the site by known positions: of marks (control points) and of an antenna on the camera.
+
+A known position p of something with the place c in the model and the lever arm a obeys p = scale * R c + R a + t. Its
+error has several parts: the survey of the point, the marks in the photos, noise of the antenna's positions and errors
+of these that last for some time, and the bending of the map, which the photos allow. The sizes of those that are not
+given are estimated by restricted likelihood (``ComponentLikelihood``), as for ranges.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import special
+from scipy.sparse import block_diag, csr_array, diags_array, kron
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import Similarity, align_points, path_shape, similarity_motions
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.positions.known_positions import LASTING_S, KnownPositions
+from rangesfm.processes.threads import with_one_blas_thread
+from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
+from rangesfm.ranging.errors.learned import ROUNDING, ComponentLikelihood, ErrorParts
+from rangesfm.ranging.errors.noise import stretch_labels
+from rangesfm.scale.anchor_plane import is_line
+from rangesfm.scale.placement_prior import PlacementPrior
+from rangesfm.scale.range_equation import Columns
+from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_estimate import ScaleUncertainty
+from rangesfm.scale.uncertainty import LinearMap, best_estimate
+
+MIN_NUM_POSITIONS = 3
+"""Fewest positions, not on one line, that determine a similarity."""
+# Share of surveys without any mistake in which a correct control point is set aside.
+POINT_FALSE_ALARM_RATE = 0.02
+_NUM_SUSPECTS = 3
+# Median length of a vector of three normally distributed numbers, in their standard deviation.
+_MEDIAN_LENGTH = 1.538
+# Residual, in standard deviations, from which a position is down-weighted (Cauchy's loss, 95 % efficient), and the
+# weight below which it is an outlier.
+_LOSS_WIDTH, OUTLYING = 2.385, 0.1
+_MAX_NUM_TRIPLES, _NUM_ROUNDS = 300, 30
+# Standard deviation of the logarithm of what a system says of its own errors, and of what is guessed of them; and the
+# share of the noise that lasts, before anything is known.
+_SPREAD_GIVEN, _SPREAD_GUESSED, _LASTING_SHARE = 0.5, 1.0, 0.3
+# An antenna's positions are averaged to at most this many groups for the estimate of their errors, and the correlation
+# of two groups is the mean over this many times of each.
+_MAX_NUM_GROUPS, _NUM_TIMES = 150, 8
+_MAX_INFLATION, _STRETCH_S = 30.0, 10.0
+# Extent of positions across their line, as a share of that along it, below which it is only rounding; and the largest
+# standard deviation of a turn of the map, radians, for which its effect is linear.
+_ON_LINE, _MAX_TURN_STDDEV = 1e-6, 0.3
+
+
+@dataclass(frozen=True)
+class ErrorPart:
+    """One component of the errors: its covariance, and the lognormal prior of its size; a spread of 0: it is known."""
+
+    name: str
+    covariance_m2: Array
+    median: float = 1.0
+    spread: float = 0.0
+
+
+@dataclass(frozen=True)
+class PositionEquations:
+    """Linear equations of g groups of positions about a similarity, three coordinates each.
+
+    Attributes:
+        linear: the equations, for the logarithm of the scale, a turn and a shift about the first camera.
+        parts: components of the errors of all coordinates. errors: as learnt.
+        is_used: (3 g,) coordinates that take part in the estimate.
+        grouping: (3 g, 3 k) sparse weights of the positions in the groups.
+    """
+
+    linear: LinearMap
+    parts: tuple[ErrorPart, ...]
+    errors: ErrorParts
+    is_used: Mask
+    grouping: csr_array
+
+    def with_mistake_learnt(self, columns: Array) -> PositionEquations:
+        """Return the equations with errors learnt again, as if a mistake with (3 k, m) ``columns`` was made.
+
+        Otherwise the errors that the mistake causes are taken for noise, in which it then hides.
+        """
+        design = np.hstack([self.linear.design, self.grouping @ columns])
+        more = np.zeros((len(self.linear.prior_design), columns.shape[1]))
+        linear = replace(self.linear, design=design, prior_design=np.hstack([self.linear.prior_design, more]))
+        return replace(self, errors=_errors_of(self.parts, _sizes(self.parts, linear, self.is_used)))
+
+    def of(self, rows: Mask) -> tuple[LinearMap, ErrorParts]:
+        """Return the equations and errors of some coordinates (3 g,)."""
+        linear, parts = self.linear, self.errors
+        chosen = parts.covariances_m2[:, rows][:, :, rows]
+        return replace(linear, off_m=linear.off_m[rows], design=linear.design[rows]), replace(
+            parts, covariances_m2=chosen
+        )
+
+    def of_mistake(self, columns: Array) -> MistakeInPositions:
+        """Estimate a mistake that changes the known positions by (3 k, m) ``columns`` times its m numbers.
+
+        Positions that it changes are taken into the equations, whether they take part or not.
+        """
+        by_groups = self.grouping @ columns
+        rows = self.is_used | np.any(by_groups != 0, axis=1)
+        linear, parts = self.of(rows)
+        by, covariance = by_groups[rows], parts.covariance_m2
+        inverse = np.linalg.inv(covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance)))
+        best, gains, _ = best_estimate(covariance, linear.design, linear.prior_design)
+        whitened = inverse @ linear.design
+        pulls = inverse @ linear.off_m
+        pulls -= whitened @ (best @ (linear.design.T @ pulls + linear.prior_design.T @ linear.prior_off))
+        information = by.T @ (inverse - whitened @ best @ whitened.T) @ by
+        values, vectors = np.linalg.eigh(information)
+        is_seen = values > _UNSEEN * np.trace(by.T @ inverse @ by)
+        root = vectors[:, is_seen] / np.sqrt(values[is_seen])
+        sizes = root @ (root.T @ (by.T @ pulls))
+        return MistakeInPositions(sizes, root, float(sizes @ information @ sizes), gains @ by, bool(is_seen.all()))
+
+
+# Share of a mistake's effect below which what the similarity leaves of it is only rounding.
+_UNSEEN = 1e-7
+
+
+@dataclass(frozen=True)
+class MistakeInPositions:
+    """A mistake of m numbers, as estimated.
+
+    Attributes:
+        sizes: (m,). root: (m, r) root of their covariance, without directions that are not seen.
+        statistic: chi-square distributed with r degrees of freedom where no such mistake was made.
+        by_unknowns: (7, m) change of the similarity by the mistake.
+        is_seen: whether no direction is hidden.
+    """
+
+    sizes: Array
+    root: Array
+    statistic: float
+    by_unknowns: Array
+    is_seen: bool
+
+
+@dataclass(frozen=True)
+class PositionScale:
+    """The scale and the place of a map by k known positions.
+
+    Attributes:
+        site_from_model: the estimate.
+        known: the positions. weights: (k,) robust weights.
+        is_left_out: (k,) control points that contradict the others.
+        threshold: squared error of a control point, in standard deviations, above which it is left out.
+        uncertainty: of the scale.
+        covariance: (7, 7) of the logarithm of the scale, a turn and a shift about the first camera.
+        best_step: (7,) from the estimate to that with the best weights for the errors.
+        equations: of the positions. bending_m2: (3 g, 3 g) covariance of their coordinates that the photos' residuals
+            let expect; 0 without photos.
+        stddev_m: (k,) standard deviation of a coordinate of each known position. inflation: root of the variance of a
+            mean of the antenna's positions over some seconds, divided by that for independent errors.
+    """
+
+    site_from_model: Similarity
+    known: KnownPositions
+    weights: Array
+    is_left_out: Mask
+    threshold: float
+    uncertainty: ScaleUncertainty
+    covariance: Array
+    best_step: Array
+    equations: PositionEquations
+    bending_m2: Array
+    stddev_m: Array
+    inflation: float
+
+    @property
+    def value(self) -> float:
+        """Metres per unit of the model."""
+        return self.site_from_model.scale
+
+    @property
+    def bending_factor(self) -> float:
+        """Return the learnt bending over the bending expected from the photos' residuals; 1 if that is unknown."""
+        expected_m = float(np.sqrt(np.trace(self.bending_m2) / len(self.bending_m2)))
+        return self.equations.errors.stddev_of_component["bending"] / expected_m if expected_m > 0 else 1.0
+
+    @property
+    def names_left_out(self) -> list[str]:
+        """Names of the control points that contradict the others."""
+        return [self.known.names[row] for row in np.flatnonzero(self.is_left_out).tolist()]
+
+    def prior(self, path: Trajectory, first_camera_from_model: Similarity) -> PlacementPrior:
+        """Return what the positions say of the place of the first camera's frame, by the best weights for their errors.
+
+        Args:
+            path: of the model.
+        """
+        best = moved_similarity(self.site_from_model, self.best_step, path)
+        return PlacementPrior.of(best @ first_camera_from_model.inverse(), np.zeros(3), self.covariance)
+
+    @property
+    def is_used(self) -> Mask:
+        """(k,) positions that take part."""
+        return np.asarray(~self.known.is_check & ~self.is_left_out & (self.weights >= OUTLYING))
+
+
+def _determine(known: KnownPositions, used: Mask) -> bool:
+    """Return whether positions determine a similarity: three or more that are not on one line."""
+    stddevs = path_shape(known.places[used]).stddevs if used.any() else np.zeros(3)
+    return int(used.sum()) >= MIN_NUM_POSITIONS and bool(stddevs[1] > _ON_LINE * stddevs[0])
+
+
+@with_one_blas_thread
+def scale_by_positions(
+    known: KnownPositions,
+    path: Trajectory,
+    bending: MapBending,
+    *,
+    lengths: LengthScale | None = None,
+    refined: Similarity | None = None,
+    lasting_s: Sequence[float] = LASTING_S,
+) -> PositionScale:
+    """Estimate the similarity to the site, with contradicting control points left out.
+
+    Args:
+        known: positions in the model of ``path``. path: of the camera. bending: of the map.
+        lengths: what measured lengths say of the scale, which takes part.
+        refined: similarity of a map that photos and positions made together; None: the map is one piece, and its
+            similarity is estimated.
+        lasting_s: for how long errors of the antenna's positions last, seconds.
+
+    Raises:
+        GeometryError: the positions are too few, or on one line.
+    """
+    if not _determine(known, ~known.is_check):
+        num = int(np.count_nonzero(~known.is_check))
+        expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
+        raise GeometryError(f"{num} known positions are in the map, {expected}")
+    problem = _Problem(known, path, bending, lengths, refined, tuple(lasting_s))
+    used = ~known.is_check
+    num_control = int(np.count_nonzero(known.is_mark & used))
+    threshold = float(special.chdtri(3, POINT_FALSE_ALARM_RATE / max(num_control, 1)))
+    fit = problem.fit(used)
+    while (worst := problem.worst(fit, threshold)) is not None:
+        fit = worst
+    found = problem.result(fit, used & ~fit.used, threshold)
+    turn_stddev = float(np.sqrt(np.linalg.eigvalsh(found.covariance[1:4, 1:4])[-1]))
+    if turn_stddev > _MAX_TURN_STDDEV:
+        raise GeometryError(
+            "the known positions are nearly on one line, which leaves the turn of the map about it open "
+            f"({np.rad2deg(turn_stddev):.0f} degrees, 1 stddev): survey a point off that line"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A robust fit of some of the positions, with their learnt errors; arrays are of all k positions."""
+
+    similarity: Similarity
+    used: Mask
+    weights: Array
+    stddev_m: Array
+    equations: PositionEquations
+    bending: BendingOfBins
+    sizes: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The positions on a map; arguments as for ``scale_by_positions``."""
+
+    known: KnownPositions
+    path: Trajectory
+    bending: MapBending
+    lengths: LengthScale | None
+    refined: Similarity | None
+    lasting_s: tuple[float, ...]
+
+    def fit(self, used: Mask, start: Similarity | None = None) -> _Fit:
+        """Fit the similarity robustly, and learn the errors from what it leaves."""
+        similarity, weights, stddev_m = self._robust(used, start)
+        grouping = _grouping(self.known, weights)
+        bending = self._bending(similarity, grouping)
+        linear = self._linear(similarity, grouping, bending)
+        parts = tuple(self._parts(similarity, grouping, stddev_m, bending))
+        takes_part = (abs(grouping) @ np.repeat(used & (weights >= OUTLYING) | used & self.known.is_mark, 3)) > 0
+        sizes = _sizes(parts, linear, takes_part)
+        equations = PositionEquations(linear, parts, _errors_of(parts, sizes), takes_part, grouping)
+        return _Fit(similarity, used, weights, stddev_m, equations, bending, sizes)
+
+    def _robust(self, used: Mask, start: Similarity | None) -> tuple[Similarity, Array, Array]:
+        """Return the similarity, (k,) weights and (k,) standard deviations, by iteratively reweighted least squares."""
+        known = self.known
+        similarity = self.refined or start or _of_triples(known, np.flatnonzero(used))
+        for _ in range(_NUM_ROUNDS):
+            off_m = known.misclosures_m(similarity)
+            stddev_m = self._stddevs_m(off_m, used)
+            away = np.linalg.norm(off_m, axis=1) / stddev_m / np.sqrt(3)
+            weights = used / (1 + (away / _LOSS_WIDTH) ** 2)
+            if self.refined is not None:  # the map has its place; only outliers are told apart
+                break
+            step = self._step(similarity, off_m, weights / stddev_m**2)
+            similarity = moved_similarity(similarity, step, self.path)
+            if np.abs(step).max() < _SMALL_STEP:
+                break
+        return similarity, weights, stddev_m
+
+    def _step(self, similarity: Similarity, off_m: Array, weights: Array) -> Array:
+        root = np.repeat(np.sqrt(weights), 3)
+        off, by = -root * off_m.ravel(), root[:, None] * self._design(similarity)
+        prior_off, prior_design = self._priors(similarity)
+        step = np.linalg.lstsq(np.vstack([by, prior_design]), np.append(off, prior_off), rcond=1e-12)[0]
+        return np.asarray(step)
+
+    def _priors(self, similarity: Similarity) -> tuple[Array, Array]:
+        """Return what the measured lengths say of the scale: (r,) and (r, 7), in standard deviations."""
+        if self.lengths is None:
+            return np.zeros(0), np.zeros((0, 7))
+        design = np.eye(1, 7) / self.lengths.relative_stddev
+        return np.log(self.lengths.value / similarity.scale) * design[:, 0], design
+
+    def _design(self, similarity: Similarity) -> Array:
+        """Return the (3 k, 7) derivatives of the positions by scale, turn and shift about the first camera."""
+        origin = similarity.apply(self.path.centers[:1])[0]
+        motions = similarity_motions(self.known.predicted_m(similarity) - origin)
+        motions[:, :, 0] = similarity.apply(self.known.places) - origin  # the lever arm does not scale
+        return motions.reshape(-1, 7)
+
+    def _stddevs_m(self, off_m: Array, used: Mask) -> Array:
+        """Return (k,) standard deviations of a coordinate: as given, or larger if the residuals of its kind are."""
+        known, stddevs = self.known, np.ones(len(self.known))
+        given = _stddev_of(known.covariance_m2)
+        freedom = np.sqrt(3 * used.sum() / max(3 * used.sum() - 7, 1))
+        for of_kind in (known.is_mark, ~known.is_mark):
+            if (rows := used & of_kind).any():
+                is_given = bool(np.isfinite(given[of_kind]).all())
+                ratio = given if is_given else np.ones(len(known))
+                shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / _MEDIAN_LENGTH
+                stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else _LEAST_STDDEV_M)
+        return stddevs
+
+    def _bending(self, similarity: Similarity, grouping: csr_array) -> BendingOfBins:
+        rotation = kron(np.eye(len(self.known)), similarity.rotation, format="csr")
+        by_pose = grouping @ rotation @ (similarity.scale * self.known.by_pose + self.known.arms_by_pose)
+        parts = by_pose.toarray().reshape(by_pose.shape[0], -1, 6)
+        parts[:, :, 3:] = parts[:, :, 3:] @ self.path.world_from_cam[0]  # bending is in the first camera's axes
+        return self.bending.of_functions(parts.reshape(len(parts), -1), frame_is_free=True)
+
+    def _linear(self, similarity: Similarity, grouping: csr_array, bending: BendingOfBins) -> LinearMap:
+        off_m = grouping @ -self.known.misclosures_m(similarity).ravel() - bending.shift_m
+        nothing = np.zeros(0, dtype=np.int64)
+        design = grouping @ self._design(similarity)
+        return LinearMap(off_m, design, *self._priors(similarity), Columns(0, 1, nothing, nothing, 7))
+
+    def _parts(
+        self, similarity: Similarity, grouping: csr_array, stddev_m: Array, bending: BendingOfBins
+    ) -> Iterator[ErrorPart]:
+        """Yield the components of the errors."""
+        for component in bending.components:
+            yield ErrorPart(component.name, component.correlation(_NO_BINS), component.median, component.spread)
+        known, rotation = self.known, similarity.rotation
+        places = similarity.scale**2 * rotation @ known.own_covariance @ rotation.T
+        places += known.arm_stddev_m[:, None, None] ** 2 * np.eye(3)
+        covariance = known.covariance_m2
+        assumed = stddev_m[:, None, None] ** 2 * np.eye(3)
+        for name, of_kind, names_of_place in (
+            ("points", known.is_mark, "marks"),
+            ("positions", ~known.is_mark, "places"),
+        ):
+            if not of_kind.any():
+                continue
+            yield ErrorPart(names_of_place, _grouped(grouping, places, of_kind))
+            is_known = bool(np.isfinite(covariance[of_kind]).all())
+            own = _grouped(grouping, covariance if is_known else assumed, of_kind)
+            spread = 0.0 if known.is_stated[of_kind].all() and name == "points" else _SPREAD_GIVEN
+            yield ErrorPart(name, own, spread=spread if is_known else _SPREAD_GUESSED)
+        if (rows := np.flatnonzero(~known.is_mark & np.isfinite(known.time_s))).size:
+            size_m = np.where(np.isfinite(_stddev_of(covariance)), _stddev_of(covariance), stddev_m)
+            of_groups, times_s = _times_of_groups(grouping, known, size_m, rows)
+            for lasting_s in self.lasting_s:
+                apart = np.exp(-np.abs(times_s.reshape(-1, 1) - times_s.ravel()) / lasting_s)
+                alike = apart.reshape(len(times_s), _NUM_TIMES, -1, _NUM_TIMES).mean(axis=(1, 3))
+                own = np.kron(alike * np.outer(of_groups, of_groups), np.eye(3))
+                yield ErrorPart(f"positions_{lasting_s:g}s", own, _LASTING_SHARE, _SPREAD_GUESSED)
+
+    def worst(self, fit: _Fit, threshold: float) -> _Fit | None:
+        """Return the fit without the control point that contradicts the others most; None if none does.
+
+        The errors are learnt again without each suspect, as its own error would be taken for theirs.
+        """
+        rows = np.flatnonzero(fit.used & self.known.is_mark)
+        statistics = np.array([fit.equations.of_mistake(at_point(self.known, row)).statistic for row in rows.tolist()])
+        found, largest = None, threshold
+        for row in rows[np.argsort(-statistics, kind="stable")[:_NUM_SUSPECTS]].tolist():
+            others = fit.used & (np.arange(len(fit.used)) != row)
+            if int(others.sum()) <= MIN_NUM_POSITIONS - 1 or not _determine(self.known, others):
+                continue
+            without = self.fit(others, fit.similarity)
+            mistake = without.equations.of_mistake(at_point(self.known, row))
+            if mistake.statistic > largest:
+                found, largest = without, mistake.statistic
+        return found
+
+    def result(self, fit: _Fit, is_left_out: Mask, threshold: float) -> PositionScale:
+        """Return the scale with its uncertainty, by the rule of ``LinearMap.known``."""
+        rows = fit.equations.is_used
+        linear, errors = fit.equations.of(rows)
+        variances = fit.stddev_m**2 / np.maximum(fit.weights, OUTLYING)
+        weighed = (fit.equations.grouping @ diags_array(np.repeat(variances, 3)) @ fit.equations.grouping.T).toarray()
+        if self.refined is not None:
+            weighed = weighed + fit.bending.formal_m2
+        weighed = weighed[np.ix_(rows, rows)]
+        formal, of_groups, of_priors = best_estimate(weighed, linear.design, linear.prior_design)
+        others = np.einsum("pi,ij,pj->p", of_groups, errors.covariance_m2, of_groups) + np.sum(of_priors**2, axis=1)
+        known = linear.known(errors, float(np.sqrt(formal[0, 0])), others)
+        _, best_groups, best_priors = best_estimate(errors.covariance_m2, linear.design, linear.prior_design)
+        return PositionScale(
+            site_from_model=fit.similarity,
+            known=self.known,
+            weights=fit.weights,
+            is_left_out=is_left_out,
+            threshold=threshold,
+            uncertainty=known.uncertainty,
+            covariance=known.covariance,
+            best_step=best_groups @ linear.off_m + best_priors @ linear.prior_off,
+            equations=fit.equations,
+            bending_m2=fit.bending.formal_m2,
+            stddev_m=self._own_stddev_m(fit),
+            inflation=self._inflation(fit),
+        )
+
+    def _own_stddev_m(self, fit: _Fit) -> Array:
+        """Return (k,) learnt standard deviations of a coordinate of the known positions, without errors that last."""
+        given = _stddev_of(self.known.covariance_m2)
+        base = np.where(np.isfinite(given), given, fit.stddev_m)
+        return base * np.where(self.known.is_mark, fit.sizes.get("points", 1.0), fit.sizes.get("positions", 1.0))
+
+    def _inflation(self, fit: _Fit) -> float:
+        """Return the inflation over some seconds; what lasts longer moves the map as a whole, and does not bend it."""
+        errors, grouping, known = fit.equations.errors, fit.equations.grouping, self.known
+        rows = np.flatnonzero(~known.is_mark & np.isfinite(known.time_s))
+        shares, times_s = _times_of_groups(grouping, known, np.ones(len(known)), rows)
+        timed = np.flatnonzero(shares > 0)
+        if not len(timed):
+            return 1.0
+        labels = stretch_labels(times_s[timed, _NUM_TIMES // 2], _STRETCH_S)
+        at = 3 * timed  # one coordinate shows it for all
+        together = (labels[:, None] == labels).astype(np.float64)
+        sums = {
+            name: float(np.sum(together * m[np.ix_(at, at)]))
+            for name, m in zip(errors.names, errors.covariances_m2, strict=True)
+            if name.startswith("positions")
+        }
+        ratio = sum(sums.values()) / max(sums["positions"], 1e-30)
+        return float(np.clip(np.sqrt(ratio), 1.0, _MAX_INFLATION))
+
+
+# Steps of the similarity (relative, radians, metres) below this are rounding.
+_SMALL_STEP = 1e-10
+_LEAST_STDDEV_M = 1e-9
+_NO_BINS: Any = None  # components of bending are the same for any bins
+
+
+def at_point(known: KnownPositions, row: int) -> Array:
+    """Return the (3 k, 3) effect of a known position that is too large by a metre in each coordinate."""
+    columns = np.zeros((3 * len(known), 3))
+    columns[3 * row : 3 * row + 3] = np.eye(3)
+    return columns
+
+
+def moved_similarity(similarity: Similarity, step: Array, path: Trajectory) -> Similarity:
+    """Return a similarity moved by (7,) logarithm of the scale, turn and shift about the first camera of a path."""
+    origin = similarity.apply(path.centers[:1])[0]
+    rotation = Rotation.from_rotvec(step[1:4]).as_matrix() @ similarity.rotation
+    scale = similarity.scale * float(np.exp(np.clip(step[0], -1.0, 1.0)))
+    return Similarity(scale, rotation, origin + step[4:] - scale * rotation @ path.centers[0])
+
+
+def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:
+    """Return the similarity of three positions with the least sum of distances of all: a robust start.
+
+    Lever arms are taken off with the rotation of a first fit.
+    """
+    places, targets = known.places[rows], known.position_m[rows]
+    for _ in range(2):
+        best = align_points(places, targets)
+        least = _distance_sum(best, places, targets)
+        for triple in _triples(len(rows)):
+            chosen = list(triple)
+            if any(is_line(path_shape(each)) for each in (places[chosen], targets[chosen])):
+                continue
+            found = align_points(places[chosen], targets[chosen])
+            if (total := _distance_sum(found, places, targets)) < least:
+                best, least = found, total
+        targets = known.position_m[rows] - known.arms_m[rows] @ best.rotation.T
+    return best
+
+
+def _distance_sum(similarity: Similarity, places: Array, targets: Array) -> float:
+    return float(np.linalg.norm(similarity.apply(places) - targets, axis=1).sum())
+
+
+def _triples(num: int) -> Iterator[tuple[int, ...]]:
+    """Yield triples of numbers below ``num``: all if they are few, else some that are spread over them."""
+    if num * (num - 1) * (num - 2) // 6 <= _MAX_NUM_TRIPLES:
+        yield from itertools.combinations(range(num), MIN_NUM_POSITIONS)
+        return
+    rng = np.random.default_rng(0)
+    for _ in range(_MAX_NUM_TRIPLES):
+        yield tuple(rng.choice(num, MIN_NUM_POSITIONS, replace=False).tolist())
+
+
+def _grouping(known: KnownPositions, weights: Array) -> csr_array:
+    """Return the (3 g, 3 k) weights of positions in groups: marks alone, an antenna's averaged in the order of time."""
+    marks = np.flatnonzero(known.is_mark)
+    others = np.flatnonzero(~known.is_mark & (weights >= OUTLYING))
+    order = (
+        others[np.argsort(known.time_s[others], kind="stable")] if np.isfinite(known.time_s[others]).all() else others
+    )
+    groups = [np.array([row]) for row in marks]
+    groups += [part for part in np.array_split(order, min(len(order), _MAX_NUM_GROUPS) or 1) if len(part)]
+    shares = [np.ones(1) if known.is_mark[rows[0]] else weights[rows] / weights[rows].sum() for rows in groups]
+    lines = np.repeat(np.arange(len(groups)), [len(rows) for rows in groups])
+    shape = (len(groups), len(known))
+    alone = csr_array((np.concatenate(shares), (lines, np.concatenate(groups))), shape=shape)
+    return kron(alone, np.eye(3), format="csr")
+
+
+def _grouped(grouping: csr_array, covariances: Array, rows: Mask) -> Array:
+    """Return the (3 g, 3 g) covariance of groups from independent (k, 3, 3) ones of the positions in ``rows``."""
+    blocks = block_diag(list(np.where(rows[:, None, None], covariances, 0.0)), format="csr")
+    return np.asarray((grouping @ blocks @ grouping.T).toarray())
+
+
+def _times_of_groups(grouping: csr_array, known: KnownPositions, size_m: Array, rows: Indices) -> tuple[Array, Array]:
+    """Return (g,) mean standard deviations of the antenna's positions in each group (0: marks), and (g, 8) times."""
+    of_groups = grouping[::3, ::3]
+    is_timed = np.zeros(len(known))
+    is_timed[rows] = 1.0
+    times = np.zeros((of_groups.shape[0], _NUM_TIMES))
+    for group in range(of_groups.shape[0]):
+        members = of_groups.indices[of_groups.indptr[group] : of_groups.indptr[group + 1]]
+        if is_timed[members].all():
+            times[group] = np.quantile(known.time_s[members], np.linspace(0, 1, _NUM_TIMES))
+    return of_groups @ (is_timed * size_m), times
+
+
+def _sizes(parts: Sequence[ErrorPart], linear: LinearMap, rows: Mask) -> dict[str, float]:
+    """Return the size of each component, by restricted likelihood over some coordinates (3 g,)."""
+    learnt = [part for part in parts if part.spread > 0]
+    sizes = {part.name: 1.0 for part in parts}
+    if not learnt:
+        return sizes
+    at = np.ix_(rows, rows)
+    known_m2 = [part.covariance_m2[at] for part in parts if part.spread == 0]
+    likelihood = ComponentLikelihood(
+        np.array([part.covariance_m2[at] for part in learnt]),
+        np.log([part.median for part in learnt]),
+        np.array([part.spread for part in learnt]),
+        np.sum([np.zeros((rows.sum(),) * 2), *known_m2], axis=0),
+        linear.off_m[rows],
+        linear.design[rows],
+        linear.prior_design,
+    )
+    found = likelihood.mean_stddevs(likelihood.most_likely())
+    return sizes | dict(zip((part.name for part in learnt), found.tolist(), strict=True))
+
+
+def _errors_of(parts: Sequence[ErrorPart], sizes: Mapping[str, float]) -> ErrorParts:
+    """Return the errors with components of these sizes."""
+    of_all = np.array([sizes[part.name] ** 2 * part.covariance_m2 for part in parts])
+    stddevs = np.sqrt(np.trace(of_all, axis1=1, axis2=2) / of_all.shape[1])
+    return ErrorParts(tuple(part.name for part in parts), stddevs, of_all)
+
+
+def _stddev_of(covariances: Array) -> Array:
+    """Return (k,) standard deviations of a coordinate: the root of the mean variance."""
+    return np.asarray(np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 3))

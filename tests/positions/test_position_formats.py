@@ -1,0 +1,137 @@
+"""Positions are read from tables, TUM trajectories, NMEA, RTKLIB and Marvelmind, and mistakes are named."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rangesfm.errors import InputError
+from rangesfm.options import PositionOptions
+from rangesfm.positions.position_formats import read_positions
+from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.ranging.readers.lists import UnclearListError
+
+DAY_S = datetime(2024, 3, 1, tzinfo=timezone.utc).timestamp()
+
+
+def read(folder: Path, text: str, **options: object) -> PositionLog:
+    """Write a file and read it."""
+    path = folder / "positions.txt"
+    path.write_text(text)
+    found = read_positions(PositionOptions().changed(path=path, **options))
+    assert found is not None
+    return found
+
+
+def nmea(*bodies: str) -> str:
+    """Return sentences with their checksums."""
+    sums = (f"{__import__('functools').reduce(lambda a, b: a ^ ord(b), body, 0):02X}" for body in bodies)
+    return "".join(f"${body}*{total}\r\n" for body, total in zip(bodies, sums, strict=True))
+
+
+def test_the_canonical_table_is_read_in_the_order_of_time(tmp_path: Path) -> None:
+    found = read(tmp_path, "timestamp_s,x_m,y_m,z_m,stddev_m\n2,4,5,6,0.1\n1,1,2,3,0.2\n2,9,9,9,0.1\n")
+    assert found.timestamp_s is not None
+    np.testing.assert_array_equal(found.timestamp_s, [1, 2])
+    np.testing.assert_array_equal(found.position_m, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(found.covariance_m2, [0.04 * np.eye(3), 0.01 * np.eye(3)])
+    np.testing.assert_array_equal(found.line, [3, 2])
+    assert found.notes == ("positions.txt: 1 of 3 positions have the time of an earlier one and are left out",)
+
+
+def test_positions_by_photo_may_have_a_covariance(tmp_path: Path) -> None:
+    names = "image_name,x_m,y_m,z_m,cov_xx_m2,cov_xy_m2,cov_xz_m2,cov_yy_m2,cov_yz_m2,cov_zz_m2"
+    found = read(tmp_path, f"{names}\na.jpg,1,2,3,4,1,0,5,0,6\nb.jpg,1,2,3,,,,,,\n")
+    assert found.image_name == ("a.jpg", "b.jpg")
+    np.testing.assert_array_equal(found.covariance_m2[0], [[4, 1, 0], [1, 5, 0], [0, 0, 6]])
+    assert np.isnan(found.covariance_m2[1]).all()
+
+
+def test_a_table_of_a_positioning_system_is_recognised_by_its_columns(tmp_path: Path) -> None:
+    rows = "".join(f"{1000 * k},T1,{100 * k},{200 * k},{5 * k}\n" for k in range(30))
+    found = read(tmp_path, f"timestamp (ms),tag_id,pos_x (mm),pos_y (mm),pos_z (mm)\n{rows}")
+    assert found.timestamp_s is not None
+    np.testing.assert_allclose(found.timestamp_s, np.arange(30.0))
+    np.testing.assert_allclose(found.position_m[2], [0.2, 0.4, 0.01])
+    with pytest.raises(InputError, match=r"has positions of several tags \(T1, T2\): say which it is"):
+        read(tmp_path, "timestamp_s,tag_id,x,y,z\n1,T1,1,2,3\n2,T2,1,2,3\n")
+    two = "timestamp_s,tag_id,x,y,z\n1,T1,1,2,3\n2,T2,4,5,6\n"
+    np.testing.assert_array_equal(read(tmp_path, two, tag_id="T2").position_m, [[4, 5, 6]])
+
+
+def test_a_tum_trajectory_gives_its_positions(tmp_path: Path) -> None:
+    found = read(tmp_path, "1.0 1 2 3 0 0 0 1\n2.0 4 5 6 0 0 0 1\n")
+    assert (found.format, found.crs) == ("tum", None)
+    np.testing.assert_array_equal(found.position_m, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_nmea_gives_ellipsoidal_heights_utc_and_stddevs(tmp_path: Path) -> None:
+    text = nmea(
+        "GPRMC,235959.00,A,4717.11399,N,00833.91590,E,0.0,0.0,290224,,,A",
+        "GPGST,235959.00,1.0,,,,0.02,0.03,0.05",
+        "GPGGA,235959.00,4717.11399,N,00833.91590,E,4,12,0.7,499.6,M,48.0,M,,",
+        "GPGGA,000001.50,4717.11400,N,00833.91590,W,1,12,0.7,499.6,M,48.0,M,,",
+        "GPGGA,000002.50,,,,,0,00,,,M,,M,,",
+    )
+    found = read(tmp_path, f"{text}$GPGGA,000003.00,broken*00\n")
+    assert (found.format, found.crs) == ("nmea", GEOGRAPHIC)
+    assert found.timestamp_s is not None
+    np.testing.assert_allclose(found.timestamp_s, [DAY_S - 1, DAY_S + 1.5])
+    np.testing.assert_allclose(found.position_m[0], [8 + 33.9159 / 60, 47 + 17.11399 / 60, 547.6])
+    assert found.position_m[1, 0] < 0
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance_m2[0])), [0.03, 0.02, 0.05])
+    assert found.covariance_m2[1, 0, 0] == pytest.approx(9.0)
+    assert found.notes == ("positions.txt: 1 broken sentences are left out",)
+
+
+def test_a_solution_of_rtklib_has_covariances_east_north_up(tmp_path: Path) -> None:
+    names = (
+        "%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio"
+    )
+    row = "2024/03/01 00:00:05.500 47.06 -1.35 84.8 1 9 0.02 0.01 0.05 -0.01 0.002 0.003 0.0"
+    found = read(tmp_path, f"% program : RTKLIB\n{names}\n{row}\n")
+    assert (found.format, found.crs) == ("rtklib", GEOGRAPHIC)
+    assert found.timestamp_s is not None
+    np.testing.assert_allclose(found.timestamp_s, [DAY_S + 5.5])
+    np.testing.assert_allclose(found.position_m, [[-1.35, 47.06, 84.8]])
+    np.testing.assert_allclose(
+        found.covariance_m2[0], [[1e-4, -1e-4, 4e-6], [-1e-4, 4e-4, 9e-6], [4e-6, 9e-6, 25e-4]], atol=1e-12
+    )
+    assert "GPS time, which is ahead of UTC" in found.notes[0]
+    with pytest.raises(InputError, match=r"positions.txt:2: is no row of an RTKLIB solution"):
+        read(tmp_path, f"{names}\n2024/03/01 00:00:05.500 47.06 -1.35\n")
+
+
+def test_a_log_of_marvelminds_dashboard_is_read(tmp_path: Path) -> None:
+    rows = "".join(f"{1700000000000 + 100 * k},100,{100 * k},5,1.0{k},2.0,0.5,1,3.2,2,4.1\n" for k in range(3))
+    found = read(tmp_path, rows)
+    assert found.format == "marvelmind"
+    assert found.timestamp_s is not None
+    np.testing.assert_allclose(np.diff(found.timestamp_s), 0.1, atol=1e-6)
+    np.testing.assert_allclose(found.position_m[:, 0], [1.0, 1.01, 1.02])
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "said"),
+    [
+        ("", {}, "the file is empty, expected a table with timestamp_s or image_name"),
+        ("timestamp_s,x_m,y_m,z_m\n", {}, "holds no position (read as table)"),
+        ("timestamp_s,x_m,y_m,z_m\n1,2,three,4\n", {}, "positions.txt:2: y_m is 'three', expected"),
+        ("timestamp_s,x_m,y_m,z_m,stddev_m\n1,2,3,4,-1\n", {}, "positions.txt:2: stddev_m is -1, expected"),
+        ("1 2 3\n", {"format": "rtk"}, "unknown format of positions 'rtk'; the nearest is 'rtklib'"),
+        ("1 2 3\n", {"format": "rtklib"}, "has no header row of an RTKLIB solution"),
+    ],
+)
+def test_a_mistake_in_positions_is_named(tmp_path: Path, text: str, options: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError) as error:
+        read(tmp_path, text, **options)
+    assert said in str(error.value)
+
+
+def test_unclear_columns_are_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(UnclearListError, match="a table of positions whose columns are not known for sure") as error:
+        read(tmp_path, "time,a,b,c\n1,2,3,4\n2,3,4,5\n")
+    assert any("--position_columns timestamp=time,x=NAME" in str(choice) for choice in error.value.choices)

@@ -1,0 +1,164 @@
+"""A map in the site by control points alone: held by them, tested by check points, and beside ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+from tests.known import known
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
+
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.progress import SilentProgress
+from rangesfm.result.summary import ResultSummary
+from rangesfm.survey.settings import Survey
+from rangesfm.workflows.run import refine_model, scale_model
+
+Array = npt.NDArray[np.float64]
+QUIET = SilentProgress()
+POINT_STDDEV_M, NUM_POINTS = 0.005, 8
+FAR_M = np.array([2_600_000.0, 1_200_000.0, 400.0])
+
+
+@dataclass(frozen=True)
+class Yard:
+    """A model with points, marks of some of them in photos, and their true coordinates."""
+
+    folder: Path
+    made: SyntheticModel
+    marks_m: Mapping[str, Array]
+
+    def survey(self, where: Path, points: str, **values: object) -> Survey:
+        """Return a survey with these rows of coordinates."""
+        path = where / "points.csv"
+        path.write_text(f"marker,x_m,y_m,z_m,stddev_m,kind\n{points}")
+        given = {key.replace("__", "."): value for key, value in values.items()}
+        base = {"images.model": self.folder / "sparse", "output.path": where / "out", "points.path": path}
+        return Survey().changed({**base, "scale.markers": self.folder / "markers.csv", **given})
+
+    def rows(self, kinds: Sequence[str], offset_m: Array | None = None, **wrong_m: float) -> str:
+        """Return rows of coordinates, accurate to 5 mm; ``wrong_m`` is added to the heights of points by name."""
+        rng, lines = np.random.default_rng(3), ""
+        for kind, (name, true_m) in zip(kinds, self.marks_m.items(), strict=False):
+            at = true_m + POINT_STDDEV_M * rng.standard_normal(3) + [0, 0, wrong_m.get(name, 0.0)]
+            at = at if offset_m is None else at + offset_m
+            lines += f"{name},{at[0]:.4f},{at[1]:.4f},{at[2]:.4f},{POINT_STDDEV_M},{kind}\n"
+        return lines
+
+    def assert_found(self, summary: ResultSummary, within: float = 0.01) -> None:
+        truth, (low, high) = self.made.metric_from_sfm.scale, known(summary.scale.interval_95)
+        assert known(low) < truth < known(high)
+        assert summary.scale.value == pytest.approx(truth, rel=within)
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
+    """Simulate fourteen photos on a loop, with marks clicked to half a pixel."""
+    path, times, rng = (
+        loop_path(20.0, height_amplitude_m=0.5, seed=1),
+        np.arange(0.0, 20.0, 1.5),
+        np.random.default_rng(5),
+    )
+    made = synthetic_model(
+        times, path.centers(times), path.world_from_cam(times), num_observations=120, pixel_stddev=0.5, seed=2
+    )
+    folder = tmp_path_factory.mktemp("yard")
+    model = made.reconstruction
+    (folder / "sparse").mkdir()
+    model.write(folder / "sparse")
+    seen = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= 4]
+    marks_m, lines = {}, "marker,image_name,x_px,y_px\n"
+    true_m = _true_points(made, seen)
+    near = [i for i in seen if np.linalg.norm(true_m[i] - made.centers_m.mean(axis=0)) < 10]
+    for k, point_id in enumerate(rng.choice(near, NUM_POINTS, replace=False).tolist()):
+        marks_m[f"M{k}"] = true_m[point_id]
+        for element in model.point3D(point_id).track.elements:
+            image = model.image(element.image_id)
+            at = np.ravel(image.points2D[element.point2D_idx].xy)
+            lines += f"M{k},{image.name},{at[0]:.2f},{at[1]:.2f}\n"
+    (folder / "markers.csv").write_text(lines)
+    return Yard(folder, made, marks_m)
+
+
+def _true_points(made: SyntheticModel, ids: Sequence[int]) -> dict[int, Array]:
+    """Return the true positions of points, which the model has exactly, in metres."""
+    model = made.reconstruction
+    return {i: made.metric_from_sfm.apply(model.point3D(i).xyz[None])[0] for i in ids}
+
+
+def test_control_points_place_the_map_in_the_site_and_check_points_test_it(yard: Yard, tmp_path: Path) -> None:
+    survey = yard.survey(tmp_path, yard.rows(["control"] * 5 + ["check"] * 3, FAR_M))
+    result = refine_model(survey, progress=QUIET)
+    summary, points = result.summary, known(result.summary.points)
+    yard.assert_found(summary)
+    assert (summary.scale.verdict, summary.frame, summary.scale.method) == ("good", "site", "positions")
+    assert known(summary.place).verdict == "good"
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse_metric" / "0")
+    found = np.array([image.projection_center() for _, image in sorted((i.name, i) for i in model.images.values())])
+    assert np.linalg.norm(found - yard.made.centers_m - FAR_M, axis=1).max() < 0.03
+    assert [row.kind for row in points.points] == ["control"] * 5 + ["check"] * 3
+    assert (points.control.num, points.check.num) == (5, 3)
+    assert known(points.control.rmse_3d_m) < 0.03  # 9 mm of the survey, and the marks in the depth of the photos
+    off = np.array([row.residual_m for row in points.points if row.kind == "check"])
+    assert known(points.check.rmse_m) == pytest.approx(np.sqrt(np.mean(off**2, axis=0)))
+    assert known(points.check.rmse_3d_m) < 0.05
+    assert [test.name for test in summary.tests] == ["control point"] * 5
+    assert not any(test.rejected for test in summary.tests)
+    assert any(line.startswith("check points: 3, RMSE ") for line in result.lines)
+    page = (survey.output.path / "report.html").read_text()
+    assert "Control and check points" in page
+    assert ResultSummary.read(survey.output.path / "result.json") == summary
+
+
+@pytest.mark.parametrize("run", [refine_model, scale_model])
+def test_a_control_point_half_a_metre_off_is_named_and_left_out(yard: Yard, tmp_path: Path, run: object) -> None:
+    assert callable(run)
+    survey = yard.survey(tmp_path, yard.rows(["control"] * 6 + ["check"], M2=0.5), report__enabled=False)
+    summary = run(survey, progress=QUIET).summary
+    yard.assert_found(summary)
+    assert (summary.tests[0].name, summary.tests[0].subject) == ("control point", "M2")
+    assert known(summary.tests[0].size) == pytest.approx(0.5, abs=0.1)
+    assert "probably the control point M2 is 0." in summary.scale.reasons[0]
+    assert [row.kind for row in known(summary.points).points] == [
+        *("control", "control", "left out", "control", "control", "control", "check")
+    ]
+    assert not any(test.rejected for test in summary.tests[1:])
+
+
+def test_three_points_alone_leave_a_doubt_that_a_check_point_removes(yard: Yard, tmp_path: Path) -> None:
+    survey = yard.survey(tmp_path, yard.rows(["control"] * 3), report__enabled=False)
+    summary = scale_model(survey, progress=QUIET).summary
+    yard.assert_found(summary, 0.05)
+    assert "rests on 3 known positions, so that nothing tells which of them is wrong" in summary.scale.reasons[0]
+    checked = yard.survey(tmp_path, yard.rows(["control"] * 3 + ["check"]), report__enabled=False)
+    summary = scale_model(checked, progress=QUIET).summary
+    assert not any("nothing tells" in reason for reason in summary.scale.reasons)
+
+
+def test_points_that_are_too_few_are_refused_with_their_number(yard: Yard, tmp_path: Path) -> None:
+    survey = yard.survey(tmp_path, yard.rows(["control"] * 2 + ["check"] * 2))
+    with pytest.raises(
+        GeometryError, match="2 known positions are in the map, expected 3 or more that are not on one line"
+    ):
+        scale_model(survey, progress=QUIET)
+
+
+def test_a_point_without_marks_is_named_and_left_out(yard: Yard, tmp_path: Path) -> None:
+    survey = yard.survey(tmp_path, yard.rows(["control"] * 4) + "unseen,1,2,3,0.01,control\n", report__enabled=False)
+    summary = scale_model(survey, progress=QUIET).summary
+    assert any("1 of 5 known points are left out" in warning and "unseen" in warning for warning in summary.warnings)
+    assert known(summary.points).points[-1].estimated_m is None
+
+
+def test_points_and_anchors_in_the_first_camera_are_refused(yard: Yard, tmp_path: Path) -> None:
+    anchors = tmp_path / "anchors.csv"
+    anchors.write_text("anchor_id,x_m,y_m,z_m\nA1,1,2,3\n")
+    survey = yard.survey(tmp_path, yard.rows(["control"] * 4), anchors__path=anchors, anchors__frame="first_camera")
+    with pytest.raises(InputError, match=r"\[points\] are in the site, expected \[anchors\] frame to be site as well"):
+        scale_model(survey, progress=QUIET)

@@ -1,0 +1,148 @@
+"""A map in the site by positions of an antenna: their clock, lever arm and outliers; and both beside ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+from tests.known import known
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
+
+from rangesfm.demo.simulated_radio import CameraPath
+from rangesfm.errors import GeometryError
+from rangesfm.progress import SilentProgress
+from rangesfm.result.summary import ResultSummary
+from rangesfm.survey.settings import Survey
+from rangesfm.workflows.run import refine_model, scale_model
+
+Array = npt.NDArray[np.float64]
+QUIET = SilentProgress()
+ANTENNA_IN_CAM_M = np.array([0.05, -0.3, -0.1])
+NOISE_M, OFFSET_S = 0.05, 7.0
+ANCHORS_M = {"A1": (6.0, 1.0, 2.5), "A2": (-6.0, 2.0, 0.4), "A3": (0.5, 7.0, 3.0)}
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A model of a walk with the times of its photos, and the true path."""
+
+    folder: Path
+    made: SyntheticModel
+    path: CameraPath
+
+    def survey(self, where: Path, **values: object) -> Survey:
+        given = {key.replace("__", "."): value for key, value in values.items()}
+        base = {"images.model": self.folder / "sparse", "images.times": self.folder / "images.csv"}
+        return Survey().changed({**base, "output.path": where / "out", "report.enabled": False, **given})
+
+    def positions(self, where: Path, clock_ahead_s: float = 0.0, num_wrong: int = 0) -> Path:
+        """Write positions at 1 Hz, the first of which are five metres off."""
+        rng = np.random.default_rng(4)
+        times = np.arange(0.4, self.path.end_s - 1.0, 1.0)
+        at_m = self.path.centers(times) + self.path.world_from_cam(times) @ ANTENNA_IN_CAM_M
+        at_m += NOISE_M * rng.standard_normal(at_m.shape)
+        at_m[:num_wrong, 0] += 5.0
+        path = where / "positions.csv"
+        rows = (f"{t + clock_ahead_s:.3f},{x:.4f},{y:.4f},{z:.4f}\n" for t, (x, y, z) in zip(times, at_m, strict=True))
+        path.write_text(f"timestamp_s,x_m,y_m,z_m\n{''.join(rows)}")
+        return path
+
+    def assert_found(self, summary: ResultSummary, within: float = 0.02) -> None:
+        truth, (low, high) = self.made.metric_from_sfm.scale, known(summary.scale.interval_95)
+        assert known(low) < truth < known(high)
+        assert summary.scale.value == pytest.approx(truth, rel=within)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
+    path, times = loop_path(30.0, height_amplitude_m=0.5, unsteadiness_m=0.1, seed=1), np.arange(0.0, 29.0, 1.0)
+    made = synthetic_model(
+        times, path.centers(times), path.world_from_cam(times), num_observations=60, pixel_stddev=0.5, seed=2
+    )
+    folder = tmp_path_factory.mktemp("walk")
+    (folder / "sparse").mkdir()
+    made.reconstruction.write(folder / "sparse")
+    rows = "".join(f"{name},{time:.3f}\n" for name, time in made.timestamps_s.items())
+    (folder / "images.csv").write_text(f"image_name,timestamp_s\n{rows}")
+    return Walk(folder, made, path)
+
+
+def test_positions_with_a_lever_arm_and_another_clock_place_the_map(walk: Walk, tmp_path: Path) -> None:
+    positions = walk.positions(tmp_path, clock_ahead_s=-OFFSET_S, num_wrong=3)
+    arm = tuple(ANTENNA_IN_CAM_M.tolist())
+    survey = walk.survey(tmp_path, positions__path=positions, positions__antenna_in_cam_m=arm, report__enabled=True)
+    summary = refine_model(survey, progress=QUIET).summary
+    walk.assert_found(summary)
+    assert (summary.scale.method, summary.scale.verdict, summary.frame) == ("positions", "good", "site")
+    entry = known(summary.positions)
+    assert known(entry.time_offset_s) == pytest.approx(OFFSET_S, abs=0.1)
+    assert entry.num_rejected == 3
+    assert known(entry.rms_m) == pytest.approx(np.sqrt(3) * NOISE_M, rel=0.3)
+    assert entry.stddev_m == pytest.approx(NOISE_M, rel=0.4)
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse_metric" / "0")
+    found = np.array([image.projection_center() for _, image in sorted((i.name, i) for i in model.images.values())])
+    assert np.linalg.norm(found - walk.made.centers_m, axis=1).max() < 0.15
+    assert {test.name for test in summary.tests} == {"antenna's lever arm", "antenna's clock"}
+    assert not any(test.rejected for test in summary.tests)
+    assert ResultSummary.read(survey.output.path / "result.json") == summary
+
+
+def test_a_lever_arm_that_is_off_is_found_with_its_size(walk: Walk, tmp_path: Path) -> None:
+    positions = walk.positions(tmp_path)
+    # Upward of a camera held level it could not be told from the height of the whole map.
+    wrong_m = ANTENNA_IN_CAM_M + np.array([-0.3, 0.0, -0.4])
+    survey = walk.survey(
+        tmp_path,
+        positions__path=positions,
+        positions__time_offset=0.0,
+        positions__antenna_in_cam_m=tuple(wrong_m.tolist()),
+    )
+    summary = scale_model(survey, progress=QUIET).summary
+    found = next(test for test in summary.tests if test.name == "antenna's lever arm")
+    assert found.rejected
+    assert known(found.size) == pytest.approx(0.5, abs=0.2)
+    assert "probably the antenna sits elsewhere on the camera, by +0.3" in " ".join(summary.scale.reasons)
+
+
+def test_clocks_that_are_apart_by_leap_seconds_are_named(walk: Walk, tmp_path: Path) -> None:
+    positions = walk.positions(tmp_path, clock_ahead_s=-18.0)
+    survey = walk.survey(tmp_path, positions__path=positions, positions__time_offset=8.0)
+    try:
+        said = "; ".join(scale_model(survey, progress=QUIET).summary.scale.reasons)
+    except GeometryError as error:  # a map of so wrong positions may also be refused
+        said = str(error)
+    assert "the positions fit the photos' path at a time offset of +18." in said
+    assert "not at the given +8.00 s: their clock is 10." in said
+    assert "s behind, as by leap seconds" in said
+
+
+def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(walk: Walk, tmp_path: Path) -> None:
+    rng, rows = np.random.default_rng(8), "timestamp_s,anchor_id,range_m\n"
+    times = np.arange(0.2, walk.path.end_s - 1.2, 0.1)
+    tags_m = walk.path.centers(times) + walk.path.world_from_cam(times) @ ANTENNA_IN_CAM_M
+    for k, (time, tag_m) in enumerate(zip(times.tolist(), tags_m, strict=True)):
+        anchor_id = list(ANCHORS_M)[k % len(ANCHORS_M)]
+        range_m = np.linalg.norm(tag_m - ANCHORS_M[anchor_id]) + 0.05 * rng.standard_normal()
+        rows += f"{time:.3f},{anchor_id},{range_m:.4f}\n"
+    (tmp_path / "uwb.csv").write_text(rows)
+    arm = tuple(ANTENNA_IN_CAM_M.tolist())
+    survey = walk.survey(
+        tmp_path,
+        positions__path=walk.positions(tmp_path),
+        positions__antenna_in_cam_m=arm,
+        positions__time_offset=0.0,
+        ranges__path=tmp_path / "uwb.csv",
+        ranges__time_offset=0.0,
+        tag__tag_in_cam_m=arm,
+    )
+    summary = refine_model(survey, progress=QUIET).summary
+    walk.assert_found(summary)
+    assert summary.frame == "site"
+    assert set(summary.scale.by_kind) == {"ranges", "positions"}
+    for anchor_id, at_m in ANCHORS_M.items():
+        assert np.linalg.norm(np.array(known(summary.anchors[anchor_id].position_m)) - at_m) < 0.3
