@@ -53,7 +53,7 @@ class SurveyedPositions:
 
     @property
     def needs_times(self) -> bool:
-        """Whether the photos' times are needed."""
+        """True if the photos' times are needed."""
         return self.antenna is not None and self.antenna.log.timestamp_s is not None
 
     def on_path(self, path: Trajectory) -> SurveyedPositions:

@@ -83,7 +83,7 @@ class RangingInputs:
 
     @property
     def needs_times(self) -> bool:
-        """Whether the photos' times are needed, for ranges or positions by time."""
+        """True if the photos' times are needed, for ranges or positions by time."""
         return self.log.image_name is None or self.positions.needs_times
 
 
