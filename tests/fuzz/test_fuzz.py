@@ -6,7 +6,7 @@ import random
 from pathlib import Path
 
 import pytest
-from tests.fuzz import models
+from tests.fuzz import model_files
 from tests.fuzz.mutation import mutated
 from tests.fuzz.targets import CORPUS, TARGETS, Target
 
@@ -30,5 +30,5 @@ def test_every_corpus_belongs_to_a_target() -> None:
 
 
 def test_damaged_models_are_refused_or_good_for_everything(tmp_path: Path) -> None:
-    outcomes = models.run(first=1, num=40, output_path=tmp_path)
+    outcomes = model_files.run(first=1, num=40, output_path=tmp_path)
     assert outcomes.keys() == {"accepted", "refused"}

@@ -53,10 +53,11 @@ class PositionCost final : public ceres::CostFunction {
                               has_time_shift_ ? *parameters[time_shift] : 0.0};
     const typename Place::Now place(place_, parameters, motion);
     for (int i = 0; i < known_.position.cols(); ++i) {
-      const Eigen::Matrix3d whitening = known_.whitening.middleCols<3>(3 * i);
+      const Eigen::Index first_row = 3 * static_cast<Eigen::Index>(i);
+      const Eigen::Matrix3d whitening = known_.whitening.middleCols<3>(first_row);
       const Eigen::Vector3d off = whitening * (place.TagInWorld(i) - known_.position.col(i));
       const Scaled scaled = MakeRobust(off);
-      Eigen::Map<Eigen::Vector3d>{residuals + 3 * i} = root_share_[i] * scaled.factor * off;
+      Eigen::Map<Eigen::Vector3d>{residuals + first_row} = root_share_[i] * scaled.factor * off;
       if (jacobians == nullptr) {
         continue;
       }
@@ -65,7 +66,7 @@ class PositionCost final : public ceres::CostFunction {
           whitening;
       for (int axis = 0; axis < 3; ++axis) {
         const Eigen::Vector3d direction = by_position.row(axis).transpose();
-        const int row = 3 * i + axis;
+        const Eigen::Index row = first_row + axis;
         for (int pose = 0; pose < Place::kNumPoses; ++pose) {
           if (jacobians[pose] != nullptr) {
             Eigen::Map<PoseGradient>{jacobians[pose] + kPoseSize* row} = place.OfPose(pose, i, direction);

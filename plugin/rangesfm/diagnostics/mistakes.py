@@ -24,8 +24,8 @@ _NUM_TRIED, _NUM_OF_KIND, _NUM_NEARLY = 6, 2, 3
 _NUM_FITTED = 12
 # Smallest difference of scores (twice a log-likelihood, less a penalty) that tells two explanations apart.
 _AS_LIKELY = 6.0
-# The same for alternatives where no test exceeds its threshold. By Markov's inequality a likelihood ratio is as large by
-# chance in one of 100 surveys at most: the mean of each ratio is 1, and the penalty counts the alternatives.
+# The same for alternatives where no test exceeds its threshold. By Markov's inequality a likelihood ratio is as large
+# by chance in one of 100 surveys at most: the mean of each ratio is 1, and the penalty counts the alternatives.
 _BEYOND_CHANCE = 2 * float(np.log(100))
 _SAME = 0.95
 _MAX_NUM_RIVALS = 2
