@@ -41,6 +41,7 @@ from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.run_results import RunResult, write_results
 
 
+@with_one_blas_thread
 def run_survey(survey: Survey, *, progress: Progress | None = None, restart: bool = False) -> RunResult:
     """Make the metric model of a survey and write the result folder, as ``rangesfm run`` does.
 
@@ -63,7 +64,6 @@ def run_survey(survey: Survey, *, progress: Progress | None = None, restart: boo
     return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
 
 
-@with_one_blas_thread
 def _from_photos(survey: Survey, progress: Progress | None, *, restart: bool) -> RunResult:
     run = begin_run(survey, Journal(progress or SilentProgress()))
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
