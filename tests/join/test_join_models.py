@@ -182,7 +182,7 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
     models = tuple(part.sfm for part in exact.parts)
 
     def reconstruct(*_: Any, **__: Any) -> ReconstructionSummary:
-        return ReconstructionSummary(models, len(names), HALF, {}, tmp_path / "mapper.log")
+        return ReconstructionSummary(models, len(names), HALF, {}, {}, tmp_path / "mapper.log")
 
     monkeypatch.setattr("rangesfm.workflows.map_photos.reconstruct", reconstruct)
     survey = exact.write(tmp_path).changed({"images.path": tmp_path / "photos"})

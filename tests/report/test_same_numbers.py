@@ -102,8 +102,8 @@ def test_place_clocks_and_residuals_are_the_same_everywhere(told: Told) -> None:
     assert f"the worst photo ± {worst_m:.2f} m" in told.page
     assert f"each keyframe to {worst_m:.2g} m or better (95 %)" in told.line("place: good: ")
     assert told.line("ranges: ") == (
-        f"{ranges['num_used']} of {ranges['num']} used; they differ from the map by {ranges['rms_m']:.3f} m (rms), half "
-        f"of them by less than {ranges['median_abs_m']:.3f} m"
+        f"{ranges['num_used']} of {ranges['num']} used; they differ from the map by {ranges['rms_m']:.3f} m (rms), "
+        f"half of them by less than {ranges['median_abs_m']:.3f} m"
     )
     assert f"{ranges['num_used']} of {ranges['num']} ranges to 4 radio anchors" in told.page
     assert re.search(rf"Ranges and map\n\s*{ranges['rms_m']:.3f} m\n", told.page)

@@ -45,7 +45,7 @@ class ResultSummary(Record):
         comparison: empty without a reference.
         georeference: null if the anchors do not give one.
         versions: of the software, by name.
-        seconds: by stage, and in total ("total").
+        seconds: by stage, also of stages that an earlier run did, and of this run in total ("total").
         computed: date and time of the end of the run, ISO 8601 in UTC; null for results of earlier versions.
     """
 

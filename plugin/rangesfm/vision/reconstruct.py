@@ -35,6 +35,7 @@ class ReconstructionSummary:
         num_keyframes: photos asked for.
         num_registered: photos in the first model.
         seconds: duration of each step ("features", "matching", "mapping"), without those taken over from earlier runs.
+        earlier_seconds: of those taken over, as far as known.
         log_path: COLMAP's own log.
     """
 
@@ -42,6 +43,7 @@ class ReconstructionSummary:
     num_keyframes: int
     num_registered: int
     seconds: dict[str, float]
+    earlier_seconds: dict[str, float]
     log_path: Path
 
 
@@ -106,7 +108,10 @@ def reconstruct(
     if len(found) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in found)
         progress.message(f"{len(found)} separate models of {sizes} photos")
-    return ReconstructionSummary(found, len(image_names), found[0].num_reg_images(), space.steps.seconds, log_path)
+    steps = space.steps
+    return ReconstructionSummary(
+        found, len(image_names), found[0].num_reg_images(), steps.seconds, steps.earlier_seconds, log_path
+    )
 
 
 def _map(

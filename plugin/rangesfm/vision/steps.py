@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -34,6 +35,7 @@ class Steps:
     Attributes:
         notes: other plain values kept in that file, by name; see ``note``.
         seconds: duration of each step that was done in this run, by name.
+        earlier_seconds: of each step that was taken over, as far as the record has it.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class Steps:
         self._passed: dict[str, str] = {}
         self._read_record()
         self.seconds: dict[str, float] = {}
+        self.earlier_seconds: dict[str, float] = {}
 
     def run(
         self,
@@ -82,13 +85,13 @@ class Steps:
         if self._earlier is not None:
             if self._earlier._has(name, inputs, output.relative_to(self._path.parent)):
                 self._passed[name] = inputs
-                self._progress.message(f"{name}: taken over from an earlier run")
+                self._take_over(name, self._earlier._record[name])
                 return
             self.begin()
         state = self._record.get(name, {})
         is_same = state.get("inputs") == inputs
         if is_same and state.get("done") and output.exists():
-            self._progress.message(f"{name}: taken over from an earlier run")
+            self._take_over(name, state)
             return
         self._progress.stage(name)
         start = time.perf_counter()
@@ -97,8 +100,8 @@ class Steps:
             prepare()
         self._set_state(name, inputs, done=False)
         work()
-        self._set_state(name, inputs, done=True)
         self.seconds[name] = time.perf_counter() - start
+        self._set_state(name, inputs, done=True, seconds=self.seconds[name])
 
     @property
     def has_begun(self) -> bool:
@@ -136,8 +139,14 @@ class Steps:
         if self._earlier is None:
             self._write()
 
-    def _set_state(self, name: str, inputs: str, *, done: bool) -> None:
-        self._record[name] = {"inputs": inputs, "done": done}
+    def _take_over(self, name: str, state: Mapping[str, Any]) -> None:
+        seconds = state.get("seconds")
+        if isinstance(seconds, float) and 0 <= seconds < math.inf:
+            self.earlier_seconds[name] = seconds
+        self._progress.message(f"{name}: taken over from an earlier run")
+
+    def _set_state(self, name: str, inputs: str, **state: Any) -> None:
+        self._record[name] = {"inputs": inputs, **state}
         self._write()
 
     def _write(self) -> None:

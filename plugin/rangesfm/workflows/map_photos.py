@@ -210,7 +210,7 @@ def map_keyframes(
             superseded=RESULT_NAMES,
             deferred=deferred,
         )
-    journal.seconds.update(summary.seconds)
+    journal.seconds.update({**summary.earlier_seconds, **summary.seconds})
     if summary.num_registered < summary.num_keyframes:
         which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
         journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
