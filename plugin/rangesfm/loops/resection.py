@@ -19,7 +19,7 @@ from rangesfm.loops.relative_errors import RelativeErrors
 from rangesfm.refine.vision_information import LoopPoses
 
 MAX_CHANCE = 1e-6
-"""Probability of a difference between photos and map by chance below which a loop is taken for a wrong one. A survey
+"""Probability by chance of a difference between photos and map below which a loop is taken for a wrong one. A survey
 has thousands of pairs, of which none should be lost by chance."""
 
 # Largest error of a match, in pixels: that of COLMAP's two-view geometries, which these matches have passed.

@@ -109,4 +109,8 @@ def closed(run: SurveyRun, found: FoundLoops, metric: MetricResult, refined: Met
     if refined.why_broken:
         run.journal.warn(f"loops are left open, because the map broke: {'; '.join(refined.why_broken)}")
         refined, outcome = metric, replace(outcome, closed=())
-    return replace(refined, loops=replace(outcome, after=refined.trajectory.as_in(refined.final)))
+    loops = replace(outcome, after=refined.trajectory.as_in(refined.final))
+    if metric.refinement is None or refined.refinement is None:
+        return replace(refined, loops=loops)
+    # The bend that the ranges took out of the map is that of the first refinement; the second began with its map.
+    return replace(refined, loops=loops, refinement=replace(refined.refinement, bend_m=metric.refinement.bend_m))
