@@ -36,6 +36,9 @@ class Rigid:
     def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
         return BendingOfBins((), np.zeros((len(bins), len(bins))), np.zeros(len(bins)))
 
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+        return BendingOfBins((), np.zeros((len(by_pose), len(by_pose))), np.zeros(len(by_pose)))
+
 
 def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -> Array:
     """(n,) errors of each anchor that come and go over some seconds."""

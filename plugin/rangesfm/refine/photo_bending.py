@@ -20,7 +20,7 @@ from rangesfm.ranging.errors.bending import (
     MapBending,
     WalkBending,
     averaged,
-    component_of,
+    bending_part,
     without_similarity,
 )
 from rangesfm.ranging.errors.range_bins import RangeBins
@@ -60,7 +60,7 @@ class PhotoBending:
         parts = functions.reshape(len(by_pose), -1, 6)
         by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
         covariance, shift_m = self.photos.of_functions(self.frame_ids, parts[:, :, :3], by_center)
-        found = component_of("bending", covariance, _FACTOR, _SPREAD)
+        found = bending_part("bending", covariance, _FACTOR, _SPREAD)
         shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else shift_m
         return BendingOfBins(() if found is None else (found,), covariance, shift_m)
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import special
@@ -361,8 +360,8 @@ class _Problem:
         self, similarity: Similarity, grouping: csr_array, stddev_m: Array, bending: BendingOfBins
     ) -> Iterator[ErrorPart]:
         """Yield the components of the errors."""
-        for component in bending.components:
-            yield ErrorPart(component.name, component.correlation(_NO_BINS), component.median, component.spread)
+        for part in bending.parts:
+            yield ErrorPart(part.name, part.alike, part.median_m, part.spread)
         known, rotation = self.known, similarity.rotation
         places = similarity.scale**2 * rotation @ known.own_covariance @ rotation.T
         places += known.arm_stddev_m[:, None, None] ** 2 * np.eye(3)
@@ -463,7 +462,6 @@ class _Problem:
 # Steps of the similarity (relative, radians, metres) below this are rounding.
 _SMALL_STEP = 1e-10
 _LEAST_STDDEV_M = 1e-9
-_NO_BINS: Any = None  # components of bending are the same for any bins
 
 
 def at_point(known: KnownPositions, row: int) -> Array:

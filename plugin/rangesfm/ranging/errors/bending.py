@@ -64,18 +64,43 @@ def by_poses(
 
 
 @dataclass(frozen=True)
-class BendingOfBins:
-    """Effect of a map's bending on c bins of ranges.
+class BendingPart:
+    """One component of a map's bending.
 
     Attributes:
-        components: of the ranges' errors, in metres.
+        name: in BENDS. alike: (c, c) covariance for a size of 1.
+        median_m: of its size, before anything is measured. spread: standard deviation of the logarithm of that.
+    """
+
+    name: str
+    alike: Array
+    median_m: float
+    spread: float
+
+    @property
+    def component(self) -> Component:
+        """Return it as a component of the errors of ranges."""
+        return Component(self.name, self.median_m, self.spread, None, False, lambda _: self.alike, BENDS[self.name])
+
+
+@dataclass(frozen=True)
+class BendingOfBins:
+    """Effect of a map's bending on c bins of ranges, or on c other functions of the path.
+
+    Attributes:
+        parts: of the bending, in metres.
         formal_m2: (c, c) covariance expected from the photos' residuals; zero if photos were not used.
         shift_m: (c,) change of the predicted ranges if the map moves to the minimum of the photos alone.
     """
 
-    components: tuple[Component, ...]
+    parts: tuple[BendingPart, ...]
     formal_m2: Array
     shift_m: Array
+
+    @property
+    def components(self) -> tuple[Component, ...]:
+        """Return the parts as components of the errors of ranges."""
+        return tuple(part.component for part in self.parts)
 
 
 class MapBending(Protocol):
@@ -100,8 +125,8 @@ class MapBending(Protocol):
         ...
 
 
-def component_of(name: str, covariance: Array, factor: float, spread: float) -> Component | None:
-    """Return a component in metres with ``factor`` as the median of its size; None if the bins are not affected.
+def bending_part(name: str, covariance: Array, factor: float, spread: float) -> BendingPart | None:
+    """Return a part in metres with ``factor`` as the median of its size; None if the bins are not affected.
 
     Args:
         covariance: (c, c) for a factor of 1. spread: standard deviation of the logarithm of the factor.
@@ -109,8 +134,7 @@ def component_of(name: str, covariance: Array, factor: float, spread: float) -> 
     size_m = float(np.sqrt(np.trace(covariance) / max(len(covariance), 1)))
     if not size_m > 0:
         return None
-    alike = covariance / size_m**2
-    return Component(name, factor * size_m, spread, None, False, lambda _: alike, BENDS[name])
+    return BendingPart(name, covariance / size_m**2, factor * size_m, spread)
 
 
 def averaged(bins: RangeBins, by_range: csr_array, num_poses: int) -> Array:
@@ -180,7 +204,7 @@ class WalkBending:
         found = []
         for name, which in _OF_STEP.items():
             own = factors[:, :, which].reshape(num, -1)
-            found.append(component_of(name, own @ own.T, _OF_PATH[name], _SPREAD))
+            found.append(bending_part(name, own @ own.T, _OF_PATH[name], _SPREAD))
         return BendingOfBins(tuple(each for each in found if each is not None), np.zeros((num, num)), shift_m)
 
     def factors(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> Array:
