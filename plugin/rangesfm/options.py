@@ -337,9 +337,9 @@ class PositionOptions(Options, table="positions"):
     path: Annotated[Path | None, KeyMeta(flag="positions", role="file", is_common=True)] = None
     """CSV timestamp_s,x_m,y_m,z_m[,stddev_m] (or image_name in place of timestamp_s; stddev_x_m, stddev_y_m and
     stddev_z_m, or a covariance cov_xx_m2, cov_xy_m2, ..), another table, a TUM trajectory, NMEA sentences, a solution
-    of RTKLIB, or a log of Marvelmind's dashboard."""
+    of RTKLIB, a log of Marvelmind's dashboard, or a database of COLMAP with pose priors, such as those from EXIF."""
     format: Annotated[str | None, KeyMeta(flag="positions_format")] = None
-    """Format of the file: table, tum, nmea, rtklib or marvelmind (default: recognised by content)."""
+    """Format of the file: table, tum, nmea, rtklib, marvelmind or colmap (default: recognised by content)."""
     columns: Annotated[dict[str, str], KeyMeta(flag="position_columns", metavar="QUANTITY=NAME,..")] = Field(
         default_factory=dict
     )

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from datetime import datetime, timezone
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from rangesfm.errors import InputError
@@ -28,7 +30,7 @@ def read(folder: Path, text: str, **options: object) -> PositionLog:
 
 def nmea(*bodies: str) -> str:
     """Return sentences with their checksums."""
-    sums = (f"{__import__('functools').reduce(lambda a, b: a ^ ord(b), body, 0):02X}" for body in bodies)
+    sums = (f"{reduce(lambda total, letter: total ^ ord(letter), body, 0):02X}" for body in bodies)
     return "".join(f"${body}*{total}\r\n" for body, total in zip(bodies, sums, strict=True))
 
 
@@ -112,6 +114,34 @@ def test_a_log_of_marvelminds_dashboard_is_read(tmp_path: Path) -> None:
     assert found.timestamp_s is not None
     np.testing.assert_allclose(np.diff(found.timestamp_s), 0.1, atol=1e-6)
     np.testing.assert_allclose(found.position_m[:, 0], [1.0, 1.01, 1.02])
+
+
+@pytest.mark.parametrize("system", ["CARTESIAN", "WGS84"])
+def test_pose_priors_of_a_database_are_positions_of_its_photos(tmp_path: Path, system: str) -> None:
+    path = tmp_path / "database.db"
+    with pycolmap.Database.open(path) as database:
+        camera = pycolmap.Camera(model="PINHOLE", width=10, height=10, params=[10, 10, 5, 5])
+        camera_id = database.write_camera(camera)
+        for k in range(3):
+            image = pycolmap.Image(name=f"{k}.jpg", camera_id=camera_id)
+            image_id = database.write_image(image)
+            image.image_id = image_id
+            prior = pycolmap.PosePrior(
+                position=[47.0 + k, 8.0, 400.0],
+                position_covariance=0.01 * np.eye(3),
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.__members__[system],
+                corr_data_id=image.data_id,
+            )
+            database.write_pose_prior(prior)
+    before = path.read_bytes()
+    found = read_positions(PositionOptions().changed(path=path))
+    assert found is not None
+    assert found.image_name == ("0.jpg", "1.jpg", "2.jpg")
+    is_geographic = system == "WGS84"
+    assert found.crs == (GEOGRAPHIC if is_geographic else None)
+    np.testing.assert_array_equal(found.position_m[1], [8, 48, 400] if is_geographic else [48, 8, 400])
+    assert np.isnan(found.covariance_m2).all() == is_geographic
+    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Readers of positions: tables of any layout, TUM trajectories, NMEA, RTKLIB's solutions, and Marvelmind's dashboard.
+"""Readers of positions: tables of any layout, TUM, NMEA, RTKLIB, Marvelmind's dashboard, and databases of COLMAP.
 
 Each is a function that returns a PositionLog, and one that recognises the beginning of a file. Pozyx and other systems
 write tables with names of columns, which are recognised like those of range logs.
@@ -19,6 +19,7 @@ from rangesfm.files.text_tables import TextTable, has_columns, header_names, rea
 from rangesfm.geometry.reference import is_tum_row, read_reference
 from rangesfm.option_model import Bounds
 from rangesfm.options import COORDINATE_M, STDDEV_M, TIME_S, PositionOptions
+from rangesfm.positions.pose_priors import is_database, read_pose_priors
 from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.columns import read_timestamps
@@ -437,6 +438,7 @@ def _covariance_of_rtklib(roots: Array, is_geographic: bool) -> Array:
 
 
 POSITION_READERS: dict[str, tuple[Callable[[str], bool], Reader]] = {
+    "colmap": (is_database, lambda path, _options: read_pose_priors(path)),
     "nmea": (_is_nmea, _read_nmea),
     "rtklib": (_is_rtklib, _read_rtklib),
     "tum": (_is_tum, _read_tum),
