@@ -37,7 +37,7 @@ def main() -> None:
     points = np.array([point.xyz for point in map_.reconstruction.points3D.values()])
     low, high = map(float, sys.argv[3:5]) if len(sys.argv) > 4 else np.quantile(points[:, 2], [0.25, 0.75])
     wall = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
-    relative_stddev = result.summary.scale.relative_stddev_empirical or 0.0
+    half_width_95 = 1.96 * (result.summary.scale.relative_stddev_empirical or 0.0)
 
     figure, axes = plt.subplots(figsize=(8, 8))
     axes.plot(wall[:, 0], wall[:, 1], ".", color="0.35", markersize=1.5, label=f"points from {low:.2f} to {high:.2f} m")
@@ -49,23 +49,23 @@ def main() -> None:
     path = map_.trajectory.centers[:, :2]
     corner = np.minimum(lowest, path.min(axis=0))
     for axis in (0, 1):
-        draw_dimension(axes, corner, (lowest[axis], highest[axis]), axis, relative_stddev)
+        draw_dimension(axes, corner, (lowest[axis], highest[axis]), axis, half_width_95)
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(loc="upper right")
     figure.savefig(plan, dpi=150, bbox_inches="tight")
     width, depth = highest - lowest
-    print(f"{width:.3f} m x {depth:.3f} m, each +- {100 * relative_stddev:.1f} % (1 stddev of the scale): {plan}")
+    print(f"{width:.3f} m x {depth:.3f} m, each +- {100 * half_width_95:.1f} % (95 %, by the scale): {plan}")
 
 
-def draw_dimension(axes: Axes, corner: Array, interval: tuple[float, float], axis: int, relative_stddev: float) -> None:
+def draw_dimension(axes: Axes, corner: Array, interval: tuple[float, float], axis: int, half_width_95: float) -> None:
     """Draw a dimension arrow with its length below the map, or left of it."""
     start, end = corner - 0.4, corner - 0.4
     start[axis], end[axis] = interval
     axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops={"arrowstyle": "<->"})
     length, middle = interval[1] - interval[0], (start + end) / 2
-    text = f"{length:.2f} ± {relative_stddev * length:.2f} m"
+    text = f"{length:.2f} ± {half_width_95 * length:.2f} m"
     aside = {"ha": "center", "va": "bottom"} if axis == 0 else {"ha": "right", "va": "center", "rotation": 90}
     axes.annotate(text, (middle[0], middle[1]), **aside)
 

@@ -18,6 +18,7 @@ from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import component_words
+from rangesfm.ranging.errors.noise import NORMAL_95
 
 REFUSED = "refused"
 """Verdict of a plan whose scale a run will refuse."""
@@ -188,22 +189,23 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
     yield f"{plan.num_ranges} ranges in {plan.duration_s:.0f} s, result in the {plan.frame.replace('_', ' ')}'s frame"
     places = (f"{name} {', '.join(f'{x:.4g}' for x in place)}" for name, place in plan.anchors_m.items())
     yield f"anchors at {'; '.join(places)}"
-    yield f"scale: +-{100 * plan.scale_stddev:.2g} % (1 stddev), {low:+.2g} to {high:+.2g} % (95 %); {plan.verdict}"
+    yield f"scale: {low:+.2g} to {high:+.2g} % (95 %); {plan.verdict}"
     yield from (f"  {reason}" for reason in plan.reasons)
     if plan.place is not None:
         place = plan.place
-        x, y, z = (_rough(stddev_m) for stddev_m in place.stddev_m)
+        x, y, z = (_half_width_95(stddev_m) for stddev_m in place.stddev_m)
         yield (
-            f"place: x {x}, y {y}, z {z}, heading {_rough(place.heading_stddev_deg, 'deg')}, tilt "
-            f"{_rough(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe} is known least, to "
-            f"{_rough(place.worst_keyframe_stddev_m)} (1 stddev)"
+            f"place: x {x}, y {y}, z {z}, heading {_half_width_95(place.heading_stddev_deg, 'deg')}, tilt "
+            f"{_half_width_95(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe} is known least, to "
+            f"{_half_width_95(place.worst_keyframe_stddev_m)} (95 %)"
         )
 
 
 def _budget(plan: SurveyPlan) -> Iterator[str]:
     largest = sorted(plan.components.items(), key=lambda item: -item[1])[:_MAX_NUM_SHOWN]
     words = component_words(name for name, _ in largest)
-    yield "what makes the scale uncertain: " + ", ".join(f"{words[name]} {100 * part:.2g} %" for name, part in largest)
+    parts = (f"{words[name]} {100 * NORMAL_95 * stddev:.2g} %" for name, stddev in largest)
+    yield f"what makes the scale uncertain (95 % each): {', '.join(parts)}"
 
 
 def _found(plan: SurveyPlan) -> Iterator[str]:
@@ -225,16 +227,20 @@ def _found(plan: SurveyPlan) -> Iterator[str]:
 def _advised(plan: SurveyPlan) -> Iterator[str]:
     if not plan.advice:
         yield "no single change gains much"
-    for_scale = [f"{each.words}: +-{100 * each.scale_stddev:.2g} %" for each in plan.advice_for_scale]
-    for_place = [f"{each.words}: {_rough(each.place_stddev_m)}" for each in plan.advice_for_place]
+    for_scale = [f"{each.words}: +-{100 * NORMAL_95 * each.scale_stddev:.2g} %" for each in plan.advice_for_scale]
+    for_place = [f"{each.words}: {_half_width_95(each.place_stddev_m)}" for each in plan.advice_for_place]
     for what, best in {"the scale": for_scale, "the place of the keyframe known least": for_place}.items():
         if best:
-            yield f"what would gain most for {what}:"
+            yield f"what would gain most for {what} (95 %):"
         yield from (f"  {number}. {words}" for number, words in enumerate(best[:_MAX_NUM_SHOWN], 1))
 
 
-def _rough(stddev: float, unit: str = "m") -> str:
-    return f"{stddev:.2g} {unit}" if np.isfinite(stddev) else "open"
+def _half_width_95(stddev: float, unit: str = "m") -> str:
+    return _rough(NORMAL_95 * stddev, unit)
+
+
+def _rough(size: float, unit: str = "m") -> str:
+    return f"{size:.2g} {unit}" if np.isfinite(size) else "open"
 
 
 def _finite(value: Any) -> Any:

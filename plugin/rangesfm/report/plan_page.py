@@ -16,6 +16,7 @@ from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan
 from rangesfm.ranging.errors.components import component_words
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.report_tables import ReportTable
@@ -25,7 +26,7 @@ from rangesfm.report.text import count, duration, fixed, percent, rough
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")
 _OPEN_COLOR = "#a3123a"
 _WALL_COLOR = "#6b7280"
-# Ends of the bands of stddevs are numbers that begin with one of these. Three bands are a factor of 10.
+# Ends of the bands of half widths are numbers that begin with one of these. Three bands are a factor of 10.
 _STEPS = np.array([1.0, 2.0, 5.0])
 _AREA_OPACITY, _AREA_WIDTH_PX = 70, 160
 _MAX_NUM_MISTAKES = 12
@@ -65,15 +66,25 @@ def _tiles(plan: SurveyPlan) -> list[tuple[str, str, str]]:
     place = plan.place
     of_place = []
     if place is not None:
-        axes = ", ".join(f"{axis} {rough(stddev_m, 'm')}" for axis, stddev_m in zip("xyz", place.stddev_m, strict=True))
+        axes = ", ".join(
+            f"{axis} {_half_width_95(stddev_m, 'm')}" for axis, stddev_m in zip("xyz", place.stddev_m, strict=True)
+        )
         of_place = [
-            ("Place", rough(math.hypot(*place.stddev_m), "m"), f"of the map's middle: {axes}"),
-            ("Heading", rough(place.heading_stddev_deg, "°"), f"tilt {rough(place.tilt_stddev_deg, '°')}"),
+            ("Place", _half_width_95(math.hypot(*place.stddev_m), "m"), f"of the map's middle: {axes}"),
+            (
+                "Heading",
+                _half_width_95(place.heading_stddev_deg, "°"),
+                f"tilt {_half_width_95(place.tilt_stddev_deg, '°')}",
+            ),
         ]
     worst = int(np.argmax(plan.keyframe_stddevs_m))
     return [
         *of_place,
-        ("Keyframe known least", rough(plan.keyframe_stddevs_m[worst], "m"), f"number {worst + 1} on the path"),
+        (
+            "Keyframe known least",
+            _half_width_95(plan.keyframe_stddevs_m[worst], "m"),
+            f"number {worst + 1} on the path",
+        ),
         ("Ranges", count(plan.num_ranges), f"in {duration(plan.duration_s)}"),
     ]
 
@@ -81,13 +92,13 @@ def _tiles(plan: SurveyPlan) -> list[tuple[str, str, str]]:
 def accuracy_views(plan: SurveyPlan) -> Figure:
     """Return plan and elevation of the path; path and surroundings are coloured by their expected stddev."""
     centers = plan.expected.planned.trajectory.centers
-    edges = _edges(np.array(plan.keyframe_stddevs_m))
+    edges = _edges(NORMAL_95 * np.array(plan.keyframe_stddevs_m))
     # A plan is drawn in the site frame, z up, even where the result will be in another frame.
     views = tuple(_view(plan, view, centers, edges) for view in views_of(centers, "site"))
     whose = "in the site" if plan.place is not None else "against the first camera"
     caption = (
-        f"Expected uncertainty of places {whose} (one stddev of the three coordinates together): of the keyframes "
-        "along the path, and of points around it that the photos show, at the path's mean height and depth."
+        f"Expected uncertainty of places {whose} (95 %, of the three coordinates together): of the keyframes along the "
+        "path, and of points around it that the photos show, at the path's mean height and depth."
     )
     return Figure("accuracy", caption, views, layout="views")
 
@@ -97,7 +108,7 @@ def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
     line = view.seen(centers)
     walls = [np.insert(wall, 2, centers[:, 2].mean(), axis=1) for wall in plan.expected.planned.walls_m]
     limits = equal_view(np.vstack([line, places, *map(view.seen, walls)]))
-    of_keyframe = np.digitize(plan.keyframe_stddevs_m, edges)
+    of_keyframe = np.digitize(NORMAL_95 * np.array(plan.keyframe_stddevs_m), edges)
     names = _names(edges)
     shown = names if len(edges) in of_keyframe else names[:-1]
     series = [
@@ -112,13 +123,13 @@ def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
 
 
 def _area(plan: SurveyPlan, view: View, middle: Array, edges: Array, limits: Limits) -> Pixels:
-    """Return an RGBA picture (h, w, 4) of the surroundings, coloured by the expected stddev of points there."""
+    """Return an RGBA picture (h, w, 4) of the surroundings, coloured by the expected uncertainty of points there."""
     (x_low, x_high), (y_low, y_high), size = limits
     width, height = _AREA_WIDTH_PX, max(round(_AREA_WIDTH_PX * size[1] / size[0]), 1)
     across, down = np.meshgrid(np.linspace(x_low, x_high, width), np.linspace(y_high, y_low, height))
     places = np.tile(middle, (width * height, 1))
     places[:, view.axes] = np.column_stack([across.ravel(), view.sign * down.ravel()])
-    bands = np.digitize(plan.expected.stddevs_at(places), edges)
+    bands = np.digitize(NORMAL_95 * plan.expected.stddevs_at(places), edges)
     palette = np.array(
         [tuple(bytes.fromhex(_color(band, len(edges) + 1)[1:])) for band in range(len(edges) + 1)], dtype=np.uint8
     )
@@ -126,19 +137,23 @@ def _area(plan: SurveyPlan, view: View, middle: Array, edges: Array, limits: Lim
     return pixels
 
 
-def _edges(stddevs_m: Array) -> Array:
-    """Return the upper ends of bands of stddevs, metres; the last is infinite.
+def _edges(half_widths_m: Array) -> Array:
+    """Return the upper ends of bands of half widths of 95 % intervals, metres; the last is infinite.
 
     The ends are 1, 2, 5, 10, ... and the median keyframe is in the band in the middle. So the colours differ where one
     place is known at least twice as well as another, and a path that is known evenly has one colour.
     """
-    known = stddevs_m[np.isfinite(stddevs_m) & (stddevs_m > 0)]
+    known = half_widths_m[np.isfinite(half_widths_m) & (half_widths_m > 0)]
     if len(known) == 0:
         return np.array([np.inf])
     exponent = math.floor(math.log10(np.median(known)))
     ladder = np.concatenate([_STEPS * 10.0 ** (exponent + by) for by in (-1, 0, 1)])
     first = int(np.searchsorted(ladder, np.median(known), side="right")) - len(_COLORS) // 2
     return np.append(ladder[first : first + len(_COLORS) - 1], np.inf)
+
+
+def _half_width_95(stddev: float, unit: str) -> str:
+    return rough(NORMAL_95 * stddev, unit)
 
 
 def _names(edges: Array) -> list[str]:
@@ -161,10 +176,10 @@ def _stretches(line: Array, inside: Mask) -> Array:
 
 def _advice(caption: str, ranked: Sequence[Advice]) -> ReportTable:
     rows = [
-        [f"{k}. {each.words}", percent(each.scale_stddev), rough(each.place_stddev_m, "m")]
+        [f"{k}. {each.words}", percent(NORMAL_95 * each.scale_stddev), _half_width_95(each.place_stddev_m, "m")]
         for k, each in enumerate(ranked, 1)
     ]
-    columns = ["one change", "scale then ±", "that keyframe then ±"]
+    columns = ["one change", "scale then ± (95 %)", "that keyframe then ± (95 %)"]
     if ranked and np.isnan(ranked[0].place_stddev_m):  # the first camera's frame has no place
         rows, columns = [row[:2] for row in rows], columns[:2]
     return ReportTable(caption, columns, rows, kind="settings")
@@ -173,8 +188,8 @@ def _advice(caption: str, ranked: Sequence[Advice]) -> ReportTable:
 def _components(plan: SurveyPlan) -> ReportTable:
     words = component_words(plan.components)
     largest = sorted(plan.components.items(), key=lambda item: -item[1])
-    rows = [[words[name], percent(part)] for name, part in largest]
-    return ReportTable("What makes the scale uncertain", ["", "of the scale"], rows, is_narrow=True)
+    rows = [[words[name], percent(NORMAL_95 * stddev)] for name, stddev in largest]
+    return ReportTable("What makes the scale uncertain", ["", "± of the scale (95 %)"], rows, is_narrow=True)
 
 
 def _anchors(plan: SurveyPlan) -> ReportTable:
