@@ -1,4 +1,4 @@
-"""Figure of the loops: matches between photos of distant times, across the path."""
+"""Figure of the loops: which keyframes matches tie together, before and after they were closed."""
 
 from __future__ import annotations
 
@@ -6,34 +6,37 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.report.content import Content
-from rangesfm.report.plot import Figure, Panel, Series, View, equal_view, views_of
+from rangesfm.report.plot import Figure, Panel, Series
 from rangesfm.result.result_tables import LoopPairs
+
+_SIZE = (420.0, 420.0)
 
 
 def loops_figure(content: Content) -> Figure | None:
-    """Return plan and elevation of the path with the loops that were closed, and those that the ranges contradict."""
+    """Return the graph of matches: a dot for each pair of keyframes that closed a loop, or contradicted the ranges."""
     pairs, path = content.result.read(LoopPairs), content.final
     if pairs is None or not pairs.status or path is None:
         return None
-    at = dict(zip(path.image_names, path.centers, strict=True))
+    number = {name: k for k, name in enumerate(path.image_names, 1)}
 
-    def chords(status: str) -> Array:
-        known = [(at[first], at[second]) for first, second in pairs.pairs(status) if first in at and second in at]
-        ends = np.array(known, dtype=np.float64).reshape(-1, 2, 3)
-        return np.concatenate([ends, np.full((len(ends), 1, 3), np.nan)], axis=1).reshape(-1, 3)
+    def dots(status: str) -> Array:
+        of_status = [pair for pair in pairs.pairs(status) if number.keys() >= set(pair)]
+        numbers = [(number[first], number[second]) for first, second in of_status]
+        return np.sort(np.array(numbers, dtype=np.float64).reshape(-1, 2), axis=1)
 
-    lines = {
-        "matches of neighbours, as before": ("before", path.centers, "line"),
-        "matches that close loops": ("after", chords("closed"), "line"),
-        "contradicted by the ranges": ("reference", chords("contradicted"), "dashed"),
-    }
-    views = tuple(_view(lines, view) for view in views_of(path.centers, content.summary.frame))
-    caption = "Which photos are tied together: along the path by neighbours in time, across it by loops."
-    return Figure("loops", caption, views, layout="views")
-
-
-def _view(lines: dict[str, tuple[str, Array, str]], view: View) -> Panel:
-    series = [
-        Series(name, color, view.seen(points), kind) for name, (color, points, kind) in lines.items() if len(points)
-    ]
-    return view.panel("matches between photos", " m", series, equal_view(series[0].points))
+    along = np.arange(1.0, len(path) + 1)
+    series = (
+        Series("neighbours in time, as before", "before", np.column_stack([along, along]), "line", is_data=False),
+        Series("closed a loop", "after", dots("closed")),
+        Series("contradict the ranges", "reference", dots("contradicted")),
+    )
+    panel = Panel(
+        "",
+        "pairs of keyframes that matches tie together",
+        ("keyframe", "matched with keyframe"),
+        tuple(one for one in series if len(one.points)),
+        size=_SIZE,
+        keeps_shape=True,
+    )
+    caption = "Pairs of keyframes that match: neighbours in time are on the line, loops are away from it."
+    return Figure("loops", caption, (panel,))
