@@ -87,7 +87,7 @@ def test_positions_with_a_lever_arm_and_another_clock_place_the_map(walk: Walk, 
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse_metric" / "0")
     found = np.array([image.projection_center() for _, image in sorted((i.name, i) for i in model.images.values())])
     assert np.linalg.norm(found - walk.made.centers_m, axis=1).max() < 0.15
-    assert {test.name for test in summary.tests} == {"antenna's lever arm", "antenna's clock"}
+    assert [test.name for test in summary.tests] == ["antenna's lever arm"]
     assert not any(test.rejected for test in summary.tests)
     assert ResultSummary.read(survey.output.path / "result.json") == summary
 

@@ -95,7 +95,7 @@ def _of_antenna(positions: PositionScale) -> Iterator[MistakeTest]:
         return
     shown = is_antenna[:, None, None]
     columns = {_ARM: np.where(shown, rotation @ known.world_from_cam, 0.0)}
-    if known.velocity.any():
+    if known.velocity.any() and not known.clock_stddev_s.any():  # an offset that was searched for has no mistake
         moves = positions.site_from_model.scale * known.velocity @ rotation.T
         columns[_CLOCK] = np.where(shown, moves[:, :, None], 0.0)
     if (known.is_mark & positions.is_used).sum() >= MIN_NUM_POSITIONS:

@@ -13,6 +13,7 @@ from rangesfm.export.apply import apply_to, best_similarity
 from rangesfm.export.colmap import (
     write_camera_positions,
     write_model,
+    write_pose_priors,
     write_project,
     write_transform,
     write_undistorted,
@@ -67,6 +68,7 @@ EXPORTERS: dict[str, Exporter] = {
     "kml": lambda map_, folder: write_features(map_, folder / "survey.kml", "KML"),
     "transform": lambda map_, folder: write_transform(map_.metric_from_sfm, folder),
     "model_aligner": lambda map_, folder: write_camera_positions(map_.reconstruction, folder / "positions.txt"),
+    "pose_priors": lambda map_, folder: write_pose_priors(map_, folder / "pose_priors.db"),
     "nerfstudio": lambda map_, folder: write_nerfstudio(map_, folder),
     "opensfm": lambda map_, folder: write_opensfm(map_, folder / "reconstruction.json"),
     "opf": lambda map_, folder: write_opf(map_, folder / "opf"),
@@ -90,6 +92,7 @@ EXPORTED_NAMES: dict[str, tuple[str, ...]] = {
     "kml": ("survey.kml",),
     "transform": ("transform_colmap_4.txt", "transform_colmap_3.8.txt"),
     "model_aligner": ("positions.txt",),
+    "pose_priors": ("pose_priors.db",),
     "nerfstudio": ("transforms.json", "transforms_points.ply", NERFSTUDIO_IMAGES),
     "opensfm": ("reconstruction.json",),
     "opf": ("opf",),

@@ -14,7 +14,7 @@ from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap, photo_files, registered_images, require_space
-from rangesfm.files.atomic import new_folder, write_text
+from rangesfm.files.atomic import new_file, new_folder, write_text
 from rangesfm.files.folders import real_path
 from rangesfm.geometry.similarity import Similarity
 
@@ -83,6 +83,38 @@ def write_camera_positions(reconstruction: pycolmap.Reconstruction, path: Path) 
         for image in registered_images(reconstruction)
     ]
     write_text("\n".join(lines) + "\n", path)
+    return path
+
+
+def write_pose_priors(map_: MetricMap, path: Path) -> Path:
+    """Write a copy of the photos' database in which their positions are pose priors, for ``pose_prior_mapper``.
+
+    The positions are those of the map, with their covariance if it is known, in the map's frame. COLMAP can match by
+    them (``spatial_matcher``) and map with them, also together with photos that are added to the database later.
+
+    Raises:
+        InputError: there is no database, or it has none of the photos.
+    """
+    if map_.database_path is None or not map_.database_path.is_file():
+        raise InputError("the format 'pose_priors' needs the photos' database (database.db), which is not there")
+    covariances = map_.center_covariance_m2 or {}
+    with new_file(path) as temporary, tempfile.TemporaryDirectory() as scratch:
+        copy = Path(shutil.copy(map_.database_path, Path(scratch) / "copy.db"))
+        with pycolmap.Database.open(copy) as database:
+            database.clear_pose_priors()
+            data_ids = {image.name: image.data_id for image in database.read_all_images()}
+            known = [image for image in registered_images(map_.reconstruction) if image.name in data_ids]
+            if not known:
+                raise InputError("it has none of the map's photos, expected their database", map_.database_path)
+            for image in known:
+                prior = pycolmap.PosePrior(
+                    corr_data_id=data_ids[image.name],
+                    position=image.projection_center(),
+                    position_covariance=covariances.get(image.name, np.full((3, 3), np.nan)),
+                    coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+                )
+                database.write_pose_prior(prior)
+        shutil.copyfile(copy, temporary)
     return path
 
 

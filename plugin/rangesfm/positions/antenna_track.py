@@ -30,7 +30,7 @@ _NUM_SEARCHED, _MAX_NUM_TRIED = 200, 4000
 # Step between offsets, as a share of the median time between keyframes: the motion hardly changes within it.
 _STEP = 0.25
 _MOST_OUTLYING = 0.2
-_NUM_REFINED = 12
+_NUM_REFINED, _STRETCH_S = 12, 10.0
 # A given offset is wrong if the residuals with it are at least so many times those with another one.
 _MUCH_WORSE = 3.0
 
@@ -67,14 +67,15 @@ class AntennaTrack:
             raise InputError("the positions have times but the photos have none: give image times", self.log.path)
         given_s, times_s, at_m = self.offset_s, self.log.timestamp_s, self.log.position_m
         try:
-            offset_s, stddev_s = _search(times_s, at_m, path, path.timestamps_s)
+            moving = _MovingAntenna(path.timestamps_s, path.centers, path.world_from_cam @ self.antenna_in_cam_m)
+            offset_s, stddev_s = _search(times_s, at_m, moving)
         except GeometryError:
             if given_s is None:
                 raise
             return self
         if given_s is None:
             return replace(self, offset_s=offset_s, offset_stddev_s=stddev_s)
-        misfits = [_misfit_m(times_s + s, at_m, path.timestamps_s, path.centers) for s in (given_s, offset_s)]
+        misfits = [moving.misfit_m(times_s + each_s, at_m) for each_s in (given_s, offset_s)]
         return replace(self, other_offset_s=offset_s) if misfits[0] > _MUCH_WORSE * misfits[1] else self
 
     def located(self, path: Trajectory) -> KnownPositions:
@@ -105,6 +106,7 @@ class AntennaTrack:
             own_covariance=stddev[:, None, None] ** 2 * np.eye(3),
             arm_stddev_m=arm_stddev_m,
             time_s=times_s,
+            clock_stddev_s=np.full(k, self.offset_stddev_s),
             velocity=velocity,
             world_from_cam=path.world_from_cam[np.where(weight < 0.5, before, after)],
             by_pose=_by_shifts(before, after, weight, n),
@@ -176,63 +178,75 @@ def _by_turns(path: Trajectory, arm_m: Array, before: Indices, after: Indices, w
     return coo_array((np.concatenate(values), (np.tile(rows.ravel(), 2), np.concatenate(columns))), shape=shape).tocsr()
 
 
-def _search(times_s: Array, position_m: Array, path: Trajectory, photo_times_s: Array) -> tuple[float, float]:
+@dataclass(frozen=True)
+class _MovingAntenna:
+    """The path of an antenna in a model: times, (n, 3) centres in its unit, and (n, 3) lever arms in metres."""
+
+    times_s: Array
+    centers: Array
+    arms_m: Array
+
+    def num_on(self, times_s: Array) -> int:
+        """Return how many times are within those of the path."""
+        return int(np.count_nonzero(self._is_on(times_s)))
+
+    def _is_on(self, times_s: Array) -> Mask:
+        return np.asarray((times_s >= self.times_s[0]) & (times_s <= self.times_s[-1]))
+
+    def misfit_m(self, times_s: Array, position_m: Array) -> float:
+        """Return the root mean square distance of positions from a similar path, without a share of the farthest."""
+        on = self._is_on(times_s)
+        if on.sum() < _MIN_NUM:
+            return np.inf
+        places, arms_m = (self._at(values, times_s[on]) for values in (self.centers, self.arms_m))
+        fit, targets = align_points(places, position_m[on]), position_m[on]
+        near = np.ones(len(targets), dtype=bool)
+        for _ in range(2):
+            targets = position_m[on] - arms_m @ fit.rotation.T
+            fit = align_points(places[near], targets[near])
+            off = np.linalg.norm(fit.apply(places) - targets, axis=1)
+            near = off <= np.quantile(off, 1 - _MOST_OUTLYING)
+            near = near if near.sum() >= _MIN_NUM else np.ones(len(targets), dtype=bool)
+        return float(np.sqrt(np.mean(off[near] ** 2)))
+
+    def _at(self, values: Array, times_s: Array) -> Array:
+        return np.column_stack([np.interp(times_s, self.times_s, values[:, axis]) for axis in range(3)])
+
+
+def _search(times_s: Array, position_m: Array, antenna: _MovingAntenna) -> tuple[float, float]:
     """Return the time offset with the best fit of a similarity, and its standard deviation.
 
     Raises:
         GeometryError: too few positions and keyframes have a moment in common, or the antenna did not move.
     """
-    if len(times_s) < _MIN_NUM or len(path) < _MIN_NUM or not (are_apart(path.centers) and are_apart(position_m)):
+    photo_times_s, num = antenna.times_s, len(times_s)
+    if min(num, len(photo_times_s)) < _MIN_NUM or not (are_apart(antenna.centers) and are_apart(position_m)):
         raise GeometryError(
-            f"the time offset of the positions is not determined: {len(times_s)} positions, {len(path)} keyframes"
+            f"the time offset of the positions is not determined: {num} positions, {len(photo_times_s)} keyframes"
         )
-    some = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _NUM_SEARCHED)).astype(np.int64))
+    some = np.unique(np.linspace(0, num - 1, min(num, _NUM_SEARCHED)).astype(np.int64))
     low, high = photo_times_s[0] - times_s[-1], photo_times_s[-1] - times_s[0]
     step = max(_STEP * float(np.median(np.diff(photo_times_s))), (high - low) / _MAX_NUM_TRIED)
-
-    def misfit(offset_s: float, rows: Indices) -> float:
-        return _misfit_m(times_s[rows] + offset_s, position_m[rows], photo_times_s, path.centers)
-
     offsets = np.arange(low, high, step)
-    most = max(_num_on(times_s[some] + offset, photo_times_s) for offset in offsets.tolist())
-    enough = max(_MIN_COVERAGE * most, _MIN_NUM)
+    nums = np.array([antenna.num_on(times_s[some] + offset) for offset in offsets.tolist()])
+    enough = max(_MIN_COVERAGE * float(nums.max(initial=0)), _MIN_NUM)
     costs = np.array(
         [
-            misfit(offset, some) if _num_on(times_s[some] + offset, photo_times_s) >= enough else np.inf
-            for offset in offsets.tolist()
+            antenna.misfit_m(times_s[some] + offset, position_m[some]) if on >= enough else np.inf
+            for offset, on in zip(offsets.tolist(), nums.tolist(), strict=True)
         ]
     )
     if not np.isfinite(costs).any():
-        raise GeometryError(
-            "the time offset of the positions is not determined: hardly any lie within the photos' times"
-        )
-    best, everything = float(offsets[int(np.argmin(costs))]), np.arange(len(times_s))
+        why = "hardly any lie within the photos' times"
+        raise GeometryError(f"the time offset of the positions is not determined: {why}")
+    best = float(offsets[int(np.argmin(costs))])
     for _ in range(_NUM_REFINED):
-        around = best + step * np.array([-1.0, 0.0, 1.0])
-        values = np.array([misfit(offset, everything) for offset in around.tolist()])
-        curvature = values[0] - 2 * values[1] + values[2]
-        moved = 0.5 * step * (values[0] - values[2]) / curvature if curvature > 0 else 0.0
+        before, now, after = (antenna.misfit_m(times_s + best + by, position_m) for by in (-step, 0.0, step))
+        curvature = before - 2 * now + after
+        moved = 0.5 * step * (before - after) / curvature if curvature > 0 else 0.0
         best, step = best + float(np.clip(moved, -step, step)), step / 2
-    # Half the mean square residual grows with the speed of the camera; the residuals that are left limit the offset.
+    # An error of the offset shifts all positions along the path, by the speed. Errors that last for seconds leave one
+    # independent position in each stretch of time.
     speed = float(np.median(np.linalg.norm(np.diff(position_m, axis=0), axis=1) / np.diff(times_s)))
-    return best, misfit(best, everything) / max(speed, 1e-6) / np.sqrt(max(len(times_s) / 3, 1.0))
-
-
-def _num_on(times_s: Array, photo_times_s: Array) -> int:
-    return int(np.count_nonzero((times_s >= photo_times_s[0]) & (times_s <= photo_times_s[-1])))
-
-
-def _misfit_m(times_s: Array, position_m: Array, photo_times_s: Array, centers: Array) -> float:
-    """Return the root mean square distance of positions from a similar path, without a share of the farthest ones."""
-    on = (times_s >= photo_times_s[0]) & (times_s <= photo_times_s[-1])
-    if on.sum() < _MIN_NUM:
-        return np.inf
-    places = np.column_stack([np.interp(times_s[on], photo_times_s, centers[:, axis]) for axis in range(3)])
-    targets = position_m[on]
-    fit = align_points(places, targets)
-    off = np.linalg.norm(fit.apply(places) - targets, axis=1)
-    near = off <= np.quantile(off, 1 - _MOST_OUTLYING)
-    if near.sum() >= _MIN_NUM:
-        fit = align_points(places[near], targets[near])
-        off = np.sort(np.linalg.norm(fit.apply(places) - targets, axis=1))[: int(near.sum())]
-    return float(np.sqrt(np.mean(off**2)))
+    stretches = max(float(times_s[-1] - times_s[0]) / _STRETCH_S, 1.0)
+    return best, antenna.misfit_m(times_s + best, position_m) / max(speed, 1e-6) / np.sqrt(min(stretches, num))

@@ -38,7 +38,7 @@ class KnownPositions:
         places: (k, 3) in the model's world and unit. arms_m: (k, 3) lever arms in the axes of the model's world.
         own_covariance: (k, 3, 3) of the places, in the model's world and unit, without errors of the poses.
         arm_stddev_m: (k,) of each coordinate of the arms.
-        time_s: (k,) on the photos' clock; NaN without a time.
+        time_s: (k,) on the photos' clock; NaN without a time. clock_stddev_s: (k,) of the time offset that all share.
         velocity: (k, 3) of the antenna, model units per second; 0 for marks.
         world_from_cam: (k, 3, 3) rotations of the camera; 0 for marks.
         by_pose, arms_by_pose: (3 k, 6 n) sparse derivatives of places and arms by the n poses of a path: for each, a
@@ -58,6 +58,7 @@ class KnownPositions:
     own_covariance: Array
     arm_stddev_m: Array
     time_s: Array
+    clock_stddev_s: Array
     velocity: Array
     world_from_cam: Array
     by_pose: csr_array
@@ -122,6 +123,7 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         own_covariance=np.array([each.errors.own_m2 for each in found]).reshape(-1, 3, 3),
         arm_stddev_m=np.zeros(k),
         time_s=np.full(k, np.nan),
+        clock_stddev_s=np.zeros(k),
         velocity=np.zeros((k, 3)),
         world_from_cam=np.zeros((k, 3, 3)),
         by_pose=vstack([csr_array((0, 6 * len(path))), *(_by_pose(each, path) for each in found)], format="csr"),

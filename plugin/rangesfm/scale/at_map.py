@@ -127,8 +127,10 @@ def estimate_at(
     """
     known = on_map.known(learned)
     value = on_map.solution.fit.state.metric_from_model.scale
-    # The refinement lets many ranges outweigh the measured lengths, so its uncertainty would ignore what they tell.
-    uncertainty = known.uncertainty if start.lengths is None else _about(start, value)
+    # The refinement lets many ranges outweigh measured lengths and known positions, so its uncertainty would ignore what
+    # they tell.
+    has_ranges_alone = start.lengths is None and start.positions is None
+    uncertainty = known.uncertainty if has_ranges_alone else _about(start, value)
     judged = judge(on_map.posed, on_map.solution, uncertainty, {}, start.anchors, (), options)
     columns, placement = known.columns, None
     if columns.frame >= 0:

@@ -24,6 +24,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
+from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.learned import ROUNDING, ComponentLikelihood, ErrorParts
 from rangesfm.ranging.errors.noise import stretch_labels
 from rangesfm.scale.anchor_plane import is_line
@@ -378,6 +379,10 @@ class _Problem:
             own = _grouped(grouping, covariance if is_known else assumed, of_kind)
             spread = 0.0 if known.is_stated[of_kind].all() and name == "points" else _SPREAD_GIVEN
             yield ErrorPart(name, own, spread=spread if is_known else _SPREAD_GUESSED)
+        if known.clock_stddev_s.any():
+            moved_m = similarity.scale * known.velocity @ rotation.T * known.clock_stddev_s[:, None]
+            of_clock = grouping @ moved_m.ravel()
+            yield ErrorPart(CLOCKS, np.outer(of_clock, of_clock))
         if (rows := np.flatnonzero(~known.is_mark & np.isfinite(known.time_s))).size:
             size_m = np.where(np.isfinite(_stddev_of(covariance)), _stddev_of(covariance), stddev_m)
             of_groups, times_s = _times_of_groups(grouping, known, size_m, rows)
