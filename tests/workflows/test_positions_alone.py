@@ -121,13 +121,16 @@ def test_clocks_that_are_apart_by_leap_seconds_are_named(walk: Walk, tmp_path: P
     assert "s behind, as by leap seconds" in said
 
 
-def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(walk: Walk, tmp_path: Path) -> None:
+@pytest.mark.parametrize("too_long", [1.0, 1.1])
+def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(
+    walk: Walk, tmp_path: Path, too_long: float
+) -> None:
     rng, rows = np.random.default_rng(8), "timestamp_s,anchor_id,range_m\n"
     times = np.arange(0.2, walk.path.end_s - 1.2, 0.1)
     tags_m = walk.path.centers(times) + walk.path.world_from_cam(times) @ ANTENNA_IN_CAM_M
     for k, (time, tag_m) in enumerate(zip(times.tolist(), tags_m, strict=True)):
         anchor_id = list(ANCHORS_M)[k % len(ANCHORS_M)]
-        range_m = np.linalg.norm(tag_m - ANCHORS_M[anchor_id]) + 0.05 * rng.standard_normal()
+        range_m = too_long * np.linalg.norm(tag_m - ANCHORS_M[anchor_id]) + 0.05 * rng.standard_normal()
         rows += f"{time:.3f},{anchor_id},{range_m:.4f}\n"
     (tmp_path / "uwb.csv").write_text(rows)
     arm = tuple(ANTENNA_IN_CAM_M.tolist())
@@ -141,8 +144,14 @@ def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(walk: Wal
         tag__tag_in_cam_m=arm,
     )
     summary = refine_model(survey, progress=QUIET).summary
-    walk.assert_found(summary)
+    found = next(test for test in summary.tests if test.name == "positions against ranges")
+    assert found.rejected == (too_long > 1)
+    assert (summary.scale.verdict == "good") == (too_long == 1)
     assert summary.frame == "site"
     assert set(summary.scale.by_kind) == {"ranges", "positions"}
+    if too_long > 1:
+        assert "by the known positions the map is -" in "; ".join(summary.scale.reasons)
+        return
+    walk.assert_found(summary)
     for anchor_id, at_m in ANCHORS_M.items():
         assert np.linalg.norm(np.array(known(summary.anchors[anchor_id].position_m)) - at_m) < 0.3

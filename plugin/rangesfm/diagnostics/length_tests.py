@@ -12,7 +12,6 @@ from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentra
 from rangesfm.diagnostics.scale_bound import hidden_lengths
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.errors import number_text
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
@@ -37,7 +36,8 @@ def diagnose_lengths(estimate: ScaleEstimate, tape: Tape | None) -> Diagnosis:
     ]
     open_words = [row.words for row, is_kept in zip(rows, lengths.is_kept, strict=True) if is_kept and row.rejected]
     either = [f"either {'; or '.join(open_words)}: {_MEASURE_AGAIN}"] if open_words else []
-    against = list(_against_ranges(estimate))
+    remedy = "measure a length again, and calibrate the radio (rangesfm ranges calibrate)"
+    against = list(against_ranges(estimate, "lengths", "measured lengths", remedy))
     reasons = (*left_out, *either, *(f"{row.words}: {row.remedy}" for row in against if row.rejected))
     # Printed tags are shown only if something was found: their sides are many and alike.
     told = [row for row, one in zip(rows, taped, strict=True) if row.rejected or not one.is_printed]
@@ -69,27 +69,29 @@ def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[Mista
         )
 
 
-def _against_ranges(estimate: ScaleEstimate) -> Iterator[MistakeTest]:
-    """Yield the test that compares the scale from lengths with the scale from ranges."""
-    ranges, lengths = (estimate.by_kind.get(kind) for kind in ("ranges", "lengths"))
-    if ranges is None or lengths is None:
+def against_ranges(estimate: ScaleEstimate, kind: str, what: str, remedy: str) -> Iterator[MistakeTest]:
+    """Yield the test that compares the scale from another kind of measurement with the scale from ranges.
+
+    Args:
+        kind: in ``estimate.by_kind``. what: in words. remedy: what to do if they differ.
+    """
+    ranges, others = (estimate.by_kind.get(each) for each in ("ranges", kind))
+    if ranges is None or others is None:
         return
-    apart = float(np.log(lengths.value / ranges.value))
-    stddev = float(np.hypot(lengths.stddev / lengths.value, ranges.stddev / ranges.value))
+    apart = float(np.log(others.value / ranges.value))
+    stddev = float(np.hypot(others.stddev / others.value, ranges.stddev / ranges.value))
     smallest = finite(float(np.sqrt(noncentrality(1))) * stddev)
     yield MistakeTest(
-        "lengths against ranges",
+        f"{kind} against ranges",
         "",
         (apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
         float(special.chdtri(1, LENGTH_FALSE_ALARM_RATE)),
-        words=f"by the measured lengths the map is {number_text(100 * (np.exp(apart) - 1), '+.1f')} % larger than by "
-        f"the ranges; their errors together explain {100 * NORMAL_95 * stddev:.1f} % (95 %)",
-        remedy="measure a length again, and calibrate the radio (rangesfm ranges calibrate)",
+        words=f"by the {what} the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the ranges; their errors "
+        f"together explain {100 * stddev:.1f} % (1 stddev)",
+        remedy=remedy,
         unit="1",
         size=apart,
         stddev=finite(stddev),
         smallest_detectable=smallest,
         effect_on_scale=smallest,
-        redundancy=(lengths.stddev / lengths.value / stddev) ** 2 if np.isfinite(stddev) else 0.0,
-        is_checked=bool(np.isfinite(stddev)),
     )

@@ -11,6 +11,7 @@ from scipy import special
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import in_axes
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
+from rangesfm.diagnostics.length_tests import against_ranges
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.scale.scale_by_positions import (
     MIN_NUM_POSITIONS,
@@ -19,8 +20,10 @@ from rangesfm.scale.scale_by_positions import (
     PositionScale,
     at_point,
 )
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 _LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
+_COMPARE = "calibrate the radio (rangesfm ranges calibrate), and look at the units of both"
 _POINT, _ARM, _CLOCK, _DATUM = "control point", "antenna's lever arm", "antenna's clock", "datum shift"
 # Words, remedy, largest possible size and unit of the mistakes of an antenna's positions. No camera carries its antenna
 # farther than 20 m; clocks that differ by more than seconds do not show as a shift of the positions alone.
@@ -47,11 +50,14 @@ _OF_ANTENNA = {
 
 
 @with_one_blas_thread
-def diagnose_positions(positions: PositionScale | None, left_out: Collection[str]) -> Diagnosis:
+def diagnose_positions(
+    positions: PositionScale | None, left_out: Collection[str], estimate: ScaleEstimate
+) -> Diagnosis:
     """Return the tests of known positions; empty if there are none.
 
     Args:
-        left_out: names of control points that contradict the others.
+        positions: on the final map. left_out: names of control points that contradict the others.
+        estimate: of the scale, by ranges, too, if there are any.
     """
     if positions is None:
         return Diagnosis((), ())
@@ -66,6 +72,9 @@ def diagnose_positions(positions: PositionScale | None, left_out: Collection[str
     ]
     if doubted := [row.words for row in rows if row.rejected and row.name == _POINT and row.subject not in left_out]:
         reasons.append(f"either {'; or '.join(doubted)}: {_LOOK_AGAIN}")
+    against = list(against_ranges(estimate, "positions", "known positions", _COMPARE))
+    reasons += [f"{row.words}: {row.remedy}" for row in against if row.rejected]
+    rows += against
     rows.sort(key=lambda row: row.threshold - row.statistic)
     return Diagnosis(tuple(rows), tuple(reasons))
 

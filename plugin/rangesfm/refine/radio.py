@@ -217,12 +217,16 @@ class AddedRadio:
 
 
 def add_range_residuals(
-    bundle: BundleAdjustment, ranges: RadioRanges, errors: RangeErrors, blocks: ceres.RangeBlocks
+    bundle: BundleAdjustment,
+    ranges: RadioRanges,
+    errors: RangeErrors,
+    blocks: ceres.RangeBlocks,
+    range_share: float = 1.0,
 ) -> Indices:
     """Add ranges as residuals, scaled so that one standard deviation of a range weighs as much as one of a pixel.
 
     Args:
-        errors: of the ranges that take part.
+        errors: of the ranges that take part. range_share: further factor on all their weights.
 
     Returns:
         (k,) index of each range's residual among those of the problem.
@@ -238,7 +242,7 @@ def add_range_residuals(
         anchor_index=log.anchor_index[rows],
         tag_index=log.tag_index[rows],
         interval_s=ranges.interval_s[rows],
-        share=bundle.pixel_stddev**2 * errors.worth,
+        share=range_share * bundle.pixel_stddev**2 * errors.worth,
     )
     return ceres.add_ranges(
         bundle.adjuster,

@@ -176,6 +176,7 @@ def refine_with_ranges(
     options: RefineOptions | None = None,
     tape: Tape | None = None,
     positions: HeldPositions | None = None,
+    range_share: float = 1.0,
     learn: Learn | None = None,
     closing: LoopClosing | None = None,
     num_threads: int = -1,
@@ -198,6 +199,7 @@ def refine_with_ranges(
         gravity: the upward direction in the first camera; used if its pose is not fixed.
         tape: taped distances, of which the control ones are fitted; ranges between anchors in the log are fitted too.
         positions: known positions in the metric world, which are fitted; None without any.
+        range_share: factor on the weights of all ranges, beside what else is measured.
         learn: estimates the ranges' errors at the refined map, for its covariance; None: those in ``errors`` are used.
         closing: loops to be closed before; None without any.
 
@@ -226,6 +228,7 @@ def refine_with_ranges(
         first_pose_is_fixed,
         None if first_pose_is_fixed else gravity,
         num_threads,
+        range_share=range_share,
     )
     with at_most(num_threads):
         to_begin_with = _errors_to_begin_with(problem, errors, metric_from_sfm.scale)

@@ -105,9 +105,13 @@ class MapWithRanges:
         mean_m = 0.0 if bending is None else float(np.sqrt(np.trace(bending.formal_m2) / len(learned.bins)))
         return learned.stddev_of_component["bending"] / mean_m if mean_m > 0 else 1.0
 
-    def known(self, learned: LearnedErrors) -> KnownMap:
-        """Return the uncertainty of the map as a whole: scale, placement and anchors."""
-        return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.bins))
+    def known(self, learned: LearnedErrors, range_share: float = 1.0) -> KnownMap:
+        """Return the uncertainty of the map as a whole: scale, placement and anchors.
+
+        Args:
+            range_share: factor on the weights of all ranges with which the map was made.
+        """
+        return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.bins), range_share)
 
     def _bending_of(self, bins: RangeBins) -> BendingOfBins | None:
         state = self.solution.fit.state
@@ -125,12 +129,10 @@ def estimate_at(
     Raises:
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
-    known = on_map.known(learned)
+    known = on_map.known(learned, start.range_share)
     value = on_map.solution.fit.state.metric_from_model.scale
-    # The refinement lets many ranges outweigh measured lengths and known positions, so its uncertainty would ignore what
-    # they tell.
-    has_ranges_alone = start.lengths is None and start.positions is None
-    uncertainty = known.uncertainty if has_ranges_alone else _about(start, value)
+    # The refinement lets many ranges outweigh the measured lengths, so its uncertainty would ignore what they tell.
+    uncertainty = known.uncertainty if start.lengths is None else _about(start, value)
     judged = judge(on_map.posed, on_map.solution, uncertainty, {}, start.anchors, (), options)
     columns, placement = known.columns, None
     if columns.frame >= 0:

@@ -33,6 +33,9 @@ from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, sol
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import known_map, learned_errors, parameter_covariance
 
+# Smallest factor on the weights of ranges beside known positions, below which they would have no effect.
+_LEAST_SHARE = 1e-4
+
 
 @with_one_blas_thread
 def initialize_scale(
@@ -146,7 +149,8 @@ def initialize_scale(
         remarks=remarks,
         lengths=lengths,
         positions=by_positions,
-        by_kind=_by_kinds(problem, solution, learned, lengths, by_positions),
+        by_kind=(by_kind := _by_kinds(problem, solution, learned, lengths, by_positions)),
+        range_share=1.0 if by_positions is None else _range_share(solution, by_kind["ranges"]),
     )
 
 
@@ -261,6 +265,14 @@ def _by_kinds(
         **({} if positions is None else _by_positions(positions)),
     }
     return {"ranges": _by_ranges(problem, solution, learned), **others} if others else {}
+
+
+def _range_share(solution: Solution, ranges: ScaleByKind) -> float:
+    """Return ``ScaleEstimate.range_share``: the formal over the learnt variance of the scale by ranges alone."""
+    problem = _ranges_alone(solution.problem)
+    alone = solve(problem, solution.fit.state, loss=solution.errors.loss)
+    formal = alone.log_scale_stddev * solution.errors.inflation
+    return float(np.clip((formal * ranges.value / ranges.stddev) ** 2, _LEAST_SHARE, 1.0))
 
 
 def _by_ranges(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleByKind:

@@ -130,6 +130,8 @@ class ScaleEstimate:
             first camera, from all error components; None in the first camera's frame.
         lengths: what the measured lengths alone say; None without lengths between points of the map.
         positions: what the known positions say; None if they do not determine the map's place.
+        range_share: factor on the weights of the ranges beside known positions, with which the ranges say no more of
+            the scale than their learnt errors allow; 1 without known positions.
         remarks: those of the reasons that a refinement does not change.
         refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
         by_kind: scale by "ranges", "lengths" and "positions", as far as available, where several of them were used.
@@ -156,6 +158,7 @@ class ScaleEstimate:
     lengths: LengthScale | None = None
     positions: PositionScale | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
+    range_share: float = 1.0
     remarks: tuple[str, ...] = ()
     refined_value: float | None = None
 

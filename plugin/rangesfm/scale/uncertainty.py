@@ -252,19 +252,25 @@ def known_map(
 
 
 def known_refined_map(
-    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending: BendingOfBins | None
+    posed: ScaleProblem,
+    solution: Solution,
+    learned: LearnedErrors,
+    bending: BendingOfBins | None,
+    range_share: float = 1.0,
 ) -> KnownMap:
     """Return the uncertainty of a refined map.
 
     Args:
         solution: at the refined map, weighted as in the refinement. bending: of the map, in its bins.
+        range_share: further factor on the weights of all ranges in the refinement.
     """
     errors, bins, given = solution.errors, learned.bins, posed.ranges
     linear = _of_bins(_linear(posed, solution), bins)
     robust, index = solution.fit.weights / errors.stddev_m**2, bins.anchor_index
     bent_m2 = np.zeros_like(learned.covariance_m2) if bending is None else bending.formal_m2
     of_biases = given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
-    alone, weighed = (np.diag(1 / np.maximum(bins.total(w), 1e-12)) for w in (robust, errors.worth * robust))
+    weights = robust, range_share * errors.worth * robust
+    alone, weighed = (np.diag(1 / np.maximum(bins.total(each), 1e-12)) for each in weights)
     formal, _, _ = best_estimate(alone + bent_m2, linear.design, linear.prior_design)
     _, of_bins, of_priors = best_estimate(weighed + bent_m2 + of_biases, linear.design, linear.prior_design)
     variances = np.einsum("pi,ij,pj->p", of_bins, learned.covariance_m2, of_bins) + np.sum(of_priors**2, axis=1)

@@ -323,6 +323,7 @@ def _refined(
         options=survey.refine,
         tape=tape,
         positions=positions,
+        range_share=estimate.range_share,
         learn=learn,
         closing=closing,
         num_threads=survey.mapper.num_threads,
@@ -413,7 +414,7 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
 def _diagnose_positions(metric: MetricResult) -> Diagnosis:
     start = metric.estimate.positions
     left_out = () if start is None else start.names_left_out
-    return diagnose_positions(metric.by_positions, left_out)
+    return diagnose_positions(metric.by_positions, left_out, metric.estimate)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
