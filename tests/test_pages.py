@@ -230,7 +230,17 @@ def test_flags_in_the_text_exist() -> None:
 # These need no page: the help says all.
 OF_THE_HELP = {"--num_photos", "--quiet"}
 OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--csv", "--ref_images_path", "--transform_path"}
-OF_STUDIES = {"--by_photo", "--calibrated", "--data", "--leave_radio_out", "--only"}
+OF_STUDIES = {
+    "--num_keyframes",
+    "--num_seeds",
+    "--pixel_stddev",
+    "--size_m",
+    "--by_photo",
+    "--calibrated",
+    "--data",
+    "--leave_radio_out",
+    "--only",
+}
 
 
 def test_the_survey_file_on_its_page_is_one(tmp_path: Path) -> None:
