@@ -19,6 +19,7 @@ from tests.simulated.path import loop_path
 
 import rangesfm
 from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.loops.resection import resection_options
 from rangesfm.options import CameraOptions, MapperOptions, RefineOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
@@ -207,12 +208,19 @@ def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:
     }
 
 
+def test_a_photo_of_a_loop_is_placed_as_colmap_places_one_with_the_error_of_its_matches() -> None:
+    matches = pycolmap.TwoViewGeometryOptions().ransac.max_error
+    assert changes(resection_options(SEED)) == {"ransac.random_seed": SEED, "ransac.max_error": matches}
+
+
 def test_no_other_options_of_colmaps_are_made_and_none_inside_of_others() -> None:
     trees = [ast.parse(path.read_text(encoding="utf-8")) for path in Path(rangesfm.__file__).parent.rglob("*.py")]
     made = [node for tree in trees for node in ast.walk(tree) if _makes_options(node)]
     assert not [ast.unparse(node) for node in made if any(map(_makes_options, list(ast.walk(node))[1:]))]
     assert {ast.unparse(node.func).removeprefix("pycolmap.") for node in made} == {
+        "AbsolutePoseEstimationOptions",
         "BundleAdjustmentOptions",
+        "DatabaseCacheOptions",  # by its arguments alone: all photos, also those without matches
         "ExhaustivePairingOptions",
         "FeatureExtractionOptions",
         "FeatureMatchingOptions",

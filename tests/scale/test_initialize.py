@@ -206,7 +206,7 @@ class TestRefused:
 
     def test_a_scale_less_certain_than_wanted(self, make_survey: MakeSurvey) -> None:
         survey = make_survey(anchors_m=ONE_ANCHOR_M, radio=NOISE)
-        with pytest.raises(GeometryError, match=r"only known to .* more than the 0.1 % allowed"):
+        with pytest.raises(GeometryError, match=r"only known to .* worse than the 0.196 % allowed"):
             survey.scale("unknown", options=ScaleOptions(max_relative_stddev=0.001))
 
     def test_the_papers_method_where_its_steadier_branch_is_negative(self, make_survey: MakeSurvey) -> None:

@@ -106,7 +106,9 @@ def test_anchors_in_wrong_places_disagree(make_survey: MakeSurvey) -> None:
 
 def test_a_refusal_says_what_to_do(make_survey: MakeSurvey) -> None:
     survey = make_survey(anchors_m=ONE_ANCHOR_M, radio=Radio(range_stddev_m=0.1))
-    with pytest.raises(GeometryError, match=r"more than the 0.1 % allowed \(max_relative_stddev\): .*next time: "):
+    with pytest.raises(
+        GeometryError, match=r"worse than the 0.196 % allowed \(1.96 times max_relative_stddev\): .*next time: "
+    ):
         survey.scale("unknown", options=ScaleOptions(max_relative_stddev=0.001))
 
 

@@ -401,14 +401,15 @@ def test_a_wrong_coordinate_is_said_and_mended_only_when_asked_for(
 
 
 @pytest.mark.parametrize(
-    ("model", "refine", "stage"), [(None, True, "run_survey"), ("m", True, "refine_model"), ("m", False, "scale_model")]
+    ("model", "refine", "stage"),
+    [(None, True, "_from_photos"), ("m", True, "refine_model"), ("m", False, "scale_model")],
 )
 def test_a_survey_begins_with_its_photos_or_with_its_model(
     model: str | None, refine: bool, stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: list[str] = []
-    for name in ("run_survey", "refine_model", "scale_model"):
-        monkeypatch.setattr(run, name, lambda survey, name=name, **_: begun.append(name))
+    for name in ("_from_photos", "refine_model", "scale_model"):
+        monkeypatch.setattr(run, name, lambda survey, *_, name=name, **__: begun.append(name))
     images = {"path": "photos"} | ({} if model is None else {"model": model})
     survey = survey_from_tables({"images": images, "refine": {"enabled": refine}}, tmp_path)
     run.run_survey(survey, progress=SilentProgress())

@@ -152,7 +152,7 @@ def test_a_frame_is_one_keyframe_with_the_time_of_its_photos_and_all_of_them_are
     assert times.by_name() == {name: float(k) for k, name in enumerate(names[::2])}
     assert journal.warnings == []
     mapped: list[str] = []
-    summary = SimpleNamespace(seconds={}, num_registered=2, num_keyframes=2, models=())
+    summary = SimpleNamespace(seconds={}, earlier_seconds={}, num_registered=2, num_keyframes=2, models=())
 
     def reconstruct(folder: Path, chosen: list[str], *_: object, **__: object) -> SimpleNamespace:
         mapped.extend(chosen)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import io
+import mmap
 import os
 import signal
 import sys
@@ -18,6 +19,8 @@ from rangesfm.errors import INTERNAL_ERROR, InputError, failure_of, one_line
 from rangesfm.processes.threads import settle_num_threads
 
 _BROKEN_PIPE = 141  # exit status after a broken pipe, the one that shells use
+# Address space that the libraries take when they are loaded, in bytes: 600 MB with one BLAS thread (ulimit -v).
+_NEEDED_ADDRESS_SPACE = 600 * 1000**2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.getcwd()
         except FileNotFoundError:
             raise InputError("the working folder has been deleted: change to one that exists") from None
+        _require_address_space()
         settle_num_threads()
         try:
             args = parse(normalize(sys.argv[1:] if argv is None else argv))
@@ -63,6 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         except OSError:  # the exit status says enough
             discard_output(sys.stderr)
         return failure.exit_status
+
+
+def _require_address_space() -> None:
+    """Raise OSError if the libraries cannot be loaded: with too little address space, some crash or wait for ever."""
+    mmap.mmap(-1, _NEEDED_ADDRESS_SPACE).close()
 
 
 def _open_closed_streams() -> None:

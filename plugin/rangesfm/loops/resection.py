@@ -94,11 +94,9 @@ class Resection:
         if len(ids) < MIN_NUM_SHARED:
             return None
         points = np.array([self.model.point3D(id_).xyz for id_ in ids.tolist()])
-        options = pycolmap.AbsolutePoseEstimationOptions()
-        options.ransac.random_seed, options.ransac.max_error = self.seed, _MAX_ERROR_PX
         pixels = np.array([image.points2D[k].xy for k in places.tolist()])
         camera = self.model.camera(image.camera_id)
-        found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, options)
+        found = pycolmap.estimate_and_refine_absolute_pose(pixels, points, camera, resection_options(self.seed))
         if found is None or int(found["num_inliers"]) < MIN_NUM_SHARED:
             return None
         fits = np.asarray(found["inlier_mask"])
@@ -201,3 +199,10 @@ def _pixels_by_points(from_camera: Array, world_from_cam: Array, focal_px: Array
 def _pixels_by_pose(by_point: Array, from_rig: Array) -> Array:
     """Return the (n, 2, 6) derivatives of pixels by a turn of the rig about the axes of the world and its shift."""
     return np.concatenate([by_point @ cross_matrices(from_rig), -by_point], axis=2)
+
+
+def resection_options(seed: int) -> pycolmap.AbsolutePoseEstimationOptions:
+    """Return COLMAP's options for a resection, with the error that matches may have and the seed of its draws."""
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.random_seed, options.ransac.max_error = seed, _MAX_ERROR_PX
+    return options
