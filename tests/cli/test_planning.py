@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ def test_the_example_is_planned_and_written(tmp_path: Path, capsys: pytest.Captu
     assert main(["plan", str(EXAMPLE), "--output_path", str(tmp_path / "plan")]) == 0
     printed = capsys.readouterr()
     assert printed.err == ""
-    assert "scale: +-" in printed.out
+    assert re.search(r"^scale: -[\d.]+ to \+[\d.]+ % \(95 %\); (good|doubtful)$", printed.out, re.MULTILINE)
     assert "what would gain most for the place" in printed.out
     content = json.loads((tmp_path / "plan" / "plan.json").read_text())
     assert "<figure" in (tmp_path / "plan" / "plan.html").read_text()
@@ -41,7 +42,7 @@ def test_a_scale_that_a_run_would_refuse_has_a_page_and_advice_too(
     printed = capsys.readouterr()
     assert printed.err == ""
     assert "% (95 %); refused\n  the scale is only known to" in printed.out
-    assert "what would gain most for the scale:\n  1. " in printed.out
+    assert "what would gain most for the scale (95 %):\n  1. " in printed.out
     assert json.loads((tmp_path / "plan" / "plan.json").read_text())["verdict"] == "refused"
     assert "<h2>Refused</h2>" in (tmp_path / "plan" / "plan.html").read_text()
 

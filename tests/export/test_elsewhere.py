@@ -101,7 +101,7 @@ def test_distances_between_cameras_agree_between_all_formats(shift: Array, tmp_p
             assert found == pytest.approx(true, rel=1e-6)
 
 
-# Formats that hold no cameras, or that need photos or a place on the Earth.
+# Formats that hold no cameras, or that need photos, their database or a place on the Earth.
 NEED_MORE = {
     *COVARIANCE_FORMATS,
     "undistorted",
@@ -113,6 +113,7 @@ NEED_MORE = {
     "kml",
     "transform",
     "opf",
+    "pose_priors",
 }
 
 

@@ -128,8 +128,11 @@ def test_with_a_snapshot_that_is_cut_off_begins_anew(
     assert listener.messages[-1] == "matching: taken over from an earlier run"
 
 
-def test_a_snapshot_between_two_refinements_of_the_whole_is_not_kept(undisturbed: Mapping, tmp_path: Path) -> None:
+def test_a_snapshot_between_two_refinements_of_the_whole_is_not_kept(
+    undisturbed: Mapping, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Continuing from it would give another map than an uninterrupted mapping."""
+    monkeypatch.setattr("time.time_ns", lambda: 1_700_000_000_000_000_000)  # all within one millisecond
     model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
     (tmp_path / "scratch").mkdir()
     snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch")

@@ -196,7 +196,7 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
         x, y, z = (_half_width_95(stddev_m) for stddev_m in place.stddev_m)
         yield (
             f"place: x {x}, y {y}, z {z}, heading {_half_width_95(place.heading_stddev_deg, 'deg')}, tilt "
-            f"{_half_width_95(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe} is known least, to "
+            f"{_half_width_95(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe + 1} is known least, to "
             f"{_half_width_95(place.worst_keyframe_stddev_m)} (95 %)"
         )
 

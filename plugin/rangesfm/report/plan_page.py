@@ -43,7 +43,8 @@ def write_plan(plan: SurveyPlan, folder: Path) -> list[Path]:
 
 def render_plan(plan: SurveyPlan) -> str:
     """Return the HTML text of the page of a plan."""
-    title = f"{len(plan.anchors_m)} anchors, {count(len(plan.keyframe_stddevs_m))} keyframes"
+    anchors = "1 anchor" if len(plan.anchors_m) == 1 else f"{len(plan.anchors_m)} anchors"
+    title = f"{anchors}, {count(len(plan.keyframe_stddevs_m))} keyframes"
     advice = [
         _advice("What would gain most for the scale", plan.advice_for_scale),
         _advice("What would gain most for the place of the keyframe known least", plan.advice_for_place),

@@ -32,11 +32,14 @@ class Snapshots:
         self._path = path
         self._scratch = scratch
         self._poses: dict[int, bytes] = {}
+        self._newest_ms = 0
 
     def add_photo(self, model: pycolmap.Reconstruction) -> None:
         """Take a snapshot if one is due; to be called when COLMAP has added a photo to the first model."""
         if self._is_just_refined(model):
-            _keep(_write(model, self._scratch), self._path)
+            # Two snapshots within a millisecond must not have the same name.
+            self._newest_ms = max(time.time_ns() // 1_000_000, self._newest_ms + 1)
+            _keep(_write(model, self._scratch / f"{self._newest_ms:013d}"), self._path)
 
     def _is_just_refined(self, model: pycolmap.Reconstruction) -> bool:
         """Return whether the whole model was refined, that is, all poses have changed since the last photo."""
@@ -45,9 +48,8 @@ class Snapshots:
         return bool(before) and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
 
 
-def _write(model: pycolmap.Reconstruction, path: Path) -> Path:
-    """Write a model into a new folder in ``path``, named by the time in milliseconds as COLMAP does; return it."""
-    folder = path / f"{time.time_ns() // 1_000_000:013d}"
+def _write(model: pycolmap.Reconstruction, folder: Path) -> Path:
+    """Write a model into a new folder, named by the time in milliseconds as COLMAP does; return the folder."""
     folder.mkdir()
     model.write_binary(folder)
     return folder
