@@ -135,8 +135,9 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
             raise InputError("--apply_to writes files in their own formats: leave out --formats")
         destination = Path(args.output_path or source / "applied")
         written, residual_m = apply_result(source, list(map(Path, args.apply_to)), destination, options=options)
-        note = f"the similarity fits the cameras to {residual_m:.3f} m (rms): the refinement has bent the map"
-        notes = [note] if residual_m else []
+        fitted = f"{residual_m:.3f}"  # smaller bends than a millimetre are rounding
+        note = f"the similarity fits the cameras to {fitted} m (rms): the refinement has bent the map"
+        notes = [note] if float(fitted) else []
     return Outcome([*map(str, written), *_frame_note(options, source), *notes])
 
 

@@ -151,7 +151,9 @@ class ResultSummary(Record):
             yield f"measured lengths: {len(held)} of {len(self.distances)} used for the scale{worst}"
         if self.positions is not None:
             num, rms = f"{self.positions.num_used} of {self.positions.num}", _text(self.positions.rms_m, ".3f")
-            yield f"positions: {num} used, rms {rms} m, {_text(self.positions.time_offset_s, '+.3f')} s time offset"
+            shift_s = self.positions.time_offset_s
+            offset_of_positions = "" if shift_s is None else f", time offset {_text(shift_s, '+.3f')} s"
+            yield f"positions: {num} used, rms {rms} m{offset_of_positions}"
         if self.points is not None:
             yield from self.points.lines()
         if offset.estimated:
