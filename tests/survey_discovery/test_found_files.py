@@ -36,6 +36,12 @@ def test_a_table_is_known_by_its_header(key: str, tmp_path: Path) -> None:
     assert found.notes == ()
 
 
+def test_distances_between_photos_are_no_log(tmp_path: Path) -> None:
+    rows = [f"IMG_{k}.jpg,IMG_{k + 1}.jpg,{1 + 0.1 * k:.2f},0.01" for k in range(8)]
+    (tmp_path / "lengths.csv").write_text("\n".join(["from,to,distance_m,stddev_m", *rows]))
+    assert paths(look_into([tmp_path])) == {"scale.distances": ["lengths.csv"]}
+
+
 def test_a_tum_trajectory_is_a_reference(tmp_path: Path) -> None:
     (tmp_path / "path.txt").write_text("# time x y z qx qy qz qw\n0.1 1 2 3 0 0 0 1\n0.2 1 2 3 0 0 1 0\n")
     assert paths(look_into([tmp_path])) == {"report.reference": ["path.txt"]}

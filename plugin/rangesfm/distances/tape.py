@@ -13,7 +13,7 @@ from pydantic import AliasChoices, Field
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, number_text
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
-from rangesfm.files.text_tables import TextTable, read_table, repeated
+from rangesfm.files.text_tables import TextTable, header_names, read_table, repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 
 CONTROL, CHECK = "control", "check"
@@ -22,6 +22,7 @@ LEFT_OUT = "left out"
 # Standard deviation of a length measured with care by a steel tape.
 DEFAULT_STDDEV_M = 0.01
 DISTANCE_COLUMNS = ("from", "to", "distance_m")
+_FURTHER_COLUMNS = ("stddev_m", "kind")
 _PIXELS = ("x_px", "y_px")
 MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
 CLICKED_STDDEV_PX = 1.0
@@ -115,9 +116,14 @@ def read_tape(distances_path: str | Path, markers_path: str | Path | None = None
     Raises:
         InputError: a file is not valid; the error gives the line.
     """
-    distances = _distances(read_table(distances_path, DISTANCE_COLUMNS, ["stddev_m", "kind"]))
+    distances = _distances(read_table(distances_path, DISTANCE_COLUMNS, _FURTHER_COLUMNS))
     markers = {} if markers_path is None else read_markers(markers_path)
     return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
+
+
+def is_tape_file(text: str) -> bool:
+    """Return whether the header row in a file's beginning has the columns of taped distances, and no others."""
+    return {*DISTANCE_COLUMNS} <= {*header_names(text)} <= {*DISTANCE_COLUMNS, *_FURTHER_COLUMNS}
 
 
 def _distances(table: TextTable) -> tuple[TapedDistance, ...]:

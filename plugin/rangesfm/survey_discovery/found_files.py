@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from rangesfm.distances.tape import DISTANCE_COLUMNS, MARKER_COLUMNS
+from rangesfm.distances.tape import DISTANCE_COLUMNS, MARKER_COLUMNS, is_tape_file
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, is_bag_folder
 from rangesfm.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
@@ -181,6 +181,8 @@ def _key_of(path: Path) -> str | None:
     head = read_head(path)
     if not head.strip() or "\0" in head:
         return None
+    if is_tape_file(head):  # between photos it could be read as a log that names photos
+        return "scale.distances"
     if is_of_satellites(head):
         return POSITIONS
     unsure = None
