@@ -329,7 +329,7 @@ def locked(path: Path) -> Iterator[None]:
     else:
         output = path.parent if path.parent.name != PRIVATE_NAME else path.parents[1]
         (output / PRIVATE_NAME).mkdir(exist_ok=True)
-        with FileLock(output / LOCK_NAME):
+        with FileLock(output / LOCK_NAME, is_singleton=True):  # one probe may lock the same folder twice
             yield
 
 
