@@ -252,7 +252,7 @@ def test_the_pointer_tells_the_values_of_what_is_nearest(browser: Browser, page:
 def test_the_pointer_names_the_mark_that_is_drawn_under_it(browser: Browser, page: Path) -> None:
     browser.open(page)
     browser.run("document.querySelector('#trajectory').scrollIntoView({block: 'center'})")
-    browser.wait_for("rangesfmFigures.trajectory[0].view")
+    browser.wait_for("rangesfmFigures.trajectory[1].view")
     for i in (0, 3, 7):
         x, y = browser.run(
             "const mark = document.querySelectorAll('#trajectory .chart')[1].querySelectorAll('.mark-symbol path');"
