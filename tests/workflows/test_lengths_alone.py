@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.distance import pdist
-from tests.known import known
+from tests.known import assert_scale, known
 from tests.outputs import paths_in
 from tests.rendering.tagged_room import DICTIONARY, NUM_TAGS, SIDE_M, tagged_room
 from tests.simulated.model import SyntheticModel
@@ -55,11 +55,6 @@ class Room:
         path.write_text("\n".join(lines) + "\n")
         return path
 
-    def assert_found(self, summary: ResultSummary, within: float) -> None:
-        truth, (low, high) = self.made.metric_from_sfm.scale, known(summary.scale.interval_95)
-        assert known(low) < truth < known(high)
-        assert summary.scale.value == pytest.approx(truth, rel=within)
-
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
@@ -75,7 +70,7 @@ def test_three_taped_lengths_make_metres_and_no_word_is_said_of_ranges(room: Roo
     survey = room.survey(tmp_path, scale__distances=room.taped(tmp_path, PAIRS[:3]))
     result = refine_model(survey, progress=QUIET)
     summary = result.summary
-    room.assert_found(summary, 0.005)
+    assert_scale(summary, room.made.metric_from_sfm.scale, 0.005)
     assert (summary.scale.verdict, summary.frame, summary.scale.method) == ("good", "first_camera", "lengths")
     assert known(summary.refine).scale_value == pytest.approx(room.made.metric_from_sfm.scale, rel=0.005)
     assert [row.name for row in summary.tests] == ["length"] * 3
@@ -93,7 +88,7 @@ def test_three_taped_lengths_make_metres_and_no_word_is_said_of_ranges(room: Roo
 def test_a_mistyped_length_among_four_is_named_and_left_out(room: Room, tmp_path: Path) -> None:
     survey = room.survey(tmp_path, scale__distances=room.taped(tmp_path, PAIRS, 0.0, 1.0))
     summary = scale_model(survey, progress=QUIET).summary
-    room.assert_found(summary, 0.005)
+    assert_scale(summary, room.made.metric_from_sfm.scale, 0.005)
     assert summary.scale.verdict == "doubtful"
     between = f"{summary.distances[1].from_} to {summary.distances[1].to}"
     assert (summary.tests[0].subject, summary.tests[0].rejected) == (between, True)
@@ -137,7 +132,7 @@ def test_corners_of_tags_are_ends_of_taped_lengths(room: Room, tmp_path: Path) -
     distances = tmp_path / "distances.csv"
     distances.write_text("from,to,distance_m\ntag0.0,tag2.0,1.7\ntag0.2,tag2.2,1.7\n")
     survey = room.survey(tmp_path, markers__dictionary=DICTIONARY, scale__distances=distances)
-    room.assert_found(scale_model(survey, progress=QUIET).summary, 0.01)
+    assert_scale(scale_model(survey, progress=QUIET).summary, room.made.metric_from_sfm.scale, 0.01)
 
 
 def test_where_no_tag_is_one_line_says_so(room: Room, tmp_path: Path) -> None:

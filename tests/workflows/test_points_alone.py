@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from tests.known import known
+from tests.known import assert_scale, known
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
@@ -50,11 +50,6 @@ class Yard:
             at = at if offset_m is None else at + offset_m
             lines += f"{name},{at[0]:.4f},{at[1]:.4f},{at[2]:.4f},{POINT_STDDEV_M},{kind}\n"
         return lines
-
-    def assert_found(self, summary: ResultSummary, within: float = 0.01) -> None:
-        truth, (low, high) = self.made.metric_from_sfm.scale, known(summary.scale.interval_95)
-        assert known(low) < truth < known(high)
-        assert summary.scale.value == pytest.approx(truth, rel=within)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +91,7 @@ def test_control_points_place_the_map_in_the_site_and_check_points_test_it(yard:
     survey = yard.survey(tmp_path, yard.rows(["control"] * 5 + ["check"] * 3, FAR_M))
     result = refine_model(survey, progress=QUIET)
     summary, points = result.summary, known(result.summary.points)
-    yard.assert_found(summary)
+    assert_scale(summary, yard.made.metric_from_sfm.scale, 0.01)
     assert (summary.scale.verdict, summary.frame, summary.scale.method) == ("good", "site", "positions")
     assert known(summary.place).verdict == "good"
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse_metric" / "0")
@@ -121,7 +116,7 @@ def test_a_control_point_half_a_metre_off_is_named_and_left_out(yard: Yard, tmp_
     assert callable(run)
     survey = yard.survey(tmp_path, yard.rows(["control"] * 6 + ["check"], M2=0.5), report__enabled=False)
     summary = run(survey, progress=QUIET).summary
-    yard.assert_found(summary)
+    assert_scale(summary, yard.made.metric_from_sfm.scale, 0.01)
     assert (summary.tests[0].name, summary.tests[0].subject) == ("control point", "M2")
     assert known(summary.tests[0].size) == pytest.approx(0.5, abs=0.1)
     assert "probably the control point M2 is 0." in summary.scale.reasons[0]
@@ -134,7 +129,7 @@ def test_a_control_point_half_a_metre_off_is_named_and_left_out(yard: Yard, tmp_
 def test_three_points_alone_leave_a_doubt_that_a_check_point_removes(yard: Yard, tmp_path: Path) -> None:
     survey = yard.survey(tmp_path, yard.rows(["control"] * 3), report__enabled=False)
     summary = scale_model(survey, progress=QUIET).summary
-    yard.assert_found(summary, 0.05)
+    assert_scale(summary, yard.made.metric_from_sfm.scale, 0.05)
     assert "rests on 3 known positions, so that nothing tells which of them is wrong" in summary.scale.reasons[0]
     checked = yard.survey(tmp_path, yard.rows(["control"] * 3 + ["check"]), report__enabled=False)
     summary = scale_model(checked, progress=QUIET).summary

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from tests.known import known
+from tests.known import assert_scale, known
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
@@ -52,11 +52,6 @@ class Walk:
         path.write_text(f"timestamp_s,x_m,y_m,z_m\n{''.join(rows)}")
         return path
 
-    def assert_found(self, summary: ResultSummary, within: float = 0.02) -> None:
-        truth, (low, high) = self.made.metric_from_sfm.scale, known(summary.scale.interval_95)
-        assert known(low) < truth < known(high)
-        assert summary.scale.value == pytest.approx(truth, rel=within)
-
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
@@ -77,7 +72,7 @@ def test_positions_with_a_lever_arm_and_another_clock_place_the_map(walk: Walk, 
     arm = tuple(ANTENNA_IN_CAM_M.tolist())
     survey = walk.survey(tmp_path, positions__path=positions, positions__antenna_in_cam_m=arm, report__enabled=True)
     summary = refine_model(survey, progress=QUIET).summary
-    walk.assert_found(summary)
+    assert_scale(summary, walk.made.metric_from_sfm.scale, 0.02)
     assert (summary.scale.method, summary.scale.verdict, summary.frame) == ("positions", "good", "site")
     entry = known(summary.positions)
     assert known(entry.time_offset_s) == pytest.approx(OFFSET_S, abs=0.1)
@@ -152,6 +147,6 @@ def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(
     if too_long > 1:
         assert "by the known positions the map is -" in "; ".join(summary.scale.reasons)
         return
-    walk.assert_found(summary)
+    assert_scale(summary, walk.made.metric_from_sfm.scale, 0.02)
     for anchor_id, at_m in ANCHORS_M.items():
         assert np.linalg.norm(np.array(known(summary.anchors[anchor_id].position_m)) - at_m) < 0.3
