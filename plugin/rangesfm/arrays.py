@@ -1,4 +1,7 @@
-"""Types of numpy arrays by the kind of number they hold; the shape is said where an array is used."""
+"""Types of numpy arrays by the kind of number they hold, and the rows of arrays that belong together.
+
+The shape of an array is said where it is used.
+"""
 
 from __future__ import annotations
 
@@ -8,3 +11,14 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
+
+
+def rows_by_key(*keys: Indices) -> list[Indices]:
+    """Return the rows that agree in all keys, group by group, in the order of the keys; the first one counts most.
+
+    Args:
+        keys: each (n,).
+    """
+    order = np.lexsort(keys[::-1])
+    starts = np.flatnonzero(np.any(np.diff(np.stack(keys)[:, order]) != 0, axis=0)) + 1
+    return np.split(order, starts) if len(order) else []

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csc_array, csr_array
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.ceres.installation_checks import check_compatibility
 from rangesfm.processes.threads import num_threads
 
@@ -207,19 +207,11 @@ def add_ranges(
         "loss_scale": loss_scale,
         "loss_is_bounded": loss_is_bounded,
     }
-    groups = _groups(ranges)
+    groups = rows_by_key(ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index)
     for rows in groups:
         cost = _cost(ranges, rows, blocks, model)
         add_residual_block(adjuster, cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
     return np.asarray(first + np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *groups])))
-
-
-def _groups(ranges: PlacedRanges) -> list[Indices]:
-    """Return the rows of the ranges that share keyframes, anchor and tag, group by group."""
-    keys = np.stack([ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index])
-    order = np.lexsort(keys[::-1])
-    starts = np.flatnonzero(np.any(np.diff(keys[:, order]) != 0, axis=0)) + 1
-    return np.split(order, starts) if len(order) else []
 
 
 def _cost(ranges: PlacedRanges, rows: Indices, blocks: RangeBlocks, model: Mapping[str, Any]) -> pyceres.CostFunction:

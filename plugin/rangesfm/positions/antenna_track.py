@@ -15,12 +15,8 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.positions.position_log import PositionLog
-from rangesfm.ranging.association import (
-    interpolated_centers,
-    interpolated_lever_arms,
-    is_too_long,
-    timing_stddev,
-)
+from rangesfm.ranging.association import is_too_long, keyframes_around, places_on_path
+from rangesfm.ranging.errors.noise import STRETCH_S
 
 # An offset that puts fewer positions on the path than this share of the largest possible number is not tried.
 _MIN_COVERAGE = 0.5
@@ -30,7 +26,7 @@ _NUM_SEARCHED, _MAX_NUM_TRIED = 200, 4000
 # Step between offsets, as a share of the median time between keyframes: the motion hardly changes within it.
 _STEP = 0.25
 _MOST_OUTLYING = 0.2
-_NUM_REFINED, _STRETCH_S = 12, 10.0
+_NUM_REFINED = 12
 # A given offset is wrong if the residuals with it are at least so many times those with another one.
 _MUCH_WORSE = 3.0
 
@@ -80,20 +76,17 @@ class AntennaTrack:
 
     def located(self, path: Trajectory) -> KnownPositions:
         """Return the positions that have a place on a path; the others are left out."""
-        rows, before, after, weight = self._places(path)
-        k, n, arms = len(rows), len(path), np.tile(self.antenna_in_cam_m, (len(rows), 1))
-        turned = np.einsum("kij,kj->ki", path.world_from_cam[before], arms)
-        offsets, stddev, arm_stddev_m = np.zeros((k, 3)), np.zeros(k), np.zeros(k)
-        velocity, times_s = np.zeros((k, 3)), np.full(k, np.nan)
-        if path.timestamps_s is not None and n > 1:
-            is_bridged = ~is_too_long(np.diff(path.timestamps_s), self.association)
-            offsets, stddev = interpolated_centers(path, before, weight, is_bridged)
-            turned, arm_stddev_m = interpolated_lever_arms(path, arms, before, weight, is_bridged)
-            stddev = np.hypot(stddev, timing_stddev(0.0, path, before, after, weight, self.association))
-            velocity = _velocities(path.timestamps_s, path.centers, before)
-            times_s = path.timestamps_s[before] if self.log.timestamp_s is None else self._times_s[rows]
+        rows, before, after, fraction = self._places(path)
+        k, times_s, velocity = len(rows), path.timestamps_s, np.zeros((len(rows), 3))
+        arms_m = np.tile(self.antenna_in_cam_m, (k, 1))
+        # The times of positions are those of a system's own epochs, so that they are exact.
+        on_path = places_on_path(path, arms_m, before, after, fraction, time_resolution_s=0.0, options=self.association)
+        if times_s is None or len(path) < 2:
+            at_s = np.full(k, np.nan)
+        else:
+            velocity = _velocities(times_s, path.centers, before)
+            at_s = times_s[before] if self.log.timestamp_s is None else self._times_s[rows]
         names = self._names
-        on_line = (1 - weight)[:, None] * path.centers[before] + weight[:, None] * path.centers[after]
         return KnownPositions(
             names=tuple(names[row] for row in rows.tolist()),
             is_mark=np.zeros(k, dtype=bool),
@@ -101,19 +94,19 @@ class AntennaTrack:
             position_m=self.log.position_m[rows],
             covariance_m2=self.log.covariance_m2[rows],
             is_stated=np.asarray(np.isfinite(self.log.covariance_m2[rows]).all(axis=(1, 2))),
-            places=on_line + offsets,
-            arms_m=turned,
-            own_covariance=stddev[:, None, None] ** 2 * np.eye(3),
-            arm_stddev_m=arm_stddev_m,
-            time_s=times_s,
+            places=on_path.centers,
+            arms_m=on_path.arms_m,
+            own_covariance=on_path.stddev[:, None, None] ** 2 * np.eye(3),
+            arm_stddev_m=on_path.arm_stddev_m,
+            time_s=at_s,
             clock_stddev_s=np.full(k, self.offset_stddev_s),
             velocity=velocity,
-            world_from_cam=path.world_from_cam[np.where(weight < 0.5, before, after)],
-            by_pose=_by_shifts(before, after, weight, n),
-            arms_by_pose=_by_turns(path, self.antenna_in_cam_m, before, after, weight),
+            world_from_cam=path.world_from_cam[np.where(fraction < 0.5, before, after)],
+            by_pose=_by_shifts(before, after, fraction, len(path)),
+            arms_by_pose=_by_turns(path, self.antenna_in_cam_m, before, after, fraction),
             on_path=np.column_stack([before, after]),
-            weight=weight,
-            from_line=offsets,
+            fraction=fraction,
+            from_line=on_path.offsets,
         )
 
     @property
@@ -129,7 +122,7 @@ class AntennaTrack:
         return [f"{time:.3f} s" for time in self.log.timestamp_s.tolist()]
 
     def _places(self, path: Trajectory) -> tuple[Indices, Indices, Indices, Array]:
-        """Return the rows of the log that have a place, and the keyframes before and after each with its weight."""
+        """Return the rows of the log that have a place, and the keyframes before and after each with its fraction."""
         log, options = self.log, self.association
         if log.image_name is not None:
             index_of = {name: index for index, name in enumerate(path.image_names)}
@@ -139,16 +132,13 @@ class AntennaTrack:
         if path.timestamps_s is None:
             raise InputError("the positions have times but the photos have none: give image times", log.path)
         times, known = self._times_s, path.timestamps_s
-        after = np.clip(np.searchsorted(known, times), min(1, len(known) - 1), len(known) - 1)
-        before = np.maximum(after - 1, 0)
+        before, after, fraction, nearest = keyframes_around(times, known)
         gap = known[after] - known[before]
-        weight = np.clip((times - known[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
         is_between: Mask = (times >= known[0]) & (times <= known[-1]) & (gap > 0) & ~is_too_long(gap, options)
-        nearest = np.where(weight < 0.5, before, after)
         is_at = ~is_between & (np.abs(times - known[nearest]) <= options.max_time_difference_s)
         before, after = np.where(is_at, nearest, before), np.where(is_at, nearest, after)
         rows = np.flatnonzero(is_between | is_at)
-        return rows, before[rows], after[rows], np.where(is_at, 0.0, weight)[rows]
+        return rows, before[rows], after[rows], np.where(is_at, 0.0, fraction)[rows]
 
 
 def _velocities(times_s: Array, centers: Array, before: Indices) -> Array:
@@ -157,21 +147,21 @@ def _velocities(times_s: Array, centers: Array, before: Indices) -> Array:
     return np.asarray(steps[np.minimum(before, len(steps) - 1)])
 
 
-def _by_shifts(before: Indices, after: Indices, weight: Array, num: int) -> csr_array:
+def _by_shifts(before: Indices, after: Indices, fraction: Array, num: int) -> csr_array:
     """Return the (3 k, 6 n) derivatives of the places by shifts of the poses."""
     rows, axes = 3 * np.arange(len(before))[:, None] + np.arange(3), 3 + np.arange(3)
-    parts = [(1 - weight, before), (weight, after)]
+    parts = [(1 - fraction, before), (fraction, after)]
     values = np.concatenate([np.repeat(share, 3) for share, _ in parts])
     columns = np.concatenate([(6 * pose[:, None] + axes).ravel() for _, pose in parts])
     return coo_array((values, (np.tile(rows.ravel(), 2), columns)), shape=(3 * len(before), 6 * num)).tocsr()
 
 
-def _by_turns(path: Trajectory, arm_m: Array, before: Indices, after: Indices, weight: Array) -> csr_array:
+def _by_turns(path: Trajectory, arm_m: Array, before: Indices, after: Indices, fraction: Array) -> csr_array:
     """Return the (3 k, 6 n) derivatives of the lever arms by turns of the poses in their own frames."""
     cross = -cross_matrices(arm_m[None])[0]
     rows = 3 * np.arange(len(before))[:, None, None] + np.arange(3)[:, None] + np.zeros(3, dtype=np.int64)
     values, columns = [], []
-    for share, pose in ((1 - weight, before), (weight, after)):
+    for share, pose in ((1 - fraction, before), (fraction, after)):
         values.append((share[:, None, None] * (path.world_from_cam[pose] @ cross)).ravel())
         columns.append((6 * pose[:, None, None] + np.zeros((3, 1), dtype=np.int64) + np.arange(3)).ravel())
     shape = (3 * len(before), 6 * len(path))
@@ -248,5 +238,5 @@ def _search(times_s: Array, position_m: Array, antenna: _MovingAntenna) -> tuple
     # An error of the offset shifts all positions along the path, by the speed. Errors that last for seconds leave one
     # independent position in each stretch of time.
     speed = float(np.median(np.linalg.norm(np.diff(position_m, axis=0), axis=1) / np.diff(times_s)))
-    stretches = max(float(times_s[-1] - times_s[0]) / _STRETCH_S, 1.0)
+    stretches = max(float(times_s[-1] - times_s[0]) / STRETCH_S, 1.0)
     return best, antenna.misfit_m(times_s + best, position_m) / max(speed, 1e-6) / np.sqrt(min(stretches, num))

@@ -43,7 +43,7 @@ class KnownPositions:
         world_from_cam: (k, 3, 3) rotations of the camera; 0 for marks.
         by_pose, arms_by_pose: (3 k, 6 n) sparse derivatives of places and arms by the n poses of a path: for each, a
             turn in its own frame and a shift, in the model's world and unit.
-        on_path: (k, 2) keyframes before and after; -1 for marks. weight: (k,) of the later one.
+        on_path: (k, 2) keyframes before and after; -1 for marks. fraction: (k,) of the later one.
         from_line: (k, 3) deviation of the curved path from the straight line between them, in the model's unit.
     """
 
@@ -64,7 +64,7 @@ class KnownPositions:
     by_pose: csr_array
     arms_by_pose: csr_array
     on_path: Indices
-    weight: Array
+    fraction: Array
     from_line: Array
 
     def __len__(self) -> int:
@@ -129,7 +129,7 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         by_pose=vstack([csr_array((0, 6 * len(path))), *(_by_pose(each, path) for each in found)], format="csr"),
         arms_by_pose=csr_array((3 * k, 6 * len(path))),
         on_path=np.full((k, 2), -1, dtype=np.int64),
-        weight=np.zeros(k),
+        fraction=np.zeros(k),
         from_line=np.zeros((k, 3)),
     )
 

@@ -43,11 +43,6 @@ class PositionLog:
     def __len__(self) -> int:
         return len(self.position_m)
 
-    @property
-    def time_resolution_s(self) -> float:
-        """Step to which the times were rounded; 0 as times of positions are those of a system's own epochs."""
-        return 0.0
-
     def moved_to(self, position_m: Array) -> PositionLog:
         """Return the log with other positions (n, 3)."""
         return replace(self, position_m=position_m)

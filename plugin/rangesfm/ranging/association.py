@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -83,19 +84,17 @@ def associate(
     tags_in_cam_m = np.vstack([lever_arms(log, tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
     centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
     offsets, stddev, arm_stddev_m = np.zeros((len(log), 3)), np.zeros(len(log)), np.zeros(len(log))
-
-    b, a, w = before[placed], after[placed], fraction[placed]
-    if trajectory.timestamps_s is None or len(trajectory) < 2:
-        lever[placed] = np.einsum("nij,nj->ni", trajectory.world_from_cam[b], tags_in_cam_m[placed])
-    else:
-        is_bridged = ~is_too_long(np.diff(trajectory.timestamps_s), options)
-        lever[placed], arm_stddev_m[placed] = interpolated_lever_arms(
-            trajectory, tags_in_cam_m[placed], b, w, is_bridged
-        )
-        offsets[placed], stddev[placed] = interpolated_centers(trajectory, b, w, is_bridged)
-        stddev[placed] = np.hypot(stddev[placed], timing_stddev(log.time_resolution_s, trajectory, b, a, w, options))
-    linear = (1 - w)[:, None] * trajectory.centers[b] + w[:, None] * trajectory.centers[a]
-    centers[placed] = linear + offsets[placed]
+    on_path = places_on_path(
+        trajectory,
+        tags_in_cam_m[placed],
+        before[placed],
+        after[placed],
+        fraction[placed],
+        time_resolution_s=log.time_resolution_s,
+        options=options,
+    )
+    centers[placed], offsets[placed], stddev[placed] = on_path.centers, on_path.offsets, on_path.stddev
+    lever[placed], arm_stddev_m[placed] = on_path.arms_m, on_path.arm_stddev_m
     return RangeObservations(log, status, before, after, fraction, centers, offsets, lever, stddev, arm_stddev_m)
 
 
@@ -162,6 +161,66 @@ def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
     return np.broadcast_to(given, (num_tags, 3))
 
 
+@dataclass(frozen=True)
+class PlacesOnPath:
+    """Places of n moments on a camera's path.
+
+    Attributes:
+        centers: (n, 3) of the camera. offsets: (n, 3) of these from the straight lines between keyframes. stddev: (n,)
+            of each coordinate. All in model units.
+        arms_m: (n, 3) lever arms in the axes of the model's world. arm_stddev_m: (n,) of each coordinate.
+    """
+
+    centers: Array
+    offsets: Array
+    stddev: Array
+    arms_m: Array
+    arm_stddev_m: Array
+
+
+def places_on_path(
+    trajectory: Trajectory,
+    arms_in_cam_m: Array,
+    before: Indices,
+    after: Indices,
+    fraction: Array,
+    *,
+    time_resolution_s: float,
+    options: AssociationOptions,
+) -> PlacesOnPath:
+    """Return the places of n moments between keyframes, interpolated by a motion model if the keyframes have times.
+
+    Args:
+        arms_in_cam_m: (n, 3) lever arms.
+        before, after, fraction: (n,) keyframes, and the interpolation fraction of the later one.
+        time_resolution_s: step to which the moments were rounded.
+    """
+    num = len(before)
+    if trajectory.timestamps_s is None or len(trajectory) < 2:
+        arms_m = np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms_in_cam_m)
+        offsets, stddev, arm_stddev_m = np.zeros((num, 3)), np.zeros(num), np.zeros(num)
+    else:
+        is_bridged = ~is_too_long(np.diff(trajectory.timestamps_s), options)
+        arms_m, arm_stddev_m = _interpolated_lever_arms(trajectory, arms_in_cam_m, before, fraction, is_bridged)
+        offsets, stddev = _interpolated_centers(trajectory, before, fraction, is_bridged)
+        stddev = np.hypot(stddev, _timing_stddev(time_resolution_s, trajectory, before, after, fraction, options))
+    on_line = (1 - fraction)[:, None] * trajectory.centers[before] + fraction[:, None] * trajectory.centers[after]
+    return PlacesOnPath(on_line + offsets, offsets, stddev, arms_m, arm_stddev_m)
+
+
+def keyframes_around(times: Array, keyframe_times: Array) -> tuple[Indices, Indices, Array, Indices]:
+    """Return the keyframes before and after each time (n,), the fraction of the later one, and the nearer one.
+
+    Times outside the path belong to its first or last two keyframes, with a fraction of 0 or 1.
+    """
+    last = len(keyframe_times) - 1
+    after = np.clip(np.searchsorted(keyframe_times, times), min(1, last), last)
+    before = np.maximum(after - 1, 0)
+    gap = keyframe_times[after] - keyframe_times[before]
+    fraction = np.clip((times - keyframe_times[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+    return before, after, fraction, np.where(fraction < 0.5, before, after)
+
+
 def _places_by_time(
     log: RangeLog, times: Array, keyframe_times: Array, options: AssociationOptions, status: npt.NDArray[np.int8]
 ) -> tuple[Indices, Indices, Array]:
@@ -169,14 +228,9 @@ def _places_by_time(
 
     ``status`` is changed where a range has no position on the path.
     """
-    last = len(keyframe_times) - 1
-    after = np.clip(np.searchsorted(keyframe_times, times), min(1, last), last)
-    before = np.maximum(after - 1, 0)
-    gap = keyframe_times[after] - keyframe_times[before]
-    fraction = np.clip((times - keyframe_times[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
-    nearest = np.where(fraction < 0.5, before, after)
-    distance = np.abs(times - keyframe_times[nearest])
-    inside = (times >= keyframe_times[0]) & (times <= keyframe_times[last])
+    before, after, fraction, nearest = keyframes_around(times, keyframe_times)
+    gap, distance = keyframe_times[after] - keyframe_times[before], np.abs(times - keyframe_times[nearest])
+    inside = (times >= keyframe_times[0]) & (times <= keyframe_times[-1])
 
     at_keyframe = distance <= options.max_time_difference_s
     interpolated = inside & ~is_too_long(gap, options)
@@ -235,7 +289,7 @@ def _deviations(values: Array) -> Array:
     return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
 
 
-def interpolated_centers(
+def _interpolated_centers(
     trajectory: Trajectory, before: Indices, fraction: Array, is_bridged: Mask
 ) -> tuple[Array, Array]:
     """Return the offsets (n, 3) of the centres from the straight lines between keyframes, in model units.
@@ -250,7 +304,7 @@ def interpolated_centers(
     return offsets, stddev
 
 
-def interpolated_lever_arms(
+def _interpolated_lever_arms(
     trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, fraction: Array, is_bridged: Mask
 ) -> tuple[Array, Array]:
     """Return the lever arms (n, 3) in the world, and the standard deviation (n,) of each coordinate, metres.
@@ -274,7 +328,7 @@ def interpolated_lever_arms(
     return np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms), stddev_m
 
 
-def timing_stddev(
+def _timing_stddev(
     log_resolution_s: float,
     trajectory: Trajectory,
     before: Indices,

@@ -170,9 +170,5 @@ def _add_by_radio(
         )
         pair = [anchor_blocks[k] for k in by_radio.anchor_pair[row]]
         ceres.add_residual_block(bundle.adjuster, cost, None, [*pair, bias])
-    if bias_stddev_m == 0:
-        bundle.adjuster.problem.set_parameter_block_constant(bias)
-    else:
-        ceres.add_normal_prior(bundle.adjuster, bias, mean=[0.0], stddev=bias_stddev_m / bundle.pixel_stddev)
-        bundle.keep_from_elimination(bias)
+    bundle.add_prior(bias, np.zeros(1), bias_stddev_m)
     return [bias]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pycolmap
 
 from rangesfm import ceres
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.distances.tape import Marker
 from rangesfm.geometry.trajectory import Trajectory, pose_of
 from rangesfm.positions.antenna_track import AntennaTrack
@@ -23,7 +23,8 @@ class HeldAntenna:
     """k positions of an antenna between keyframes, with their learnt errors.
 
     Attributes:
-        frame_ids: of the n keyframes. before, after: (k,) indices of keyframes. weight: (k,) of the later one.
+        frame_ids: of the n keyframes. before, after: (k,) indices of keyframes. fraction: (k,) interpolation fraction
+            of the later one.
         offset_in_world_m: (k, 3) deviation of the antenna's curved path from the straight line, in the metric world.
         interval_s: (k,) time between the two keyframes.
         position_m: (k, 3). whitening: (k, 3, 3) of their errors. share: factor of each loss, for errors that last.
@@ -35,7 +36,7 @@ class HeldAntenna:
     frame_ids: Indices
     before: Indices
     after: Indices
-    weight: Array
+    fraction: Array
     offset_in_world_m: Array
     interval_s: Array
     position_m: Array
@@ -57,15 +58,15 @@ class HeldAntenna:
         if not len(rows):
             return None
         before, after = known.on_path[rows].T
-        weight, turned = known.weight[rows], trajectory.world_from_cam @ arm_m
-        on_line = (1 - weight)[:, None] * turned[before] + weight[:, None] * turned[after]
+        fraction, turned = known.fraction[rows], trajectory.world_from_cam @ arm_m
+        on_line = (1 - fraction)[:, None] * turned[before] + fraction[:, None] * turned[after]
         beyond = placed.scale * known.from_line[rows] + known.arms_m[rows] - on_line
         times = np.zeros(len(trajectory)) if trajectory.timestamps_s is None else trajectory.timestamps_s
         return cls(
             frame_ids=trajectory.frame_ids,
             before=before,
             after=after,
-            weight=weight,
+            fraction=fraction,
             offset_in_world_m=beyond @ placed.rotation.T,
             interval_s=times[after] - times[before],
             position_m=known.position_m[rows],
@@ -157,14 +158,14 @@ def add_positions(
         return []
     given_m, arm_m = antenna.antenna_in_cam_m
     arm_is_free, shift_is_free = lever_arm_stddev_m > 0, antenna.time_shift_stddev_s > 0
-    for rows in _between_same_keyframes(antenna):
+    for rows in rows_by_key(antenna.before, antenna.after):
         poses = _poses(bundle.metric, antenna, int(rows[0]))
         is_between = len(poses) == 2
         cost = ceres.position_cost(
             position_m=antenna.position_m[rows],
             whitening=antenna.whitening[rows],
             tag_in_cam_m=None if arm_is_free else arm_m,
-            weight=antenna.weight[rows] if is_between else None,
+            weight=antenna.fraction[rows] if is_between else None,
             offset_in_world_m=antenna.offset_in_world_m[rows] if is_between else None,
             interval_s=antenna.interval_s[rows[0]] if is_between and shift_is_free else None,
             share=bundle.pixel_stddev**2 * antenna.share,
@@ -172,22 +173,9 @@ def add_positions(
         )
         shifts = [antenna.time_shift_s] if is_between and shift_is_free else []
         ceres.add_residual_block(bundle.adjuster, cost, None, [*poses, *([arm_m] if arm_is_free else []), *shifts])
-    added = []
-    for block, mean, stddev in (
-        (arm_m, given_m, lever_arm_stddev_m),
-        (antenna.time_shift_s, np.zeros(1), antenna.time_shift_stddev_s),
-    ):
-        if stddev > 0 and bundle.adjuster.problem.has_parameter_block(block):
-            ceres.add_normal_prior(bundle.adjuster, block, mean, stddev / bundle.pixel_stddev)
-            bundle.keep_from_elimination(block)
-            added.append(block)
-    return added
-
-
-def _between_same_keyframes(antenna: HeldAntenna) -> Sequence[Indices]:
-    order = np.lexsort((antenna.after, antenna.before))
-    changes = np.any(np.diff(np.stack([antenna.before, antenna.after])[:, order]) != 0, axis=0)
-    return np.split(order, np.flatnonzero(changes) + 1)
+    bundle.add_prior(arm_m, given_m, lever_arm_stddev_m)
+    bundle.add_prior(antenna.time_shift_s, np.zeros(1), antenna.time_shift_stddev_s)
+    return [block for block in (arm_m, antenna.time_shift_s) if bundle.adjuster.problem.has_parameter_block(block)]
 
 
 def _poses(metric: pycolmap.Reconstruction, antenna: HeldAntenna, row: int) -> list[Array]:

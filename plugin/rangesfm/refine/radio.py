@@ -269,12 +269,12 @@ def add_radio_priors(
         common_bias_stddev_m: of the bias that all ranges share.
     """
     for anchor, position in zip(radio.anchors, blocks.anchors, strict=True):
-        _add_prior(bundle, position, anchor.prior_position_m, anchor.prior_position_stddev_m)
+        bundle.add_prior(position, anchor.prior_position_m, anchor.prior_position_stddev_m)
     _add_bias_priors(bundle, radio.anchors, blocks.biases, common_bias_stddev_m)
     for block, given in zip(blocks.tags_in_cam, tags_in_cam_m, strict=True):
-        _add_prior(bundle, block, given, options.lever_arm_stddev_m)
-    _add_prior(bundle, blocks.time_shift, np.zeros(1), options.time_offset_stddev_s)
-    _add_prior(bundle, blocks.amplitude, np.zeros(1), options.short_range_stddev_m)
+        bundle.add_prior(block, given, options.lever_arm_stddev_m)
+    bundle.add_prior(blocks.time_shift, np.zeros(1), options.time_offset_stddev_s)
+    bundle.add_prior(blocks.amplitude, np.zeros(1), options.short_range_stddev_m)
 
 
 def _add_bias_priors(
@@ -283,7 +283,7 @@ def _add_bias_priors(
     """Add one joint prior for all estimated biases, because they share the tag's bias."""
     drawn = []
     for anchor, bias in zip(anchors, biases, strict=True):
-        _add_prior(bundle, bias, None, anchor.prior_bias_stddev_m)
+        bundle.add_prior(bias, None, anchor.prior_bias_stddev_m)
         if bundle.adjuster.problem.has_parameter_block(bias) and 0 < anchor.prior_bias_stddev_m < np.inf:
             drawn.append((anchor, bias))
     if drawn:
@@ -293,19 +293,6 @@ def _add_bias_priors(
             whitening=bundle.pixel_stddev * bias_whitening(own_stddev_m, common_stddev_m),
         )
         ceres.add_residual_block(bundle.adjuster, cost, None, [bias for _, bias in drawn])
-
-
-def _add_prior(bundle: BundleAdjustment, block: Array | None, mean: Array | None, stddev: float) -> None:
-    """Add the prior of a parameter block, if it is in the problem; stddev 0 fixes the block, no mean leaves it free."""
-    problem = bundle.adjuster.problem
-    if block is None or not problem.has_parameter_block(block):
-        return
-    if stddev == 0:
-        problem.set_parameter_block_constant(block)
-        return
-    if mean is not None:
-        ceres.add_normal_prior(bundle.adjuster, block, mean, stddev / bundle.pixel_stddev)
-    bundle.keep_from_elimination(block)
 
 
 def moved_anchors(

@@ -26,7 +26,8 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.learned import ROUNDING, ComponentLikelihood, ErrorParts
-from rangesfm.ranging.errors.noise import stretch_labels
+from rangesfm.ranging.errors.noise import MAX_INFLATION, STRETCH_S, stretch_labels
+from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import Columns
@@ -41,9 +42,8 @@ POINT_FALSE_ALARM_RATE = 0.02
 _NUM_SUSPECTS = 3
 # Median length of a vector of three normally distributed numbers, in their standard deviation.
 _MEDIAN_LENGTH = 1.538
-# Residual, in standard deviations, from which a position is down-weighted (Cauchy's loss, 95 % efficient), and the
-# weight below which it is an outlier.
-_LOSS_WIDTH, OUTLYING = 2.385, 0.1
+# Robust weight below which a position is an outlier.
+OUTLYING = 0.1
 _MAX_NUM_TRIPLES, _NUM_ROUNDS = 300, 30
 # Standard deviation of the logarithm of what a system says of its own errors, and of what is guessed of them; and the
 # share of the noise that lasts, before anything is known.
@@ -51,7 +51,6 @@ _SPREAD_GIVEN, _SPREAD_GUESSED, _LASTING_SHARE = 0.5, 1.0, 0.3
 # An antenna's positions are averaged to at most this many groups for the estimate of their errors, and the correlation
 # of two groups is the mean over this many times of each.
 _MAX_NUM_GROUPS, _NUM_TIMES = 150, 8
-_MAX_INFLATION, _STRETCH_S = 30.0, 10.0
 # Extent of positions across their line, as a share of that along it, below which it is only rounding; and the largest
 # standard deviation of a turn of the map, radians, for which its effect is linear.
 _ON_LINE, _MAX_TURN_STDDEV = 1e-6, 0.3
@@ -301,7 +300,7 @@ class _Problem:
             off_m = known.misclosures_m(similarity)
             stddev_m = self._stddevs_m(off_m, used)
             away = np.linalg.norm(off_m, axis=1) / stddev_m / np.sqrt(3)
-            weights = used / (1 + (away / _LOSS_WIDTH) ** 2)
+            weights = used * CAUCHY.weights(away)
             if self.refined is not None:  # the map has its place; only outliers are told apart
                 break
             step = self._step(similarity, off_m, weights / stddev_m**2)
@@ -452,7 +451,7 @@ class _Problem:
         timed = np.flatnonzero(shares > 0)
         if not len(timed):
             return 1.0
-        labels = stretch_labels(times_s[timed, _NUM_TIMES // 2], _STRETCH_S)
+        labels = stretch_labels(times_s[timed, _NUM_TIMES // 2], STRETCH_S)
         at = 3 * timed  # one coordinate shows it for all
         together = (labels[:, None] == labels).astype(np.float64)
         sums = {
@@ -461,7 +460,7 @@ class _Problem:
             if name.startswith("positions")
         }
         ratio = sum(sums.values()) / max(sums["positions"], 1e-30)
-        return float(np.clip(np.sqrt(ratio), 1.0, _MAX_INFLATION))
+        return float(np.clip(np.sqrt(ratio), 1.0, MAX_INFLATION))
 
 
 # Steps of the similarity (relative, radians, metres) below this are rounding.

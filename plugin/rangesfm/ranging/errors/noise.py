@@ -29,7 +29,9 @@ MIN_STDDEV_M = 1e-9
 _STDDEV_PER_MAD = 1.4826
 # Root mean square of residuals, in standard deviations, below which they are only rounding and the solver's tolerance.
 NO_ERROR = 1e-3
-_MAX_INFLATION = 30.0
+MAX_INFLATION = 30.0
+STRETCH_S = 10.0
+"""Length of stretches of time, seconds, in which errors may be correlated; where a log names photos, each is one."""
 # Smallest number of stretches of time for an estimate of the correlation.
 _MIN_NUM_STRETCHES = 8
 # Largest number of residuals to which the mixture of noise and outliers is fitted.
@@ -111,7 +113,7 @@ def correlation_inflation(
     squares = float(np.sum(shares * influence**2))
     if squares <= NO_ERROR**2 * np.sum(shares) or len(sums) < 2:
         return 1.0
-    return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, _MAX_INFLATION))
+    return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, MAX_INFLATION))
 
 
 @dataclass(frozen=True)

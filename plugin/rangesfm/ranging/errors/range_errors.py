@@ -9,11 +9,12 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import (
     START_STDDEV_M,
+    STRETCH_S,
     InlierNoise,
     correlation_inflation,
     inlier_noise,
@@ -35,9 +36,6 @@ _SIGNIFICANT = 3.0
 _MIN_NUM_OF_ANCHOR = 20
 _NUM_MEAN_ROUNDS = 10
 _MIN_ORDINARY = 0.3
-# Length of stretches of time, seconds, in which errors may be correlated; where the log names photos, each photo is
-# one.
-_STRETCH_S = 10.0
 # A median residual of a stretch above this many standard deviations is not noise.
 _MAX_BLOCK_STDDEVS = 3.0
 _MIN_BLOCK = 5
@@ -115,7 +113,7 @@ class RangeErrors:
             shared_m=shared,
             placing_m=np.zeros(len(rows)),
             anchor_index=log.anchor_index[rows],
-            block=observations.before[rows] if times is None else stretch_labels(times, _STRETCH_S),
+            block=observations.before[rows] if times is None else stretch_labels(times, STRETCH_S),
             place=nothing,
             loss=GEMAN_MCCLURE,
             common_bias_stddev_m=range_model.common_bias_stddev_m,
@@ -331,7 +329,7 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
     typical = robust_stddev(stated)
     if len(stated) >= _MIN_DIFFERENCES and typical > _MAX_BLOCK_STDDEVS:
         reasons.append(Misfit(f"range residuals are typically {typical:.1f} times their stddev"))
-    off = [np.median(stated[rows]) for rows in _by_group(errors.group) if len(rows) >= _MIN_BLOCK]
+    off = [np.median(stated[rows]) for rows in rows_by_key(errors.group) if len(rows) >= _MIN_BLOCK]
     num_off = int(np.sum(np.abs(off) > _MAX_BLOCK_STDDEVS))
     if num_off:
         told = f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole"
@@ -350,8 +348,3 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
             else:
                 reasons.append(Misfit(told))
     return tuple(reasons)
-
-
-def _by_group(labels: Indices) -> list[Indices]:
-    order = np.argsort(labels, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
