@@ -73,6 +73,14 @@ def test_a_normal_prior_is_off_by_its_stddevs(reconstruction: pycolmap.Reconstru
     np.testing.assert_allclose(jacobian[-4:], np.diag([10.0, 2.0, 0.5, 1e9]), rtol=1e-12)
 
 
+def test_further_errors_widen_a_normal_prior(reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf) -> None:
+    problem = (adjuster := adjuster_of(reconstruction)).problem
+    off, further = np.array([0.3, -0.1, 0.2]), np.array([[0.09, 0.02, 0], [0.02, 0.04, 0], [0, 0, 0]])
+    add_normal_prior(adjuster, off.copy(), np.zeros(3), 0.1, further)
+    squared = off @ np.linalg.solve(further + 0.01 * np.eye(3), off)
+    assert np.sum(np.square(problem.evaluate_residuals()[-3:])) == pytest.approx(squared, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("mean", "stddev"),
     [

@@ -419,7 +419,7 @@ def with_long_ranges(survey: Survey) -> RangeObservations:
 def marker_of(sfm: pycolmap.Reconstruction, point: pycolmap.Point3D) -> Marker:
     images = [(sfm.image(element.image_id), element.point2D_idx) for element in point.track.elements]
     pixels = np.array([image.points2D[index].xy for image, index in images])
-    return Marker(tuple(image.name for image, _ in images), pixels, tuple(range(2, 2 + len(images))))
+    return Marker(tuple(image.name for image, _ in images), pixels, tuple(range(2, 2 + len(images))), stddev_px=0.5)
 
 
 class TestDistances:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.distance import pdist
+from tests.known import known
 from tests.simulated.path import orbit_path
 
 from rangesfm.demo.simulated_radio import Radio
@@ -375,6 +376,18 @@ def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_s
     assert abs(alone.value / truth - 1) > 0.02
     assert held.value == pytest.approx(truth, rel=0.005)
     assert held.uncertainty.formal < 0.5 * alone.uncertainty.formal
+
+
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_ranges_tell_which_of_two_distances_is_wrong(make_survey: MakeSurvey, wrong: int) -> None:
+    survey = make_survey(radio=NOISE, num_epochs=2)
+    distances = between_cameras(survey)
+    mistyped = replace(distances, distance_m=distances.distance_m * np.where(np.arange(2) == wrong, 1.3, 1.0))
+    found = survey.scale("unknown", distances=mistyped)
+    low, high = found.interval_95
+    np.testing.assert_array_equal(known(found.lengths).is_kept, np.arange(2) != wrong)
+    assert low < survey.truth("first_camera").scale < high
+    assert found.value == pytest.approx(survey.scale("unknown", distances=distances).value, rel=0.005)
 
 
 def test_control_distances_between_anchors_put_unknown_anchors_in_their_places(make_survey: MakeSurvey) -> None:

@@ -11,6 +11,7 @@ from tests.known import known
 from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
+from rangesfm.scale.scale_by_kind import ScaleByKind
 from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
 
 SCALE, TAPE_M = 0.45, 0.005
@@ -59,7 +60,7 @@ def test_a_mistyped_length_is_left_out_and_its_size_found(rng: np.random.Generat
     found = scaled(wrong, centers)
     np.testing.assert_array_equal(found.is_kept, np.arange(5) != 2)
     assert found.too_long_m[2] == pytest.approx(off_m, abs=4 * found.stddev_m[2])
-    assert found.statistic[2] > found.threshold
+    assert found.statistic[2] > found.threshold[2]
     assert found.value == pytest.approx(SCALE, rel=0.01)
 
 
@@ -69,6 +70,21 @@ def test_nothing_checks_a_single_length(rng: np.random.Generator) -> None:
     assert np.isinf(found.stddev_m[0])
     assert found.statistic[0] == 0
     assert found.is_kept.all()
+
+
+def test_the_other_kinds_tell_whether_a_single_length_is_wrong(rng: np.random.Generator) -> None:
+    """Positions and ranges agree against a mistyped length; a length and ranges agree against wrong positions."""
+    centers = path(rng)
+    honest = located(centers, 1, rng)
+    mistyped = replace(honest, distance_m=1.09 * honest.distance_m)
+    right, wrong = ScaleByKind(SCALE, 0.01 * SCALE), ScaleByKind(1.09 * SCALE, 0.01 * SCALE)
+    left_out = known(scale_by_lengths(mistyped, centers, [right, right]))
+    assert not left_out.is_used
+    assert left_out.beside_ranges(mistyped).distance_m.size == 0
+    assert left_out.too_long_m[0] == pytest.approx(0.09 * honest.distance_m[0], rel=0.2)
+    assert known(scale_by_lengths(mistyped, centers, [right])).is_used
+    assert known(scale_by_lengths(honest, centers, [right, wrong])).is_used
+    assert known(scale_by_lengths(honest, centers, [right, right])).value == scaled(honest, centers).value
 
 
 def test_of_two_that_contradict_each_other_none_is_left_out_and_the_interval_says_so(rng: np.random.Generator) -> None:

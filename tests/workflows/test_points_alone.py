@@ -126,6 +126,24 @@ def test_a_control_point_half_a_metre_off_is_named_and_left_out(yard: Yard, tmp_
     assert not any(test.rejected for test in summary.tests[1:])
 
 
+@pytest.mark.parametrize("num", [1, 2])
+def test_a_mistyped_length_beside_control_points_is_told_apart(yard: Yard, tmp_path: Path, num: int) -> None:
+    """A single one contradicts the points, and either may be wrong; with a second one it is left out."""
+    pairs, text = [("M6", "M7"), ("M5", "M7")][:num], "from,to,distance_m\n"
+    for factor, (start, end) in zip((1.3, 1.0), pairs, strict=False):
+        text += f"{start},{end},{factor * np.linalg.norm(yard.marks_m[end] - yard.marks_m[start]):.3f}\n"
+    (tmp_path / "tape.csv").write_text(text)
+    rows = yard.rows(["control"] * 5)
+    survey = yard.survey(tmp_path, rows, scale__distances=tmp_path / "tape.csv", report__enabled=False)
+    summary = scale_model(survey, progress=QUIET).summary
+    assert summary.scale.verdict == "doubtful"
+    if num == 1:
+        assert any("by the measured lengths the map is +" in reason for reason in summary.scale.reasons)
+    else:
+        assert any("probably the length from M6 to M7 is given as" in reason for reason in summary.scale.reasons)
+        assert_scale(summary, yard.made.metric_from_sfm.scale, 0.01)
+
+
 def test_three_points_alone_leave_a_doubt_that_a_check_point_removes(yard: Yard, tmp_path: Path) -> None:
     survey = yard.survey(tmp_path, yard.rows(["control"] * 3), report__enabled=False)
     summary = scale_model(survey, progress=QUIET).summary

@@ -64,7 +64,11 @@ def add_residual_block(
 
 
 def add_normal_prior(
-    adjuster: pycolmap.CeresBundleAdjuster, block: Array, mean: npt.ArrayLike, stddev: npt.ArrayLike
+    adjuster: pycolmap.CeresBundleAdjuster,
+    block: Array,
+    mean: npt.ArrayLike,
+    stddev: npt.ArrayLike,
+    covariance: Array | None = None,
 ) -> None:
     """Add a prior for each of the n numbers of a block, as the residual ``(x - mean) / stddev``.
 
@@ -73,6 +77,7 @@ def add_normal_prior(
         block: (n,) without a manifold, such as an anchor, a range bias or a lever arm.
         mean: (n,) in the block's unit.
         stddev: one for all, or (n,), positive, in the block's unit.
+        covariance: (n, n) of further errors, square units; None: there are none.
 
     Raises:
         ValueError: a value is not finite, or a standard deviation is not positive, or a shape is wrong.
@@ -87,7 +92,8 @@ def add_normal_prior(
     check_compatibility()
     import pyceres
 
-    cost = pyceres.factors.NormalPrior(means, np.diag(variances))
+    of_all = np.diag(variances) if covariance is None else np.diag(variances) + covariance
+    cost = pyceres.factors.NormalPrior(means, of_all)
     add_residual_block(adjuster, cost, None, [block])
 
 

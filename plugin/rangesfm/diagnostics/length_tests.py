@@ -1,4 +1,4 @@
-"""Tests of measured lengths: each against the others, and all of them against the ranges."""
+"""Tests of measured lengths: each against all else, and all of them against ranges and known positions."""
 
 from __future__ import annotations
 
@@ -36,13 +36,16 @@ def diagnose_lengths(estimate: ScaleEstimate, tape: Tape | None) -> Diagnosis:
     ]
     open_words = [row.words for row, is_kept in zip(rows, lengths.is_kept, strict=True) if is_kept and row.rejected]
     either = [f"either {'; or '.join(open_words)}: {_MEASURE_AGAIN}"] if open_words else []
-    remedy = "measure a length again, and calibrate the radio (rangesfm ranges calibrate)"
-    against = list(against_ranges(estimate, "lengths", "measured lengths", remedy))
+    against = [
+        *against_other(estimate, "lengths", "ranges", "measure a length again, and calibrate the radio"),
+        *against_other(estimate, "lengths", "positions", "measure a length again, and look at the units of both"),
+    ]
     reasons = (*left_out, *either, *(f"{row.words}: {row.remedy}" for row in against if row.rejected))
     # Printed tags are shown only if something was found: their sides are many and alike.
     told = [row for row, one in zip(rows, taped, strict=True) if row.rejected or not one.is_printed]
     told.sort(key=lambda row: row.threshold - row.statistic)
-    return Diagnosis((*told, *against), reasons, hidden=hidden_lengths(lengths, against[0].stddev if against else None))
+    hidden = hidden_lengths(lengths, min((row.stddev for row in against if row.stddev is not None), default=None))
+    return Diagnosis((*told, *against), reasons, hidden=hidden)
 
 
 def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[MistakeTest]:
@@ -55,8 +58,8 @@ def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[Mista
             "length",
             between,
             float(lengths.statistic[k]),
-            lengths.threshold,
-            words=f"the length from {between} is given as {one.distance_m:.3f} m, but the other lengths give "
+            float(lengths.threshold[k]),
+            words=f"the length from {between} is given as {one.distance_m:.3f} m, but all else gives "
             f"{one.distance_m - size_m:.3f} m ({number_text(size_m, '+.3f')} m)",
             remedy=_MEASURE_AGAIN,
             unit="m",
@@ -69,25 +72,28 @@ def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[Mista
         )
 
 
-def against_ranges(estimate: ScaleEstimate, kind: str, what: str, remedy: str) -> Iterator[MistakeTest]:
-    """Yield the test that compares the scale from another kind of measurement with the scale from ranges.
+_NAMES = {"ranges": "ranges", "lengths": "measured lengths", "positions": "known positions"}
+
+
+def against_other(estimate: ScaleEstimate, kind: str, other: str, remedy: str) -> Iterator[MistakeTest]:
+    """Yield the test that compares the scales from two kinds of measurement.
 
     Args:
-        kind: in ``estimate.by_kind``. what: in words. remedy: what to do if they differ.
+        kind, other: in ``estimate.by_kind``. remedy: what to do if they differ.
     """
-    ranges, others = (estimate.by_kind.get(each) for each in ("ranges", kind))
-    if ranges is None or others is None:
+    first, second = (estimate.by_kind.get(each) for each in (kind, other))
+    if first is None or second is None:
         return
-    apart = float(np.log(others.value / ranges.value))
-    stddev = float(np.hypot(others.stddev / others.value, ranges.stddev / ranges.value))
+    apart = float(np.log(first.value / second.value))
+    stddev = float(np.hypot(first.stddev / first.value, second.stddev / second.value))
     smallest = finite(float(np.sqrt(noncentrality(1))) * stddev)
     yield MistakeTest(
-        f"{kind} against ranges",
+        f"{kind} against {other}",
         "",
         (apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
         float(special.chdtri(1, LENGTH_FALSE_ALARM_RATE)),
-        words=f"by the {what} the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the ranges; their errors "
-        f"together explain {100 * stddev:.1f} % (1 stddev)",
+        words=f"by the {_NAMES[kind]} the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the "
+        f"{_NAMES[other]}; their errors together explain {100 * stddev:.1f} % (1 stddev)",
         remedy=remedy,
         unit="1",
         size=apart,

@@ -11,7 +11,7 @@ from scipy import special
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import in_axes
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
-from rangesfm.diagnostics.length_tests import against_ranges
+from rangesfm.diagnostics.length_tests import against_other
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.scale.scale_by_positions import (
     MIN_NUM_POSITIONS,
@@ -72,7 +72,7 @@ def diagnose_positions(
     ]
     if doubted := [row.words for row in rows if row.rejected and row.name == _POINT and row.subject not in left_out]:
         reasons.append(f"either {'; or '.join(doubted)}: {_LOOK_AGAIN}")
-    against = list(against_ranges(estimate, "positions", "known positions", _COMPARE))
+    against = list(against_other(estimate, "positions", "ranges", _COMPARE))
     reasons += [f"{row.words}: {row.remedy}" for row in against if row.rejected]
     rows += against
     rows.sort(key=lambda row: row.threshold - row.statistic)

@@ -23,7 +23,14 @@ from rangesfm.scale.scale_estimate import ScaleUncertainty
 
 RISK = 1e-4
 """Probability with which the scale may be off by more than the bound."""
-CHECKED_KINDS = ("anchor place", "anchor bias", "lever arm", "length", "lengths against ranges")
+CHECKED_KINDS = (
+    "anchor place",
+    "anchor bias",
+    "lever arm",
+    "length",
+    "lengths against ranges",
+    "lengths against positions",
+)
 """Mistakes in what was given: coordinates and ranges of each anchor, lever arm of each tag, measured lengths."""
 # Mistakes that move a test by this many standard deviations beyond its threshold are found for certain. Sizes up to
 # there are tried, so many of them.
@@ -76,19 +83,21 @@ def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:
     )
 
 
-def hidden_lengths(lengths: LengthScale, against_ranges_stddev: float | None) -> tuple[HiddenMistake, ...]:
+def hidden_lengths(lengths: LengthScale, against_stddev: float | None) -> tuple[HiddenMistake, ...]:
     """Return mistakes of measured lengths.
 
     Args:
-        against_ranges_stddev: relative standard deviation of the comparison with the ranges; None without ranges.
+        against_stddev: relative standard deviation of the comparison with ranges or positions; None without any.
     """
-    slopes = np.abs(lengths.by_metre) * np.where(np.isfinite(lengths.stddev_m), lengths.stddev_m, 0.0)
-    hidden = [HiddenMistake("length", slope, lengths.threshold, 1, np.inf) for slope in slopes.tolist()]
-    if against_ranges_stddev is not None:
+    is_checked = np.isfinite(lengths.stddev_m)
+    slopes = (np.abs(lengths.by_metre) * lengths.stddev_m)[is_checked]
+    found = zip(slopes.tolist(), lengths.threshold[is_checked].tolist(), strict=True)
+    hidden = [HiddenMistake("length", slope, threshold, 1, np.inf) for slope, threshold in found]
+    if against_stddev is not None:
         threshold = float(special.chdtri(1, LENGTH_FALSE_ALARM_RATE))
-        hidden.append(HiddenMistake("lengths", against_ranges_stddev, threshold, 1, np.inf))
-    elif not np.isfinite(lengths.stddev_m).all():
-        hidden.append(HiddenMistake("length", np.inf, lengths.threshold, 1, np.inf))
+        hidden.append(HiddenMistake("lengths", against_stddev, threshold, 1, np.inf))
+    elif not is_checked.all():
+        hidden.append(HiddenMistake("length", np.inf, np.inf, 1, np.inf))
     return tuple(hidden)
 
 

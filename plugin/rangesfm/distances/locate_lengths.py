@@ -122,7 +122,7 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
         if start in points and end in points:
             ends[row] = points[start], points[end]
             marked = [(tape.markers[name], points[name]) for name in taped.ends if name in markers]
-            of_ends = [_mark_covariance(marker, point, images) for marker, point in marked]
+            of_ends = [mark_covariance(marker, point, images) for marker, point in marked]
             along = (ends[row, 1] - ends[row, 0]) / max(float(np.linalg.norm(ends[row, 1] - ends[row, 0])), 1e-12)
             mark_stddev[row] = np.sqrt(sum(along @ covariance @ along for covariance in of_ends))
         elif start in anchor_ids and end in anchor_ids:
@@ -211,8 +211,10 @@ def triangulate_marker(
     return point
 
 
-def _mark_covariance(marker: Marker, point: Array, images: dict[str, pycolmap.Image]) -> Array:
+def mark_covariance(marker: Marker, point: Array, images: Mapping[str, pycolmap.Image]) -> Array:
     """Return the covariance (3, 3) of a marker's position due to the errors of its marks, in the model's unit."""
+    if marker.stddev_px == 0:
+        return np.zeros((3, 3))
     information = np.zeros((3, 3))
     for view in (images[name] for name in marker.image_names if name in images):
         step = 1e-4 * float(np.linalg.norm(point - view.projection_center()))

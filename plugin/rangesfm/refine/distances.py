@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pycolmap
@@ -13,6 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import (
     LocatedDistances,
     images_by_name,
+    mark_covariance,
     triangulate_marker,
     triangulate_markers,
 )
@@ -79,43 +80,77 @@ def remove_marker_points(model: pycolmap.Reconstruction, marker_ids: Mapping[str
         model.image(image_id).points2D.pop()
 
 
+def errors_beyond_features(
+    bundle: BundleAdjustment, markers: Mapping[str, Marker], marker_ids: Mapping[str, int]
+) -> dict[str, Array]:
+    """Return the covariances (3, 3) of marked points, square metres, from errors that their residuals do not have.
+
+    COLMAP's residuals weigh a mark like a feature, but one set by hand is less precise.
+
+    Args:
+        markers: by name. marker_ids: 3-D points of the model, by name.
+    """
+    images, found = images_by_name(bundle.metric), {}
+    for name, point_id in marker_ids.items():
+        beyond_px = float(np.sqrt(max(markers[name].stddev_px ** 2 - bundle.pixel_stddev**2, 0.0)))
+        point = np.array(bundle.metric.point3D(point_id).xyz)
+        found[name] = mark_covariance(replace(markers[name], stddev_px=beyond_px), point, images)
+    return found
+
+
 def add_distances(
     bundle: BundleAdjustment,
     distances: MeasuredDistances,
     anchors: Sequence[AnchorEstimate],
     anchor_blocks: Sequence[Array],
     errors: RangeErrors,
+    of_marks: Mapping[str, Array],
 ) -> list[Array]:
     """Add the distances to the bundle adjustment, as residuals in pixels.
 
     Args:
         anchors, anchor_blocks: in the order of the log. Distances to an anchor without a position are left out.
         errors: of the ranges; their loss and common bias also apply to ranges between anchors.
+        of_marks: as ``errors_beyond_features`` gives them.
 
     Returns:
         the parameter blocks that were added.
     """
     placed = {
-        anchor.anchor_id: _End(block, None)
+        anchor.anchor_id: _End(block, None, np.array(block))
         for anchor, block in zip(anchors, anchor_blocks, strict=True)
         if np.isfinite(block).all()
     }
-    origins = _add_taped(bundle, distances, placed)
+    origins = _add_taped(bundle, distances, placed, of_marks)
     return origins + _add_by_radio(bundle, distances.by_radio, anchor_blocks, errors)
 
 
 @dataclass(frozen=True)
 class _End:
-    """One end of a distance: a parameter block, and the end's position in that rig; None if the block is the end."""
+    """One end of a distance.
+
+    Attributes:
+        block: parameter block of a point, or of a rig's pose.
+        in_rig_m: (3,) position of the end in that rig; None if the block is the end.
+        place_m: (3,) in the metric world. covariance_m2: (3, 3) of errors that no residual has.
+    """
 
     block: Array
     in_rig_m: Array | None
+    place_m: Array
+    covariance_m2: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
-def _add_taped(bundle: BundleAdjustment, distances: MeasuredDistances, anchors: Mapping[str, _End]) -> list[Array]:
+def _add_taped(
+    bundle: BundleAdjustment,
+    distances: MeasuredDistances,
+    anchors: Mapping[str, _End],
+    of_marks: Mapping[str, Array],
+) -> list[Array]:
     ends, origins = dict(anchors), []
     for name, point_id in distances.marker_ids.items():
-        ends[name] = _End(bundle.metric.point3D(point_id).xyz, None)
+        block = bundle.metric.point3D(point_id).xyz
+        ends[name] = _End(block, None, np.array(block), of_marks[name])
         bundle.keep_from_elimination(ends[name].block)
     images = images_by_name(bundle.metric) if distances.tape.distances else {}
     ends |= {name: _camera(bundle.metric, image) for name, image in images.items()}
@@ -123,12 +158,14 @@ def _add_taped(bundle: BundleAdjustment, distances: MeasuredDistances, anchors: 
         if not set(taped.ends) <= ends.keys():
             continue
         a, b = (ends[name] for name in taped.ends)
+        along = (b.place_m - a.place_m) / max(float(np.linalg.norm(b.place_m - a.place_m)), 1e-12)
+        variance_m2 = taped.stddev_m**2 + float(along @ (a.covariance_m2 + b.covariance_m2) @ along)
         if a.block is b.block or np.shares_memory(a.block, b.block):
             a, b = (_in_rig(bundle.metric, images[name]) for name in taped.ends)
             origins += [end.block for end in (a, b) if end.in_rig_m is None]
         cost = ceres.distance_cost(
             distance_m=taped.distance_m,
-            stddev_m=taped.stddev_m / bundle.pixel_stddev,
+            stddev_m=float(np.sqrt(variance_m2)) / bundle.pixel_stddev,
             a_in_cam_m=a.in_rig_m,
             b_in_cam_m=b.in_rig_m,
         )
@@ -143,13 +180,14 @@ def _in_rig(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:
     sensor, rig = image.data_id.sensor_id, metric.rig(metric.frame(image.frame_id).rig_id)
     # The pose itself is needed as a parameter block: sensor_from_rig() returns a copy.
     pose = None if rig.is_ref_sensor(sensor) else rig.non_ref_sensors[sensor]
-    return _End(np.zeros(3), None) if pose is None else _End(pose.params, np.zeros(3))
+    center_m = image.projection_center()
+    return _End(np.zeros(3), None, center_m) if pose is None else _End(pose.params, np.zeros(3), center_m)
 
 
 def _camera(metric: pycolmap.Reconstruction, image: pycolmap.Image) -> _End:
     """Return a photo's projection centre as a point of its rig."""
     pose = pose_of(metric.frame(image.frame_id))
-    return _End(pose.params, pose * image.projection_center())
+    return _End(pose.params, pose * image.projection_center(), image.projection_center())
 
 
 def _add_by_radio(

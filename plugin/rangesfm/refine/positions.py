@@ -139,6 +139,7 @@ def add_positions(
     bundle: BundleAdjustment,
     positions: HeldPositions,
     marker_ids: Mapping[str, int],
+    of_marks: Mapping[str, Array],
     *,
     lever_arm_stddev_m: float,
     loss_scale: float,
@@ -147,12 +148,14 @@ def add_positions(
 
     Args:
         marker_ids: 3-D points of the model, by the names of the markers.
+        of_marks: (3, 3) covariances of their errors that no residual has, by name.
         lever_arm_stddev_m: of each coordinate of the lever arm; 0 keeps it.
         loss_scale: length of an error, in standard deviations of its coordinates, from which it is down-weighted.
     """
     for name, position_m in positions.position_m.items():
         mark = bundle.metric.point3D(marker_ids[name]).xyz
-        ceres.add_normal_prior(bundle.adjuster, mark, position_m, positions.stddev_m[name] / bundle.pixel_stddev)
+        stddev, further = positions.stddev_m[name] / bundle.pixel_stddev, of_marks[name] / bundle.pixel_stddev**2
+        ceres.add_normal_prior(bundle.adjuster, mark, position_m, stddev, further)
     antenna = positions.antenna
     if antenna is None:
         return []

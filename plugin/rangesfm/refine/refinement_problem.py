@@ -18,7 +18,7 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
-from rangesfm.refine.distances import MeasuredDistances, add_distances
+from rangesfm.refine.distances import MeasuredDistances, add_distances, errors_beyond_features
 from rangesfm.refine.positions import HeldPositions, add_positions
 from rangesfm.refine.radio import (
     AddedRadio,
@@ -91,11 +91,14 @@ class RefinementProblem:
         """Add all other measurements, starting from an estimate; ``errors`` are of the ranges that take part."""
         blocks = radio_blocks(radio, self.metric, self.ranges.trajectory, self.options)
         rows = add_range_residuals(bundle, self.ranges, errors, blocks, self.range_share)
-        others = add_distances(bundle, self.distances, radio.anchors, blocks.anchors, errors)
+        markers = {**self.distances.tape.markers, **self.positions.markers}
+        of_marks = errors_beyond_features(bundle, markers, self.distances.marker_ids)
+        others = add_distances(bundle, self.distances, radio.anchors, blocks.anchors, errors, of_marks)
         others += add_positions(
             bundle,
             self.positions,
             self.distances.marker_ids,
+            of_marks,
             lever_arm_stddev_m=self.options.lever_arm_stddev_m,
             loss_scale=self.options.range_loss_scale,
         )

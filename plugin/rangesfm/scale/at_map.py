@@ -19,8 +19,9 @@ from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.initialize import camera_velocities, model_from_cam
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
+from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import PositionScale
-from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
+from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from
 from rangesfm.scale.scale_verdict import judge, judge_positions
 from rangesfm.scale.solution import Solution, weighted
@@ -59,7 +60,9 @@ class MapWithRanges:
         biases_m: Array,
         errors: RangeErrors,
         bending: MapBending,
+        *,
         placement: PlacementPrior | None = None,
+        lengths: LengthScale | None = None,
     ) -> MapWithRanges:
         """Transfer the ranges of a scale estimate to another map.
 
@@ -69,15 +72,20 @@ class MapWithRanges:
             tags_m, centers_m: (k, 3) positions of tag and camera at each of the k ranges.
             anchors_m: (m, 3). biases_m: (m,). errors: of the k ranges, as weighted.
             placement: what known positions say of the other map's first camera; None without any.
+            lengths: what measured lengths say of the other map's scale; None without any.
         """
         assert start.problem is not None, "a map with ranges"
         trajectory = trajectory_m.transformed(1 / scale, np.eye(3), np.zeros(3))
         from_map = first_camera_from(trajectory)
         placed = Similarity(scale, from_map.rotation.T, trajectory_m.centers[0])
+        distances = start.problem.ranges.distances
+        if distances is not None and lengths is not None:
+            distances = lengths.at_scale(1 / scale).beside_ranges(distances, with_bending=True)
         problem = replace(
             start.problem.ranges,
             centers=placed.inverse().apply(centers_m),
             tag_from_center=(tags_m - centers_m) @ placed.rotation,
+            distances=distances,
             placement=placement,
         )
         posed = replace(start.problem, ranges=problem, first_camera_from_sfm=from_map)
@@ -131,9 +139,7 @@ def estimate_at(
     """
     known = on_map.known(learned, start.range_share)
     value = on_map.solution.fit.state.metric_from_model.scale
-    # The refinement lets many ranges outweigh the measured lengths, so its uncertainty would ignore what they tell.
-    uncertainty = known.uncertainty if start.lengths is None else _about(start, value)
-    judged = judge(on_map.posed, on_map.solution, uncertainty, {}, start.anchors, (), options)
+    judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, (), options)
     columns, placement = known.columns, None
     if columns.frame >= 0:
         of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
@@ -141,7 +147,7 @@ def estimate_at(
     return replace(
         start,
         refined_value=value,
-        uncertainty=uncertainty,
+        uncertainty=known.uncertainty,
         verdict=judged.verdict,
         reasons=(*judged.reasons, *start.remarks),
         advice=judged.advice,
@@ -172,8 +178,3 @@ def estimate_by_positions_at(
         advice=judged.advice,
         placement=positions.covariance,
     )
-
-
-def _about(start: ScaleEstimate, value: float) -> ScaleUncertainty:
-    """Return the uncertainty of an estimate, shifted so that it refers to another value of the scale."""
-    return replace(start.uncertainty, lean=start.uncertainty.lean + float(np.log(start.value / value)))

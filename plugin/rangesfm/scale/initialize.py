@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,9 +23,10 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.range_equation import RangeProblem, solve
+from rangesfm.scale.scale_by_kind import ScaleByKind
 from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
-from rangesfm.scale.scale_estimate import ScaleByKind, ScaleEstimate, ScaleSensitivity, ScaleUncertainty
+from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleSensitivity, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from, scale_problem
 from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, levelled_places
 from rangesfm.scale.sensitivity import cutoff_test, scale_sensitivity
@@ -33,7 +34,7 @@ from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, sol
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import known_map, learned_errors, parameter_covariance
 
-# Smallest factor on the weights of ranges beside known positions, below which they would have no effect.
+# Smallest factor on the weights of ranges beside other measurements, below which they would have no effect.
 _LEAST_SHARE = 1e-4
 
 
@@ -71,16 +72,17 @@ def initialize_scale(
         GeometryError: the scale is not determined.
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
-    lengths = scale_by_lengths(distances, trajectory.centers)
     bending = bending or WalkBending(in_first_camera(trajectory))
     by_positions, remarks = None, tuple[str, ...]()
     try:
         if positions is not None:
             by_positions = scale_by_positions(positions, trajectory, bending, lasting_s=lasting_s)
     except GeometryError as error:
-        if not len(observations.log) and lengths is None:
+        if not len(observations.log) and scale_by_lengths(distances, trajectory.centers) is None:
             raise GeometryError(f"the scale is not determined: {error}") from None
         remarks = (f"the known positions are not used: {error}",)
+    others = [] if by_positions is None else [by_positions.alone]
+    lengths = scale_by_lengths(distances, trajectory.centers, others)
     if not len(observations.log):
         if by_positions is not None:
             return _by_positions_alone(
@@ -90,33 +92,83 @@ def initialize_scale(
             raise GeometryError("the scale is not determined: no measured length has both its ends in the map")
         alone = _by_lengths_alone(lengths, observations, trajectory, range_model, options)
         return replace(alone, reasons=(*alone.reasons, *remarks), remarks=remarks)
+    given = _Given(
+        observations, trajectory, anchors, anchor_frame, options, range_model, distances, by_positions, bending,
+        remarks, seed,
+    )  # fmt: skip
+    found = _with_ranges(given, lengths)
+    if lengths is None:
+        return found
+    checked = scale_by_lengths(distances, trajectory.centers, [*others, found.by_kind["ranges"]])
+    assert checked is not None, "the lengths are the same"
+    return (
+        replace(found, lengths=checked)
+        if np.array_equal(checked.is_kept, lengths.is_kept)
+        else _with_ranges(given, checked)
+    )
+
+
+@dataclass(frozen=True)
+class _Given:
+    """Input of the scale by ranges and all else, as for ``initialize_scale``.
+
+    Attributes:
+        by_positions: what the known positions say.
+        remarks: reasons that are known before.
+    """
+
+    observations: RangeObservations
+    trajectory: Trajectory
+    anchors: Sequence[Anchor]
+    anchor_frame: str
+    options: ScaleOptions
+    range_model: RangeModelOptions
+    distances: LocatedDistances | None
+    by_positions: PositionScale | None
+    bending: MapBending
+    remarks: tuple[str, ...]
+    seed: int
+
+
+def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
+    """Return the estimate by ranges, and by lengths and positions, if there are any."""
+    observations, trajectory, anchors, options = given.observations, given.trajectory, given.anchors, given.options
+    by_positions, distances, anchor_frame = given.by_positions, given.distances, given.anchor_frame
     if lengths is not None and distances is not None:
         distances = lengths.beside_ranges(distances)
     gravity = gravity_of(options.up_in_first_camera)
     placement = None if by_positions is None else by_positions.prior(trajectory, first_camera_from(trajectory))
-    given = (observations, trajectory, anchors, anchor_frame, range_model, distances, gravity, placement)
-    problem, open_place = scale_problem(*given), tuple[str, ...]()
+    posing = (observations, trajectory, anchors, anchor_frame, given.range_model, distances, gravity, placement)
+    problem, open_place = scale_problem(*posing), tuple[str, ...]()
     try:
-        solution = solve_scale(problem, camera_side=options.camera_side, seed=seed)
+        solution = solve_scale(problem, camera_side=options.camera_side, seed=given.seed)
     except OpenPlaceError as error:
         open_place = (f"scale only, in the first camera's frame: {error}",)
-        problem = scale_problem(*given, place_is_open=True)
+        problem = scale_problem(*posing, place_is_open=True)
         solution = solution_from(problem, error.in_first_camera)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
     learned, (per_anchor, tests) = both(
         lambda: learned_errors(
-            problem, solution, observations, rotations, camera_velocities(observations, trajectory, problem), bending
+            problem,
+            solution,
+            observations,
+            rotations,
+            camera_velocities(observations, trajectory, problem),
+            given.bending,
         ),
         lambda: (scale_per_anchor(solution, observations.log.anchor_ids), cutoff_test(solution)),
     )
+    by_kind = _by_kinds(problem, solution, learned, lengths, by_positions)
+    range_share = _range_share(solution, by_kind["ranges"]) if by_kind else 1.0
+    solution = _with_share(solution, range_share)
     posed = problem if lengths is None else _bent(problem, lengths)
     known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
     uncertainty = known.uncertainty
     covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
     judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
-    verdict, remarks = judged.verdict, (*open_place, *remarks)
+    verdict, remarks = judged.verdict, (*open_place, *given.remarks)
     if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
         remarks = (*remarks, *levelled_places(gravity, anchors, found))
     reasons = (*judged.reasons, *remarks)
@@ -149,8 +201,8 @@ def initialize_scale(
         remarks=remarks,
         lengths=lengths,
         positions=by_positions,
-        by_kind=(by_kind := _by_kinds(problem, solution, learned, lengths, by_positions)),
-        range_share=1.0 if by_positions is None else _range_share(solution, by_kind["ranges"]),
+        by_kind=by_kind,
+        range_share=range_share,
     )
 
 
@@ -213,9 +265,9 @@ def _by_positions_alone(
         alone: what the positions say without the lengths.
     """
     found, by_kind = alone, dict[str, ScaleByKind]()
-    if lengths is not None:
+    if lengths is not None and lengths.is_used:
         found = scale_by_positions(alone.known, trajectory, bending, lengths=lengths, lasting_s=lasting_s)
-        by_kind = {**_by_positions(alone), **_by_lengths(lengths)}
+        by_kind = {"positions": alone.alone, **_by_lengths(lengths)}
     judged = judge_positions(found, found.uncertainty, options)
     return replace(
         _without_ranges(observations, range_model),
@@ -248,10 +300,6 @@ def _by_lengths(lengths: LengthScale) -> dict[str, ScaleByKind]:
     return {"lengths": ScaleByKind(lengths.value, lengths.value * lengths.relative_stddev)}
 
 
-def _by_positions(positions: PositionScale) -> dict[str, ScaleByKind]:
-    return {"positions": ScaleByKind(positions.value, positions.value * positions.uncertainty.empirical)}
-
-
 def _by_kinds(
     problem: ScaleProblem,
     solution: Solution,
@@ -261,8 +309,8 @@ def _by_kinds(
 ) -> dict[str, ScaleByKind]:
     """Return the scale by each kind of measurement alone; empty where there are only ranges."""
     others = {
-        **({} if lengths is None else _by_lengths(lengths)),
-        **({} if positions is None else _by_positions(positions)),
+        **({} if lengths is None or not lengths.is_used else _by_lengths(lengths)),
+        **({} if positions is None else {"positions": positions.alone}),
     }
     return {"ranges": _by_ranges(problem, solution, learned), **others} if others else {}
 
@@ -273,6 +321,16 @@ def _range_share(solution: Solution, ranges: ScaleByKind) -> float:
     alone = solve(problem, solution.fit.state, loss=solution.errors.loss)
     formal = alone.log_scale_stddev * solution.errors.inflation
     return float(np.clip((formal * ranges.value / ranges.stddev) ** 2, _LEAST_SHARE, 1.0))
+
+
+def _with_share(solution: Solution, range_share: float) -> Solution:
+    """Return the solution with all ranges weighted by a further factor."""
+    if range_share == 1:
+        return solution
+    problem = solution.problem
+    share = range_share * (np.ones(len(problem.range_m)) if problem.share is None else problem.share)
+    problem = replace(problem, share=share)
+    return replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
 
 
 def _by_ranges(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleByKind:

@@ -7,17 +7,21 @@ along its way. The size of this variation is estimated from how the lengths disa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
+from scipy.linalg import block_diag
+from scipy.optimize import brentq
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.scale.scale_by_kind import ScaleByKind
 
 # BENDING: relative variation of the scale within a map (stddev). _BENDING_SPREAD: stddev of its logarithm from map to
 # map. _ALIKE_WITHIN: correlation length of the variation, as a share of the path's extent. Source: lengths of 0.5 to
@@ -38,12 +42,13 @@ class LengthScale:
         value: metres per SfM unit.
         components: relative standard deviations of the scale, by cause.
         rows: (m,) rows of the lengths among the distances.
-        is_kept: (m,) True for lengths that agree with each other; the others are not used.
-        too_long_m, stddev_m: (m,) excess of each length over what all other kept lengths predict, and its standard
+        is_kept: (m,) True for lengths that agree with all else; the others are not used. Where none is kept, the scale
+            is that of all of them, and takes no part.
+        too_long_m, stddev_m: (m,) excess of each length over what all other kept measurements predict, and its standard
             deviation; inf where nothing predicts it.
         redundancy: (m,) how much of an error of each length the others check, 0 to 1 (Baarda's redundancy number).
+        threshold: (m,) squared error of each length, in standard deviations, above which it is an outlier.
         by_metre: (m,) relative change of the scale if the length was a metre longer.
-        threshold: squared error of a length, in standard deviations, above which it is an outlier.
     """
 
     value: float
@@ -53,12 +58,17 @@ class LengthScale:
     too_long_m: Array
     stddev_m: Array
     redundancy: Array
+    threshold: Array
     by_metre: Array
-    threshold: float
 
     @property
     def relative_stddev(self) -> float:
         return float(np.linalg.norm(list(self.components.values())))
+
+    @property
+    def is_used(self) -> bool:
+        """Return whether any of the lengths takes part."""
+        return bool(self.is_kept.any())
 
     @property
     def statistic(self) -> Array:
@@ -70,7 +80,7 @@ class LengthScale:
         return replace(self, value=self.value / metres_per_unit, by_metre=self.by_metre)
 
     def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
-        """Return the distances with all lengths between points replaced by one that gives the same scale.
+        """Return the distances with one length that gives the same scale in place of all those between points, if used.
 
         Its standard deviation is that of the measurement and the marks. The bending is left out, because it should only
         widen the interval, as most systematic errors of radios do.
@@ -78,18 +88,24 @@ class LengthScale:
         Args:
             with_bending: whether the standard deviation includes the bending after all.
         """
+        others = distances.subset(~distances.is_between_points)
+        if not self.is_used:
+            return others
         unit = np.array([1.0])
         measured = float(np.hypot(self.components["tape"], self.components["marks"]))
         stddev_m = self.value * (self.relative_stddev if with_bending else measured) * unit
         one = LocatedDistances.of(self.value * unit, stddev_m, model_length=unit)
-        return one.joined(distances.subset(~distances.is_between_points))
+        return one.joined(others)
 
 
-def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> LengthScale | None:
+def scale_by_lengths(
+    distances: LocatedDistances | None, centers: Array, others: Sequence[ScaleByKind] = ()
+) -> LengthScale | None:
     """Estimate the scale with outlying lengths left out; None where there is no length between points.
 
     Args:
         centers: (n, 3) camera centres of the path, in the model's unit.
+        others: scales by other kinds of measurement. They only help to tell which lengths are wrong.
 
     Raises:
         GeometryError: both ends of a length are in one place of the map.
@@ -99,27 +115,17 @@ def scale_by_lengths(distances: LocatedDistances | None, centers: Array) -> Leng
     rows = np.flatnonzero(distances.is_between_points & ~distances.is_check)
     if not len(rows):
         return None
-    lengths = _Lengths.of(distances, rows, float(np.linalg.norm(path_shape(centers).stddevs)))
-    # Threshold of a squared Student's t: the size of the bending is estimated from the other lengths and its prior.
-    degrees_of_freedom = 1 / (2 * _BENDING_SPREAD**2) + max(len(rows) - 2, 0)
-    threshold = float(special.stdtrit(degrees_of_freedom, LENGTH_FALSE_ALARM_RATE / (2 * len(rows))) ** 2)
-    kept = np.ones(len(rows), dtype=bool)
-    ratios = np.log(lengths.metric / lengths.model)
-    while kept.sum() > 2 and (~kept).sum() + 1 < len(rows) / 2:
-        among = np.flatnonzero(kept)
-        far = np.argsort(-np.abs(ratios[among] - np.median(ratios[among])), kind="stable")[:_NUM_SUSPECTS]
-        tests = {k: lengths.errors(kept & (np.arange(len(rows)) != k), k) for k in among[far].tolist()}
-        worst = max(tests, key=lambda k: tests[k][0] ** 2 / tests[k][1] ** 2)
-        if (tests[worst][0] / tests[worst][1]) ** 2 <= threshold:
-            break
-        kept[worst] = False
-    fit = lengths.fit(kept)
-    errors = [lengths.errors(kept, k, fit) for k in range(len(rows))]
-    too_long_m, stddev_m, redundancy = np.array(errors).T
-    by_metre = np.zeros(len(rows))
-    by_metre[kept] = fit.gains / fit.scale
+    lengths = _Lengths.of(distances, rows, float(np.linalg.norm(path_shape(centers).stddevs))).beside(others)
+    is_length = np.arange(len(lengths.model)) < len(rows)
+    agree = lengths.agreeing()
+    fit = lengths.fit(agree & is_length if (agree & is_length).any() else is_length)
+    of_all = lengths.fit(agree)
+    tests = [lengths.test(agree, k, of_all) for k in range(len(rows))]
+    kept, by_metre = agree[is_length], np.zeros(len(rows))
+    by_metre[kept if kept.any() else slice(None)] = fit.gains / fit.scale
     components = {name: float(np.sqrt(fit.gains @ part @ fit.gains)) / fit.scale for name, part in fit.parts.items()}
-    return LengthScale(fit.scale, components, rows, kept, too_long_m, stddev_m, redundancy, by_metre, threshold)
+    too_long_m, stddev_m, redundancy, threshold = np.array(tests).T
+    return LengthScale(fit.scale, components, rows, kept, too_long_m, stddev_m, redundancy, threshold, by_metre)
 
 
 @dataclass(frozen=True)
@@ -127,15 +133,32 @@ class _Fit:
     """A least squares fit.
 
     Attributes:
-        scale: metres per SfM unit. bending: relative variation of the scale.
+        scale: metres per SfM unit. bending: relative variation of the scale, root of its mean square.
+        sizes, probabilities: (t,) possible variations over that, and how likely they are.
         parts: (k, k) covariances of the lengths by cause, square metres.
         gains: (k,) derivatives of the scale by each length.
     """
 
     scale: float
     bending: float
+    sizes: Array
+    probabilities: Array
     parts: dict[str, Array]
     gains: Array
+
+
+class _Test(NamedTuple):
+    """Test of one length against all else (Baarda's test); attributes as in ``LengthScale``."""
+
+    too_long_m: float
+    stddev_m: float
+    redundancy: float
+    threshold: float
+
+    @property
+    def excess(self) -> float:
+        """Statistic over its threshold."""
+        return (self.too_long_m / self.stddev_m) ** 2 / self.threshold
 
 
 @dataclass(frozen=True)
@@ -175,6 +198,32 @@ class _Lengths:
             alike * np.outer(model, model),
         )
 
+    def beside(self, others: Sequence[ScaleByKind]) -> _Lengths:
+        """Return the lengths and, after them, one length of one unit for each of the other scales."""
+        values, variances = np.array([[each.value, each.stddev**2] for each in others]).reshape(-1, 2).T
+        nothing = np.zeros((len(others), len(others)))
+        return _Lengths(
+            np.append(self.model, np.ones(len(others))),
+            np.append(self.metric, values),
+            block_diag(self.of_tape_m2, np.diag(variances)),
+            block_diag(self.of_marks, nothing),
+            block_diag(self.of_bending, nothing),
+        )
+
+    def agreeing(self) -> Mask:
+        """Return which lengths agree with each other, a majority; one is left out at a time, the worst first."""
+        num, kept = len(self.model), np.ones(len(self.model), dtype=bool)
+        ratios = np.log(self.metric / self.model)
+        while kept.sum() > 2 and (~kept).sum() + 1 < num / 2:
+            among = np.flatnonzero(kept)
+            far = np.argsort(-np.abs(ratios[among] - np.median(ratios[among])), kind="stable")[:_NUM_SUSPECTS]
+            excess = {k: self.test(kept & (np.arange(num) != k), k).excess for k in among[far].tolist()}
+            worst = max(excess, key=excess.__getitem__)
+            if excess[worst] <= 1:
+                break
+            kept[worst] = False
+        return kept
+
     def _parts(self, chosen: Mask, scale: float, bending: float) -> dict[str, Array]:
         part = np.ix_(chosen, chosen)
         return {
@@ -196,31 +245,48 @@ class _Lengths:
             of_sizes = [self._parts(chosen, scale, BENDING * np.exp(each)) for each in logs]
             unlikeliness = np.array([_unlikeliness(_total(p), model, metric) for p in of_sizes])
             weights = np.exp(-(unlikeliness - unlikeliness.min()) - 0.5 * (logs / _BENDING_SPREAD) ** 2)
-            bending = BENDING * float(np.sqrt(weights @ np.exp(2 * logs) / weights.sum()))
+            probabilities = weights / weights.sum()
+            bending = BENDING * float(np.sqrt(probabilities @ np.exp(2 * logs)))
             parts = self._parts(chosen, scale, bending)
             by_model = np.linalg.solve(_total(parts), model)
             gains = by_model / (model @ by_model)
             scale = float(gains @ metric)
-        return _Fit(scale, bending, parts, gains)
+        return _Fit(scale, bending, BENDING * np.exp(logs) / bending, probabilities, parts, gains)
 
-    def errors(self, kept: Mask, k: int, fit: _Fit | None = None) -> tuple[float, float, float]:
-        """Return the excess of length k over the prediction by the kept ones, and its stddev, metres (Baarda's test).
+    def test(self, kept: Mask, k: int, fit: _Fit | None = None) -> _Test:
+        """Test length k against the other kept ones.
 
-        The third number is its redundancy.
+        The distribution of the statistic is that over all sizes that the bending may have.
 
         Args:
-            fit: of the kept lengths; None: fit them here (for a k that is not among them).
+            fit: whose size of the bending is used, as that of a fit for each of many lengths takes long; None: fit
+                the other kept ones.
         """
-        if (kept & (np.arange(len(kept)) != k)).sum() < 1:
-            return 0.0, np.inf, 0.0
-        fit = fit or self.fit(kept)
-        chosen = kept | (np.arange(len(kept)) == k)
-        at, model = int(chosen[:k].sum()), self.model[chosen]
-        inverse = np.linalg.inv(_total(self._parts(chosen, fit.scale, fit.bending)))
+        others, risk = kept & (np.arange(len(kept)) != k), LENGTH_FALSE_ALARM_RATE / len(kept)
+        if not others.any():
+            return _Test(0.0, np.inf, 0.0, float(special.chdtri(1, risk)))
+        fit, chosen, at = fit or self.fit(others), others | (np.arange(len(kept)) == k), int(others[:k].sum())
+        model, parts = self.model[chosen], self._parts(chosen, fit.scale, fit.bending)
+        inverse = np.linalg.inv(_total(parts))
         by_model = inverse @ model
         off = inverse - np.outer(by_model, by_model) / (model @ by_model)
-        excess_m = float(off[at] @ self.metric[chosen] / off[at, at])
-        return excess_m, float(off[at, at] ** -0.5), float(off[at, at] / inverse[at, at])
+        by = off[at] / off[at, at]
+        of_bending = float(by @ parts["bending"] @ by)
+        variances = 1 / off[at, at] + (fit.sizes**2 - 1) * of_bending
+        threshold = off[at, at] * _quantile(variances, fit.probabilities, risk) ** 2
+        excess_m, redundancy = float(by @ self.metric[chosen]), float(off[at, at] / inverse[at, at])
+        return _Test(excess_m, float(off[at, at] ** -0.5), redundancy, float(threshold))
+
+
+def _quantile(variances: Array, probabilities: Array, risk: float) -> float:
+    """Return the size that a normal number with one of these variances (t,) exceeds, on either side, with this risk."""
+    stddevs = np.sqrt(np.maximum(variances, 0.0)) + 1e-300
+    widest = -special.ndtri(risk / 2) * float(stddevs.max())
+
+    def excess_risk(size: float) -> float:
+        return float(2 * probabilities @ special.ndtr(-size / stddevs)) - risk
+
+    return float(brentq(excess_risk, 0.0, widest))
 
 
 def _total(parts: Mapping[str, Array]) -> Array:

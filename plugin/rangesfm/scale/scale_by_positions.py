@@ -31,6 +31,7 @@ from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import Columns
+from rangesfm.scale.scale_by_kind import ScaleByKind
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.uncertainty import LinearMap, best_estimate
@@ -180,6 +181,11 @@ class PositionScale:
     def value(self) -> float:
         """Metres per unit of the model."""
         return self.site_from_model.scale
+
+    @property
+    def alone(self) -> ScaleByKind:
+        """The scale with its standard deviation."""
+        return ScaleByKind(self.value, self.value * self.uncertainty.empirical)
 
     @property
     def bending_factor(self) -> float:

@@ -14,6 +14,7 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
+from rangesfm.scale.scale_by_kind import ScaleByKind
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
@@ -57,18 +58,6 @@ class ScaleUncertainty:
     def half_width_95(self) -> float:
         """Half the width of the 95 % interval, in the logarithm of the scale."""
         return NORMAL_95 * self.empirical
-
-
-@dataclass(frozen=True)
-class ScaleByKind:
-    """The scale from ranges alone, or from measured lengths alone, in metres per SfM unit.
-
-    Attributes:
-        stddev: with all error components; inf where the scale is not determined.
-    """
-
-    value: float
-    stddev: float
 
 
 @dataclass(frozen=True)
@@ -130,8 +119,8 @@ class ScaleEstimate:
             first camera, from all error components; None in the first camera's frame.
         lengths: what the measured lengths alone say; None without lengths between points of the map.
         positions: what the known positions say; None if they do not determine the map's place.
-        range_share: factor on the weights of the ranges beside known positions, with which the ranges say no more of
-            the scale than their learnt errors allow; 1 without known positions.
+        range_share: factor on the weights of the ranges beside measured lengths and known positions, with which the
+            ranges say no more of the scale than their learnt errors allow; 1 where there are only ranges.
         remarks: those of the reasons that a refinement does not change.
         refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
         by_kind: scale by "ranges", "lengths" and "positions", as far as available, where several of them were used.

@@ -17,7 +17,7 @@ from rangesfm.diagnostics.finished_map import Doubt, doubts_of_map, doubts_of_pi
 from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.diagnostics.position_tests import diagnose_positions
-from rangesfm.distances.locate_lengths import surveyed_distances
+from rangesfm.distances.locate_lengths import locate_distances, surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import gravity_of
@@ -35,6 +35,7 @@ from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, LoopClosing, RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult, Rivals
 from rangesfm.scale.at_map import MapWithRanges, estimate_at, estimate_by_positions_at
+from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import first_camera_from
@@ -337,15 +338,22 @@ def _positions_at_rest(metric: MetricResult, surveyed: SurveyedPositions, rest: 
         bending: MapBending = by_photos(rest.photos, rest.trajectory_m, 1.0, is_at_optimum=False)
     except GeometryError:
         bending = WalkBending(in_first_camera(rest.trajectory_m))
-    lengths = metric.estimate.lengths
     return scale_by_positions(
         known,
         rest.trajectory_m,
         bending,
-        lengths=lengths and lengths.at_scale(rest.scale),
+        lengths=_lengths_at_rest(metric, rest),
         refined=IDENTITY,
         lasting_s=surveyed.lasting_s,
     )
+
+
+def _lengths_at_rest(metric: MetricResult, rest: AtRest) -> LengthScale | None:
+    """Return the scale of a refined map by the measured lengths that took part; None without any."""
+    if metric.tape is None:
+        return None
+    anchor_ids = metric.observations.log.anchor_ids
+    return scale_by_lengths(locate_distances(metric.tape, rest.photos.metric, anchor_ids), rest.trajectory_m.centers)
 
 
 def _at_rest(metric: MetricResult, rest: AtRest, positions: PositionScale | None) -> MapWithRanges:
@@ -366,7 +374,8 @@ def _at_rest(metric: MetricResult, rest: AtRest, positions: PositionScale | None
         np.array([anchor.range_bias_m for anchor in rest.anchors]),
         rest.errors,
         bending,
-        None if positions is None else positions.prior(path, model_from_map),
+        placement=None if positions is None else positions.prior(path, model_from_map),
+        lengths=_lengths_at_rest(metric, rest),
     )
 
 

@@ -1,0 +1,17 @@
+"""ScaleByKind: the scale from one kind of measurement alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ScaleByKind:
+    """The scale from ranges, measured lengths or known positions alone, in metres per SfM unit.
+
+    Attributes:
+        stddev: with all error components; inf where the scale is not determined.
+    """
+
+    value: float
+    stddev: float
