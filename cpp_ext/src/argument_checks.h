@@ -108,6 +108,17 @@ inline Eigen::Matrix3Xd Vector3ForEachRange(const std::string& name, const Array
   return columns;
 }
 
+// Returns a row (k,) for each of n ranges, from an array (n, k).
+inline Eigen::MatrixXd RowForEachRange(const std::string& name, const Array& array, Eigen::Index num_ranges) {
+  if (array.ndim() != 2 || array.shape(0) != num_ranges) {
+    FailOnShape(name, array, "a row for each of " + std::to_string(num_ranges) + " ranges");
+  }
+  using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+  Eigen::MatrixXd rows = Eigen::Map<const RowMajor>(array.data(), num_ranges, array.shape(1));
+  CheckEach(name, rows.reshaped(), Finite);
+  return rows;
+}
+
 // Returns three columns for each of n matrices (n, 3, 3).
 inline Eigen::Matrix3Xd Matrix3ForEach(const std::string& name, const Array& array, Eigen::Index num) {
   if (array.ndim() != 3 || array.shape(0) != num || array.shape(1) != 3 || array.shape(2) != 3) {

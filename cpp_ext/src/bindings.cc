@@ -43,13 +43,15 @@ RobustLoss Loss(double loss_scale, bool is_bounded) {
   return {PositiveOrInfinite("loss_scale", loss_scale), is_bounded};
 }
 
-MeasuredRanges Measured(const Array& range_m, const Array& stddev_m, const Array& share) {
+MeasuredRanges Measured(const Array& range_m, const Array& stddev_m, const Array& share,
+                        const OptionalArray& loadings_m) {
   if (range_m.ndim() > 1 || range_m.size() == 0) {
     FailOnShape("range_m", range_m, "one number, or one dimension and one number or more");
   }
   const Eigen::Index num_ranges = range_m.size();
   return {ForEachRange("range_m", range_m, num_ranges, Positive),
-          ForEachRange("stddev_m", stddev_m, num_ranges, Positive), ForEachRange("share", share, num_ranges, Positive)};
+          ForEachRange("stddev_m", stddev_m, num_ranges, Positive), ForEachRange("share", share, num_ranges, Positive),
+          loadings_m ? RowForEachRange("loadings_m", *loadings_m, num_ranges) : Eigen::MatrixXd(num_ranges, 0)};
 }
 
 RangeModel Model(const OptionalArray& tag_in_cam_m, std::optional<double> short_range_length_m, double loss_scale,
@@ -69,13 +71,14 @@ constexpr auto kRangeCostDoc = R"(Make the cost of ranges measured at one keyfra
 
 The error of a range is
 
-``r = (d + bias + amplitude * exp(-d / short_range_length) - range) / stddev``,
+``r = (d + bias + amplitude * exp(-d / short_range_length) + loadings * shared - range) / stddev``,
 ``d = ||R^T (tag_in_cam - t) - anchor||``.
 
 The square of its residual is the robust loss of r times the range's share. Metres throughout. Parameter blocks:
 rig_from_world (7,) as [qx qy qz qw tx ty tz]; anchor in the world (3,); range bias (1,), positive if the radio reads
 too long. Then, in this order and as far as they are estimated: tag_in_cam (3,); amplitude (1,) of the short-range
-error, positive if short ranges are too long. Where the tag is at the anchor, the distance has no derivative, and that
+error, positive if short ranges are too long; k numbers that all ranges share, in blocks (6,) and a last one of what
+remains. Where the tag is at the anchor, the distance has no derivative, and that
 part of the Jacobian is zero.
 
 Args:
@@ -83,6 +86,7 @@ Args:
     stddev_m: standard deviation of the noise of all ranges, or (n,) of each, positive.
     tag_in_cam_m: (3,) lever arm, the tag's antenna in the rig frame; None makes it a parameter block.
     share: factor of the loss of all ranges, or (n,) of each, positive.
+    loadings_m: (n, k) change of each range by each of the numbers that all ranges share; None: there are none.
     short_range_length_m: distance over which the short-range error decays, positive; None: there is no such error.
     loss_scale: scale of the robust loss in standard deviations, positive; infinity means least squares.
     loss_is_bounded: whether the loss is Geman and McClure's, ``r^2 / (1 + r^2 / scale^2)``, which never exceeds
@@ -93,9 +97,10 @@ Raises:
 )";
 
 ceres::CostFunction* MakeRangeCost(const Array& range_m, const Array& stddev_m, const OptionalArray& tag_in_cam_m,
-                                   const Array& share, std::optional<double> short_range_length_m, double loss_scale,
+                                   const Array& share, const OptionalArray& loadings_m,
+                                   std::optional<double> short_range_length_m, double loss_scale,
                                    bool loss_is_bounded) {
-  return new RangeCost<KeyframePlace>(KeyframePlace(), Measured(range_m, stddev_m, share),
+  return new RangeCost<KeyframePlace>(KeyframePlace(), Measured(range_m, stddev_m, share, loadings_m),
                                       Model(tag_in_cam_m, short_range_length_m, loss_scale, loss_is_bounded));
 }
 
@@ -105,8 +110,8 @@ It is like ``range_cost``, with the tag at ``(1 - w) * p_before + w * p_after + 
 ``p = R^T (tag_in_cam - t)`` for each pose and ``w = weight + time_shift / interval``. The time shift, in seconds, is
 how much later the ranges were taken than assumed, and is to be added to the clock offset. Parameter blocks:
 rig_from_world before (7,) and after (7,), of two different frames; anchor in the world (3,); range bias (1,). Then, in
-this order and as far as they are estimated: tag_in_cam (3,); time shift (1,); amplitude (1,). The other arguments and
-the errors are those of ``range_cost``.
+this order and as far as they are estimated: tag_in_cam (3,); time shift (1,); amplitude (1,); shared numbers. The other
+arguments and the errors are those of ``range_cost``.
 
 Args:
     weight: interpolation weight of all ranges, or (n,) of each, from 0 (at the pose before) to 1 (at the pose after).
@@ -118,9 +123,10 @@ Args:
 ceres::CostFunction* MakeInterpolatedRangeCost(const Array& range_m, const Array& stddev_m,
                                                const OptionalArray& tag_in_cam_m, const Array& weight,
                                                const Array& offset_in_world_m, std::optional<double> interval_s,
-                                               const Array& share, std::optional<double> short_range_length_m,
-                                               double loss_scale, bool loss_is_bounded) {
-  MeasuredRanges measured = Measured(range_m, stddev_m, share);
+                                               const Array& share, const OptionalArray& loadings_m,
+                                               std::optional<double> short_range_length_m, double loss_scale,
+                                               bool loss_is_bounded) {
+  MeasuredRanges measured = Measured(range_m, stddev_m, share, loadings_m);
   RangeModel model = Model(tag_in_cam_m, short_range_length_m, loss_scale, loss_is_bounded);
   model.has_time_shift = interval_s.has_value();
   const Eigen::Index num_ranges = measured.range.size();
@@ -282,11 +288,13 @@ PYBIND11_MODULE(_cpp, m) {
   m.attr("pybind11_internals_version") = PYBIND11_INTERNALS_VERSION;
 
   m.def("range_cost", &rangesfm::MakeRangeCost, kOwn, rangesfm::kRangeCostDoc, py::kw_only(), arg("range_m"),
-        arg("stddev_m"), arg("tag_in_cam_m"), arg("share") = 1.0, arg("short_range_length_m") = py::none(),
+        arg("stddev_m"), arg("tag_in_cam_m"), arg("share") = 1.0, arg("loadings_m") = py::none(),
+        arg("short_range_length_m") = py::none(),
         arg("loss_scale") = kLeastSquares, arg("loss_is_bounded") = false);
   m.def("interpolated_range_cost", &rangesfm::MakeInterpolatedRangeCost, kOwn, rangesfm::kInterpolatedRangeCostDoc,
         py::kw_only(), arg("range_m"), arg("stddev_m"), arg("tag_in_cam_m"), arg("weight"), arg("offset_in_world_m"),
-        arg("interval_s") = py::none(), arg("share") = 1.0, arg("short_range_length_m") = py::none(),
+        arg("interval_s") = py::none(), arg("share") = 1.0, arg("loadings_m") = py::none(),
+        arg("short_range_length_m") = py::none(),
         arg("loss_scale") = kLeastSquares, arg("loss_is_bounded") = false);
   m.def("distance_cost", &rangesfm::MakeDistanceCost, kOwn, rangesfm::kDistanceCostDoc, py::kw_only(),
         arg("distance_m"), arg("stddev_m"), arg("a_in_cam_m") = py::none(), arg("b_in_cam_m") = py::none(),

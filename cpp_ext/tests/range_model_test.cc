@@ -169,6 +169,31 @@ TEST(RangeModel, AShareMultipliesTheLossOfItsRange) {
   EXPECT_DOUBLE_EQ(part * part, 0.25 * whole * whole);
 }
 
+TEST(RangeModel, SharedNumbersChangeEachRangeByItsLoadings) {
+  Random random(7);
+  constexpr int kNumRanges = 4;
+  MeasuredRanges measured = Measured(random, kNumRanges, 10.0);
+  const RangeModel model = FullModel(20.0, RobustLoss(3.0, false));
+  const InterpolatedPlace place = Between(random, kNumRanges, 0.7);
+  std::vector<Block> blocks = FullBlocks(random, 5.0);
+  MeasuredRanges shorter = measured;
+  measured.loadings = Eigen::MatrixXd(kNumRanges, 8);
+  const Eigen::VectorXd shared = Uniform(random, 8, -0.3, 0.3);
+  for (int k = 0; k < measured.loadings.cols(); ++k) {
+    measured.loadings.col(k) = Uniform(random, kNumRanges, -0.1, 0.1);
+  }
+  shorter.range -= measured.loadings * shared;
+  const Evaluation expected = Evaluate(RangeCost<InterpolatedPlace>(place, shorter, model), blocks);
+  blocks.emplace_back(shared.begin(), shared.begin() + 6);
+  blocks.emplace_back(shared.begin() + 6, shared.end());
+  const RangeCost<InterpolatedPlace> cost(place, measured, model);
+  const Evaluation found = Evaluate(cost, blocks);
+  for (int i = 0; i < kNumRanges; ++i) {
+    EXPECT_NEAR(found.residuals[i], expected.residuals[i], 1e-12);
+  }
+  ExpectGradientsAreRight(cost, blocks, 1e-7);
+}
+
 TEST(RangeModel, AFreeLeverArmIsTheConstantOneWithAGradient) {
   Random random(6);
   const Eigen::Vector3d tag_in_cam = random.Vector(0.3);

@@ -3,9 +3,11 @@
 #include <ceres/cost_function.h>
 
 #include <Eigen/Core>
+#include <algorithm>
 #include <cmath>
 #include <optional>
 #include <utility>
+#include <vector>
 
 #include "rangesfm/range_geometry.h"
 #include "rangesfm/robust_loss.h"
@@ -16,8 +18,9 @@ namespace rangesfm {
 // n measured ranges.
 struct MeasuredRanges {
   Eigen::VectorXd range;
-  Eigen::VectorXd stddev;  // unit of the robust loss
-  Eigen::VectorXd share;   // factor of the robust loss
+  Eigen::VectorXd stddev;      // unit of the robust loss
+  Eigen::VectorXd share;       // factor of the robust loss
+  Eigen::MatrixXd loadings{};  // n x k: change by each of k numbers that all ranges share
 };
 
 // Model of a range between two antennas, and which of its parameters are estimated.
@@ -39,6 +42,7 @@ class RangeCost final : public ceres::CostFunction {
         range_(std::move(measured.range)),
         inv_stddev_(measured.stddev.cwiseInverse()),
         root_share_(measured.share.cwiseSqrt()),
+        loadings_(std::move(measured.loadings)),
         model_(std::move(model)),
         inv_short_range_length_(model_.short_range_length ? 1.0 / *model_.short_range_length : 0.0) {
     set_num_residuals(static_cast<int>(range_.size()));
@@ -50,6 +54,9 @@ class RangeCost final : public ceres::CostFunction {
     lever_arm_ = AddBlock(!model_.tag_in_cam.has_value(), 3);
     time_shift_ = AddBlock(model_.has_time_shift, 1);
     amplitude_ = AddBlock(model_.short_range_length.has_value(), 1);
+    for (Eigen::Index first = 0; first < loadings_.cols(); first += kNumSharedInBlock) {
+      shared_.push_back(AddBlock(true, static_cast<int>(std::min(kNumSharedInBlock, loadings_.cols() - first))));
+    }
   }
 
   bool Evaluate(double const* const* parameters, double* residuals, double** jacobians) const override {
@@ -60,7 +67,7 @@ class RangeCost final : public ceres::CostFunction {
       const AnchorToTag anchor_to_tag(place.TagInWorld(i), parameters[anchor_]);
       const double distance = anchor_to_tag.Distance();
       const double fading = std::exp(-distance * inv_short_range_length_);
-      const double predicted = distance + bias + amplitude * fading;
+      const double predicted = distance + bias + amplitude * fading + SharedError(i, parameters);
       const RobustLoss::Robust robust = model_.loss((predicted - range_[i]) * inv_stddev_[i]);
       residuals[i] = root_share_[i] * robust.value;
       if (jacobians != nullptr) {
@@ -69,6 +76,7 @@ class RangeCost final : public ceres::CostFunction {
         WriteGeometry(i, place, of_distance * anchor_to_tag.Direction(), jacobians);
         WriteNumber(i, bias_, of_range, jacobians);
         WriteNumber(i, amplitude_, of_range * fading, jacobians);
+        WriteShared(i, of_range, jacobians);
       }
     }
     return true;
@@ -77,6 +85,7 @@ class RangeCost final : public ceres::CostFunction {
  private:
   static constexpr int kPoseSize = 7;
   static constexpr int kNone = -1;
+  static constexpr Eigen::Index kNumSharedInBlock = 6;  // as many columns as a pose has
 
   int AddBlock(bool is_there, int size) {
     if (!is_there) {
@@ -87,6 +96,21 @@ class RangeCost final : public ceres::CostFunction {
   }
 
   static double Number(double const* const* parameters, int block) { return block == kNone ? 0.0 : *parameters[block]; }
+
+  // Returns the loadings of one range by the numbers of one block.
+  auto SharedLoadings(int range, size_t block) const {
+    const Eigen::Index first = static_cast<Eigen::Index>(block) * kNumSharedInBlock;
+    return loadings_.row(range).segment(first, std::min(kNumSharedInBlock, loadings_.cols() - first));
+  }
+
+  double SharedError(int range, double const* const* parameters) const {
+    double sum = 0.0;
+    for (size_t block = 0; block < shared_.size(); ++block) {
+      const auto loadings = SharedLoadings(range, block);
+      sum += loadings.dot(Eigen::Map<const Eigen::RowVectorXd>(parameters[shared_[block]], loadings.size()));
+    }
+    return sum;
+  }
 
   TagMotion Motion(double const* const* parameters) const {
     return {model_.tag_in_cam ? *model_.tag_in_cam : Eigen::Vector3d(parameters[lever_arm_]),
@@ -125,10 +149,20 @@ class RangeCost final : public ceres::CostFunction {
     }
   }
 
+  void WriteShared(int range, double of_range, double** jacobians) const {
+    for (size_t block = 0; block < shared_.size(); ++block) {
+      if (double* const row = Row(range, shared_[block], jacobians)) {
+        const auto loadings = SharedLoadings(range, block);
+        Eigen::Map<Eigen::RowVectorXd>(row, loadings.size()) = of_range * loadings;
+      }
+    }
+  }
+
   const Place place_;
   const Eigen::VectorXd range_;
   const Eigen::VectorXd inv_stddev_;
   const Eigen::VectorXd root_share_;
+  const Eigen::MatrixXd loadings_;
   const RangeModel model_;
   const double inv_short_range_length_;
   int anchor_ = kNone;
@@ -136,6 +170,7 @@ class RangeCost final : public ceres::CostFunction {
   int lever_arm_ = kNone;
   int time_shift_ = kNone;
   int amplitude_ = kNone;
+  std::vector<int> shared_;
 };
 
 }  // namespace rangesfm

@@ -27,6 +27,7 @@ from rangesfm.ceres.adjuster_problem import (
     add_residual_block,
     keep_from_elimination,
     num_columns,
+    shared_blocks,
     solve_adjuster,
     tangent_jacobian,
 )
@@ -58,6 +59,7 @@ __all__ = [
     "num_columns",
     "position_cost",
     "range_cost",
+    "shared_blocks",
     "solve_adjuster",
     "tangent_jacobian",
 ]

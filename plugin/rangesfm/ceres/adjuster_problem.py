@@ -121,6 +121,11 @@ def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, 
         _used_by_adjuster[adjuster].append(manifold)
 
 
+def shared_blocks(numbers: Array) -> list[Array]:
+    """Return k numbers that all ranges share as blocks of as many as a pose has columns; the last may be smaller."""
+    return [numbers[first : first + _NUM_POSE_COLUMNS].copy() for first in range(0, len(numbers), _NUM_POSE_COLUMNS)]
+
+
 @dataclass(frozen=True)
 class PlacedRanges:
     """n ranges, each at one keyframe (``before == after``) or between two.
@@ -135,6 +140,7 @@ class PlacedRanges:
         tag_index: (n,) indices in ``RangeBlocks.tags_in_cam``.
         interval_s: (n,) time from ``before`` to ``after``; needed only for a time shift.
         share: (n,) weight besides the noise, positive; None: 1.
+        loadings_m: (n, k) change of each range by each number of ``RangeBlocks.shared``; None: there are none.
     """
 
     range_m: Array
@@ -147,6 +153,7 @@ class PlacedRanges:
     tag_index: Indices
     interval_s: Array | None = None
     share: Array | None = None
+    loadings_m: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -162,6 +169,8 @@ class RangeBlocks:
         time_shift: (1,) seconds by which the ranges were taken later than assumed; None: not estimated. It affects
             ranges between two keyframes, also those with a weight of 0 or 1.
         amplitude: (1,) excess of short ranges at distance 0; given exactly if ``short_range_length_m`` is.
+        shared: numbers that all ranges share, as many as ``PlacedRanges.loadings_m`` has columns, as
+            ``shared_blocks`` divides them.
     """
 
     poses: Sequence[Array]
@@ -171,6 +180,7 @@ class RangeBlocks:
     lever_arms_are_free: bool = False
     time_shift: Array | None = None
     amplitude: Array | None = None
+    shared: Sequence[Array] = ()
 
 
 def add_ranges(
@@ -227,6 +237,7 @@ def _cost(ranges: PlacedRanges, rows: Indices, blocks: RangeBlocks, model: Mappi
         "range_m": ranges.range_m[rows],
         "stddev_m": ranges.stddev_m[rows],
         "share": np.ones(len(rows)) if ranges.share is None else ranges.share[rows],
+        "loadings_m": None if ranges.loadings_m is None else ranges.loadings_m[rows],
         "tag_in_cam_m": None if blocks.lever_arms_are_free else blocks.tags_in_cam[ranges.tag_index[rows[0]]],
         **model,
     }
@@ -255,7 +266,7 @@ def _blocks_of_group(ranges: PlacedRanges, row: int, blocks: RangeBlocks) -> lis
         found.append(blocks.time_shift)
     if blocks.amplitude is not None:
         found.append(blocks.amplitude)
-    return found
+    return [*found, *blocks.shared]
 
 
 @dataclass(frozen=True)

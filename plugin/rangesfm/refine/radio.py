@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -83,12 +83,14 @@ class RadioEstimate:
         tags_in_cam_m: (num_tags, 3) antennas in the rig frame.
         time_shift_s: how much later than assumed the ranges were taken.
         short_range_error_m: amplitude of ``exp(-distance / SHORT_RANGE_LENGTH_M)``, by which short ranges are too long.
+        shared: (k,) size of each of ``RadioRanges.shared_errors_m``.
     """
 
     anchors: tuple[AnchorEstimate, ...]
     tags_in_cam_m: Array
     time_shift_s: float = 0.0
     short_range_error_m: float = 0.0
+    shared: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -98,11 +100,17 @@ class RadioRanges:
     Attributes:
         observations, trajectory: of the unscaled model.
         antennas: of all ranges, with the lever arms as given.
+        shared_errors_m: (n, k) errors that all ranges share, for k independent standard deviations.
     """
 
     observations: RangeObservations
     trajectory: Trajectory
     antennas: Antennas
+    shared_errors_m: Array
+
+    def shared_m(self, radio: RadioEstimate) -> Array:
+        """Return by how much each range (n,) is too long because of the shared errors."""
+        return np.asarray(self.shared_errors_m @ radio.shared)
 
     @property
     def rows(self) -> Indices:
@@ -168,7 +176,8 @@ def radio_as_given(
     """Return ranges and radio parameters as given; arguments as for ``refine_with_ranges``."""
     tags_in_cam_m = lever_arms(observations.log, tag_in_cam_m)
     placed = antennas(trajectory, observations, metric_from_sfm, tags_in_cam_m)
-    return RadioRanges(observations, trajectory, placed), RadioEstimate(tuple(anchors), tags_in_cam_m)
+    none_shared = np.zeros((len(observations.log), 0))
+    return RadioRanges(observations, trajectory, placed, none_shared), RadioEstimate(tuple(anchors), tags_in_cam_m)
 
 
 def radio_blocks(
@@ -183,6 +192,7 @@ def radio_blocks(
         lever_arms_are_free=options.lever_arm_stddev_m > 0,
         time_shift=np.array([radio.time_shift_s]) if options.time_offset_stddev_s else None,
         amplitude=np.array([radio.short_range_error_m]) if options.short_range_stddev_m else None,
+        shared=ceres.shared_blocks(radio.shared),
     )
 
 
@@ -203,7 +213,7 @@ class AddedRadio:
     def all_but_anchors(self) -> list[Array]:
         """Every parameter block that is not a point of the world."""
         wanted = [block for block in (self.blocks.time_shift, self.blocks.amplitude) if block is not None]
-        return [*self.blocks.biases, *self.blocks.tags_in_cam, *wanted, *self.others]
+        return [*self.blocks.biases, *self.blocks.tags_in_cam, *wanted, *self.blocks.shared, *self.others]
 
     def estimate(self, before: RadioEstimate) -> RadioEstimate:
         """Return the parameters with the solver's values."""
@@ -213,6 +223,7 @@ class AddedRadio:
             np.array(blocks.tags_in_cam).reshape(-1, 3),
             before.time_shift_s if blocks.time_shift is None else float(blocks.time_shift[0]),
             before.short_range_error_m if blocks.amplitude is None else float(blocks.amplitude[0]),
+            np.concatenate([np.zeros(0), *blocks.shared]),
         )
 
 
@@ -221,12 +232,11 @@ def add_range_residuals(
     ranges: RadioRanges,
     errors: RangeErrors,
     blocks: ceres.RangeBlocks,
-    range_share: float = 1.0,
 ) -> Indices:
     """Add ranges as residuals, scaled so that one standard deviation of a range weighs as much as one of a pixel.
 
     Args:
-        errors: of the ranges that take part. range_share: further factor on all their weights.
+        errors: of the ranges that take part.
 
     Returns:
         (k,) index of each range's residual among those of the problem.
@@ -242,7 +252,8 @@ def add_range_residuals(
         anchor_index=log.anchor_index[rows],
         tag_index=log.tag_index[rows],
         interval_s=ranges.interval_s[rows],
-        share=range_share * bundle.pixel_stddev**2 * errors.worth,
+        share=bundle.pixel_stddev**2 * errors.worth,
+        loadings_m=ranges.shared_errors_m[rows],
     )
     return ceres.add_ranges(
         bundle.adjuster,
@@ -275,6 +286,8 @@ def add_radio_priors(
         bundle.add_prior(block, given, options.lever_arm_stddev_m)
     bundle.add_prior(blocks.time_shift, np.zeros(1), options.time_offset_stddev_s)
     bundle.add_prior(blocks.amplitude, np.zeros(1), options.short_range_stddev_m)
+    for numbers in blocks.shared:
+        bundle.add_prior(numbers, np.zeros(len(numbers)), 1.0)
 
 
 def _add_bias_priors(

@@ -43,7 +43,6 @@ class RefinementProblem:
         first_pose_is_fixed: the gauge.
         gravity: the upward direction in the first camera; None if unknown, or if that camera's pose is fixed.
         left_out_ids: 3-D points that do not take part.
-        range_share: factor on the weights of all ranges.
     """
 
     metric: pycolmap.Reconstruction
@@ -57,7 +56,6 @@ class RefinementProblem:
     gravity: Gravity | None
     num_threads: int
     left_out_ids: frozenset[int] = frozenset()
-    range_share: float = 1.0
 
     @property
     def frame_ids(self) -> Indices:
@@ -90,7 +88,7 @@ class RefinementProblem:
     def add_to(self, bundle: BundleAdjustment, errors: RangeErrors, radio: RadioEstimate) -> AddedRadio:
         """Add all other measurements, starting from an estimate; ``errors`` are of the ranges that take part."""
         blocks = radio_blocks(radio, self.metric, self.ranges.trajectory, self.options)
-        rows = add_range_residuals(bundle, self.ranges, errors, blocks, self.range_share)
+        rows = add_range_residuals(bundle, self.ranges, errors, blocks)
         markers = {**self.distances.tape.markers, **self.positions.markers}
         of_marks = errors_beyond_features(bundle, markers, self.distances.marker_ids)
         others = add_distances(bundle, self.distances, radio.anchors, blocks.anchors, errors, of_marks)
@@ -124,15 +122,16 @@ class RefinementProblem:
             return None
         learned = errors.learned.without(*BENDS)  # bending is already in the errors of the photos' residuals
         scaled = self.residuals_m(added.estimate(self.radio))[self.ranges.rows] / errors.stddev_m
-        in_residuals = np.sqrt(self.range_share * errors.worth) * errors.loss.slopes(scaled) / errors.stddev_m
+        in_residuals = np.sqrt(errors.worth) * errors.loss.slopes(scaled) / errors.stddev_m
         covariance_m2, has_bin = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
         places = (has_bin, learned.of_range[has_bin])
         of_bins = csr_array((in_residuals[has_bin], places), shape=(len(scaled), len(covariance_m2)))
         return ResidualErrors(added.residual_rows, of_bins, covariance_m2 / bending_factor**2, bending_factor**-2)
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
-        """Return the (n,) residuals, predicted minus measured, metres; NaN for ranges without a place."""
-        return self.ranges.predicted_m(self.metric, radio) - self.ranges.observations.log.range_m
+        """Return the (n,) residuals, predicted minus measured, metres, shared errors included; NaN without a place."""
+        predicted_m = self.ranges.predicted_m(self.metric, radio) + self.ranges.shared_m(radio)
+        return predicted_m - self.ranges.observations.log.range_m
 
 
 def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:

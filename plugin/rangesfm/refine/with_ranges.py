@@ -119,6 +119,7 @@ class AtRest:
         trajectory_m: of its keyframes. scale: metres per unit of the unscaled model.
         tags_m, centers_m: (k, 3) positions of tag and camera at each range.
         anchors: with their biases. errors: as weighted.
+        shared_m: (k,) by how much the map takes the ranges to be too long because of shared errors.
         photos: bundle adjustment of the photos alone.
     """
 
@@ -128,6 +129,7 @@ class AtRest:
     centers_m: Array
     anchors: tuple[AnchorEstimate, ...]
     errors: RangeErrors
+    shared_m: Array
     photos: BundleAdjustment
 
 
@@ -176,7 +178,7 @@ def refine_with_ranges(
     options: RefineOptions | None = None,
     tape: Tape | None = None,
     positions: HeldPositions | None = None,
-    range_share: float = 1.0,
+    shared_errors_m: Array | None = None,
     learn: Learn | None = None,
     closing: LoopClosing | None = None,
     num_threads: int = -1,
@@ -199,7 +201,8 @@ def refine_with_ranges(
         gravity: the upward direction in the first camera; used if its pose is not fixed.
         tape: taped distances, of which the control ones are fitted; ranges between anchors in the log are fitted too.
         positions: known positions in the metric world, which are fitted; None without any.
-        range_share: factor on the weights of all ranges, beside what else is measured.
+        shared_errors_m: (n, k) errors that the log's ranges share, for k independent standard deviations, which all
+            other measurements may correct; None without any.
         learn: estimates the ranges' errors at the refined map, for its covariance; None: those in ``errors`` are used.
         closing: loops to be closed before; None without any.
 
@@ -217,6 +220,9 @@ def refine_with_ranges(
     metric = pycolmap.Reconstruction(reconstruction)
     tape, positions = (tape or Tape()).control(), positions or HeldPositions()
     ranges, radio = radio_as_given(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors)
+    if shared_errors_m is not None:
+        ranges = replace(ranges, shared_errors_m=shared_errors_m)
+        radio = replace(radio, shared=np.zeros(shared_errors_m.shape[1]))
     problem = RefinementProblem(
         metric,
         ranges,
@@ -228,7 +234,6 @@ def refine_with_ranges(
         first_pose_is_fixed,
         None if first_pose_is_fixed else gravity,
         num_threads,
-        range_share=range_share,
     )
     with at_most(num_threads):
         to_begin_with = _errors_to_begin_with(problem, errors, metric_from_sfm.scale)
@@ -351,7 +356,8 @@ def _at_rest(problem: RefinementProblem, radio: RadioEstimate, errors: RangeErro
     tags_m, centers_m = (places[ranges.rows] for places in ranges.places(path, radio))
     scale = align_points(ranges.trajectory.centers, path.centers).scale
     photos = problem.of_photos(problem.options.max_num_iterations)
-    return AtRest(path, scale, tags_m, centers_m, radio.anchors, errors, photos)
+    shared_m = ranges.shared_m(radio)[ranges.rows]
+    return AtRest(path, scale, tags_m, centers_m, radio.anchors, errors, shared_m, photos)
 
 
 def _tolerance_m(problem: RefinementProblem, errors: RangeErrors) -> float:

@@ -59,6 +59,7 @@ class MapWithRanges:
         anchors_m: Array,
         biases_m: Array,
         errors: RangeErrors,
+        shared_m: Array,
         bending: MapBending,
         *,
         placement: PlacementPrior | None = None,
@@ -71,6 +72,7 @@ class MapWithRanges:
             scale: of the other map, metres per unit of the unscaled model.
             tags_m, centers_m: (k, 3) positions of tag and camera at each of the k ranges.
             anchors_m: (m, 3). biases_m: (m,). errors: of the k ranges, as weighted.
+            shared_m: (k,) by how much the map takes them to be too long because of shared errors.
             placement: what known positions say of the other map's first camera; None without any.
             lengths: what measured lengths say of the other map's scale; None without any.
         """
@@ -91,7 +93,7 @@ class MapWithRanges:
         posed = replace(start.problem, ranges=problem, first_camera_from_sfm=from_map)
         state = RangeState(placed, anchors_m, biases_m)
         by_errors = weighted(problem, errors)
-        robust = errors.robust_weights(predicted_ranges(problem, state) - problem.range_m)
+        robust = errors.robust_weights(predicted_ranges(problem, state) + shared_m - problem.range_m)
         fit = fit_at(by_errors, state, robust)
         solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
         return cls(posed, solution, start.observations, trajectory, bending)
@@ -113,13 +115,14 @@ class MapWithRanges:
         mean_m = 0.0 if bending is None else float(np.sqrt(np.trace(bending.formal_m2) / len(learned.bins)))
         return learned.stddev_of_component["bending"] / mean_m if mean_m > 0 else 1.0
 
-    def known(self, learned: LearnedErrors, range_share: float = 1.0) -> KnownMap:
+    def known(self, learned: LearnedErrors, shared_errors_m: Array) -> KnownMap:
         """Return the uncertainty of the map as a whole: scale, placement and anchors.
 
         Args:
-            range_share: factor on the weights of all ranges with which the map was made.
+            shared_errors_m: of all ranges of the log, as in ``ScaleEstimate``, with which the map was made.
         """
-        return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.bins), range_share)
+        shared_m = shared_errors_m[self.posed.rows]
+        return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.bins), shared_m)
 
     def _bending_of(self, bins: RangeBins) -> BendingOfBins | None:
         state = self.solution.fit.state
@@ -137,7 +140,7 @@ def estimate_at(
     Raises:
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
-    known = on_map.known(learned, start.range_share)
+    known = on_map.known(learned, start.shared_errors_m)
     value = on_map.solution.fit.state.metric_from_model.scale
     judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, (), options)
     columns, placement = known.columns, None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
@@ -32,7 +32,7 @@ from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, 
 from rangesfm.scale.sensitivity import cutoff_test, scale_sensitivity
 from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import known_map, learned_errors, parameter_covariance
+from rangesfm.scale.uncertainty import known_map, learned_errors, parameter_covariance, shared_errors_m
 
 # Smallest factor on the weights of ranges beside other measurements, below which they would have no effect.
 _LEAST_SHARE = 1e-4
@@ -99,7 +99,9 @@ def initialize_scale(
     found = _with_ranges(given, lengths)
     if lengths is None:
         return found
-    checked = scale_by_lengths(distances, trajectory.centers, [*others, found.by_kind["ranges"]])
+    if found.by_kind:
+        others.append(found.by_kind["ranges"])
+    checked = scale_by_lengths(distances, trajectory.centers, others)
     assert checked is not None, "the lengths are the same"
     return (
         replace(found, lengths=checked)
@@ -159,9 +161,12 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         ),
         lambda: (scale_per_anchor(solution, observations.log.anchor_ids), cutoff_test(solution)),
     )
-    by_kind = _by_kinds(problem, solution, learned, lengths, by_positions)
-    range_share = _range_share(solution, by_kind["ranges"]) if by_kind else 1.0
-    solution = _with_share(solution, range_share)
+    by_kind, shared_m = dict[str, ScaleByKind](), np.zeros((len(problem.rows), 0))
+    if lengths is not None or by_positions is not None:
+        alone = _by_ranges_alone(solution)
+        by_kind = _by_kinds(problem, alone, learned, lengths, by_positions)
+        shared_m = shared_errors_m(alone, learned)
+        solution = _with_share(solution, _range_share(alone, by_kind["ranges"]))
     posed = problem if lengths is None else _bent(problem, lengths)
     known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
     uncertainty = known.uncertainty
@@ -202,7 +207,7 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         lengths=lengths,
         positions=by_positions,
         by_kind=by_kind,
-        range_share=range_share,
+        shared_errors_m=_of_all(shared_m, problem.rows, len(observations.log)),
     )
 
 
@@ -302,44 +307,50 @@ def _by_lengths(lengths: LengthScale) -> dict[str, ScaleByKind]:
 
 def _by_kinds(
     problem: ScaleProblem,
-    solution: Solution,
+    alone: Solution,
     learned: LearnedErrors,
     lengths: LengthScale | None,
     positions: PositionScale | None,
 ) -> dict[str, ScaleByKind]:
-    """Return the scale by each kind of measurement alone; empty where there are only ranges."""
+    """Return the scale by each kind of measurement; ``alone`` is that by the ranges. Empty if no others take part."""
     others = {
         **({} if lengths is None or not lengths.is_used else _by_lengths(lengths)),
         **({} if positions is None else {"positions": positions.alone}),
     }
-    return {"ranges": _by_ranges(problem, solution, learned), **others} if others else {}
+    return {"ranges": _by_ranges(problem, alone, learned), **others} if others else {}
 
 
-def _range_share(solution: Solution, ranges: ScaleByKind) -> float:
-    """Return ``ScaleEstimate.range_share``: the formal over the learnt variance of the scale by ranges alone."""
-    problem = _ranges_alone(solution.problem)
-    alone = solve(problem, solution.fit.state, loss=solution.errors.loss)
-    formal = alone.log_scale_stddev * solution.errors.inflation
+def _range_share(alone: Solution, ranges: ScaleByKind) -> float:
+    """Return the formal over the learnt variance of the scale by ranges alone, at most 1."""
+    formal = alone.fit.log_scale_stddev * alone.errors.inflation
     return float(np.clip((formal * ranges.value / ranges.stddev) ** 2, _LEAST_SHARE, 1.0))
 
 
 def _with_share(solution: Solution, range_share: float) -> Solution:
-    """Return the solution with all ranges weighted by a further factor."""
-    if range_share == 1:
-        return solution
+    """Return the solution of a rigid map with all ranges weighted by a further factor."""
     problem = solution.problem
     share = range_share * (np.ones(len(problem.range_m)) if problem.share is None else problem.share)
     problem = replace(problem, share=share)
     return replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
 
 
-def _by_ranges(posed: ScaleProblem, solution: Solution, learned: LearnedErrors) -> ScaleByKind:
-    """Estimate the scale again without lengths between points and known positions, starting from the solution."""
-    posed = replace(posed, ranges=_ranges_alone(posed.ranges))
+def _of_all(shared_m: Array, rows: Indices, num: int) -> Array:
+    """Return the (num, k) shared errors of all ranges of the log, of which ``rows`` took part; 0 for the others."""
+    of_all = np.zeros((num, shared_m.shape[1]))
+    of_all[rows] = shared_m
+    return of_all
+
+
+def _by_ranges_alone(solution: Solution) -> Solution:
+    """Return the solution without lengths between points and known positions, starting from that with them."""
     problem = _ranges_alone(solution.problem)
-    alone = replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
+    return replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
+
+
+def _by_ranges(posed: ScaleProblem, alone: Solution, learned: LearnedErrors) -> ScaleByKind:
+    known = known_map(replace(posed, ranges=_ranges_alone(posed.ranges)), alone, learned)
     value = alone.fit.state.metric_from_model.scale
-    return ScaleByKind(value, value * known_map(posed, alone, learned).uncertainty.empirical)
+    return ScaleByKind(value, value * known.uncertainty.empirical)
 
 
 def _ranges_alone(problem: RangeProblem) -> RangeProblem:

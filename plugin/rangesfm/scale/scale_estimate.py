@@ -119,8 +119,8 @@ class ScaleEstimate:
             first camera, from all error components; None in the first camera's frame.
         lengths: what the measured lengths alone say; None without lengths between points of the map.
         positions: what the known positions say; None if they do not determine the map's place.
-        range_share: factor on the weights of the ranges beside measured lengths and known positions, with which the
-            ranges say no more of the scale than their learnt errors allow; 1 where there are only ranges.
+        shared_errors_m: (n, k) errors that the log's ranges share, for k independent standard deviations: what measured
+            lengths and known positions may correct. k is 0 where there are only ranges.
         remarks: those of the reasons that a refinement does not change.
         refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
         by_kind: scale by "ranges", "lengths" and "positions", as far as available, where several of them were used.
@@ -147,7 +147,7 @@ class ScaleEstimate:
     lengths: LengthScale | None = None
     positions: PositionScale | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
-    range_share: float = 1.0
+    shared_errors_m: Array = field(default_factory=lambda: np.zeros((0, 0)))
     remarks: tuple[str, ...] = ()
     refined_value: float | None = None
 

@@ -10,7 +10,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, by_poses
-from rangesfm.ranging.errors.components import CLOCKS, GIVEN, PLACES, REWEIGHTING
+from rangesfm.ranging.errors.components import BENDS, CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ErrorParts, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisiness, range_bins
 from rangesfm.ranging.range_observations import RangeObservations
@@ -256,23 +256,25 @@ def known_refined_map(
     solution: Solution,
     learned: LearnedErrors,
     bending: BendingOfBins | None,
-    range_share: float = 1.0,
+    shared_m: Array,
 ) -> KnownMap:
     """Return the uncertainty of a refined map.
 
     Args:
         solution: at the refined map, weighted as in the refinement. bending: of the map, in its bins.
-        range_share: further factor on the weights of all ranges in the refinement.
+        shared_m: (n, k) errors of the ranges that the refinement took for shared ones, as ``shared_errors_m``.
     """
     errors, bins, given = solution.errors, learned.bins, posed.ranges
     linear = _of_bins(_linear(posed, solution), bins)
     robust, index = solution.fit.weights / errors.stddev_m**2, bins.anchor_index
     bent_m2 = np.zeros_like(learned.covariance_m2) if bending is None else bending.formal_m2
     of_biases = given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
-    weights = robust, range_share * errors.worth * robust
-    alone, weighed = (np.diag(1 / np.maximum(bins.total(each), 1e-12)) for each in weights)
+    alone, weighed = (np.diag(1 / np.maximum(bins.total(each), 1e-12)) for each in (robust, errors.worth * robust))
+    shared = bins.mean(shared_m)
     formal, _, _ = best_estimate(alone + bent_m2, linear.design, linear.prior_design)
-    _, of_bins, of_priors = best_estimate(weighed + bent_m2 + of_biases, linear.design, linear.prior_design)
+    _, of_bins, of_priors = best_estimate(
+        weighed + bent_m2 + of_biases + shared @ shared.T, linear.design, linear.prior_design
+    )
     variances = np.einsum("pi,ij,pj->p", of_bins, learned.covariance_m2, of_bins) + np.sum(of_priors**2, axis=1)
     at_optimum = linear if bending is None else replace(linear, off_m=linear.off_m - bending.shift_m)
     return at_optimum.known(learned, float(np.sqrt(formal[0, 0])), variances)
@@ -336,6 +338,25 @@ def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
     """Return the (p, p) covariance of all parameters of a fit, from the errors of ranges and of given values."""
     of_bins = parameter_influence(solution.fit, solution.problem, learned)
     return of_bins @ learned.covariance_m2 @ of_bins.T + _by_what_was_given(solution)
+
+
+def shared_errors_m(solution: Solution, learned: LearnedErrors) -> Array:
+    """Return the errors (n, k) that ranges share, for k independent standard deviations.
+
+    They are the principal axes of the learnt errors, in units of what a bin's ranges scatter by themselves; axes along
+    which the errors are smaller than that are noise to the bins anyway.
+
+    Args:
+        solution: by the ranges. learned: their errors; those of the map are left out, as photos see them.
+    """
+    covariance_m2 = learned.without("white", *BENDS).covariance_m2
+    errors, bins = solution.errors, learned.bins
+    worth = bins.total(errors.worth * solution.fit.weights / errors.stddev_m**2)
+    scatter_m = 1 / np.sqrt(np.maximum(worth, 1e-12))
+    variances, axes = np.linalg.eigh(covariance_m2 / np.outer(scatter_m, scatter_m))
+    matters = variances > 1
+    of_bins = scatter_m[:, None] * axes[:, matters] * np.sqrt(variances[matters])
+    return np.where(learned.of_range[:, None] >= 0, of_bins[learned.of_range], 0.0)
 
 
 def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:

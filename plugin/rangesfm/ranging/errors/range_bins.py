@@ -50,11 +50,11 @@ class RangeBins:
 
     def mean(self, values: Array) -> Array:
         """Return the (c, ...) weighted means of (n, ...) values of the ranges."""
-        flat = values.reshape(len(values), -1)
-        weighted = (self.robust_weight * column for column in flat.T)
-        sums = np.stack([np.bincount(self.of_range, column, len(self)) for column in weighted], axis=1)
-        means: Array = sums / np.maximum(self.worth, 1e-12)[:, None]
-        return means.reshape(len(self), *values.shape[1:])
+        means = np.zeros((len(self), *values.shape[1:]))
+        for at in np.ndindex(values.shape[1:]):
+            column = (slice(None), *at)
+            means[column] = self.total(self.robust_weight * values[column]) / np.maximum(self.worth, 1e-12)
+        return means
 
     def shared_by_places(self, towards: Array, placing_m: Array, gap: Indices) -> Array:
         """Return the covariance (c, c), square metres, of the bins due to uncertain positions of the antenna.
