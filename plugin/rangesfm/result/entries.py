@@ -76,10 +76,10 @@ class TwoCandidateEntry(Record):
 
 
 class ScaleByKindEntry(Record):
-    """The scale by one kind of measurement alone, "ranges" or "lengths", in metres per unit of the unscaled model.
+    """The scale by one kind of measurement alone, such as "ranges", in metres per unit of the unscaled model.
 
     Attributes:
-        stddev: null where it is not determined.
+        value: middle of its interval. stddev: null where it is not determined.
     """
 
     value: Number

@@ -150,23 +150,20 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         solution = solution_from(problem, error.in_first_camera)
     table = _paper_table(solution)
     rotations = model_from_cam(observations, trajectory, problem)
+    velocities = camera_velocities(observations, trajectory, problem)
+
+    def learn(fitted: Solution) -> LearnedErrors:
+        return learned_errors(problem, fitted, observations, rotations, velocities, given.bending)
+
+    by_kind = _by_other_kinds(lengths, by_positions)
+    if by_kind:
+        alone = _by_ranges_alone(solution)
+        by_kind = {"ranges": _by_ranges(problem, alone, learn(solution)), **by_kind}
+        solution = _with_share(solution, _range_share(alone, by_kind["ranges"]))
     learned, (per_anchor, tests) = both(
-        lambda: learned_errors(
-            problem,
-            solution,
-            observations,
-            rotations,
-            camera_velocities(observations, trajectory, problem),
-            given.bending,
-        ),
+        lambda: learn(solution),
         lambda: (scale_per_anchor(solution, observations.log.anchor_ids), cutoff_test(solution)),
     )
-    by_kind, shared_m = dict[str, ScaleByKind](), np.zeros((len(problem.rows), 0))
-    if lengths is not None or by_positions is not None:
-        alone = _by_ranges_alone(solution)
-        by_kind = _by_kinds(problem, alone, learned, lengths, by_positions)
-        shared_m = shared_errors_m(alone, learned)
-        solution = _with_share(solution, _range_share(alone, by_kind["ranges"]))
     posed = problem if lengths is None else _bent(problem, lengths)
     known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
     uncertainty = known.uncertainty
@@ -207,7 +204,11 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         lengths=lengths,
         positions=by_positions,
         by_kind=by_kind,
-        shared_errors_m=_of_all(shared_m, problem.rows, len(observations.log)),
+        shared_errors_m=_of_all(
+            shared_errors_m(solution, learned) if by_kind else np.zeros((len(problem.rows), 0)),
+            problem.rows,
+            len(observations.log),
+        ),
     )
 
 
@@ -305,19 +306,12 @@ def _by_lengths(lengths: LengthScale) -> dict[str, ScaleByKind]:
     return {"lengths": ScaleByKind(lengths.value, lengths.value * lengths.relative_stddev)}
 
 
-def _by_kinds(
-    problem: ScaleProblem,
-    alone: Solution,
-    learned: LearnedErrors,
-    lengths: LengthScale | None,
-    positions: PositionScale | None,
-) -> dict[str, ScaleByKind]:
-    """Return the scale by each kind of measurement; ``alone`` is that by the ranges. Empty if no others take part."""
-    others = {
+def _by_other_kinds(lengths: LengthScale | None, positions: PositionScale | None) -> dict[str, ScaleByKind]:
+    """Return the scale by each kind of measurement besides ranges, if it takes part."""
+    return {
         **({} if lengths is None or not lengths.is_used else _by_lengths(lengths)),
         **({} if positions is None else {"positions": positions.alone}),
     }
-    return {"ranges": _by_ranges(problem, alone, learned), **others} if others else {}
 
 
 def _range_share(alone: Solution, ranges: ScaleByKind) -> float:
@@ -349,8 +343,7 @@ def _by_ranges_alone(solution: Solution) -> Solution:
 
 def _by_ranges(posed: ScaleProblem, alone: Solution, learned: LearnedErrors) -> ScaleByKind:
     known = known_map(replace(posed, ranges=_ranges_alone(posed.ranges)), alone, learned)
-    value = alone.fit.state.metric_from_model.scale
-    return ScaleByKind(value, value * known.uncertainty.empirical)
+    return known.uncertainty.about(alone.fit.state.metric_from_model.scale)
 
 
 def _ranges_alone(problem: RangeProblem) -> RangeProblem:

@@ -1,4 +1,4 @@
-"""ScaleByKind: the scale from one kind of measurement alone."""
+"""ScaleByKind: the scale by one kind of measurement alone."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ScaleByKind:
-    """The scale from ranges, measured lengths or known positions alone, in metres per SfM unit.
+    """The scale by ranges, measured lengths or known positions alone, in metres per SfM unit.
 
     Attributes:
-        stddev: with all error components; inf where the scale is not determined.
+        value: middle of its interval. stddev: with all error components; inf where the scale is not determined.
     """
 
     value: float

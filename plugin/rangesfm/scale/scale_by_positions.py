@@ -26,7 +26,6 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.learned import ROUNDING, ComponentLikelihood, ErrorParts
-from rangesfm.ranging.errors.noise import MAX_INFLATION, STRETCH_S, stretch_labels
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.placement_prior import PlacementPrior
@@ -160,8 +159,8 @@ class PositionScale:
         best_step: (7,) from the estimate to that with the best weights for the errors.
         equations: of the positions. bending_m2: (3 g, 3 g) covariance of their coordinates that the photos' residuals
             let expect; 0 without photos.
-        stddev_m: (k,) standard deviation of a coordinate of each known position. inflation: root of the variance of a
-            mean of the antenna's positions over some seconds, divided by that for independent errors.
+        stddev_m: (k,) standard deviation of a coordinate of each known position.
+        inflation: standard deviation of the scale by the antenna's positions, divided by that for independent errors.
     """
 
     site_from_model: Similarity
@@ -184,8 +183,8 @@ class PositionScale:
 
     @property
     def alone(self) -> ScaleByKind:
-        """The scale with its standard deviation."""
-        return ScaleByKind(self.value, self.value * self.uncertainty.empirical)
+        """The scale, with its standard deviation."""
+        return self.uncertainty.about(self.value)
 
     @property
     def bending_factor(self) -> float:
@@ -440,7 +439,7 @@ class _Problem:
             equations=fit.equations,
             bending_m2=fit.bending.formal_m2,
             stddev_m=self._own_stddev_m(fit),
-            inflation=self._inflation(fit),
+            inflation=self._inflation(fit, errors, of_groups[0]),
         )
 
     def _own_stddev_m(self, fit: _Fit) -> Array:
@@ -449,24 +448,13 @@ class _Problem:
         base = np.where(np.isfinite(given), given, fit.stddev_m)
         return base * np.where(self.known.is_mark, fit.sizes.get("points", 1.0), fit.sizes.get("positions", 1.0))
 
-    def _inflation(self, fit: _Fit) -> float:
-        """Return the inflation over some seconds; what lasts longer moves the map as a whole, and does not bend it."""
-        errors, grouping, known = fit.equations.errors, fit.equations.grouping, self.known
-        rows = np.flatnonzero(~known.is_mark & np.isfinite(known.time_s))
-        shares, times_s = _times_of_groups(grouping, known, np.ones(len(known)), rows)
-        timed = np.flatnonzero(shares > 0)
-        if not len(timed):
-            return 1.0
-        labels = stretch_labels(times_s[timed, _NUM_TIMES // 2], STRETCH_S)
-        at = 3 * timed  # one coordinate shows it for all
-        together = (labels[:, None] == labels).astype(np.float64)
-        sums = {
-            name: float(np.sum(together * m[np.ix_(at, at)]))
-            for name, m in zip(errors.names, errors.covariances_m2, strict=True)
-            if name.startswith("positions")
-        }
-        ratio = sum(sums.values()) / max(sums["positions"], 1e-30)
-        return float(np.clip(np.sqrt(ratio), 1.0, MAX_INFLATION))
+    def _inflation(self, fit: _Fit, errors: ErrorParts, of_groups: Array) -> float:
+        """Return the inflation for the scale, given its (3 g,) change by the coordinates that take part."""
+        is_antenna = abs(fit.equations.grouping) @ np.repeat(~self.known.is_mark, 3) > 0
+        by = np.where(is_antenna[fit.equations.is_used], of_groups, 0.0)
+        of_parts = {name: size for name, size in errors.stddev_of_bins(by).items() if name.startswith("positions")}
+        alone = of_parts.get("positions", 0.0)
+        return float(np.linalg.norm([*of_parts.values()])) / alone if alone > 0 else 1.0
 
 
 # Steps of the similarity (relative, radians, metres) below this are rounding.

@@ -49,6 +49,11 @@ class ScaleUncertainty:
             self, components={**self.components, name: float(np.hypot(self.components.get(name, 0), stddev))}
         )
 
+    def about(self, value: float) -> ScaleByKind:
+        """Return the middle of the interval about an estimate, with its standard deviation."""
+        middle = value * float(np.exp(self.lean))
+        return ScaleByKind(middle, middle * self.empirical)
+
     @property
     def interval_95(self) -> tuple[float, float]:
         """Bounds, with 95 % probability, of the logarithm of the true scale divided by the estimate."""
