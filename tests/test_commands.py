@@ -566,6 +566,10 @@ class TestResultFolder:
             for image_id, image in moved.images.items()
         ]
         assert max(apart) < 0.1
+        for again in ("applied/0", "sparse_metric/0"):
+            done = rangesfm_command("export", out, "--apply_to", again, "--output_path", "twice", cwd=out, status=2)
+            assert f"{again}: is in metres already" in done.stderr
+        assert not (out / "twice").exists()
 
     def test_gets_its_report_anew(self, out: Path, rangesfm_command: Command) -> None:
         before = (out / "report.html").read_bytes()

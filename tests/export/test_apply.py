@@ -15,7 +15,8 @@ from tests.export.models import synthesized
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
-from rangesfm.export import MetricMap, apply_to, best_similarity, export_map
+from rangesfm.export import MetricMap, apply_to, best_similarity, export_map, refuse_metric
+from rangesfm.export.ply import write_points
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.options import ExportOptions
 
@@ -62,7 +63,7 @@ def test_a_binary_mesh_moves_and_keeps_its_faces_and_colours(
     path = tmp_path / "mesh.ply"
     path.write_bytes(header(encoding, kind) + vertices_as(code).tobytes() + FACES)
     head, _, body = carry(path, tmp_path / "out").read_bytes().partition(b"end_header\n")
-    assert head + b"end_header\n" == header(encoding, kind)
+    assert head + b"end_header\n" == header(encoding, kind).replace(b" 1.0\n", b" 1.0\ncomment metres\n")
     read = np.frombuffer(body[: -len(FACES)], dtype=vertices_as(code).dtype)
     assert body.endswith(FACES)
     tolerance = 1e-5 if code.endswith("4") else 1e-12
@@ -102,8 +103,8 @@ def test_an_obj_moves_and_keeps_the_rest(tmp_path: Path) -> None:
     path = tmp_path / "mesh.obj"
     path.write_text("# made elsewhere\nmtllib a.mtl\nv 1 2 3 0.5 0.5 0.5\nvn 0 0 1\nf 1//1 1//1 1//1\n")
     lines = carry(path, tmp_path / "out").read_text().splitlines()
-    assert [lines[0], lines[1], lines[4]] == ["# made elsewhere", "mtllib a.mtl", "f 1//1 1//1 1//1"]
-    v, vn = (np.array(lines[i].split()[1:], dtype=np.float64) for i in (2, 3))
+    assert [*lines[:3], lines[5]] == ["# metres", "# made elsewhere", "mtllib a.mtl", "f 1//1 1//1 1//1"]
+    v, vn = (np.array(lines[i].split()[1:], dtype=np.float64) for i in (3, 4))
     np.testing.assert_allclose(v, [*METRIC_FROM_SFM.apply(np.array([1.0, 2.0, 3.0])), 0.5, 0.5, 0.5], rtol=1e-9)
     np.testing.assert_allclose(vn, METRIC_FROM_SFM.rotation[:, 2], rtol=1e-9)
 
@@ -207,3 +208,43 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="would overwrite"):
         apply_to([path], METRIC_FROM_SFM, tmp_path)
     assert path.read_text() == "v 1 2 3\n"
+
+
+def without_comment(path: Path) -> Path:
+    """Remove the comment that a PLY file is in metres, as a program does that reads it and writes it again."""
+    path.write_bytes(path.read_bytes().replace(b"comment metres\n", b""))
+    return path
+
+
+def written_from(model: pycolmap.Reconstruction, folder: Path) -> list[Path]:
+    """Write a model as each kind of file; the points without a word of their unit, and a part of them alone."""
+    folder.mkdir()
+    centers = [image.projection_center().tolist() for image in model.images.values()]
+    cameras = [{"position": center, "rotation": np.eye(3).tolist()} for center in centers]
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    rows = [point.xyz for point in model.points3D.values() if point.xyz[0] > np.mean(centers, axis=0)[0]]
+    (folder / "part.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in rows))
+    points = without_comment(write_points(model, folder / "points.ply"))
+    (nerfstudio,) = export_map(MetricMap(model), folder, ExportOptions(formats=("nerfstudio",)))
+    (folder / "model").mkdir()
+    model.write(folder / "model")
+    return [folder / "cameras.json", folder / "part.obj", points, nerfstudio, folder / "model"]
+
+
+@pytest.mark.parametrize("scale", [0.02, 0.7, 1.0, 2.5, 40.0])
+def test_a_file_that_lies_on_the_metric_map_is_not_scaled_again(
+    scale: float, sfm: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    metric = rescale(sfm, Similarity(scale, METRIC_FROM_SFM.rotation, METRIC_FROM_SFM.translation))
+    refuse_metric(written_from(sfm, tmp_path / "unscaled"), sfm, [metric])
+    for path in written_from(metric, tmp_path / "metric"):
+        with pytest.raises(InputError, match=r"in metres already: its .* lie on the metric map"):
+            refuse_metric([path], sfm, [metric])
+
+
+def test_what_was_written_in_metres_says_so(sfm: pycolmap.Reconstruction, tmp_path: Path) -> None:
+    points = without_comment(write_points(sfm, tmp_path / "points.ply"))
+    (tmp_path / "mesh.obj").write_text("v 1 2 3\n")
+    for path in (points, tmp_path / "mesh.obj"):
+        with pytest.raises(InputError, match="says that it is in metres already"):
+            refuse_metric([carry(path, tmp_path / "out")], sfm, [])

@@ -9,7 +9,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, RangesfmError, failure_of
-from rangesfm.export.apply import apply_to, best_similarity
+from rangesfm.export.apply import apply_to, best_similarity, refuse_metric
 from rangesfm.export.colmap import (
     write_camera_positions,
     write_model,
@@ -38,6 +38,7 @@ __all__ = [
     "check_formats",
     "export_map",
     "export_model",
+    "refuse_metric",
     "write_camera_positions",
     "write_model",
     "write_points",

@@ -32,6 +32,7 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _MAX_HEADER_BYTES = 1 << 16
 # In metres. Further from the origin than this, single precision is coarser than a millimetre.
 _MAX_SINGLE = 8192.0
+_IN_METRES = "comment metres"
 
 
 def write_points(reconstruction: pycolmap.Reconstruction, path: Path) -> Path:
@@ -64,7 +65,7 @@ def _write_vertices(
     columns |= zip(("red", "green", "blue"), np.broadcast_to(np.asarray(colors, dtype=np.uint8), xyz.shape).T)
     kind = [(name, values.dtype) for name, values in columns.items()]
     vertices = np.rec.fromarrays(columns.values(), dtype=kind)
-    header = ["ply", "format binary_little_endian 1.0", "comment metres"]
+    header = ["ply", "format binary_little_endian 1.0", _IN_METRES]
     header += [f"comment {comment}"] if comment else []
     header += [f"element vertex {len(xyz)}"]
     header += [f"property {PLY_TYPES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
@@ -95,18 +96,13 @@ class _Header:
 def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
     """Write a copy of a PLY file with transformed vertices (x, y, z) and turned normals (nx, ny, nz).
 
-    All else is copied unchanged.
+    All else is copied unchanged, but for a comment that the file is in metres.
 
     Raises:
         InputError: it is not a PLY file that begins with vertices, or it has Gaussian splats, whose colours depend on
             direction and would have to be turned, too.
     """
-    with open_regular(path) as file:
-        content = file.read()
-    header = _read_header(path, content)
-    if "rot_0" in header.columns:
-        raise InputError("Gaussian splats cannot be transformed: train them again on the metric model", path)
-    vertices, rest = _split(path, content, header)
+    header, vertices, rest = _read(path)
     try:
         with overflow_raised():
             written = _moved(vertices, new_from_old)
@@ -114,12 +110,36 @@ def transform_ply(path: Path, new_from_old: Similarity, target: Path) -> Path:
         raise InputError(
             "some coordinates of vertices are infinite or too large, expected finite numbers", path
         ) from None
-    text = "\n".join(header.lines) + "\n"
+    format_line = 1 + next(n for n, line in enumerate(header.lines) if line.split()[:1] == ["format"])
+    comments = [] if _IN_METRES in header.lines else [_IN_METRES]
+    text = "\n".join([*header.lines[:format_line], *comments, *header.lines[format_line:]]) + "\n"
     if written.dtype != vertices.dtype:
         text = re.sub(r"^[ \t]*property[ \t].*[ \t]([xyz])[ \t]*$", r"property double \1", text, flags=re.MULTILINE)
     with new_file(target) as temporary:
         temporary.write_bytes(text.encode("latin-1") + _body(written, header) + rest)
     return target
+
+
+def read_ply(path: Path) -> Array:
+    """Return the vertices (n, 3) of a PLY file; they may be NaN. Raises as ``transform_ply``."""
+    vertices = _read(path)[1]
+    return np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
+
+
+def says_metres(path: Path) -> bool:
+    """Return whether a comment of a PLY file says that it is in metres, as in all that this package writes."""
+    with open_regular(path) as file:
+        return _IN_METRES in _read_header(path, file.read(_MAX_HEADER_BYTES)).lines
+
+
+def _read(path: Path) -> tuple[_Header, Vertices, bytes]:
+    """Return the header, the vertices, and the bytes of all elements after them."""
+    with open_regular(path) as file:
+        content = file.read()
+    header = _read_header(path, content)
+    if "rot_0" in header.columns:
+        raise InputError("Gaussian splats cannot be transformed: train them again on the metric model", path)
+    return header, *_split(path, content, header)
 
 
 def _moved(vertices: Vertices, new_from_old: Similarity) -> Vertices:

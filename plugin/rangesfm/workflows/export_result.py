@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
-from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats, export_map
+from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats, export_map, refuse_metric
 from rangesfm.export.metric_map import in_frame
 from rangesfm.files.atomic import sole_writer
 from rangesfm.options import ExportOptions
@@ -64,8 +66,9 @@ def apply_result(
         the best similarity. It is not zero, because the refinement has bent the map, which a similarity cannot do.
 
     Raises:
-        InputError: a file cannot be transformed, or the result lacks its models.
+        InputError: a file cannot be transformed, or is in metres already; or the result lacks its models.
     """
+    options, paths = options or ExportOptions(), list(paths)
     result = read_result_folder(output_path)
     map_ = _read_map(result, None)
     residual_m = 0.0
@@ -73,11 +76,20 @@ def apply_result(
     if result.read_model("sparse_metric") is not None and sfm is not None:
         similarity, residual_m = best_similarity(sfm, map_.reconstruction)
         map_ = replace(map_, metric_from_sfm=similarity)
-    similarity_in_frame = in_frame(map_, options or ExportOptions()).metric_from_sfm
-    if similarity_in_frame is None:
+    wanted = in_frame(map_, options)
+    if map_.metric_from_sfm is None or wanted.metric_from_sfm is None:
         raise InputError("the result has no similarity from the unscaled model to the metric one", output_path)
+    metric = [each.reconstruction for each in (map_, wanted, *_in_other_frames(map_, options))]
+    refuse_metric(paths, sfm or rescale(map_.reconstruction, map_.metric_from_sfm.inverse()), metric)
     with sole_writer(destination):
-        return apply_to(list(paths), similarity_in_frame, destination), residual_m
+        return apply_to(paths, wanted.metric_from_sfm, destination), residual_m
+
+
+def _in_other_frames(map_: MetricMap, options: ExportOptions) -> Iterator[MetricMap]:
+    """Yield the map in those frames in which it may have been exported, as far as they are determined."""
+    for frame in ("level", "enu"):
+        with suppress(InputError):
+            yield in_frame(map_, options.changed(frame=frame))
 
 
 def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
