@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from tests.conftest import TAG_IN_CAM_M, WalkedSurvey
 from tests.known import assert_scale, known
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
@@ -103,7 +104,7 @@ def test_control_points_place_the_map_in_the_site_and_check_points_test_it(yard:
     off = np.array([row.residual_m for row in points.points if row.kind == "check"])
     assert known(points.check.rmse_m) == pytest.approx(np.sqrt(np.mean(off**2, axis=0)))
     assert known(points.check.rmse_3d_m) < 0.05
-    assert [test.name for test in summary.tests] == ["control point"] * 5
+    assert sorted(test.name for test in summary.tests) == ["check point"] * 3 + ["control point"] * 5
     assert not any(test.rejected for test in summary.tests)
     assert any(line.startswith("check points: 3, RMSE ") for line in result.lines)
     page = (survey.output.path / "report.html").read_text()
@@ -124,6 +125,52 @@ def test_a_control_point_half_a_metre_off_is_named_and_left_out(yard: Yard, tmp_
         *("control", "control", "left out", "control", "control", "control", "check")
     ]
     assert not any(test.rejected for test in summary.tests[1:])
+    assert known(summary.place).verdict == "doubtful"
+    assert known(summary.place).reasons == summary.scale.reasons
+
+
+def test_a_check_point_that_is_not_where_the_map_has_it_makes_the_verdicts_doubtful(yard: Yard, tmp_path: Path) -> None:
+    survey = yard.survey(tmp_path, yard.rows(["control"] * 5 + ["check"] * 2, M6=0.2), report__enabled=False)
+    summary = scale_model(survey, progress=QUIET).summary
+    assert_scale(summary, yard.made.metric_from_sfm.scale, 0.01)
+    assert [(test.name, test.subject) for test in summary.tests if test.rejected] == [("check point", "M6")]
+    assert (summary.scale.verdict, known(summary.place).verdict) == ("doubtful", "doubtful")
+    assert "the check point M6 is 0.2" in known(summary.place).reasons[0]
+
+
+def test_beside_ranges_a_check_point_is_compared_with_the_map_that_they_hold(
+    walked_survey: WalkedSurvey, tmp_path: Path
+) -> None:
+    folder, model = walked_survey.folder, pycolmap.Reconstruction(walked_survey.folder / "sparse" / "0")
+    chosen = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= 5][:100:20]
+    marks, points = "marker,image_name,x_px,y_px\n", "marker,x_m,y_m,z_m,stddev_m,kind\n"
+    for k, point_id in enumerate(chosen):
+        x_m, y_m, z_m = walked_survey.site_from_sfm.apply(model.point3D(point_id).xyz)
+        points += f"M{k},{x_m},{y_m},{z_m + (k == 2)},0.01,check\n"
+        for element in model.point3D(point_id).track.elements:
+            image = model.image(element.image_id)
+            x_px, y_px = image.points2D[element.point2D_idx].xy
+            marks += f"M{k},{image.name},{x_px},{y_px}\n"
+    (tmp_path / "marks.csv").write_text(marks)
+    (tmp_path / "points.csv").write_text(points)
+    survey = Survey().changed(
+        {
+            "images.model": folder / "sparse" / "0",
+            "images.times": folder / "images.csv",
+            "ranges.path": folder / "uwb.csv",
+            "anchors.path": folder / "anchors.csv",
+            "tag.tag_in_cam_m": tuple(TAG_IN_CAM_M),
+            "points.path": tmp_path / "points.csv",
+            "scale.markers": tmp_path / "marks.csv",
+            "output.path": tmp_path / "out",
+            "report.enabled": False,
+        }
+    )
+    summary = scale_model(survey, progress=QUIET).summary
+    assert [(test.name, test.subject) for test in summary.tests if test.rejected] == [("check point in the map", "M2")]
+    assert known(summary.place).verdict == "doubtful"
+    assert "the map has the check point M2 1." in known(summary.place).reasons[0]
+    assert not any("not used" in reason for reason in summary.scale.reasons)
 
 
 @pytest.mark.parametrize("num", [1, 2])

@@ -22,9 +22,10 @@ from rangesfm.scale.scale_by_positions import (
 )
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
-_LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
+LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
 _COMPARE = "calibrate the radio (rangesfm ranges calibrate), and look at the units of both"
-_POINT, _ARM, _CLOCK, _DATUM = "control point", "antenna's lever arm", "antenna's clock", "datum shift"
+_POINT, _CHECK_POINT = "control point", "check point"
+_ARM, _CLOCK, _DATUM = "antenna's lever arm", "antenna's clock", "datum shift"
 # Words, remedy, largest possible size and unit of the mistakes of an antenna's positions. No camera carries its antenna
 # farther than 20 m; clocks that differ by more than seconds do not show as a shift of the positions alone.
 _OF_ANTENNA = {
@@ -62,16 +63,17 @@ def diagnose_positions(
     if positions is None:
         return Diagnosis((), ())
     rows = [*_of_points(positions, left_out), *_of_antenna(positions)]
+    if estimate.problem is None:  # beside ranges, check points are compared with the map that both hold
+        rows += _of_check_points(positions, left_out)
     reasons = [
         f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}; it is left out"
         for row in rows
         if row.rejected and row.subject in left_out
     ]
-    reasons += [
-        f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in _likeliest(rows)
-    ]
+    likely = [*_likeliest(rows), *(row for row in rows if row.rejected and row.name == _CHECK_POINT)]
+    reasons += [f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in likely]
     if doubted := [row.words for row in rows if row.rejected and row.name == _POINT and row.subject not in left_out]:
-        reasons.append(f"either {'; or '.join(doubted)}: {_LOOK_AGAIN}")
+        reasons.append(f"either {'; or '.join(doubted)}: {LOOK_AGAIN}")
     against = list(against_other(estimate, "positions", "ranges", _COMPARE))
     reasons += [f"{row.words}: {row.remedy}" for row in against if row.rejected]
     rows += against
@@ -80,14 +82,26 @@ def diagnose_positions(
 
 
 def _of_points(positions: PositionScale, left_out: Collection[str]) -> Iterator[MistakeTest]:
+    """Yield the test of each control point against all others."""
     known = positions.known
     for row in np.flatnonzero(known.is_mark).tolist():
-        if known.is_check[row] and known.names[row] not in left_out:
-            continue
-        found = positions.equations.of_mistake(at_point(known, row))
-        name, off_m = known.names[row], found.sizes
-        words = f"the control point {name} is {np.linalg.norm(off_m):.2f} m from its coordinates ({in_axes(-off_m)})"
-        yield row_of_mistake(_POINT, name, found, positions.threshold, words, _LOOK_AGAIN)
+        if not known.is_check[row] or known.names[row] in left_out:
+            yield _of_point(positions, _POINT, row, positions.threshold)
+
+
+def _of_check_points(positions: PositionScale, left_out: Collection[str]) -> Iterator[MistakeTest]:
+    """Yield the test of each check point against the control points, which it does not move."""
+    known = positions.known
+    rows = [row for row in np.flatnonzero(known.is_mark & known.is_check).tolist() if known.names[row] not in left_out]
+    threshold = float(special.chdtri(3, POINT_FALSE_ALARM_RATE / max(len(rows), 1)))
+    for row in rows:
+        yield replace(_of_point(positions, _CHECK_POINT, row, threshold), effect_on_scale=0.0)
+
+
+def _of_point(positions: PositionScale, kind: str, row: int, threshold: float) -> MistakeTest:
+    found, name = positions.equations.of_mistake(at_point(positions.known, row)), positions.known.names[row]
+    far = f"{np.linalg.norm(found.sizes):.2f} m from its coordinates ({in_axes(-found.sizes)})"
+    return row_of_mistake(kind, name, found, threshold, f"the {kind} {name} is {far}", LOOK_AGAIN)
 
 
 def _likeliest(rows: Sequence[MistakeTest]) -> Sequence[MistakeTest]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array
 
@@ -83,26 +84,30 @@ class MapErrors:
             (3, 3) covariance of second minus first in square metres, and (3,) its expected change where the logarithm
             of the scale changes by 1.
         """
-        slopes = _difference(first.by_part, second.by_part)
-        covariance = first.own_m2 + second.own_m2
-        by_mode, by_scale = np.zeros((3, self._num_modes)), np.zeros(3)
-        for (kind, id_), slope in slopes.items():
+        covariance, by_scale = self.joint([first, second], scale_stddev)
+        apart = np.hstack([-np.eye(3), np.eye(3)])
+        return apart @ covariance @ apart.T, apart @ by_scale
+
+    def joint(self, points: Sequence[MapPointErrors], scale_stddev: float) -> tuple[Array, Array]:
+        """Return how k points err together in the world; arguments and values as for ``relative``.
+
+        Returns:
+            (3 k, 3 k) covariance of their coordinates, and (3 k,) their expected change by the logarithm of the scale.
+        """
+        covariance: Array = block_diag(*(point.own_m2 for point in points))
+        by_mode, by_scale = np.zeros((len(covariance), self._num_modes)), np.zeros(len(covariance))
+        for part in dict.fromkeys(part for point in points for part in point.by_part):
+            (kind, id_) = part
             errors = self.parts[kind]
-            row, num = errors.row_of[id_], slope.shape[1]  # cameras of other models have more parameters
+            num = next(point.by_part[part].shape[1] for point in points if part in point.by_part)
+            row, nothing = errors.row_of[id_], np.zeros((3, num))  # cameras of other models have more parameters
+            slope = np.vstack([point.by_part.get(part, nothing) for point in points])
             by_mode += slope @ errors.modes[row, :num]
             by_scale += slope @ errors.by_scale[row, :num]
             covariance = covariance + slope @ errors.rests[row, :num, :num] @ slope.T
         covariance = covariance + by_mode @ by_mode.T
-        covariance += (scale_stddev**2 - self.scale_stddev**2) * np.outer(by_scale, by_scale)
-        return covariance, by_scale
+        return covariance + (scale_stddev**2 - self.scale_stddev**2) * np.outer(by_scale, by_scale), by_scale
 
     @property
     def _num_modes(self) -> int:
         return int(next(iter(self.parts.values())).modes.shape[2])
-
-
-def _difference(first: Mapping[Part, Array], second: Mapping[Part, Array]) -> dict[Part, Array]:
-    slopes = dict(second)
-    for part, slope in first.items():
-        slopes[part] = slopes[part] - slope if part in slopes else -slope
-    return slopes

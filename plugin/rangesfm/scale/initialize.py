@@ -75,7 +75,7 @@ def initialize_scale(
     bending = bending or WalkBending(in_first_camera(trajectory))
     by_positions, remarks = None, tuple[str, ...]()
     try:
-        if positions is not None:
+        if positions is not None and not (len(observations.log) and positions.is_check.all()):
             by_positions = scale_by_positions(positions, trajectory, bending, lasting_s=lasting_s)
     except GeometryError as error:
         if not len(observations.log) and scale_by_lengths(distances, trajectory.centers) is None:

@@ -8,14 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
+from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
-from rangesfm.diagnostics.finished_map import Doubt, doubts_of_map, doubts_of_pieces, place_of_map, why_broken
+from rangesfm.diagnostics.finished_map import (
+    Doubt,
+    doubts_of_map,
+    doubts_of_pieces,
+    place_of_map,
+    why_broken,
+)
 from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
+from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.diagnostics.position_tests import diagnose_positions
 from rangesfm.distances.locate_lengths import locate_distances, surveyed_distances
 from rangesfm.distances.tape import Tape
@@ -390,8 +398,10 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     """
     survey, journal = run.survey, run.journal
     metric, on_map = _estimated(survey, metric)
-    diagnosis = diagnose_lengths(metric.estimate, metric.tape)
-    diagnosis = _diagnose_positions(metric).with_more(diagnosis)
+    centers_m = metric.trajectory.as_in(metric.final).centers
+    bent_by_m = np.zeros(0) if on_map is None else bends_m(on_map)
+    of_positions = _diagnose_positions(metric, centers_m, bent_by_m)
+    diagnosis = of_positions.with_more(diagnose_lengths(metric.estimate, metric.tape))
     try:
         if (of_ranges := _diagnose(survey, on_map)) is not None:
             diagnosis = of_ranges.with_more(diagnosis)
@@ -413,18 +423,33 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     doubts += [Doubt(reason, advice) for reason in metric.positions.doubts_of_clock()]
     journal.warn(*(doubt.reason for doubt in doubts), *by_rivals)
     doubts += known_doubts
-    centers_m = metric.trajectory.as_in(metric.final).centers
-    bent_by_m = np.zeros(0) if on_map is None else bends_m(on_map)
-    place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, doubts, bent_by_m)
+    of_place = [*(Doubt(reason, "") for reason in of_positions.reasons), *doubts]
+    place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, of_place, bent_by_m)
     judged = replace(metric, place=place, diagnosis=diagnosis).doubted(by_rivals)
     judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
     return judged.doubted(diagnosis.reasons)
 
 
-def _diagnose_positions(metric: MetricResult) -> Diagnosis:
-    start = metric.estimate.positions
+def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array) -> Diagnosis:
+    """Return the tests of known positions against each other, and of points against a map that ranges hold, too.
+
+    Args:
+        centers_m: (n, 3) keyframe centres in the final map. bent_by_m: (n,) as for ``place_of_map``.
+    """
+    estimate, start = metric.estimate, metric.estimate.positions
     left_out = () if start is None else start.names_left_out
-    return diagnose_positions(metric.by_positions, left_out, metric.estimate)
+    diagnosis = diagnose_positions(metric.by_positions, left_out, estimate)
+    if estimate.problem is None or estimate.placement is None:
+        return diagnosis
+    return diagnosis.with_more(
+        diagnose_points(
+            metric.positions.points,
+            metric.final,
+            metric.map_errors,
+            estimate.uncertainty.empirical,
+            Placed(estimate.placement, centers_m[0], float(bent_by_m.max(initial=0.0))),
+        )
+    )
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
