@@ -80,7 +80,7 @@ def diagnose_points(
     of_map = placed.of(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)[0]
     own = np.repeat([of.stddev_m**2 for of in tested], 3)
     off_m = np.ravel([at.position_m - of.position_m for of, at in zip(tested, found, strict=True)])
-    root: Array = np.linalg.cholesky(np.diag(own) + of_map)
+    root = np.asarray(np.linalg.cholesky(np.diag(own) + of_map), dtype=np.float64)
     rows = _tested(_Residuals(off_m, root), tested)
     reasons = tuple(f"{row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in rows if row.rejected)
     return Diagnosis(tuple(rows), reasons)
