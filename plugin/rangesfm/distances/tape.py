@@ -11,9 +11,10 @@ import numpy as np
 from pydantic import AliasChoices, Field
 
 from rangesfm.arrays import Array
+from rangesfm.distances.measured_lists import LENGTHS, MARKS, MeasuredList
 from rangesfm.errors import InputError, number_text
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
-from rangesfm.files.text_tables import TextTable, header_names, read_table, repeated
+from rangesfm.files.text_tables import repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 
 CONTROL, CHECK = "control", "check"
@@ -21,10 +22,6 @@ CONTROL, CHECK = "control", "check"
 LEFT_OUT = "left out"
 # Standard deviation of a length measured with care by a steel tape.
 DEFAULT_STDDEV_M = 0.01
-DISTANCE_COLUMNS = ("from", "to", "distance_m")
-_FURTHER_COLUMNS = ("stddev_m", "kind")
-_PIXELS = ("x_px", "y_px")
-MARKER_COLUMNS = ("marker", "image_name", *_PIXELS)
 CLICKED_STDDEV_PX = 1.0
 """Standard deviation of a coordinate of a mark set by hand."""
 FOUND_STDDEV_PX = 0.3
@@ -82,12 +79,14 @@ class Tape:
         distances: the lengths in the order of the file.
         markers: the markers by name.
         distances_path, markers_path: the files they were read from, for messages.
+        notes: lines for the user about how the lengths were read.
     """
 
     distances: tuple[TapedDistance, ...] = ()
     markers: Mapping[str, Marker] = field(default_factory=dict)
     distances_path: Path | None = None
     markers_path: Path | None = None
+    notes: tuple[str, ...] = ()
 
     def control(self) -> Tape:
         """Return the tape with its control lengths only."""
@@ -109,41 +108,38 @@ class Tape:
 
 
 def read_tape(distances_path: str | Path, markers_path: str | Path | None = None) -> Tape:
-    """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``.
+    """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``, or other tables of these.
 
     A length without a kind is a control length. Without a standard deviation it gets DEFAULT_STDDEV_M.
 
     Raises:
         InputError: a file is not valid; the error gives the line.
     """
-    distances = _distances(read_table(distances_path, DISTANCE_COLUMNS, _FURTHER_COLUMNS))
+    listed = LENGTHS.read(Path(distances_path))
     markers = {} if markers_path is None else read_markers(markers_path)
-    return Tape(distances, markers, Path(distances_path), None if markers_path is None else Path(markers_path))
+    of_markers = None if markers_path is None else Path(markers_path)
+    return Tape(_distances(listed), markers, Path(distances_path), of_markers, listed.notes)
 
 
-def is_tape_file(text: str) -> bool:
-    """Return whether the header row in a file's beginning has the columns of taped distances, and no others."""
-    return {*DISTANCE_COLUMNS} <= {*header_names(text)} <= {*DISTANCE_COLUMNS, *_FURTHER_COLUMNS}
-
-
-def _distances(table: TextTable) -> tuple[TapedDistance, ...]:
+def _distances(listed: MeasuredList) -> tuple[TapedDistance, ...]:
+    table = listed.table
     if not len(table):
         raise InputError("holds no distance, expected one per line", table.path)
-    starts, ends = table.text("from"), table.text("to")
-    kinds = table.text("kind", empty=CONTROL) if "kind" in table else [CONTROL] * len(table)
+    starts, ends = listed.text("from"), listed.text("to")
+    kinds = [kind.lower() for kind in listed.text("kind", CONTROL)]
     for row, (start, end, kind) in enumerate(zip(starts, ends, kinds, strict=True)):
         if start == end:
-            raise table.error(row, "to", "another end than 'from'")
+            raise table.error(row, listed.columns["to"], "another end than 'from'")
         if kind not in (CONTROL, CHECK):
-            raise table.error(row, "kind", f"{CONTROL} or {CHECK}")
-    lengths = table.numbers("distance_m", bounds=LENGTH_M)
-    stddevs = table.numbers("stddev_m", empty=DEFAULT_STDDEV_M, bounds=STDDEV_M)
+            raise table.error(row, listed.columns["kind"], f"{CONTROL} or {CHECK}")
+    lengths = listed.metres("distance", LENGTH_M)
+    stddevs = listed.metres("stddev", STDDEV_M, DEFAULT_STDDEV_M)
     rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
 
 
 def read_markers(path: str | Path, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
-    """Read ``marker,image_name,x_px,y_px``.
+    """Read ``marker,image_name,x_px,y_px``, or another table of marks in photos.
 
     Args:
         path: the file.
@@ -152,9 +148,9 @@ def read_markers(path: str | Path, stddev_px: float = CLICKED_STDDEV_PX) -> dict
     Raises:
         InputError: the file is not valid; the error gives the line.
     """
-    table = read_table(path, MARKER_COLUMNS)
-    names, image_names = table.text("marker"), table.text("image_name")
-    pixels = np.column_stack([table.numbers(column, bounds=PIXEL) for column in _PIXELS])
+    listed = MARKS.read(Path(path))
+    names, image_names = listed.text("marker"), listed.text("image_name")
+    pixels = np.column_stack([listed.table.numbers(listed.columns[axis], bounds=PIXEL) for axis in ("x", "y")])
     rows_of: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         rows_of.setdefault(name, []).append(row)
@@ -162,8 +158,8 @@ def read_markers(path: str | Path, stddev_px: float = CLICKED_STDDEV_PX) -> dict
     for name, rows in rows_of.items():
         seen_in = tuple(image_names[row] for row in rows)
         if again := repeated(seen_in):
-            raise table.error(rows[again[0]], "image_name", "each photo once for this marker")
-        markers[name] = Marker(seen_in, pixels[rows], tuple(table.line[rows].tolist()), stddev_px)
+            raise listed.table.error(rows[again[0]], listed.columns["image_name"], "each photo once for this marker")
+        markers[name] = Marker(seen_in, pixels[rows], tuple(listed.table.line[rows].tolist()), stddev_px)
     return markers
 
 

@@ -340,6 +340,12 @@ def has_columns(text: str, required: Collection[str], aliases: Mapping[str, str]
     return {*required} <= {(aliases or {}).get(name, name) for name in header_names(text)}
 
 
+def is_plain_table(text: str, required: Collection[str], aliases: Mapping[str, str] | None = None) -> bool:
+    """Return whether a file's beginning has the required columns and no decimal commas, as ``read_table`` reads it."""
+    header_row = next(filter(_has_content, text.split("\n")), "")
+    return has_columns(text, required, aliases) and ("," in header_row or "," not in text)
+
+
 def guess_separator(row: str) -> str:
     """Return the most frequent of comma, semicolon and tab in a row, or a blank if it has none of them."""
     separator = max(",;\t", key=row.count)

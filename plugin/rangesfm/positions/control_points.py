@@ -14,18 +14,27 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.distances.locate_lengths import images_by_name
 from rangesfm.distances.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker, read_markers
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import TextTable, has_columns, read_head, read_table, read_text, repeated
+from rangesfm.files.text_tables import (
+    TextTable,
+    has_columns,
+    is_plain_table,
+    read_head,
+    read_table,
+    read_text,
+    repeated,
+)
 from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
 from rangesfm.ranging.anchors.anchor_file import find_anchor_columns
 from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
 from rangesfm.ranging.readers.lists import UnclearListError, check_columns, read_list
 from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
+from rangesfm.ranging.readers.vocabulary import KIND
 
 POINT_COLUMNS = ("marker", "x_m", "y_m", "z_m")
-QUANTITIES = ("marker", "x", "y", "z", "stddev", "kind")
+_CANONICAL = {"marker": "marker", "x": "x_m", "y": "y_m", "z": "z_m", "stddev": "stddev_m", "kind": "kind"}
+QUANTITIES = tuple(_CANONICAL)
 _AXES = ("x", "y", "z")
 _KINDS = (CONTROL, CHECK)
-_KIND_WORDS = frozenset({"kind", "role", "type", "use"})
 _EXPECTED = f"expected a table with {','.join(POINT_COLUMNS)}"
 # First line of ODM's gcp_list.txt: the coordinate system, by number, by PROJ's parameters, or as a zone of UTM.
 _CRS = re.compile(r"\s*(?:(EPSG:\d+)|(\+(?:proj|init)=.+)|WGS ?84\s+UTM\s+(\d{1,2})\s*([NS])\w*)\s*", re.IGNORECASE)
@@ -129,14 +138,13 @@ def is_point_file(head: str) -> bool:
 
 
 def _table(path: Path, options: PointOptions, head: str) -> ControlPoints:
-    if not options.columns and options.unit is None and has_columns(head, POINT_COLUMNS):
+    if not options.columns and options.unit is None and is_plain_table(head, POINT_COLUMNS):
         table = read_table(path, POINT_COLUMNS, ["stddev_m", "kind"], separator=None)
-        names = {quantity: f"{quantity}_m" if quantity in (*_AXES, "stddev") else quantity for quantity in QUANTITIES}
-        return _points(table, names, dict.fromkeys(QUANTITIES, "m"), ("",), options, [])
+        return _points(table, _CANONICAL, dict.fromkeys(QUANTITIES, "m"), ("",), options, [])
     layout = find_layout(path)
     if layout is None:
         raise InputError(f"no table, {_EXPECTED}", path)
-    columns = _columns_by_user(options.columns, layout, path) if options.columns else _found_columns(path, layout)
+    columns = _columns_by_user(options.columns, layout, path) if options.columns else _found_columns(path, layout, head)
     table, notes = read_list(layout, columns)
     by_name = {column.name: column.unit for column in layout.columns}
     own = {quantity: named_length_unit(f"{name} {by_name[name]}") for quantity, name in columns.items()}
@@ -144,8 +152,10 @@ def _table(path: Path, options: PointOptions, head: str) -> ControlPoints:
     return _points(table, columns, units, MISSING, options, notes)
 
 
-def _found_columns(path: Path, layout: Layout) -> dict[str, str]:
-    """Return the name of the column of each quantity, recognized as in a table of anchors."""
+def _found_columns(path: Path, layout: Layout, head: str) -> dict[str, str]:
+    """Return the name of the column of each quantity: as in the canonical CSV, else recognized as in one of anchors."""
+    if has_columns(head, POINT_COLUMNS):
+        return {quantity: name for quantity, name in _CANONICAL.items() if name in layout.units}
     try:
         found = find_anchor_columns(path, layout)
     except UnclearListError as error:
@@ -157,7 +167,7 @@ def _found_columns(path: Path, layout: Layout) -> dict[str, str]:
     kinds = [
         column.name
         for column in layout.columns
-        if {*column.words} & _KIND_WORDS and {cell.strip().lower() for cell in column.cells} <= {*_KINDS, ""}
+        if {*column.words} & KIND and {cell.strip().lower() for cell in column.cells} <= {*_KINDS, ""}
     ]
     return columns | ({"kind": kinds[0]} if len(kinds) == 1 else {})
 

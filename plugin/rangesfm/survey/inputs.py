@@ -125,7 +125,12 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_reference(survey.report.reference)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
-    assumed = (*log.notes, *(() if listed is None else listed.notes), *positions.notes)
+    assumed = (
+        *log.notes,
+        *(() if listed is None else listed.notes),
+        *positions.notes,
+        *(() if tape is None else tape.notes),
+    )
     log = log.in_time_order()
     return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions)
 

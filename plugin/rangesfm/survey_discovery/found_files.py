@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from rangesfm.distances.tape import DISTANCE_COLUMNS, MARKER_COLUMNS, is_tape_file
+from rangesfm.distances.measured_lists import LENGTHS, MARKS
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, is_bag_folder
 from rangesfm.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
@@ -59,8 +59,7 @@ _TABLE_EXTENSIONS = (
 )
 # Tables that are recognised by their header row, after it is known that the file is not a log.
 _TABLES: dict[str, Callable[[str], bool]] = {
-    "scale.markers": partial(has_columns, required=MARKER_COLUMNS),
-    "scale.distances": partial(has_columns, required=DISTANCE_COLUMNS),
+    "scale.distances": partial(has_columns, required=LENGTHS.required.values()),
     POINTS: is_point_file,
     "ranges.error_curve": is_error_curve_file,
     REFERENCE: is_reference_file,
@@ -181,8 +180,10 @@ def _key_of(path: Path) -> str | None:
     head = read_head(path)
     if not head.strip() or "\0" in head:
         return None
-    if is_tape_file(head):  # between photos it could be read as a log that names photos
+    if LENGTHS.is_such(path):  # between photos it could be read as a log that names photos
         return "scale.distances"
+    if MARKS.is_such(path):
+        return "scale.markers"
     if is_of_satellites(head):
         return POSITIONS
     unsure = None

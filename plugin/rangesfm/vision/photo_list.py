@@ -12,7 +12,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
-from rangesfm.files.text_tables import TextTable, has_columns, read_head, read_table
+from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.columns import read_timestamps
@@ -92,9 +92,7 @@ def read_photo_list(
 
 def is_canonical_photo_list(head: str) -> bool:
     """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
-    names = [*_CANONICAL.values()]
-    has_commas = "," in next((line for line in head.split("\n") if has_columns(line, names)), "")
-    return has_columns(head, names) and (has_commas or "," not in head)
+    return is_plain_table(head, [*_CANONICAL.values()])
 
 
 def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:

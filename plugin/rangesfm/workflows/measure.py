@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.distances.map_points import MapPoints
+from rangesfm.distances.measured_lists import PAIRS
 from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
 from rangesfm.errors import InputError, number_text
-from rangesfm.files.text_tables import align_rows, read_table, write_table
+from rangesfm.files.text_tables import align_rows, write_table
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.measurements import Interval, MeasuredMap, Measurement, up_in_map
 from rangesfm.result.places import input_beside
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import TagCorners
 
-PAIR_COLUMNS = ("from", "to")
 _MEASURES = ("distance", "height_difference")
-_COLUMNS = (*PAIR_COLUMNS, *(f"{name}{end}_m" for name in _MEASURES for end in ("", "_low", "_high")))
+_COLUMNS = (*PAIRS.required, *(f"{name}{end}_m" for name in _MEASURES for end in ("", "_low", "_high")))
 _SCALE_ALONE = (
     "the intervals come from the uncertainty of the scale alone, because the result has no joint covariance of its map "
     "(rangesfm run and rangesfm refine make one, with [refine] covariance); bends of the map are not in them"
@@ -91,18 +91,19 @@ def measure(
 
 
 def read_point_pairs(path: Path) -> list[tuple[str, str]]:
-    """Read the pairs of a CSV ``from,to``; a file of taped distances has these columns, too.
+    """Read the pairs of a CSV ``from,to``, or of another table of two ends, as a file of taped distances is.
 
     Raises:
         InputError: the file is not valid; the error gives the line.
     """
-    table = read_table(path, PAIR_COLUMNS, text=list(PAIR_COLUMNS))
+    listed = PAIRS.read(path)
+    table = listed.table
     if not len(table):
         raise InputError("holds no pair of points, expected one per line", path)
-    pairs = list(zip(table.text("from"), table.text("to"), strict=True))
+    pairs = list(zip(listed.text("from"), listed.text("to"), strict=True))
     for row, (first, second) in enumerate(pairs):
         if first == second:
-            raise table.error(row, "to", "another point than 'from'")
+            raise table.error(row, listed.columns["to"], "another point than 'from'")
     return pairs
 
 

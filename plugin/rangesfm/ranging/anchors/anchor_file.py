@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
-from rangesfm.files.text_tables import TextTable, has_columns, read_head, read_table, repeated, write_user_table
+from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, read_table, repeated, write_user_table
 from rangesfm.option_model import Bounds
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -100,8 +100,7 @@ def read_anchor_list(
 
 def is_canonical_anchor_file(head: str) -> bool:
     """Return whether a file with this beginning has the columns of the canonical CSV, and no decimal commas."""
-    has_commas = "," in next((line for line in head.split("\n") if has_columns(line, _REQUIRED, _ALIASES)), "")
-    return has_columns(head, _REQUIRED, _ALIASES) and (has_commas or "," not in head)
+    return is_plain_table(head, _REQUIRED, _ALIASES)
 
 
 def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:

@@ -103,5 +103,15 @@ STDDEV = _words("stddev stdev std sigma sd uncertainty accuracy genauigkeit stan
 BIAS = _words("bias offset")
 PHOTO = _words("image images img photo photos foto fotos picture pictures pic bild bilder bildname frame imagen")
 FILE = _words("file filename filenames name names path datei dateiname fichier nom source sourcefile archivo")
+# Words in the names of columns of measured lengths, and of marks in photos.
+FROM = _words("from von de desde da start begin anfang début debut inicio")
+TO = _words("to nach bis à hasta end ende fin")
+FIRST_AND_SECOND = (_words("1 a first erster premier"), _words("2 b second zweiter deuxième"))
+LENGTH = RANGE | _words("length lengths länge laenge längen longueur strecke mass maß messung mesure d")
+KIND = _words("kind role type use art")
+REMARK = _words("remark remarks comment comments note notes bemerkung bemerkungen kommentar remarque commentaire")
+MARK = _words("marker markers mark marks marke marken gcp target targets zielmarke passpunkt passpunkte repère cible")
+PIXEL = _words("px pix pixel pixels image img bild coord coordinate koordinate pos position")
+PIXEL_AXES = {"x": _words("x u col column spalte colonne"), "y": _words("y v row zeile ligne")}
 # Words in the name of a file that is about anchors.
 ABOUT_ANCHORS = _words("anchor anchors anker beacon beacons ancla anclas ancre ancres balise balises")
