@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 
 from rangesfm.survey.survey_reader import parse_toml, read_survey
 
@@ -67,14 +68,12 @@ def test_own_problem_converges_on_a_model_that_fits_its_ranges(walked_survey: Wa
 
 
 def test_scale_existing_model_takes_it_to_metres(walked_survey: WalkedSurvey, tmp_path: Path) -> None:
-    # The example takes a log on the camera's clock.
-    lines = (walked_survey.folder / "uwb.csv").read_text().splitlines()
-    shifted = [f"{float(line.split(',')[0]) + 2.0},{line.split(',', 1)[1]}" for line in lines[1:]]
-    (tmp_path / "uwb.csv").write_text("\n".join([lines[0], *shifted]) + "\n")
-    arguments = ("sparse/0", "images.csv", str(tmp_path / "uwb.csv"), str(tmp_path / "metric" / "0"))
-    printed = run_process("scale_existing_model.py", *arguments, cwd=walked_survey.folder)
-    scale = float(printed.split()[0])
-    assert scale == pytest.approx(walked_survey.site_from_sfm.scale, rel=0.02)
+    files = ("sparse/0", "images.csv", "uwb.csv", str(tmp_path / "metric" / "0"))
+    arm = map(str, TAG_IN_CAM_M)
+    printed = run_process("scale_existing_model.py", *files, "--tag_in_cam", *arm, cwd=walked_survey.folder)
+    offset, scale, _ = printed.splitlines()
+    assert float(offset.split()[2]) == pytest.approx(TIME_OFFSET_S, abs=0.05)
+    assert float(scale.split()[0]) == pytest.approx(walked_survey.site_from_sfm.scale, rel=0.02)
     images = sorted(pycolmap.Reconstruction(tmp_path / "metric" / "0").images.values(), key=lambda image: image.name)
     centers = np.array([image.projection_center() for image in images])
     length_m, true_m = (

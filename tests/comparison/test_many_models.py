@@ -17,6 +17,7 @@ from rangesfm.comparison.comparison_page import write_comparison
 from rangesfm.comparison.many_models import ModelsComparison, compare_many, read_named_models
 from rangesfm.distances.tape import read_tape
 from rangesfm.errors import InputError
+from rangesfm.geometry.reference import read_reference
 from rangesfm.progress import SilentProgress
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.ranges_for_models import ranges_of_survey
@@ -289,6 +290,19 @@ def test_the_command_prints_tables_and_writes_the_page(
     assert "2 models of 40 photos" in page
     for row in compared(*models[:2]).rows:
         assert f"<td>{row.scale_ratio:.6g}</td>" in page
+
+
+def test_the_page_has_the_table_against_the_reference_that_the_terminal_prints(
+    models: tuple[Path, Path, Path], walked_survey: WalkedSurvey, tmp_path: Path
+) -> None:
+    reference = read_reference(walked_survey.folder / "reference.csv")
+    comparison = compare_many(read_named_models(models[:2]), reference=reference)
+    page = write_comparison(comparison, tmp_path).read_text(encoding="utf-8")
+    assert "Each model against the reference" in page
+    assert "scale / truth" in str(comparison)
+    for row in comparison.truth:
+        assert "".join(f"<td>{cell}</td>" for cell in row[1:]) in page
+        assert row[-1] in str(comparison)
 
 
 def test_one_model_alone_has_no_page(

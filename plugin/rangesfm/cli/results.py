@@ -186,7 +186,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
-    from rangesfm.comparison.many_models import against_reference, compare_many, read_named_models
+    from rangesfm.comparison.many_models import compare_many, read_named_models
     from rangesfm.distances.tape import read_tape
     from rangesfm.geometry.reference import read_reference
     from rangesfm.workflows.ranges_for_models import ranges_of_survey
@@ -204,10 +204,9 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
         ranges = ranges_of_survey(survey, model, path)
     if survey.scale.distances is not None:
         tape = read_tape(survey.scale.distances, survey.scale.markers)
-    comparison = compare_many(models, ranges, tape)
+    reference = None if args.reference is None else read_reference(args.reference)
+    comparison = compare_many(models, ranges, tape, reference)
     lines = [str(comparison)]
-    if args.reference is not None:
-        lines += ["", against_reference(models, read_reference(args.reference))]
     if args.output_path is not None:
         from rangesfm.comparison.comparison_page import write_comparison
 

@@ -29,7 +29,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
     aligned = [carried_by(row.base_from_model, model.path) for model, row in zip(comparison.models, comparison.rows)]
     title = f"{len(comparison.models)} models of {len(base.path)} photos"
     frame = base.frame or "first_camera"
-    similarity, *lengths = comparison.tables
+    similarity, *lengths, truth = comparison.tables
     figures = [*_moved_figure(comparison), _path_figure(comparison, aligned, frame)]
     with sole_writer(folder):
         page = render_page(
@@ -39,6 +39,7 @@ def write_comparison(comparison: ModelsComparison, folder: Path) -> Path:
             view=view_of(_scene(comparison, aligned, frame)),
             sections=[
                 Section("models", "Models", tables=[similarity]),
+                Section("truth", "Reference", tables=[truth]),
                 Section("moved-section", "Differences of the cameras", figures),
                 Section("distances", "Distances", tables=lengths),
             ],

@@ -125,12 +125,14 @@ class ModelsComparison:
         rows: one for each model.
         distances: between a few pairs of photos that all models have.
         taped: taped distances; empty if none are given.
+        truth: rows of the table against a reference; empty without one.
     """
 
     models: tuple[NamedModel, ...]
     rows: tuple[ModelRow, ...]
     distances: tuple[Length, ...]
     taped: tuple[TapedRow, ...] = ()
+    truth: tuple[Sequence[str], ...] = ()
 
     @property
     def tables(self) -> tuple[ReportTable, ...]:
@@ -154,6 +156,7 @@ class ModelsComparison:
                 [_taped_cells(row) for row in self.taped],
                 _TAPED_NOTE,
             ),
+            ReportTable("Each model against the reference", _TRUTH_HEADER, self.truth, _TRUTH_NOTE),
         )
 
     def __str__(self) -> str:
@@ -206,7 +209,10 @@ def _result_around(path: Path) -> ResultFolder | None:
 
 
 def compare_many(
-    models: Sequence[NamedModel], ranges: ModelRanges | None = None, tape: Tape | None = None
+    models: Sequence[NamedModel],
+    ranges: ModelRanges | None = None,
+    tape: Tape | None = None,
+    reference: Reference | None = None,
 ) -> ModelsComparison:
     """Compare models with the first of them.
 
@@ -214,9 +220,11 @@ def compare_many(
         models: to compare.
         ranges: with which to compare the models; None: those of the first result folder among the models, if any.
         tape: taped distances to measure in each model; None for none.
+        reference: true positions; None for none.
 
     Raises:
-        InputError: a model has no photo in common with the first, or lacks an end of a taped distance.
+        InputError: a model has no photo in common with the first, or lacks an end of a taped distance; or the reference
+            has no keyframe of a model, or is by time and the times of its photos are not known.
     """
     if ranges is None:
         of_results = (ranges_of_result(one.result, one.path) for one in models if one.result is not None)
@@ -224,7 +232,8 @@ def compare_many(
     onto_ranges = [None if ranges is None else _onto(ranges.metric_path, model.path) for model in models]
     rows = tuple(_row(models[0], model, ranges, onto) for model, onto in zip(models, onto_ranges))
     taped = () if tape is None else tuple(_taped(models, ranges, onto_ranges, tape))
-    return ModelsComparison(tuple(models), rows, lengths_along([model.path for model in models]), taped)
+    truth = () if reference is None else tuple(_truth_cells(model, reference) for model in models)
+    return ModelsComparison(tuple(models), rows, lengths_along([model.path for model in models]), taped, truth)
 
 
 def _read_model(path: Path) -> NamedModel:
@@ -356,6 +365,11 @@ def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
     return rmse(np.concatenate(errors))
 
 
+_TRUTH_HEADER = ("model", "keyframes", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale / truth")
+_TRUTH_NOTE = (
+    "Root mean square distances of the cameras from the reference: as the model is, after the best rotation and shift, "
+    "and after the best similarity. Of a model that is not known to be in metres, only the last is compared."
+)
 _UNIT_NOTE = "Lengths of a model whose unit is not known to be the metre are in its own units."
 _NOTE = (
     "Scale / first: lengths in the model divided by those in the first model. Turn: rotation of the best similarity "
@@ -370,23 +384,13 @@ _TAPED_NOTE = (
 )
 
 
-def against_reference(models: Sequence[NamedModel], reference: Reference) -> str:
-    """Return the table of the models' differences from a reference, as plain text.
-
-    Of a model that is not known to be in metres, only the scale and what remains after Sim(3) are compared.
-
-    Raises:
-        InputError: the reference has no keyframe of a model, or is by time and the times of its photos are not known.
-    """
-    header = ("model", "keyframes", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale / truth")
-    rows: list[Sequence[str]] = []
-    for model in models:
-        (row,) = compare({model.name: model.path}, reference, frame=model.frame)
-        unaligned_m = (row.rmse_m, None if model.frame is None else row.rmse_se3_m)
-        ratio = None if row.scale_error_percent is None else 1.0 + row.scale_error_percent / 100.0
-        lengths = [text_or_dash(length_m, ".4f") for length_m in (*unaligned_m, row.rmse_sim3_m)]
-        rows.append((model.name, str(row.num_keyframes), *lengths, text_or_dash(ratio, ".6g")))
-    return align_rows([header, *rows])
+def _truth_cells(model: NamedModel, reference: Reference) -> Sequence[str]:
+    """Return the cells of a model's row against a reference, under ``_TRUTH_HEADER``."""
+    (row,) = compare({model.name: model.path}, reference, frame=model.frame)
+    unaligned_m = (row.rmse_m, None if model.frame is None else row.rmse_se3_m)
+    ratio = None if row.scale_error_percent is None else 1.0 + row.scale_error_percent / 100.0
+    lengths = [text_or_dash(length_m, ".4f") for length_m in (*unaligned_m, row.rmse_sim3_m)]
+    return (model.name, str(row.num_keyframes), *lengths, text_or_dash(ratio, ".6g"))
 
 
 def _cells(row: ModelRow, first: NamedModel) -> list[tuple[str, str]]:
