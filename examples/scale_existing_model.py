@@ -2,8 +2,8 @@
 
     python examples/scale_existing_model.py sparse/0 images.csv uwb.csv metric/0 --tag_in_cam 0.03 -0.12 -0.05
 
-The log is canonical CSV (timestamp_s,anchor_id,range_m), images.csv has image_name,timestamp_s. The lever arm is the
-vector from the lens to the radio's antenna: metres right, down and forward of the camera. The clocks of camera and radio
+The log is canonical CSV (timestamp_s,anchor_id,range_m), images.csv has image_name,timestamp_s. The lever arm is
+the vector from the lens to the antenna: metres right, down and forward of the camera. The clocks of camera and radio
 may differ: without --time_offset (image time = range time + offset, seconds), the difference is searched for.
 """
 
