@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import loop_path
 
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.planning.expected import Expected
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.range_observations import RangeObservations
+from rangesfm.refine.keyframe_graph import GraphBending
 
 Array = npt.NDArray[np.float64]
 Place = tuple[float, float, float]
@@ -31,23 +30,20 @@ def loop(duration_s: float = 60.0, num_keyframes: int = 120, height_amplitude_m:
     return Trajectory(np.arange(num_keyframes), names, times, path.centers(times), path.world_from_cam(times))
 
 
+def free_bend_m(expected: Expected) -> float:
+    """Root mean square bend of the keyframes by the photos alone, metres."""
+    path = expected.planned.trajectory
+    assert expected.vision is not None
+    centers = np.zeros((len(path), 3, len(path), 6))
+    centers[np.arange(len(path)), :, np.arange(len(path)), 3:] = np.eye(3)
+    bending = GraphBending(expected.vision, in_first_camera(path))
+    covariance = bending.of_functions(centers.reshape(3 * len(path), -1), frame_is_free=True).formal_m2
+    return float(np.sqrt(np.trace(covariance) / len(path)))
+
+
 def planned(
     anchors_m: Sequence[Place], frame: str, trajectory: Trajectory | None = None, **others: Any
 ) -> PlannedSurvey:
     """A plan with a radio that ranges five times a second."""
     anchors = tuple(Anchor(f"A{number}", np.array(place)) for number, place in enumerate(anchors_m))
     return PlannedSurvey(trajectory or loop(), anchors, frame, **{"rate_hz": 5.0, **others})
-
-
-def turned_out(expected: Expected, seed: int) -> RangeObservations:
-    """Simulate an outcome of a plan: its ranges with errors drawn from the expected ones."""
-    rng = np.random.default_rng(seed)
-    learned, log = expected.learned, expected.observations.log
-    white = learned.names.index("white")
-    together = learned.covariance_m2 - learned.covariances_m2[white]
-    together += 1e-10 * np.trace(together) * np.eye(len(together))
-    of_bins = np.linalg.cholesky(together) @ rng.standard_normal(len(together))
-    errors = of_bins[learned.of_range] + learned.stddevs[white] * rng.standard_normal(len(learned.of_range))
-    ranges = log.range_m.copy()
-    ranges[expected.posed.rows] += errors
-    return replace(expected.observations, log=replace(log, range_m=np.maximum(ranges, 0.05)))

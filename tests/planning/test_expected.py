@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned, turned_out
+from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned
 
 from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.errors import GeometryError
@@ -32,7 +32,7 @@ def test_the_expected_stddev_of_the_scale_is_what_runs_state(
     first = Similarity(1.0, path.world_from_cam[0], path.centers[0]).inverse()
     told = [replace(a, position_m=first.apply(at)) for a, at in zip(plan.anchors, plan.anchors_m, strict=True)]
     stated = [
-        initialize_scale(turned_out(expected, seed), path, told, anchor_frame=frame).uncertainty.empirical
+        initialize_scale(expected.turned_out(seed), path, told, anchor_frame=frame).uncertainty.empirical
         for seed in range(5)
     ]
     assert expected.uncertainty.empirical == pytest.approx(np.median(stated), rel=0.3)
@@ -44,7 +44,7 @@ def test_the_expected_place_is_as_certain_as_runs_state() -> None:
     stated = []
     for seed in range(3):
         estimate = initialize_scale(
-            turned_out(expected, seed), plan.trajectory, plan.anchors, anchor_frame="site", seed=seed
+            expected.turned_out(seed), plan.trajectory, plan.anchors, anchor_frame="site", seed=seed
         )
         assert estimate.placement is not None
         of_keyframes = by_similarity(estimate.placement, plan.trajectory.centers)[1]
@@ -59,7 +59,7 @@ def test_ranges_that_stand_for_several_say_what_all_would() -> None:
     every = replace(plan, max_num_ranges=100_000)
     assert every.num_alike == 1
     whole = expect(every)
-    assert len(whole.posed.rows) > 2 * len(thinned.posed.rows)
+    assert len(whole.learned.of_range) > 2 * len(thinned.learned.of_range)
     assert thinned.uncertainty.empirical == pytest.approx(whole.uncertainty.empirical, rel=0.05)
     assert thinned.worst_keyframe_m == pytest.approx(whole.worst_keyframe_m, rel=0.05)
 
@@ -94,7 +94,7 @@ def test_an_unknown_anchor_in_line_with_a_straight_path_leaves_the_scale_as_open
     straight = path_through([(0.0, 0.0, 1.6), (8.0, 0.0, 1.6)], speed_m_per_s=0.5, photo_rate_hz=2.0)
     in_line = planned([(14.0, 0.0, 1.6)], "unknown", straight, rate_hz=20.0)
     expected = expect(in_line)
-    stated = initialize_scale(turned_out(expected, 0), straight, in_line.anchors, anchor_frame="unknown")
+    stated = initialize_scale(expected.turned_out(0), straight, in_line.anchors, anchor_frame="unknown")
     assert expected.uncertainty.empirical == pytest.approx(stated.uncertainty.empirical, rel=0.3)
 
 
@@ -102,7 +102,7 @@ def test_what_is_known_of_the_radio_counts() -> None:
     usual = expect(planned(FIVE_ANCHORS_M, "site"))
     better = expect(planned(FIVE_ANCHORS_M, "site", component_stddevs={"tag_antenna": 0.0025}))
     assert better.uncertainty.components["tag_antenna"] < 0.2 * usual.uncertainty.components["tag_antenna"]
-    assert better.uncertainty.empirical < 0.9 * usual.uncertainty.empirical
+    assert better.uncertainty.empirical < 0.95 * usual.uncertainty.empirical
 
 
 def test_a_taped_length_makes_the_scale_no_better_than_itself_and_the_bending_of_the_map() -> None:

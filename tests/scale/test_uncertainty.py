@@ -18,7 +18,7 @@ from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
-from rangesfm.scale.uncertainty import expected_scale_uncertainty, known_map
+from rangesfm.scale.uncertainty import known_map, parameter_covariance
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -152,11 +152,11 @@ def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(
     learned = found.errors.learned
     for share in (1.0, 1e-6):
         told = replace(learned, covariances_m2=share * learned.covariances_m2)
-        summed = expected_scale_uncertainty(found.solution, told).components
+        by_robust = parameter_covariance(found.solution, told)[0, 0]
         uncertainty = known_map(found.problem, found.solution, told).uncertainty
         stated = uncertainty.components
         best = np.array([stated[name] for name in stated if name != "reweighting"])
-        chance = np.sqrt(np.sum(np.square(list(summed.values()))) - np.sum(best**2))
+        chance = np.sqrt(by_robust - np.sum(best**2))
         assert stated["reweighting"] == abs(uncertainty.lean) <= 0.5 * chance * (1 + 1e-9)
     # With a covariance a millionth as large, the lean of the best weights exceeds chance, and is limited to it.
     assert stated["reweighting"] == pytest.approx(0.5 * chance)

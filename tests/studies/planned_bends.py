@@ -3,9 +3,9 @@
 Run: python -m tests.studies.planned_bends --rows FILE [--num_seeds 40] [--surveys NAME]
 
 Simulated features of known noise are mapped, scaled and refined with ranges by the stages themselves. Prints for each
-survey the predicted stddev of keyframes (root mean square over the path) for a rigid map and for a map that can bend as
-its photos allow; the spread of the refined keyframes about the truth, with its stddev by chance; and the map's bend
-alone, predicted and as found in the maps before any range is used.
+survey the predicted stddev of keyframes (root mean square over the path) for a map whose photos are not planned, and for
+one that can bend as its photos allow; the spread of the refined keyframes about the truth, with its stddev by chance; and
+the map's bend alone, predicted and as found in the maps before any range is used.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from tests.planning.plans import free_bend_m
 from tests.studies.kept_runs import Row, spread, study
 from tests.studies.simulated_survey import (
     RANGE_MODEL,
@@ -111,17 +112,16 @@ def rms(stddevs: Expected) -> float:
 
 def main() -> None:
     asked = study(__doc__)
-    print(f"{'survey':30}{'rigid':>9}{'planned':>10}{'spread':>9}{'ratio':>16}{'bend':>10}{'spread':>9}{'ratio':>16}")
+    print(f"{'survey':30}{'poses':>9}{'planned':>10}{'spread':>9}{'ratio':>16}{'bend':>10}{'spread':>9}{'ratio':>16}")
     for name, (make, seen, pixel_stddev) in SURVEYS.items():
         if not name.startswith(asked.beginning):
             continue
         survey = make()
         plan = planned(survey, seen)
-        rigid, expected = expect(replace(plan, photos=None)), expect(plan)
+        poses, expected = expect(replace(plan, photos=None)), expect(plan)
         rows = asked.runs_of(name, partial(one_run, survey, pixel_stddev))
-        told = [f"{name:30}{rms(rigid):7.3f} m"]
-        free_m = 3**0.5 * expected.learned.stddev_of_component["bending"]
-        for predicted, of in ((rms(expected), "refined"), (free_m, "bend")):
+        told = [f"{name:30}{rms(poses):7.3f} m"]
+        for predicted, of in ((rms(expected), "refined"), (free_bend_m(expected), "bend")):
             found, chance = spread(rows, of)
             ratio = predicted / found
             told.append(f"{predicted:8.3f} m{found:7.3f} m{ratio:8.2f} +-{ratio * chance:4.2f}")

@@ -19,7 +19,7 @@ from rangesfm.scale.range_equation import state_after
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import judge
-from rangesfm.scale.uncertainty import KnownMap, LinearMap, best_estimate
+from rangesfm.scale.uncertainty import KnownMap, LinearMap, bias_covariance
 
 _MAX_NUM_ROUNDS = 8
 # Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
@@ -94,13 +94,10 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
 
 def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
     """Return the uncertainty of a path at the estimate with the best weights, compared with simple weights."""
-    errors, given, index = problem.errors, posed.ranges, problem.bins.anchor_index
-    simple = errors.without(*(set(errors.names) - {"white", *BENDS})).covariance_m2
-    simple += given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
-    _, of_bins, of_priors = best_estimate(simple, problem.design, problem.prior_design)
-    variances = np.einsum("pi,ij,pj->p", of_bins, errors.covariance_m2, of_bins) + np.sum(of_priors**2, axis=1)
-    off_m, prior_off = -problem.residual_m, -problem.prior_residual
+    errors, off_m, prior_off = problem.errors, -problem.residual_m, -problem.prior_residual
+    simple_m2 = errors.only("white", *BENDS).covariance_m2 + bias_covariance(problem.bins, posed.ranges)
     linear = LinearMap(off_m, problem.design, prior_off, problem.prior_design, problem.columns)
+    variances, of_bins, of_priors = linear.with_weights(simple_m2, errors.covariance_m2)
     return linear.known(errors, formal, variances, of_bins @ off_m + of_priors @ prior_off)
 
 

@@ -17,7 +17,7 @@ from rangesfm.planning.paths import way_along
 from rangesfm.planning.placement import spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.components import BENDS, COMPONENTS
+from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.scale.scale_verdict import CALIBRATE
 
 # Changes of an anchor's height that are tried, metres.
@@ -78,20 +78,14 @@ _Change = tuple[str, str, str, PlannedSurvey]
 def advise(expected: Expected) -> tuple[Advice, ...]:
     """Return all changes of a plan that gain something, in no particular order.
 
-    The bending of the map is assumed to be the same with each change.
+    What the photos see is assumed to be the same with each change.
     """
-    bending = {name: stddev for name, stddev in expected.learned.stddev_of_component.items() if name in BENDS}
-    before = _compared(expected.planned, bending)
+    before = expect_roughly(expected.planned, expected.vision)
     possible = (
         change for change in _changes(expected.planned) if not _leads_through_walls(expected.planned, change[3])
     )
-    afters = ((change, _compared(change[3], bending)) for change in possible)
-    found = (_advice(change, after, before, expected) for change, after in afters if before and after)
+    found = (_advice(change, expect_roughly(change[3], expected.vision), before, expected) for change in possible)
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
-
-
-def _compared(planned: PlannedSurvey, bending: dict[str, float]) -> Expected | None:
-    return expect_roughly(replace(planned, component_stddevs={**planned.component_stddevs, **bending}))
 
 
 def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
@@ -123,20 +117,14 @@ def _advice(change: _Change, after: Expected, before: Expected, stated: Expected
         stated: the full computation without the change.
     """
     scale_ratio = after.uncertainty.empirical / before.uncertainty.empirical
-    place_after_m, place_before_m = after.worst_keyframe_m, before.worst_keyframe_m
-    is_open = np.isinf(place_before_m) or np.isinf(place_after_m)
+    after_m, before_m, stated_m = after.worst_keyframe_m, before.worst_keyframe_m, stated.worst_keyframe_m
     # A position that is not determined is still known to be on the site.
     size_m = float(np.linalg.norm(np.ptp(stated.planned.places_m, axis=0)))
-    place_ratio = min(place_after_m, size_m) / min(place_before_m, size_m)
-    if not is_open:
-        # The quick computations are of a rigid map, so the ratio does not apply to the part from the map's bending.
-        worst_m, bend_m = stated.worst_keyframe_m, float(stated.bends_m[int(np.argmax(stated.keyframe_stddevs_m))])
-        place_after_m = float(np.hypot(place_ratio * np.sqrt(max(worst_m**2 - bend_m**2, 0.0)), bend_m))
-        place_ratio = place_after_m / worst_m
+    place_ratio = min(after_m, size_m) / min(before_m, size_m)
     return Advice(
         *change,
         scale_stddev=stated.uncertainty.empirical * scale_ratio,
-        place_stddev_m=place_after_m,
+        place_stddev_m=place_ratio * stated_m if np.isfinite([after_m, before_m]).all() else after_m,
         scale_gain=1 - scale_ratio,
         place_gain=0.0 if np.isnan(place_ratio) else 1 - place_ratio,
     )

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.errors import GeometryError
 from rangesfm.planning.expected import expect_roughly
 from rangesfm.planning.paths import places_on_way, way_along
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 
@@ -65,6 +67,7 @@ def spread_anchors(num: int, places: Array, stddev_m: float) -> tuple[Anchor, ..
     return tuple(Anchor(f"P{k}", place, stddev_m) for k, place in enumerate(spread_places(num, places), 1))
 
 
+@with_one_blas_thread
 def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> PlannedSurvey:
     """Return the survey with its anchors moved to improve scale and position; the result is a local optimum.
 
@@ -96,8 +99,9 @@ def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> P
 
 def _badness(planned: PlannedSurvey) -> float:
     """Return the sum of the logarithms of both standard deviations; that of the position is at most the site's size."""
-    expected = expect_roughly(planned)
-    if expected is None:
+    try:
+        expected = expect_roughly(planned)
+    except GeometryError:  # a run will find too few ranges
         return np.inf
     size_m = float(np.linalg.norm(np.ptp(planned.places_m, axis=0)))
     place_m = expected.worst_keyframe_m

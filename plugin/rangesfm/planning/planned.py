@@ -11,18 +11,49 @@ from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.options import RangeModelOptions
+from rangesfm.options import AssociationOptions, RangeModelOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
+from rangesfm.positions.antenna_track import AntennaTrack
+from rangesfm.positions.control_points import ControlPoint
+from rangesfm.positions.known_positions import LASTING_S, KnownPositions, joined_positions
+from rangesfm.positions.position_log import PositionLog
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
+from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeState
+from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
 
 # Offset of anchors with unknown positions, metres. In practice no anchor is exactly in line with a path or in its
 # plane. In a plan it may be, and the linearized problem would then miss what is not determined.
 _OFF_LINE_M = (0.07, 0.07, 0.1)
+
+
+@dataclass(frozen=True)
+class PlannedAntenna:
+    """Positions of an antenna on the camera that will be known.
+
+    Attributes:
+        rate_hz: positions per second. stddev_m: standard deviation of each coordinate.
+        antenna_in_cam_m: (3,) lever arm. lasting_s: time for which errors last; None: a mixture.
+    """
+
+    rate_hz: float
+    stddev_m: float
+    antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lasting_s: float | None = None
+
+    def located(self, path: Trajectory) -> KnownPositions:
+        """Return the positions without errors on a path."""
+        assert path.timestamps_s is not None, "a planned path has times"
+        times_s = np.arange(path.timestamps_s[0], path.timestamps_s[-1], 1 / self.rate_hz)
+        covariance_m2 = np.tile(self.stddev_m**2 * np.eye(3), (len(times_s), 1, 1))
+        nowhere, lines = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.int64)
+        log = PositionLog(nowhere, covariance_m2, times_s, None, lines)
+        found = AntennaTrack(log, np.array(self.antenna_in_cam_m), 0.0, AssociationOptions()).located(path)
+        return replace(found, position_m=found.predicted_m(IDENTITY))
 
 
 @dataclass(frozen=True)
@@ -41,7 +72,8 @@ class PlannedSurvey:
         taped: taped lengths between points of the map, as pairs of length and standard deviation.
         heights_m: lowest and highest height for anchors; None: not below the ground, which is 0 or the lowest point.
         path_is_level: whether the camera cannot go up and down, as on a rover.
-        photos: field of view and features of the camera; None: the map is assumed to be rigid.
+        photos: field of view and features of the camera; None: the map bends as maps of poses usually do.
+        points: control and check points in the site. antenna: positions of an antenna on the camera; None without any.
         allowed_m: (k, 3) allowed places for anchors; None: not given.
         walls_m: corners (k, 2) of each wall, as seen from above, through which no advice leads path or anchors.
         is_placed: whether the anchors' places are fixed; else they may be moved to any allowed place.
@@ -58,6 +90,8 @@ class PlannedSurvey:
     component_stddevs: Mapping[str, float] = field(default_factory=dict)
     taped: tuple[tuple[float, float], ...] = ()
     photos: PlannedPhotos | None = None
+    points: tuple[ControlPoint, ...] = ()
+    antenna: PlannedAntenna | None = None
     heights_m: tuple[float, float] | None = None
     path_is_level: bool = False
     allowed_m: Array | None = None
@@ -68,7 +102,7 @@ class PlannedSurvey:
     @property
     def anchors_m(self) -> Array:
         """Positions of the anchors (m, 3)."""
-        return np.array([anchor.position_m for anchor in self.anchors], dtype=np.float64)
+        return np.array([anchor.position_m for anchor in self.anchors], dtype=np.float64).reshape(-1, 3)
 
     @property
     def _standing_m(self) -> Array:
@@ -77,8 +111,9 @@ class PlannedSurvey:
 
     @property
     def places_m(self) -> Array:
-        """Positions of all anchors and keyframes (m + n, 3)."""
-        return np.vstack([self.anchors_m, self.trajectory.centers])
+        """Positions of all anchors, points and keyframes (m + k + n, 3)."""
+        points_m = np.array([point.position_m for point in self.points], dtype=np.float64).reshape(-1, 3)
+        return np.vstack([self.anchors_m, points_m, self.trajectory.centers])
 
     @property
     def duration_s(self) -> float:
@@ -105,7 +140,7 @@ class PlannedSurvey:
         return -(-self.num_ranges // self.max_num_ranges) or 1
 
     @property
-    def _site_from_first_camera(self) -> Similarity:
+    def site_from_first_camera(self) -> Similarity:
         return Similarity(1.0, self.trajectory.world_from_cam[0], self.trajectory.centers[0])
 
     def observations(self) -> RangeObservations:
@@ -124,22 +159,46 @@ class PlannedSurvey:
         measured = replace(log, range_m=np.nan_to_num(distances, nan=1.0), shared_stddev_m=curve)
         return replace(places, log=measured)
 
-    def posed(self, observations: RangeObservations) -> ScaleProblem:
+    @property
+    def lasting_s(self) -> tuple[float, ...]:
+        """Times for which errors of the antenna's positions last, seconds."""
+        return LASTING_S if self.antenna is None or self.antenna.lasting_s is None else (self.antenna.lasting_s,)
+
+    def known_positions(self) -> tuple[KnownPositions | None, tuple[str, ...]]:
+        """Return the known positions without errors, as a run finds them in the map, and what it will leave out."""
+        marks, notes = None, tuple[str, ...]()
+        if self.points:
+            marks = (self.photos or PlannedPhotos()).marks_of(self.trajectory, self.points)
+            if unseen := [point.name for point in self.points if point.name not in marks.names]:
+                notes = (
+                    f"{len(unseen)} of {len(self.points)} points are left out, as fewer than two photos of the path "
+                    f"show them ([photos] field_of_view_deg, seen_m): {', '.join(unseen)}",
+                )
+        track = None if self.antenna is None else self.antenna.located(self.trajectory)
+        return joined_positions([marks, track]), notes
+
+    def posed(self, observations: RangeObservations, placement: PlacementPrior | None = None) -> ScaleProblem:
         """Return the scale problem that a run will solve, with the input that it will have.
+
+        Args:
+            placement: what known positions say of the map's place.
 
         Raises:
             GeometryError: the run will refuse the input.
         """
-        from_site = self._site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
+        from_site = self.site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
         told = [replace(a, position_m=from_site.apply(at)) for a, at in zip(self.anchors, self.anchors_m, strict=True)]
         lengths, stddevs = np.array(self.taped, dtype=np.float64).reshape(-1, 2).T
+        # Between its ends the scale of the map varies.
+        stddevs = np.hypot(stddevs, BENDING * lengths)
         taped = LocatedDistances.of(lengths, stddevs, model_length=lengths) if self.taped else None
-        return scale_problem(observations, self.trajectory, told, self.anchor_frame, self.range_model, taped)
+        given = (observations, self.trajectory, told, self.anchor_frame, self.range_model, taped)
+        return scale_problem(*given, placement=placement)
 
     def state(self, posed: ScaleProblem, anchor_ids: tuple[str, ...]) -> RangeState:
         """Return the true state in the frame of the problem."""
         at = {anchor.anchor_id: place for anchor, place in zip(self.anchors, self._standing_m, strict=True)}
-        places, first = np.array([at[anchor_id] for anchor_id in anchor_ids]), self._site_from_first_camera
+        places, first = np.array([at[anchor_id] for anchor_id in anchor_ids]), self.site_from_first_camera
         biases = posed.ranges.bias_mean_m.copy()
         if posed.frame == "site":
             return RangeState(first, places, biases)

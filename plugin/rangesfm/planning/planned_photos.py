@@ -1,33 +1,28 @@
 """Photos of a planned survey: how far the map will bend, before and after the ranges straighten it.
 
-Points are scattered in front of the camera. They go into the keyframe graph of the refinement, where the points are
-eliminated and the remaining information connects neighbouring keyframes.
+Points are scattered in front of the camera. They are eliminated as in the keyframe graph of the refinement, and the
+remaining information connects neighbouring keyframes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 from pydantic import AfterValidator, Field
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import KeyMeta, Options
-from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.association import lever_arms
-from rangesfm.ranging.errors.learned import LearnedErrors
-from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.refine.keyframe_graph import KeyframeGraph, linear_functions
-from rangesfm.refine.radio import antennas
+from rangesfm.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.positions.known_positions import KnownPositions, locate_points
 from rangesfm.refine.vision_information import Observations, Poses, VisionInformation, vision_information
-from rangesfm.scale.scale_problem import ScaleProblem
-from rangesfm.scale.solution import Solution
 
 MAX_NUM_PHOTOS = 2000
 """Largest number of photos; more would take minutes, and with fewer photos the path bends in the same way."""
@@ -38,11 +33,6 @@ _HEIGHT = 2 / 3
 _NUM_COMPUTED, _LEAST_COMPUTED, _NUM_ROUNDS = 20_000, 40, 5
 # A point is found again later if it is seen from a direction within 30 degrees, at a distance within a factor of 2.
 _SAME_LOOK, _SAME_SIZE = np.cos(np.deg2rad(30.0)), 2.0
-# Number of keyframes for which the bending is computed; it is interpolated between them.
-_NUM_BENT = 40
-# Motions with a singular value below this fraction of the largest do not move the keyframes, like the rotation about a
-# straight path.
-_NO_MOTION = 1e-6
 
 
 def ascending(ends: tuple[float, float]) -> tuple[float, float]:
@@ -113,6 +103,46 @@ class PlannedPhotos(Options, table="photos"):
                         seen_by.append(by)
         return self._as_rays(path, np.array(points).reshape(-1, 3), seen_by, self.num_points / num)
 
+    def marks_of(self, path: Trajectory, points: Sequence[ControlPoint]) -> KnownPositions:
+        """Return points as a run finds them in the map, from marks in evenly chosen photos that show them.
+
+        Each is marked in up to ``num_photos_of_point`` photos, as exactly as features are found. Points that fewer than
+        two photos show are left out.
+        """
+        width_px = 1 / self.feature_stddev
+        camera = pycolmap.Camera(
+            camera_id=1,
+            model="SIMPLE_PINHOLE",
+            width=round(width_px),
+            height=round(_HEIGHT * width_px),
+            params=[width_px / (2 * self._half_width), width_px / 2, _HEIGHT * width_px / 2],
+        )
+        model, markers = pycolmap.Reconstruction(), dict[str, Marker]()
+        model.add_camera_with_trivial_rig(camera)
+        numbered = replace(path, frame_ids=np.arange(1, len(path) + 1))
+        for point in points:
+            in_cam = np.einsum("nji,nj->ni", path.world_from_cam, point.position_m - path.centers)
+            shown = np.flatnonzero(self._shows(in_cam))
+            num = min(len(shown), self.num_photos_of_point)
+            photos = shown[np.linspace(0, len(shown) - 1, num).astype(np.int64)]
+            pixels = np.array([camera.img_from_cam(in_cam[photo]) for photo in photos.tolist()]).reshape(-1, 2)
+            names = tuple(path.image_names[photo] for photo in photos.tolist())
+            markers[point.name] = Marker(names, pixels, (0,) * len(photos))
+            for photo in photos.tolist():
+                if not model.exists_image(photo + 1):
+                    image = pycolmap.Image(name=path.image_names[photo], camera_id=1, image_id=photo + 1)
+                    rotation = path.world_from_cam[photo].T
+                    cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ path.centers[photo])
+                    model.add_image_with_trivial_frame(image, cam_from_world)
+        return locate_points(ControlPoints(tuple(points), markers), model, numbered)
+
+    def _shows(self, in_cam: Array) -> Mask:
+        """Return whether photos show points (n, 3) in the axes of their cameras."""
+        depth = np.where(in_cam[:, 2] > 0, in_cam[:, 2], np.nan)
+        at, distance = np.abs(in_cam[:, :2] / depth[:, None]), np.linalg.norm(in_cam, axis=1)
+        is_within = (at[:, 0] < self._half_width) & (at[:, 1] < _HEIGHT * self._half_width)
+        return np.asarray(is_within & (distance >= self.seen_m[0]) & (distance <= self.seen_m[1]))
+
     def _scattered(self, path: Trajectory, frame: int, num: int, rng: np.random.Generator) -> Array:
         near, far = self.seen_m
         depths = near * (far / near) ** rng.random(num)
@@ -158,106 +188,3 @@ def _in_runs(found: npt.NDArray[np.bool_], longest: int) -> npt.NDArray[np.bool_
     index = np.arange(len(found))
     since = index - np.maximum.accumulate(np.where(found, -1, index))
     return since <= longest
-
-
-@dataclass(frozen=True)
-class PlannedMap:
-    """The map that photos and ranges will determine, linearized at the true values.
-
-    Attributes:
-        path: path of the n keyframes in the site frame.
-        vision: information of the photos about the path.
-        posed: the scale problem of the run.
-        observations: its ranges.
-        tag_in_cam_m: (3,) lever arm of the tag.
-    """
-
-    path: Trajectory
-    vision: VisionInformation
-    posed: ScaleProblem
-    observations: RangeObservations
-    tag_in_cam_m: tuple[float, float, float]
-
-    def bend_m(self, solution: Solution) -> float:
-        """Return the standard deviation by which the map bends before the refinement, metres.
-
-        It is that of each coordinate of a keyframe, relative to the best-fitting similarity.
-        """
-        by_photos, _ = linear_functions(replace(self._graph(solution, 0.0), held_frame=None), self._gradients)
-        bent = _without(self._motions)
-        return float(np.sqrt(np.trace(bent @ by_photos @ bent) / len(by_photos)))
-
-    def bends_m(self, solution: Solution, learned: LearnedErrors, num_alike: float) -> Array:
-        """Return the standard deviations of the keyframes' positions (n,) after the refinement, metres.
-
-        Errors of the ranges that move or scale the map as a whole are left out. The covariance is that of the run,
-        (J^T W J)^-1 J^T W S W J (J^T W J)^-1, with the covariance S of the ranges. It contains all errors of the
-        photos, and the errors of the ranges as far as they bend the map.
-
-        Args:
-            solution: solution with the range errors that a bending map sees.
-            learned: error model of the ranges.
-            num_alike: number of ranges that each simulated one stands for.
-        """
-        graph = self._graph(solution, num_alike)
-        by_photos, by_metre = linear_functions(graph, self._gradients)
-        by_bin = np.stack([learned.bins.total(column) for column in by_metre.T], axis=1)
-        by_ranges = by_bin.T @ learned.covariance_m2 @ by_bin
-        # In the first camera's frame, the map as a whole can only change its scale.
-        bent = _without(self._motions if graph.held_frame is None else self._motions[:, :, :1])
-        variances = np.diag(by_photos + bent @ by_ranges @ bent).reshape(-1, 3).sum(axis=1)
-        return np.asarray(np.interp(np.arange(len(self.path)), self._some, np.sqrt(np.maximum(variances, 0.0))))
-
-    @property
-    def _some(self) -> Indices:
-        """Indices of the k keyframes for which the bending is computed."""
-        some: Indices = np.unique(np.linspace(0, len(self.path) - 1, _NUM_BENT).round().astype(np.int64))
-        return some
-
-    @property
-    def _motions(self) -> Array:
-        """Derivatives (k, 3, 7) of these keyframes' centres by a similarity about the first camera."""
-        return similarity_motions(self.path.centers[self._some] - self.path.centers[0])
-
-    @property
-    def _gradients(self) -> Array:
-        """Derivatives (6 n, 3 k) of these keyframes' centres by all n poses."""
-        gradients = np.zeros((len(self.path), 6, len(self._some), 3))
-        for column, frame in enumerate(self._some):
-            gradients[frame, 3:, column] = np.eye(3)
-        return gradients.reshape(6 * len(self.path), -1)
-
-    def _graph(self, solution: Solution, num_alike: float) -> KeyframeGraph:
-        """Return the keyframe graph of the refinement in the site frame.
-
-        If the result is in the first camera's frame, only the held keyframe differs.
-        """
-        posed, ranges, log = self.posed, self.posed.ranges, self.observations.log
-        in_site = (solution.fit.state.metric_from_model @ posed.first_camera_from_sfm).inverse()
-        anchors = tuple(
-            AnchorEstimate(anchor_id, at, 0.0, at if np.isfinite(stddev_m) else None, stddev_m, 0.0, 0.0, bias_stddev_m)
-            for anchor_id, at, stddev_m, bias_stddev_m in zip(
-                log.anchor_ids,
-                in_site.apply(solution.fit.state.anchors_m),
-                ranges.anchor_stddev_m.tolist(),
-                ranges.bias_stddev_m.tolist(),
-                strict=True,
-            )
-        )
-        tags_in_cam_m = lever_arms(log, self.tag_in_cam_m)
-        return KeyframeGraph(
-            vision=self.vision,
-            antennas=antennas(self.path, self.observations, IDENTITY, tags_in_cam_m).subset(posed.rows),
-            range_m=log.range_m[posed.rows],
-            errors=replace(solution.errors, share=num_alike * solution.errors.share),
-            anchors=anchors,
-            held_frame=None if ranges.frame_is_free else 0,
-            gravity=None,
-        )
-
-
-def _without(motions: Array) -> Array:
-    """Return the projector (3 k, 3 k) onto the displacements that the motions (k, 3, m) do not explain."""
-    left, sizes, _ = np.linalg.svd(motions.reshape(-1, motions.shape[2]), full_matrices=False)
-    basis = left[:, sizes > _NO_MOTION * sizes.max()]
-    return np.asarray(np.eye(len(basis)) - basis @ basis.T)

@@ -127,7 +127,7 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         num_ranges=planned.num_ranges,
         duration_s=planned.duration_s,
         anchors_m={a.anchor_id: tuple(at.tolist()) for a, at in zip(planned.anchors, planned.anchors_m, strict=True)},
-        frame=expected.posed.frame,
+        frame=expected.frame,
         scale_stddev=expected.uncertainty.empirical,
         scale_stddev_formal=expected.uncertainty.formal,
         scale_interval_95=(float(np.expm1(-half_width)), float(np.expm1(half_width))),
@@ -173,7 +173,10 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
 
     Nothing has been measured yet, so that there is nothing to test. The sizes and effects are known all the same.
     """
-    on_map = ranges_on_map(expected.posed, expected.solution, expected.observations, expected.planned.trajectory, None)
+    ranges = expected.ranges
+    if ranges is None:
+        return ()
+    on_map = ranges_on_map(ranges.posed, ranges.solution, ranges.observations, expected.planned.trajectory, None)
     problem = replace(linearized(on_map, expected.learned.bins), errors=expected.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = []

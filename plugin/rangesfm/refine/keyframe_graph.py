@@ -19,7 +19,10 @@ from rangesfm.ceres.linear_solver import Factored, SingularError, factor, normal
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.bending import BendingOfBins, averaged, bending_part, without_similarity
+from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.refine.bundle_adjustment import farthest, still_to_come
@@ -114,7 +117,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     factored, used, step_count, movement = None, damping, 0, 0.0
     while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
         step_count += 1
-        solved, used, factored = terms, damping, _factor(terms, damping)
+        solved, used, factored = terms, damping, _factor(terms.hessian_of_free, damping)
         step = factored.solve(-terms.gradient[layout.free])
         trial = _moved(state, layout, step)
         trial_terms = _Terms.at(graph, layout, trial)
@@ -126,29 +129,36 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
         if min(movement, still_to_come(movement, last)) < tolerance_m:
             break
     if factored is None or used > _INITIAL_DAMPING:  # more would hide what the ranges determine
-        factored = _factor(solved, 0.0)
+        factored = _factor(solved.hessian_of_free, 0.0)
     return GraphSolution(state, step_count, _num_absorbed(solved, factored))
 
 
-def linear_functions(graph: KeyframeGraph, gradients: Array) -> tuple[Array, Array]:
-    """Return the errors of linear functions of the poses, to first order at the start.
+@dataclass(frozen=True)
+class GraphBending:
+    """Bending of a map as the photos' information on relative poses allows it.
 
-    Args:
-        gradients: (6 n, k) derivatives by the turn (in the keyframe's own frame) and the shift of each pose.
-
-    Returns:
-        (k, k) covariance from the errors of the photos alone; and (num_ranges, k) change of the functions per metre by
-        which each range is longer. Undetermined directions are treated as weakly determined.
+    Attributes:
+        vision: of a map with the same poses, in any world. path: of the map, in its first camera's frame.
     """
-    layout = _Layout.of(graph)
-    terms = _Terms.at(graph, layout, graph.start())
-    gradient = np.zeros((layout.num, gradients.shape[1]))
-    gradient[: layout.first_anchor] = gradients
-    solved = _factor(terms, 0.0).solve(gradient[layout.free])
-    by_stddev = terms.whitened[:, layout.free] @ solved
-    by_prior = terms.prior[:, layout.free] @ solved
-    by_metre = (np.sqrt(graph.errors.worth) / graph.errors.stddev_m)[:, None] * by_stddev
-    return gradient[layout.free].T @ solved - by_stddev.T @ by_stddev - by_prior.T @ by_prior, by_metre
+
+    vision: VisionInformation
+    path: Trajectory
+
+    def of_bins(self, bins: RangeBins, by_pose: sparse.csr_array, *, frame_is_free: bool) -> BendingOfBins:
+        return self.of_functions(averaged(bins, by_pose, len(self.path)), frame_is_free=frame_is_free)
+
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+        functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)
+        parts = functions.reshape(len(by_pose), -1, 6)
+        parts[:, :, 3:] = parts[:, :, 3:] @ self.vision.origin.world_from_rig[0].T
+        covariance = functions @ self._factored.solve(np.ascontiguousarray(functions.T))
+        found = bending_part("bending", covariance, 1.0, 0.0)
+        return BendingOfBins(() if found is None else (found,), covariance, np.zeros(len(by_pose)))
+
+    @cached_property
+    def _factored(self) -> Factored:
+        _, seen = _relative_poses(self.vision, self.vision.origin)
+        return _factor(resized(normal_matrix(seen, self.vision.matrix), 6 * len(self.path)), 0.0)
 
 
 @dataclass(frozen=True)
@@ -246,6 +256,10 @@ class _Terms:
         of_photos = resized(normal_matrix(self.seen, self.vision), self.layout.num)
         return of_photos + self.layout.squares(self.whitened) + self.prior.T @ self.prior
 
+    @property
+    def hessian_of_free(self) -> Array | sparse.csr_array:
+        return self.hessian[self.layout.free][:, self.layout.free]
+
 
 def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:
     """Return (6 u,) turns and shifts of relative poses against their origin, in the reference's frame, with derivative.
@@ -336,18 +350,17 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     return np.array(residuals), sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def _factor(terms: _Terms, damping: float) -> Factored:
-    """Factor the Hessian, with more damping if rounding makes it indefinite, as happens in a meaningless map."""
-    part = terms.hessian[terms.layout.free][:, terms.layout.free]
-    diagonal = part.diagonal()
+def _factor(hessian: Array | sparse.csr_array, damping: float) -> Factored:
+    """Factor a Hessian, with more damping if rounding makes it indefinite, as happens in a meaningless map."""
+    diagonal = hessian.diagonal()
     # The floor keeps a pose without constraints in place.
-    damped = part + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
+    damped = hessian + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
     try:
         return factor(damped)
     except SingularError:
         if damping > _MAX_DAMPING:  # then the matrix has entries that are not finite
             raise
-        return _factor(terms, max(10 * damping, _INITIAL_DAMPING))
+        return _factor(hessian, max(10 * damping, _INITIAL_DAMPING))
 
 
 def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:

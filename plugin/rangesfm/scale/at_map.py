@@ -171,7 +171,7 @@ def estimate_by_positions_at(
     Raises:
         GeometryError: as for ``estimate_at``.
     """
-    judged = judge_positions(positions, positions.uncertainty, options)
+    judged = judge_positions(positions.num_used, positions.uncertainty, options, has_check=positions.has_check)
     return replace(
         start,
         refined_value=value,

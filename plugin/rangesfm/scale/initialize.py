@@ -274,7 +274,7 @@ def _by_positions_alone(
     if lengths is not None and lengths.is_used:
         found = scale_by_positions(alone.known, trajectory, bending, lengths=lengths, lasting_s=lasting_s)
         by_kind = {"positions": alone.alone, **_by_lengths(lengths)}
-    judged = judge_positions(found, found.uncertainty, options)
+    judged = judge_positions(found.num_used, found.uncertainty, options, has_check=found.has_check)
     return replace(
         _without_ranges(observations, range_model),
         metric_from_sfm=found.site_from_model,

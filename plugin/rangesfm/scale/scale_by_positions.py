@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import Similarity, align_points, path_shape, similarity_motions
+from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.processes.threads import with_one_blas_thread
@@ -211,6 +211,15 @@ class PositionScale:
         """(k,) positions that take part."""
         return np.asarray(~self.known.is_check & ~self.is_left_out & (self.weights >= OUTLYING))
 
+    @property
+    def num_used(self) -> int:
+        return int(np.count_nonzero(self.is_used))
+
+    @property
+    def has_check(self) -> bool:
+        """True if some of the positions only check the others."""
+        return bool(self.known.is_check.any())
+
 
 def _determine(known: KnownPositions, used: Mask) -> bool:
     """Return whether positions determine a similarity: three or more that are not on one line."""
@@ -240,11 +249,8 @@ def scale_by_positions(
     Raises:
         GeometryError: the positions are too few, or on one line.
     """
-    if not _determine(known, ~known.is_check):
-        num = int(np.count_nonzero(~known.is_check))
-        expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
-        raise GeometryError(f"{num} known positions are in the map, {expected}")
     problem = _Problem(known, path, bending, lengths, refined, tuple(lasting_s))
+    problem.require_enough()
     used = ~known.is_check
     num_control = int(np.count_nonzero(known.is_mark & used))
     threshold = float(special.chdtri(3, POINT_FALSE_ALARM_RATE / max(num_control, 1)))
@@ -252,13 +258,18 @@ def scale_by_positions(
     while (worst := problem.worst(fit, threshold)) is not None:
         fit = worst
     found = problem.result(fit, used & ~fit.used, threshold)
-    turn_stddev = float(np.sqrt(np.linalg.eigvalsh(found.covariance[1:4, 1:4])[-1]))
+    refuse_open_turn(found.covariance)
+    return found
+
+
+def refuse_open_turn(covariance: Array) -> None:
+    """Raise GeometryError if a (7, 7) covariance of a similarity by known positions leaves its turn open."""
+    turn_stddev = float(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1]))
     if turn_stddev > _MAX_TURN_STDDEV:
         raise GeometryError(
             "the known positions are nearly on one line, which leaves the turn of the map about it open "
             f"({np.rad2deg(turn_stddev):.0f} degrees, 1 stddev): survey a point off that line"
         )
-    return found
 
 
 @dataclass(frozen=True)
@@ -285,19 +296,35 @@ class _Problem:
     refined: Similarity | None
     lasting_s: tuple[float, ...]
 
+    def require_enough(self) -> None:
+        """Raise GeometryError if the positions do not determine a similarity."""
+        is_control = ~self.known.is_check
+        if not _determine(self.known, is_control):
+            expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
+            raise GeometryError(f"{np.count_nonzero(is_control)} known positions are in the map, {expected}")
+
     def fit(self, used: Mask, start: Similarity | None = None) -> _Fit:
         """Fit the similarity robustly, and learn the errors from what it leaves."""
-        similarity, weights, stddev_m = self._robust(used, start)
+        similarity, weights, stddev_m = self.robust(used, start)
+        before, bending = self.equations(used, similarity, weights, stddev_m)
+        sizes = _sizes(before.parts, before.linear, before.is_used)
+        equations = replace(before, errors=_errors_of(before.parts, sizes))
+        return _Fit(similarity, used, weights, stddev_m, equations, bending, sizes)
+
+    def equations(
+        self, used: Mask, similarity: Similarity, weights: Array, stddev_m: Array
+    ) -> tuple[PositionEquations, BendingOfBins]:
+        """Return the equations about a similarity with the errors to expect before any is learnt, and the bending."""
         grouping = _grouping(self.known, weights)
-        bending = self._bending(similarity, grouping)
+        by_pose = groups_by_pose(self.known, similarity, self.path, grouping)
+        bending = self.bending.of_functions(by_pose, frame_is_free=True)
         linear = self._linear(similarity, grouping, bending)
         parts = tuple(self._parts(similarity, grouping, stddev_m, bending))
         takes_part = (abs(grouping) @ np.repeat(used & (weights >= OUTLYING) | used & self.known.is_mark, 3)) > 0
-        sizes = _sizes(parts, linear, takes_part)
-        equations = PositionEquations(linear, parts, _errors_of(parts, sizes), takes_part, grouping)
-        return _Fit(similarity, used, weights, stddev_m, equations, bending, sizes)
+        errors = _errors_of(parts, {part.name: part.median * float(np.exp(part.spread**2)) for part in parts})
+        return PositionEquations(linear, parts, errors, takes_part, grouping), bending
 
-    def _robust(self, used: Mask, start: Similarity | None) -> tuple[Similarity, Array, Array]:
+    def robust(self, used: Mask, start: Similarity | None) -> tuple[Similarity, Array, Array]:
         """Return the similarity, (k,) weights and (k,) standard deviations, by iteratively reweighted least squares."""
         known = self.known
         similarity = self.refined or start or _of_triples(known, np.flatnonzero(used))
@@ -347,13 +374,6 @@ class _Problem:
                 shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / _MEDIAN_LENGTH
                 stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else _LEAST_STDDEV_M)
         return stddevs
-
-    def _bending(self, similarity: Similarity, grouping: csr_array) -> BendingOfBins:
-        rotation = kron(np.eye(len(self.known)), similarity.rotation, format="csr")
-        by_pose = grouping @ rotation @ (similarity.scale * self.known.by_pose + self.known.arms_by_pose)
-        parts = by_pose.toarray().reshape(by_pose.shape[0], -1, 6)
-        parts[:, :, 3:] = parts[:, :, 3:] @ self.path.world_from_cam[0]  # bending is in the first camera's axes
-        return self.bending.of_functions(parts.reshape(len(parts), -1), frame_is_free=True)
 
     def _linear(self, similarity: Similarity, grouping: csr_array, bending: BendingOfBins) -> LinearMap:
         off_m = grouping @ -self.known.misclosures_m(similarity).ravel() - bending.shift_m
@@ -423,8 +443,8 @@ class _Problem:
         if self.refined is not None:
             weighed = weighed + fit.bending.formal_m2
         weighed = weighed[np.ix_(rows, rows)]
-        formal, of_groups, of_priors = best_estimate(weighed, linear.design, linear.prior_design)
-        others = np.einsum("pi,ij,pj->p", of_groups, errors.covariance_m2, of_groups) + np.sum(of_priors**2, axis=1)
+        formal, _, _ = best_estimate(weighed, linear.design, linear.prior_design)
+        others, of_groups, _ = linear.with_weights(weighed, errors.covariance_m2)
         known = linear.known(errors, float(np.sqrt(formal[0, 0])), others)
         _, best_groups, best_priors = best_estimate(errors.covariance_m2, linear.design, linear.prior_design)
         return PositionScale(
@@ -455,6 +475,35 @@ class _Problem:
         of_parts = {name: size for name, size in errors.stddev_of_bins(by).items() if name.startswith("positions")}
         alone = of_parts.get("positions", 0.0)
         return float(np.linalg.norm([*of_parts.values()])) / alone if alone > 0 else 1.0
+
+
+def groups_by_pose(known: KnownPositions, similarity: Similarity, path: Trajectory, grouping: csr_array) -> Array:
+    """Return (3 g, 6 n) derivatives of groups of positions by the poses of a path, with shifts as in its first camera.
+
+    These are the axes in which ``MapBending`` has the shifts.
+    """
+    rotation = kron(np.eye(len(known)), similarity.rotation, format="csr")
+    by_pose = grouping @ rotation @ (similarity.scale * known.by_pose + known.arms_by_pose)
+    parts = by_pose.toarray().reshape(by_pose.shape[0], -1, 6)
+    parts[:, :, 3:] = parts[:, :, 3:] @ path.world_from_cam[0]
+    return np.asarray(parts.reshape(len(parts), -1))
+
+
+def expected_positions(
+    known: KnownPositions, path: Trajectory, bending: MapBending, lasting_s: Sequence[float] = LASTING_S
+) -> PositionEquations:
+    """Return the equations of positions that are planned: on a map that is true, with the errors to expect.
+
+    Args:
+        known: without errors, in the model of ``path``, whose world is the site.
+
+    Raises:
+        GeometryError: the positions are too few, or on one line.
+    """
+    problem = _Problem(known, path, bending, None, IDENTITY, tuple(lasting_s))
+    problem.require_enough()
+    used = ~known.is_check
+    return problem.equations(used, *problem.robust(used, None))[0]
 
 
 # Steps of the similarity (relative, radians, metres) below this are rounding.

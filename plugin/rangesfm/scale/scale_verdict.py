@@ -16,7 +16,7 @@ from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.scale_by_lengths import LengthScale
-from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, PositionScale
+from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.scale.scale_estimate import CutoffTest, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.sensitivity import scale_drift
@@ -96,11 +96,15 @@ def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: 
     return _verdict(doubts, [], uncertainty.half_width_95, options)
 
 
-def judge_positions(positions: PositionScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
-    """Return the verdict on a scale that was found from known positions, perhaps with measured lengths."""
-    doubts, num = [], int(np.count_nonzero(positions.is_used))
-    if num == MIN_NUM_POSITIONS and not positions.known.is_check.any():
-        reason = f"the map rests on {num} known positions, so that nothing tells which of them is wrong if one is"
+def judge_positions(num_used: int, uncertainty: ScaleUncertainty, options: ScaleOptions, *, has_check: bool) -> Verdict:
+    """Return the verdict on a scale from known positions, perhaps with measured lengths.
+
+    Args:
+        num_used: number of positions. has_check: whether others check them.
+    """
+    doubts = []
+    if num_used == MIN_NUM_POSITIONS and not has_check:
+        reason = f"the map rests on {num_used} known positions, so that nothing tells which of them is wrong if one is"
         doubts.append(_Doubt(reason, "survey a fourth control point, far from the others"))
     if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
         reason = "the known positions are close together for their standard deviations"

@@ -110,22 +110,20 @@ def errors_to_expect(
     model_from_cam: Array,
     stddevs: Mapping[str, float],
     max_num_bins: int = MAX_NUM_BINS,
-    bending: MapBending | None = None,
 ) -> LearnedErrors:
-    """Return the errors to expect before anything is measured, from what is usual for radios.
+    """Return the errors to expect before anything is measured, from what is usual for radios; the map is not bent.
 
     Args:
         stddevs: by name, standard deviations of components of which more is known.
         max_num_bins: fewer bins are coarser and take less time.
     """
-    taken_off, state = observations.log.shared_stddev_m, solution.fit.state
+    taken_off = observations.log.shared_stddev_m
     of_ranges = _bins(posed, solution, observations, model_from_cam, max_num_bins)
     return ExpectedErrors.of(
         of_ranges,
         None if taken_off is None else taken_off[posed.rows],
         ruled_out(solution.problem),
         _by_places(posed, solution, of_ranges),
-        bending=bending_of_bins(bending, of_ranges, posed, state, observations, model_from_cam),
     ).usual(stddevs)
 
 
@@ -207,6 +205,19 @@ class LinearMap:
     prior_design: Array
     columns: Columns
 
+    def with_weights(self, assumed_m2: Array, covariance_m2: Array) -> tuple[Array, Array, Array]:
+        """Return the (p,) variances of the estimate with the weights for other errors, and its gains.
+
+        Args:
+            assumed_m2: (c, c) covariance from which the weights come. covariance_m2: (c, c) covariance of the errors.
+
+        Returns:
+            the variances, and the (p, c) and (p, r) gains of ``best_estimate``.
+        """
+        _, of_bins, of_priors = best_estimate(assumed_m2, self.design, self.prior_design)
+        variances = np.einsum("pi,ij,pj->p", of_bins, covariance_m2, of_bins) + np.sum(of_priors**2, axis=1)
+        return variances, of_bins, of_priors
+
     def known(
         self, learned: ErrorParts, formal: float, variance_by_others: Array, change_by_others: Array | None = None
     ) -> KnownMap:
@@ -245,7 +256,7 @@ def known_map(
         posed: its measured lengths must have the uncertainty that the map's bending gives them.
         bending_of_lengths: relative standard deviation of the scale by measured lengths, due to the map's bending.
     """
-    linear = _of_bins(_linear(posed, solution), learned.bins)
+    linear = linear_map(posed, solution, learned.bins)
     variances = np.diag(parameter_covariance(solution, learned))[: linear.columns.num].copy()
     variances[linear.columns.scale] += (_say_of_lengths(solution) * bending_of_lengths) ** 2
     return linear.known(learned, solution.fit.log_scale_stddev, variances)
@@ -265,49 +276,41 @@ def known_refined_map(
         shared_m: (n, k) errors of the ranges that the refinement took for shared ones, as ``shared_errors_m``.
     """
     errors, bins, given = solution.errors, learned.bins, posed.ranges
-    linear = _of_bins(_linear(posed, solution), bins)
-    robust, index = solution.fit.weights / errors.stddev_m**2, bins.anchor_index
+    linear, robust = linear_map(posed, solution, bins), solution.fit.weights / errors.stddev_m**2
     bent_m2 = np.zeros_like(learned.covariance_m2) if bending is None else bending.formal_m2
-    of_biases = given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2
     alone, weighed = (np.diag(1 / np.maximum(bins.total(each), 1e-12)) for each in (robust, errors.worth * robust))
-    shared = bins.mean(shared_m)
     formal, _, _ = best_estimate(alone + bent_m2, linear.design, linear.prior_design)
-    _, of_bins, of_priors = best_estimate(
-        weighed + bent_m2 + of_biases + shared @ shared.T, linear.design, linear.prior_design
-    )
-    variances = np.einsum("pi,ij,pj->p", of_bins, learned.covariance_m2, of_bins) + np.sum(of_priors**2, axis=1)
+    shared = bins.mean(shared_m)
+    assumed_m2 = weighed + bent_m2 + bias_covariance(bins, given) + shared @ shared.T
+    variances, _, _ = linear.with_weights(assumed_m2, learned.covariance_m2)
     at_optimum = linear if bending is None else replace(linear, off_m=linear.off_m - bending.shift_m)
     return at_optimum.known(learned, float(np.sqrt(formal[0, 0])), variances)
 
 
-def _of_bins(linear: LinearMap, bins: RangeBins) -> LinearMap:
+def linear_map(posed: ScaleProblem, solution: Solution, bins: RangeBins) -> LinearMap:
+    """Return the linear equations of bins of a problem's ranges about its solution."""
+    linear = _linear(posed, solution)
     return replace(linear, off_m=bins.mean(linear.off_m), design=bins.mean(linear.design))
+
+
+def bias_covariance(bins: RangeBins, given: RangeProblem) -> Array:
+    """Return the (c, c) covariance of bins by the priors of the anchors' biases."""
+    index = bins.anchor_index
+    return np.asarray(
+        given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2, dtype=np.float64
+    )
+
+
+def regular(covariance: Array) -> Array:
+    """Return a covariance that is positive definite in spite of rounding."""
+    return np.asarray(covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance)))
 
 
 def best_estimate(covariance: Array, design: Array, prior_design: Array) -> tuple[Array, Array, Array]:
     """Return the (p, p) covariance of the best estimate for given error covariance, and its (p, c) and (p, r) gains."""
-    covariance = covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance))
-    whitened = cho_solve(cho_factor(covariance), design)
+    whitened = cho_solve(cho_factor(regular(covariance)), design)
     inverse = invert_information(design.T @ whitened + prior_design.T @ prior_design)
     return inverse, inverse @ whitened.T, inverse @ prior_design.T
-
-
-def expected_scale_uncertainty(
-    solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
-) -> ScaleUncertainty:
-    """Return the uncertainty to expect of the scale before anything is measured, with its robust weights.
-
-    The uncertainty after the survey is smaller if the best weights find much the same scale.
-
-    Args:
-        bending_of_lengths: relative standard deviation of the scale by measured lengths, due to the map's bending.
-    """
-    summed = learned.stddev_of(scale_influence(solution.fit, solution.problem))
-    of_given = max(float(_by_what_was_given(solution)[0, 0]), 0.0)  # rounding may make it negative
-    given = np.hypot(np.sqrt(of_given), _say_of_lengths(solution) * bending_of_lengths)
-    if given > 0:
-        summed[GIVEN] = float(given)
-    return ScaleUncertainty(solution.fit.log_scale_stddev, summed)
 
 
 def _say_of_lengths(solution: Solution) -> float:

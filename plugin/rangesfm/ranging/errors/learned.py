@@ -57,7 +57,11 @@ class ErrorParts:
 
     def without(self: _Parts, *names: str) -> _Parts:
         """Return the errors without some components."""
-        kept = [row for row, each in enumerate(self.names) if each not in names]
+        return self.only(*(each for each in self.names if each not in names))
+
+    def only(self: _Parts, *names: str) -> _Parts:
+        """Return the errors of some components."""
+        kept = [row for row, each in enumerate(self.names) if each in names]
         return replace(
             self,
             names=tuple(self.names[row] for row in kept),
