@@ -48,6 +48,18 @@ def test_closed_loops_tie_the_laps_together(closed: Closed, laps: LoopedSurvey) 
     assert longest > 20
 
 
+def test_a_map_that_was_bent_to_its_ranges_is_not_bent_again() -> None:
+    laps = two_laps(100, size_m=(24.0, 16.0), num_observations=40, pixel_stddev=1.0)
+    scaled = ScaledMap.of(laps.survey, laps.chain(), range_log(laps.survey, 1))
+    refined, _ = scaled.refined()
+    again, _ = scaled.refined(refined)
+    scaled_m, refined_m, again_m = (
+        trajectory_from_reconstruction(model, laps.survey.model.timestamps_s).centers
+        for model in (scaled.scaled, refined, again)
+    )
+    assert rmse(again_m - refined_m) < 0.005 * rmse(refined_m - scaled_m)
+
+
 def test_pairs_that_look_alike_in_two_aisles_are_contradicted_by_the_ranges() -> None:
     survey = two_aisles(num_keyframes=10, length_m=4.0)
     scaled = ScaledMap.of(survey.looped.survey, survey.looped.chain(), range_log(survey.looped.survey, 1))

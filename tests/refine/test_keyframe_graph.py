@@ -18,9 +18,9 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.refine import keyframe_graph
-from rangesfm.refine.keyframe_graph import KeyframeGraph, local_scales, solve_graph
+from rangesfm.refine.keyframe_graph import KeyframeGraph, local_scales, solve_graph, with_gradient
 from rangesfm.refine.radio import Antennas
-from rangesfm.refine.vision_information import Poses, vision_information
+from rangesfm.refine.vision_information import Poses, VisionInformation, photo_gradient, vision_information
 
 Array = npt.NDArray[np.float64]
 ANCHORS_M = np.array([[-40.0, -28.0, 12.0], [-15.0, -28.0, 0.0], [-28.0, -42.0, 9.0], [-30.0, -20.0, 15.0]])
@@ -122,6 +122,21 @@ def test_photos_bind_neither_place_nor_turn_nor_scale_of_the_whole(chain: Synthe
     sideways = Poses(truth.world_from_rig, truth.centers + 0.01 * np.arange(len(truth))[:, None] % 2 * [0.0, 1.0, 0.0])
     assert cost(sideways) > 100
     assert cost(moved) < 1e-6 * cost(sideways)
+
+
+def test_photos_that_fit_best_elsewhere_draw_the_graph_there(chain: SyntheticModel) -> None:
+    truth, rays = poses_and_rays(chain)
+    rng = np.random.default_rng(0)
+    turns = Rotation.from_rotvec(1e-4 * rng.standard_normal((len(truth), 3))).as_matrix()
+    origin = Poses(truth.world_from_rig @ turns, truth.centers + 1e-3 * rng.standard_normal((len(truth), 3)))
+    vision = vision_information(rays, origin)
+
+    def cost_at_truth(vision: VisionInformation) -> float:
+        residuals, _ = keyframe_graph._relative_poses(vision, truth)
+        return float(residuals @ (vision.matrix @ residuals))
+
+    drawn = with_gradient(vision, photo_gradient(rays, origin))
+    assert cost_at_truth(drawn) < 1e-3 * cost_at_truth(vision)
 
 
 @pytest.mark.parametrize(

@@ -89,9 +89,13 @@ class Survey:
         ]
 
     def refine(
-        self, anchors: Sequence[AnchorEstimate], scale_error: float = 1.0, **changes: Any
+        self,
+        anchors: Sequence[AnchorEstimate],
+        scale_error: float = 1.0,
+        refined: pycolmap.Reconstruction | None = None,
+        **changes: Any,
     ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-        """Refine from the true similarity with a wrong scale; ``errors`` may be the stddev of all ranges."""
+        """Refine from the true similarity with a wrong scale, or again; ``errors`` may be the stddev of all ranges."""
         start = Similarity(scale_error, np.eye(3), np.zeros(3)) @ self.metric_from_sfm
         observations = changes.pop("observations", self.observations)
         errors = changes.pop("errors", RANGE_STDDEV_M)
@@ -103,9 +107,8 @@ class Survey:
             "camera": CameraOptions(refine_intrinsics=False),
             "num_threads": 1,
         }
-        return refine_with_ranges(
-            rescale(self.sfm, start), self.trajectory, observations, start, anchors, errors, **(arguments | changes)
-        )
+        model = rescale(self.sfm, start) if refined is None else refined
+        return refine_with_ranges(model, self.trajectory, observations, start, anchors, errors, **(arguments | changes))
 
     def centers(self, model: pycolmap.Reconstruction) -> Array:
         return trajectory_from_reconstruction(model, self.timestamps_s).centers
@@ -577,6 +580,7 @@ class TestWithNoise:
         assert rmse(before - survey.centers_m) < 0.1
         assert rmse(after - before) < 0.01
 
+    @pytest.mark.parametrize("assumed_stddev_m", [RANGE_STDDEV_M, 3 * RANGE_STDDEV_M])
     @pytest.mark.parametrize(
         ("frame", "num_epochs", "kind", "share", "max_error_m"),
         [
@@ -586,20 +590,34 @@ class TestWithNoise:
         ],
     )
     def test_where_most_ranges_are_wrong_the_map_does_not_follow_them(
-        self, frame: str, num_epochs: int, kind: str, share: float, max_error_m: float
+        self, frame: str, num_epochs: int, kind: str, share: float, max_error_m: float, assumed_stddev_m: float
     ) -> None:
         """Moreover, an anchor's good ranges do not lose weight because it has more wrong ones."""
-        radio = Radio(range_stddev_m=0.1)
-        survey = make_survey(frame, pixel_stddev=0.3, radio=radio, num_epochs=num_epochs, seed=1)
+        survey = make_survey(
+            frame, pixel_stddev=0.3, radio=Radio(range_stddev_m=RANGE_STDDEV_M), num_epochs=num_epochs, seed=1
+        )
         log = survey.observations.log
         wrong = replace(log, range_m=spoilt(log.range_m, kind, share, np.random.default_rng(1)))
-        observations = replace(survey.observations, log=wrong)
+        observations = replace(survey.observations, log=wrong, center_stddev=np.zeros(len(log)))
         refined, _ = survey.refine(
             survey.anchors(0.0, bias_stddev_m=0.01),
             observations=observations,
-            errors=known_errors(observations, RANGE_STDDEV_M, is_estimated=True),
+            errors=known_errors(observations, assumed_stddev_m, is_estimated=True),
         )
         assert rmse(survey.centers(refined) - survey.centers_m) < max_error_m
+
+    def test_a_refined_map_stays_where_it_is_and_its_errors_are_learnt_alike(self) -> None:
+        """The ranges of one anchor are noisier, which only residuals show."""
+        survey = make_survey("first_camera", pixel_stddev=0.3, radio=Radio(range_stddev_m=0.1), num_epochs=8, seed=1)
+        log, noise = survey.observations.log, np.random.default_rng(1).standard_normal(len(survey.observations.log))
+        log = replace(log, range_m=log.range_m + 0.4 * noise * (log.anchor_index == 0))
+        observations = replace(survey.observations, log=log, center_stddev=np.zeros(len(log)))
+        told = {"observations": observations, "errors": known_errors(observations, 0.2, is_estimated=True)}
+        refined, first = survey.refine(survey.anchors(0.0), scale_error=1.1, **told)
+        again, second = survey.refine(survey.anchors(0.0), refined=refined, **told)
+        assert rmse(survey.centers(again) - survey.centers(refined)) < 1e-4
+        np.testing.assert_allclose(second.errors.stddev_m, first.errors.stddev_m, rtol=0.02)
+        assert np.ptp(first.errors.stddev_m) > 0.2
 
     def test_a_place_where_the_camera_lingered_draws_the_map_no_more_than_in_the_scale(self) -> None:
         """Ranges of one place have the same error, and three of twenty places have most of the ranges."""

@@ -15,6 +15,7 @@ from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
 from rangesfm.errors import InputError
 from rangesfm.files.manifest import content_hash
 from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.result.metric_result import MetricResult
@@ -138,6 +139,17 @@ def test_an_interrupted_run_goes_on_with_the_matches_that_it_has(closed: ClosedL
     assert closed.summary.loops is not None
     num = closed.summary.loops.num_proposed
     assert closed.counts == [(num, num)]
+
+
+def test_where_no_loops_are_found_the_map_is_refined_once(laps: Laps, tmp_path: Path) -> None:
+    changes = {"output.path": tmp_path / "out", "report.reference": None, "scale.max_relative_stddev": 10.0}
+    listener, survey = Listener(), laps.survey.changed(changes)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LoopFinder, "propose", lambda *_, **__: [])
+        loops = refine_model(survey, progress=listener).summary.loops
+    assert listener.stages.count("refinement") == 1
+    assert loops is not None
+    assert (loops.num_proposed, loops.moved_m) == (0, 0)
 
 
 def test_loops_stay_open_where_that_is_asked_for(laps: Laps) -> None:

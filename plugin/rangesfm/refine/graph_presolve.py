@@ -16,7 +16,14 @@ from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import wider
-from rangesfm.refine.keyframe_graph import GraphSolution, GraphState, KeyframeGraph, local_scales, solve_graph
+from rangesfm.refine.keyframe_graph import (
+    GraphSolution,
+    GraphState,
+    KeyframeGraph,
+    local_scales,
+    solve_graph,
+    with_gradient,
+)
 from rangesfm.refine.radio import moved_anchors
 from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import (
@@ -25,6 +32,7 @@ from rangesfm.refine.vision_information import (
     Poses,
     VisionInformation,
     model_poses,
+    photo_gradient,
     project,
     ray_residuals,
     robust_root_weights,
@@ -113,9 +121,9 @@ def _graph(
     """Set up the keyframe graph of the current model."""
     ranges = problem.ranges
     takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))[rays.point]
-    seen = rays.subset(np.flatnonzero(takes_part))
+    seen, poses = rays.subset(np.flatnonzero(takes_part)), model_poses(problem.metric, problem.frame_ids)
     return KeyframeGraph(
-        vision=vision_information(seen, model_poses(problem.metric, problem.frame_ids)),
+        vision=with_gradient(vision_information(seen, poses), photo_gradient(seen, poses)),
         antennas=ranges.antennas.subset(ranges.rows),
         range_m=ranges.observations.log.range_m[ranges.rows],
         errors=errors,
@@ -166,11 +174,8 @@ def _solve_with_own_errors(graph: KeyframeGraph) -> tuple[GraphSolution, RangeEr
     seen, reached = (
         errors.noise_of_estimated(graph.residuals_m(state)).log_likelihood for state in (start, wide.state)
     )
-    if reached >= seen:
-        state, residuals_m = wide.state, graph.residuals_m(wide.state)
-        errors = replace(shown, loss=errors.loss).seen_by_bending_map(residuals_m, wide.num_absorbed)
-    else:
-        state, errors = start, replace(errors, log_likelihood=seen)
+    state = wide.state if reached >= seen else start
+    errors = replace(shown, loss=errors.loss).seen_by_bending_map(graph.residuals_m(state), wide.num_absorbed)
     bounded, errors = _alternate(graph, errors, state)
     settled = solve_graph(replace(graph, errors=errors), bounded.state, tolerance_m=_tolerance_m(errors))
     return replace(settled, num_steps=wide.num_steps + bounded.num_steps + settled.num_steps), errors

@@ -7,7 +7,7 @@ because its points have to follow every turn of the world.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -161,6 +161,18 @@ class GraphBending:
         return _factor(resized(normal_matrix(seen, self.vision.matrix), 6 * len(self.path)), 0.0)
 
 
+def with_gradient(vision: VisionInformation, gradient: Array) -> VisionInformation:
+    """Return the information with the gradient (6 n,) of the photos' cost at its origin, where they need not fit best.
+
+    In a map that was bent to its ranges they do not. The gradient has to be that of all observations: those of a part
+    of the tracks, or with other weights, have their minimum elsewhere.
+    """
+    _, by_pose = _relative_poses(vision, vision.origin)
+    normal = resized(normal_matrix(by_pose, vision.matrix), len(gradient))
+    to_optimum = _factor(normal, 0.0).solve(-gradient)
+    return replace(vision, from_optimum=-(by_pose @ to_optimum))
+
+
 @dataclass(frozen=True)
 class _Layout:
     """Order of the unknowns: 6 per pose (turn in its own frame, shift), 3 per anchor, the biases, their common part.
@@ -273,7 +285,7 @@ def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, spa
     turn_before, shift_before = vision.measured()
     scale = _local_scale(vision, shift, shift_before)[r][:, None]
     angles = Rotation.from_matrix(np.swapaxes(turn_before, 1, 2) @ turn).as_rotvec()
-    residuals = np.concatenate([angles, shift / scale - shift_before], axis=1)
+    residuals = np.concatenate([angles, shift / scale - shift_before], axis=1).ravel() + vision.from_optimum
     # d log(Exp(a) Exp(d)) to first order in a: Solà et al., "A micro Lie theory", eq. 144.
     spread = np.eye(3) + 0.5 * cross_matrices(angles)
     to_reference, to_frame = np.zeros((2, len(r), 6, 6))
@@ -284,7 +296,7 @@ def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, spa
     to_reference[:, 3:, :3] = cross_matrices(shift) / scale[:, :, None]
     blocks = np.stack([to_reference, to_frame], axis=1).reshape(-1, 6, 6)
     columns, starts = np.stack([r, k], axis=1).ravel(), np.arange(0, 2 * len(r) + 1, 2)
-    return residuals.ravel(), sparse.bsr_array((blocks, columns, starts), shape=(6 * len(r), 6 * len(poses)))
+    return residuals, sparse.bsr_array((blocks, columns, starts), shape=(6 * len(r), 6 * len(poses)))
 
 
 def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -> Array:

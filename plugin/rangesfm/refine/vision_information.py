@@ -109,9 +109,10 @@ class VisionInformation:
     """Gaussian information on u relative poses (6 numbers each: turn, shift), linearised at ``origin``.
 
     Attributes:
-        origin: the poses of linearisation, at which the photos fit best.
+        origin: the poses of linearisation.
         reference, frame: (u,) pose of keyframe ``frame`` relative to keyframe ``reference``.
         matrix: (6 u, 6 u) sparse information, in blocks of 6 by 6.
+        from_optimum: (6 u,) relative poses at the origin, minus those at which the photos fit best.
         loops: the last of the relative poses, which are not as at the origin; None without any.
     """
 
@@ -119,6 +120,7 @@ class VisionInformation:
     reference: Indices
     frame: Indices
     matrix: sparse.bsr_array
+    from_optimum: Array
     loops: LoopPoses | None = None
 
     def with_loops(self, loops: LoopPoses) -> VisionInformation:
@@ -131,6 +133,7 @@ class VisionInformation:
             np.concatenate([self.reference, loops.reference]),
             np.concatenate([self.frame, loops.frame]),
             sparse.block_diag([self.matrix, further], format="bsr"),
+            np.concatenate([self.from_optimum, np.zeros(size)]),
             loops,
         )
 
@@ -140,7 +143,7 @@ class VisionInformation:
         return len(self.reference) - (0 if self.loops is None else len(self.loops.reference))
 
     def measured(self) -> tuple[Array, Array]:
-        """Return the (u, 3, 3) turns and (u, 3) shifts of the relative poses that fit the photos best."""
+        """Return the (u, 3, 3) turns and (u, 3) shifts at the origin, and of loops as they were measured."""
         turn, shift = relative_poses(self.origin, self.reference, self.frame)
         if self.loops is not None:
             turn[self.num_from_points :], shift[self.num_from_points :] = self.loops.turn, self.loops.shift
@@ -261,7 +264,30 @@ def vision_information(observations: Observations, poses: Poses) -> VisionInform
     starts = np.searchsorted(place[: len(key)], np.arange(len(pairs) + 1))
     size = 6 * len(pairs)
     matrix = sparse.bsr_array((values / share, place[len(key) :], starts), shape=(size, size))
-    return VisionInformation(poses, pairs // n, pairs % n, matrix)
+    return VisionInformation(poses, pairs // n, pairs % n, matrix, np.zeros(size))
+
+
+def photo_gradient(observations: Observations, poses: Poses) -> Array:
+    """Return the (6 n,) gradient of half the photos' sum of squares by the poses, where the points follow them.
+
+    The numbers of a pose are a turn in its own frame and a shift. In a refined map the ranges balance this gradient.
+    """
+    in_rig, in_cam, derivative = project(observations, poses, observations.points)
+    is_seen = in_cam[:, 2] > 0
+    residuals = np.where(is_seen[:, None], ray_residuals(observations, in_cam), 0.0)
+    to_rig = np.where(is_seen[:, None, None], derivative, 0.0) @ observations.cam_from_rig_rotation
+    rig_from_world = np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
+    to_point = to_rig @ rig_from_world
+    information, slope = np.zeros((len(observations.points), 3, 3)), np.zeros((len(observations.points), 3))
+    np.add.at(information, observations.point, np.swapaxes(to_point, 1, 2) @ to_point)
+    np.add.at(slope, observations.point, np.einsum("nai,na->ni", to_point, residuals))
+    ridge = 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-200
+    step = np.linalg.solve(information + ridge * np.eye(3), slope[:, :, None])
+    residuals = residuals - (to_point @ step[observations.point])[:, :, 0]
+    to_pose = np.concatenate([to_rig @ cross_matrices(in_rig), -to_point], axis=2)
+    gradient = np.zeros((len(poses), 6))
+    np.add.at(gradient, observations.frame, np.einsum("nai,na->ni", to_pose, residuals))
+    return gradient.ravel()
 
 
 def _added(key: Indices, blocks: Array) -> tuple[Indices, Array]:

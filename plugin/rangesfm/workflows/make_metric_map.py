@@ -104,8 +104,10 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         with run.journal.stage("refinement"):
             metric = refine_map(run, metric)
         if (found := find_loops(run, metric)) is not None:
-            with run.journal.stage("refinement"):
-                again = metric if found.closing is None else refine_map(run, metric, found.closing)
+            again = metric
+            if found.closing is not None:
+                with run.journal.stage("refinement"):
+                    again = refine_map(run, metric, found.closing)
             metric = closed(run, found, metric, again)
     with run.journal.timed("judgement"):
         return judge_map(run, metric, of_pieces)
