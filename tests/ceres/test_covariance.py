@@ -272,7 +272,7 @@ def test_large_problems_are_solved_sparsely_with_the_same_answer(monkeypatch: py
     answers = []
     for dense_from in (0.0, 1.0):
         monkeypatch.setattr("rangesfm.ceres.linear_solver._DENSE_FROM", dense_from)
-        monkeypatch.setattr("rangesfm.ceres.covariance._BLOCKS_AT_ONCE", 7)
+        monkeypatch.setattr("rangesfm.ceres.nested_dissection._MAX_LEAF", 3)
         answers.append(
             joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
         )

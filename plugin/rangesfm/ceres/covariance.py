@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
-from rangesfm.ceres.linear_solver import SingularError, factor, normal_matrix, resized
+from rangesfm.ceres.linear_solver import factor, normal_matrix, resized
+from rangesfm.ceres.nested_dissection import NestedFactor, SingularError
 from rangesfm.ceres.part_errors import PartSteps, map_errors
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.map_errors import MapErrors
@@ -23,14 +24,11 @@ from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import both
 
-_Product = Callable[[Array], Array]
-
 # A motion of the whole world changes no residual if its effect is below this share of the effects of its parts alone:
 # rounding leaves some 1e-15, a single weak range some 1e-5.
 _FREE_MOTION = 1e-9
 # Smallest pivot of the normal equations, with their diagonal scaled to 1, for a direction to count as determined.
 _MIN_PIVOT = 1e-13
-_BLOCKS_AT_ONCE = 64
 # Share of the squared extent of a path below which it is straight: then the turn about it is not determined.
 _NO_TURN = 1e-10
 
@@ -120,8 +118,8 @@ def joint_covariance(
     jacobian = tangent_jacobian(problem, columns.variable)
     normal, kept, _ = _schur_complement(jacobian, columns, np.zeros(jacobian.shape[0]))
     free = _free_motions(jacobian, _world_motions(columns))[kept]
-    inverse = _Inverse(normal, free, columns, _excess(jacobian, kept, columns, errors))
-    blocks = inverse.diagonal_blocks([columns.span(i) for i in range(columns.num_kept_blocks)])
+    inverse = _Inverse(normal, free, columns, _Excess.of(jacobian, kept, columns, errors))
+    blocks = inverse.diagonal_blocks()
     variance = residual_stddev**2
     frames = columns.frames
     poses = np.array([variance * columns.covariance(pose, blocks) for pose in columns.poses]).reshape(-1, 6, 6)
@@ -166,7 +164,7 @@ class PhotosAlone:
         jacobian, residuals = tangent_jacobian(problem, self._columns.variable), problem.evaluate_residuals()
         normal, kept, self._gradient = _schur_complement(jacobian, self._columns, np.asarray(residuals))
         free = _free_motions(jacobian, _world_motions(self._columns))[kept]
-        self._inverse = _Inverse(normal, free, self._columns, np.zeros_like)
+        self._inverse = _Inverse(normal, free, self._columns, _Excess.of(jacobian, kept, self._columns, None))
         self._size, self._stddev = len(kept), residual_stddev
 
     def of_functions(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
@@ -271,17 +269,28 @@ class _Columns:
         return f"{kind} number {self.kinds[:index].count(kind)}"
 
 
-def _excess(jacobian: csc_array, kept: Indices, columns: _Columns, errors: ResidualErrors | None) -> _Product:
-    """Return the product of J^T (S - 1) J, in the columns that are kept, with a matrix (size, k)."""
-    if errors is None:
-        return np.zeros_like
-    has_point = np.diff(csr_array(jacobian[:, columns.num_kept_columns :]).indptr) > 0
-    has_point[errors.rows] = True
-    of_all = csr_array(jacobian[:, kept])
-    rows, without = of_all[errors.rows], of_all[np.flatnonzero(~has_point)]
-    independent, by_error = csr_array(rows.T @ rows), csr_array(rows.T @ errors.by_error)
-    independent = independent + (1 - errors.variance_without_points) * csr_array(without.T @ without)
-    return lambda right: np.asarray(by_error @ (errors.covariance @ (by_error.T @ right)) - independent @ right)
+@dataclass(frozen=True)
+class _Excess:
+    """J^T (S - 1) J in the columns that are kept: by_error @ covariance @ by_error.T - independent."""
+
+    by_error: csr_array
+    covariance: Array
+    independent: csr_array
+
+    @classmethod
+    def of(cls, jacobian: csc_array, kept: Indices, columns: _Columns, errors: ResidualErrors | None) -> _Excess:
+        if errors is None:
+            return cls(csr_array((len(kept), 0)), np.zeros((0, 0)), csr_array((len(kept), len(kept))))
+        has_point = np.diff(csr_array(jacobian[:, columns.num_kept_columns :]).indptr) > 0
+        has_point[errors.rows] = True
+        of_all = csr_array(jacobian[:, kept])
+        rows, without = of_all[errors.rows], of_all[np.flatnonzero(~has_point)]
+        independent = csr_array(rows.T @ rows) + (1 - errors.variance_without_points) * csr_array(without.T @ without)
+        return cls(csr_array(rows.T @ errors.by_error), errors.covariance, independent)
+
+    def times(self, right: Array) -> Array:
+        """Return the product with a matrix (size, k)."""
+        return np.asarray(self.by_error @ (self.covariance @ (self.by_error.T @ right)) - self.independent @ right)
 
 
 def _address(block: Array) -> int:
@@ -365,60 +374,67 @@ def _free_motions(jacobian: csc_array, motions: Array) -> Array:
 
 
 class _Inverse:
-    """Pseudo-inverse of the normal equations, orthogonal to the free motions."""
+    """Pseudo-inverse of the normal equations, orthogonal to the free motions, and the covariance by it."""
 
-    def __init__(self, normal: Array | csr_array, free: Array, columns: _Columns, excess: _Product) -> None:
-        self._excess = excess
-        self._free = linalg.orth(free) if free.shape[1] else free
+    def __init__(self, normal: Array | csr_array, free: Array, columns: _Columns, excess: _Excess) -> None:
+        self._excess, self._free = excess, linalg.orth(free) if free.shape[1] else free
         scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
         # Fixing as many coordinates as there are free motions makes the matrix regular; any suitable choice will do.
         held = np.zeros(len(scale))
         held[linalg.qr(self._free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
         scaled = diags_array(scale) @ normal @ diags_array(scale) + diags_array(held)
         self._scale = scale[:, None]
-        self._solve_scaled = _solver(scaled, columns)
+        self._starts = np.concatenate(
+            [columns.starts[: columns.num_kept_blocks + 1], np.arange(columns.num_kept_columns, len(scale), 3) + 3]
+        )
+        self._factor = _factored(scaled, self._starts, columns)
 
     def solve(self, right: Array) -> Array:
         """Solve for a right side (size, k)."""
         right = right - self._free @ (self._free.T @ right)
-        solution = self._scale * self._solve_scaled(self._scale * right)
+        solution = self._scale * self._factor.solve(self._scale * right)
         return np.asarray(solution - self._free @ (self._free.T @ solution))
 
-    def diagonal_blocks(self, spans: Sequence[slice]) -> list[Array]:
-        """Return the blocks of the covariance at these rows and columns."""
-        blocks: list[Array] = []
-        for first in range(0, len(spans), _BLOCKS_AT_ONCE):
-            some = spans[first : first + _BLOCKS_AT_ONCE]
-            start, stop = some[0].start, some[-1].stop
-            right = np.zeros((len(self._scale), stop - start))
-            right[np.arange(start, stop), np.arange(stop - start)] = 1.0
-            solution = self.solve(right)
-            excess = self._excess(solution)
-            for span in some:
-                of_block = slice(span.start - start, span.stop - start)
-                blocks.append(solution[span, of_block] + solution[:, of_block].T @ excess[:, of_block])
-        return blocks
+    def diagonal_blocks(self) -> list[Array]:
+        """Return the blocks of the covariance on its diagonal."""
+        scale, free, excess = self._scale[:, 0], self._free, self._excess
+        between = diags_array(scale) @ -excess.independent @ diags_array(scale)
+        blocks = self._factor.blocks_of_sandwich(csr_array(between))
+        # The same without the free motions, from the product of this matrix with them.
+        of_free = self._scale * self._factor.solve(self._scale * free)
+        of_free -= self._scale * self._factor.solve(self._scale * (excess.independent @ of_free))
+        of_free -= 0.5 * free @ (free.T @ of_free)
+        by_error = self.solve(excess.by_error.toarray())
+        return [
+            self._scale[rows] * block * self._scale[rows].T
+            - of_free[rows] @ free[rows].T
+            - free[rows] @ of_free[rows].T
+            + by_error[rows] @ excess.covariance @ by_error[rows].T
+            for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
+        ]
 
     def covariance_times(self, right: Array) -> Array:
         """Return the covariance of all columns times (size, k)."""
         solution = self.solve(right)
-        return solution + self.solve(self._excess(solution))
+        return solution + self.solve(self._excess.times(solution))
 
     def of_functions(self, gradients: Array) -> Array:
         """Return the (k, k) covariance of linear functions with (size, k) gradients."""
         solution = self.solve(gradients)
-        return np.asarray(gradients.T @ solution + solution.T @ self._excess(solution))
+        return np.asarray(gradients.T @ solution + solution.T @ self._excess.times(solution))
 
 
-def _solver(normal: Array | csr_array, columns: _Columns) -> Callable[[Array], Array]:
+def _factored(normal: Array | csr_array, starts: Indices, columns: _Columns) -> NestedFactor:
+    is_pose = np.array([kind == "pose" for kind in columns.kinds[: columns.num_kept_blocks]], dtype=bool)
+    is_last = np.append(~is_pose, np.zeros(len(starts) - 1 - len(is_pose), dtype=bool))
     try:
-        factored = factor(normal)
+        found = factor(normal, starts, is_last)
     except SingularError as error:
         raise _not_determined(columns, error.column) from error
-    worst = int(np.argmin(factored.pivots))
-    if not factored.pivots[worst] > _MIN_PIVOT:
+    worst = int(np.argmin(found.pivots))
+    if not found.pivots[worst] > _MIN_PIVOT:
         raise _not_determined(columns, worst)
-    return factored.solve
+    return found
 
 
 def _not_determined(columns: _Columns, column: int) -> GeometryError:

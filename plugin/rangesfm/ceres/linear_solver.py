@@ -8,20 +8,15 @@ from __future__ import annotations
 import functools
 import itertools
 import operator
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
-from scipy.sparse import bsr_array, csc_array, csr_array
+from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from scipy.sparse.linalg import splu
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.ceres.nested_dissection import NestedFactor, cost_of_factor
 from rangesfm.processes.threads import side_by_side
 
-# Time for an entry of a sparse factor, relative to an entry of a dense factor.
-_SPARSE_SLOWDOWN = 8
 # The same per multiplication, where whole blocks of photos are eliminated at once.
 _BLOCKWISE_SLOWDOWN = 2
 # From this share of nonzeros on, a dense factor is faster than a sparse one.
@@ -35,16 +30,14 @@ def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
 
     COLMAP uses an iterative solver beyond a number of photos, whatever they see. Along a path, where each photo shares
     points with few others, that converges slowly, while the time of the direct solver is proportional to the number of
-    photos. The envelope gives an upper bound of its cost, because a row of the Cholesky factor begins no further left
-    than that of its matrix (George and Liu, "Computer Solution of Large Sparse Positive Definite Systems", 1981). The
-    bound is compared with the cost of ``limit`` photos that all share points.
+    photos. A bound of its cost is compared with the cost of ``limit`` photos that all share points.
 
     Args:
         overlaps: (n, n), symmetric; nonzero where two photos share a point.
         limit: COLMAP's ``max_num_images_direct_sparse_cpu_solver``.
     """
     num = overlaps.shape[0]
-    return num if num > limit and _cost(_envelope_widths(overlaps)) <= _cost(np.arange(limit)) else limit
+    return num if num > limit and _cost(overlaps) <= _cost_of_all(limit) else limit
 
 
 def dense_is_faster(overlaps: csr_array) -> bool:
@@ -53,34 +46,35 @@ def dense_is_faster(overlaps: csr_array) -> bool:
     Args:
         overlaps: as for ``max_num_images_direct``.
     """
-    return _cost(np.arange(overlaps.shape[0])) < _BLOCKWISE_SLOWDOWN * _cost(_envelope_widths(overlaps))
+    return _cost_of_all(overlaps.shape[0]) < _BLOCKWISE_SLOWDOWN * _cost(overlaps)
 
 
 def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:
-    """Return True if the photos' columns of the inverse take no longer than those of ``limit`` photos that all overlap.
-
-    The time for a column is proportional to the number of entries of the factor.
+    """Return True if factor and inverse take no longer than those of ``limit`` photos that all overlap.
 
     Args:
         overlaps: as for ``max_num_images_direct``.
     """
-    num = int(overlaps.shape[0])
-    num_entries = _SPARSE_SLOWDOWN * int(np.sum(_envelope_widths(overlaps) + 1))
-    return num <= limit or num * num_entries <= limit * limit * (limit + 1) // 2
+    return bool(overlaps.shape[0] <= limit) or cost_of_factor(overlaps) <= float(limit) ** 3
 
 
-def _envelope_widths(overlaps: csr_array) -> Indices:
-    """Return (n,) distances from each row's first entry to the diagonal, in an order that keeps neighbours together."""
+def _cost(overlaps: csr_array) -> float:
+    """Return an upper bound on the multiplications of a Cholesky factorisation, up to a constant factor.
+
+    It is that of the envelope, because a row of the factor begins no further left than that of its matrix (George and
+    Liu, "Computer Solution of Large Sparse Positive Definite Systems", 1981), or that of nested dissection.
+    """
     order = reverse_cuthill_mckee(overlaps, symmetric_mode=True)
-    ordered = overlaps[order][:, order].tocoo()
+    ordered = csr_array(overlaps[order][:, order]).tocoo()
     leftmost = np.arange(overlaps.shape[0])
     np.minimum.at(leftmost, ordered.row, ordered.col)
-    return np.arange(overlaps.shape[0]) - leftmost
+    widths = np.arange(overlaps.shape[0]) - leftmost
+    return min(float(np.sum(widths.astype(np.float64) ** 2)), cost_of_factor(overlaps))
 
 
-def _cost(widths: Indices) -> float:
-    """Return the number of multiplications of a Cholesky factorisation, up to a constant factor."""
-    return float(np.sum(widths.astype(np.float64) ** 2))
+def _cost_of_all(num: int) -> float:
+    """Return the same for photos that all overlap."""
+    return float(np.sum(np.arange(num, dtype=np.float64) ** 2))
 
 
 def normal_matrix(rows: bsr_array, information: bsr_array | None = None) -> bsr_array:
@@ -107,7 +101,7 @@ def resized(normal: bsr_array, size: int) -> Array | csr_array:
     return dense
 
 
-def _is_full(normal: bsr_array | csc_array | csr_array) -> bool:
+def _is_full(normal: bsr_array | csr_array) -> bool:
     return bool(normal.nnz > _DENSE_FROM * normal.shape[0] ** 2)
 
 
@@ -119,56 +113,15 @@ def _strip(rows: bsr_array, first: int, last: int) -> bsr_array:
     return bsr_array((rows.data[entries], rows.indices[entries], starts - starts[0]), shape=shape)
 
 
-class SingularError(Exception):
-    """A matrix is singular: a column depends on others.
+def factor(normal: Array | csr_array, starts: Indices, is_last: Mask) -> NestedFactor:
+    """Factor normal equations; dense ones are overwritten, and sparse ones that are full enough are made dense.
 
-    Attributes:
-        column: the one at which this shows.
-    """
-
-    def __init__(self, column: int) -> None:
-        super().__init__(f"column {column} depends on others")
-        self.column = column
-
-
-@dataclass(frozen=True)
-class Factored:
-    """A factor of a symmetric positive definite matrix.
-
-    Attributes:
-        solve: solves for a right side of shape (size, k) or (size,).
-        pivots: (size,) of the columns.
-    """
-
-    solve: Callable[[Array], Array]
-    pivots: Array
-
-
-def factor(normal: Array | csr_array) -> Factored:
-    """Factor normal equations; dense ones are overwritten.
+    Args:
+        starts, is_last: as for ``NestedFactor``.
 
     Raises:
         SingularError: they are singular, by rounding or exactly.
     """
-    if isinstance(normal, np.ndarray):
-        return _dense(normal)
-    return _dense(normal.toarray()) if _is_full(normal) else _sparse(normal.T)  # in columns; it is symmetric
-
-
-def _dense(normal: Array) -> Factored:
-    # The matrix is symmetric, so its transpose has the memory order of LAPACK and nothing is copied. SciPy's own
-    # function reports the failing column only in a text that differs between versions.
-    lower, info = linalg.lapack.dpotrf(normal.T, lower=True, overwrite_a=True, clean=False)
-    if info > 0:
-        raise SingularError(info - 1)
-    return Factored(
-        lambda right: np.asarray(linalg.cho_solve((lower, True), right, check_finite=False)), np.square(np.diag(lower))
-    )
-
-
-def _sparse(normal: csc_array) -> Factored:
-    try:
-        lu = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    except RuntimeError as error:  # exactly singular
-        raise SingularError(int(np.argmin(normal.diagonal()))) from error
-    return Factored(lambda right: np.asarray(lu.solve(right)), np.abs(lu.U.diagonal())[lu.perm_c])
+    if not isinstance(normal, np.ndarray) and _is_full(normal):
+        normal = normal.toarray()
+    return NestedFactor(normal, starts, is_last)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -150,16 +152,32 @@ def bundle_adjustment(
         SolverError: no point takes part.
         InputError: an option passed through to COLMAP is unknown.
     """
-    adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_id, num_threads)
-    for point_id in left_out_ids:
-        if adjuster.problem.has_parameter_block(xyz := metric.point3D(point_id).xyz):
-            adjuster.problem.remove_parameter_block(xyz)
+    with _without_points(metric, left_out_ids):
+        adjuster = _bundle_adjuster(metric, camera, options, fixed_frame_id, num_threads)
     num_reprojections = adjuster.problem.num_residuals()
     if num_reprojections == 0:
         raise SolverError("no point of the model takes part in the bundle adjustment")
     pixel_stddev = _pixel_stddev(adjuster, num_reprojections)
     tie_points = _tie_points(metric, adjuster, marker_ids)
     return BundleAdjustment(metric, adjuster, num_reprojections, pixel_stddev, tie_points)
+
+
+@contextmanager
+def _without_points(metric: pycolmap.Reconstruction, point_ids: Collection[int]) -> Iterator[None]:
+    """Take some points out of a model inside the block.
+
+    To remove a point from a finished problem takes Ceres as long as to go through the whole problem.
+    """
+    points = {point_id: copy(metric.point3D(point_id)) for point_id in point_ids}
+    for point_id in points:
+        metric.delete_point3D(point_id)
+    try:
+        yield
+    finally:
+        for point_id, point in points.items():
+            metric.add_point3D_with_id(point_id, point)
+            for element in point.track.elements:
+                metric.image(element.image_id).set_point3D_for_point2D(element.point2D_idx, point_id)
 
 
 def _tie_points(

@@ -14,8 +14,9 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.linear_solver import Factored, SingularError, factor, normal_matrix, resized
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.ceres.linear_solver import factor, normal_matrix, resized
+from rangesfm.ceres.nested_dissection import NestedFactor, SingularError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
@@ -117,7 +118,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     factored, used, step_count, movement = None, damping, 0, 0.0
     while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
         step_count += 1
-        solved, used, factored = terms, damping, _factor(terms.hessian_of_free, damping)
+        solved, used, factored = terms, damping, _factor(terms.hessian_of_free, damping, layout.blocks)
         step = factored.solve(-terms.gradient[layout.free])
         trial = _moved(state, layout, step)
         trial_terms = _Terms.at(graph, layout, trial)
@@ -129,7 +130,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
         if min(movement, still_to_come(movement, last)) < tolerance_m:
             break
     if factored is None or used > _INITIAL_DAMPING:  # more would hide what the ranges determine
-        factored = _factor(solved.hessian_of_free, 0.0)
+        factored = _factor(solved.hessian_of_free, 0.0, layout.blocks)
     return GraphSolution(state, step_count, _num_absorbed(solved, factored))
 
 
@@ -156,9 +157,10 @@ class GraphBending:
         return BendingOfBins(() if found is None else (found,), covariance, np.zeros(len(by_pose)))
 
     @cached_property
-    def _factored(self) -> Factored:
+    def _factored(self) -> NestedFactor:
         _, seen = _relative_poses(self.vision, self.vision.origin)
-        return _factor(resized(normal_matrix(seen, self.vision.matrix), 6 * len(self.path)), 0.0)
+        num = len(self.path)
+        return _factor(resized(normal_matrix(seen, self.vision.matrix), 6 * num), 0.0, _pose_blocks(num))
 
 
 def with_gradient(vision: VisionInformation, gradient: Array) -> VisionInformation:
@@ -169,7 +171,7 @@ def with_gradient(vision: VisionInformation, gradient: Array) -> VisionInformati
     """
     _, by_pose = _relative_poses(vision, vision.origin)
     normal = resized(normal_matrix(by_pose, vision.matrix), len(gradient))
-    to_optimum = _factor(normal, 0.0).solve(-gradient)
+    to_optimum = _factor(normal, 0.0, _pose_blocks(len(gradient) // 6)).solve(-gradient)
     return replace(vision, from_optimum=-(by_pose @ to_optimum))
 
 
@@ -215,6 +217,14 @@ class _Layout:
         starts = np.flatnonzero(np.diff(key[order], prepend=-1))
         world_is_free = graph.held_frame is None
         return cls(first_anchor, first_bias, num, np.flatnonzero(is_free), world_is_free, of_ranges, order, starts)
+
+    @property
+    def blocks(self) -> tuple[Indices, Mask]:
+        """Return the first free column of each pose, and of all else, and whether it is all else, which comes last."""
+        starts = np.arange(0, np.count_nonzero(self.free < self.first_anchor) + 1, 6)
+        if starts[-1] < len(self.free):
+            starts = np.append(starts, len(self.free))
+        return starts, starts[:-1] >= np.count_nonzero(self.free < self.first_anchor)
 
     def squares(self, rows: sparse.csr_array) -> sparse.coo_array:
         """Return J^T J of the ranges, from dense products within each group of equal columns."""
@@ -362,17 +372,26 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     return np.array(residuals), sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def _factor(hessian: Array | sparse.csr_array, damping: float) -> Factored:
-    """Factor a Hessian, with more damping if rounding makes it indefinite, as happens in a meaningless map."""
+def _pose_blocks(num: int) -> tuple[Indices, Mask]:
+    """Return the blocks of n poses alone."""
+    return 6 * np.arange(num + 1), np.zeros(num, dtype=bool)
+
+
+def _factor(hessian: Array | sparse.csr_array, damping: float, blocks: tuple[Indices, Mask]) -> NestedFactor:
+    """Factor a Hessian, with more damping if rounding makes it indefinite, as happens in a meaningless map.
+
+    Args:
+        blocks: as ``_Layout.blocks`` and ``_pose_blocks`` give them.
+    """
     diagonal = hessian.diagonal()
     # The floor keeps a pose without constraints in place.
     damped = hessian + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
     try:
-        return factor(damped)
+        return factor(damped, *blocks)
     except SingularError:
         if damping > _MAX_DAMPING:  # then the matrix has entries that are not finite
             raise
-        return _factor(hessian, max(10 * damping, _INITIAL_DAMPING))
+        return _factor(hessian, max(10 * damping, _INITIAL_DAMPING), blocks)
 
 
 def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:
@@ -399,7 +418,7 @@ def _turned(poses: Poses, turns: Array, shifts: Array, *, is_free: bool) -> Pose
     return Poses(around @ own @ poses.world_from_rig, poses.centers + shifts + arcs)
 
 
-def _num_absorbed(terms: _Terms, factored: Factored) -> float:
+def _num_absorbed(terms: _Terms, factored: NestedFactor) -> float:
     """Estimate the trace of the ranges' hat matrix with random vectors (Hutchinson 1990)."""
     rng = np.random.default_rng(0)
     whitened = terms.whitened[:, terms.layout.free]

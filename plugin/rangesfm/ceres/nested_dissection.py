@@ -1,0 +1,306 @@
+"""Cholesky factor of normal equations by nested dissection, and the diagonal blocks of their inverse.
+
+A separator is a set of photos without which the others fall into two parts that share no point. The parts are divided
+in the same way, and each separator is eliminated after its parts (George, "Nested dissection of a regular finite
+element mesh", 1973). What is eliminated at once, with all that it is tied to, is a dense matrix, a front (Duff and
+Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", 1983). From the last front back to
+the first, the entries of the inverse within each front follow from those within the next one that it is tied to
+(Erisman and Tinney, "On computing certain elements of the inverse of a sparse matrix", 1975), in about the time of the
+factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy import linalg
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from rangesfm.arrays import Array, Indices, Mask
+
+# Largest number of blocks that are not divided any further.
+_MAX_LEAF = 50
+
+
+class SingularError(Exception):
+    """A matrix is singular: a column depends on others.
+
+    Attributes:
+        column: the one at which this shows.
+    """
+
+    def __init__(self, column: int) -> None:
+        super().__init__(f"column {column} depends on others")
+        self.column = column
+
+
+@dataclass(frozen=True)
+class Front:
+    """Blocks that are eliminated at once.
+
+    Attributes:
+        own: (m,) blocks. boundary: (b,) blocks that are eliminated later and that these are tied to, in that order.
+        children: numbers of the fronts before whose boundary begins here.
+    """
+
+    own: Indices
+    boundary: Indices
+    children: tuple[int, ...]
+
+
+def fronts_of(tied: csr_array, is_last: Mask) -> list[Front]:
+    """Return the fronts in the order of their elimination, each after its children.
+
+    Args:
+        tied: (n, n) symmetric; nonzero where two blocks are tied to each other.
+        is_last: (n,) blocks to be eliminated after all others, such as those that many others are tied to.
+    """
+    first = np.flatnonzero(~is_last)
+    parts = list(_dissected(csr_array(tied[first][:, first]), first))
+    if is_last.any():
+        parts.append(np.flatnonzero(is_last))
+    block_at = np.concatenate(parts)
+    place = np.argsort(block_at)
+    part_at = np.repeat(np.arange(len(parts)), [len(own) for own in parts])
+    below: list[list[int]] = [[] for _ in parts]
+    fronts: list[Front] = []
+    for number, own in enumerate(parts):
+        ties = [csr_array(tied[own]).indices, *(fronts[child].boundary for child in below[number])]
+        places = np.unique(place[np.concatenate(ties)])
+        later = places[places > place[own].max()]
+        fronts.append(Front(own, block_at[later], tuple(below[number])))
+        if len(later):
+            below[part_at[later[0]]].append(number)
+    return fronts
+
+
+def _dissected(tied: csr_array, blocks: Indices) -> Iterator[Indices]:
+    """Yield the blocks in parts, each separator after the parts that it separates."""
+    if len(blocks) > _MAX_LEAF:
+        order = reverse_cuthill_mckee(tied, symmetric_mode=True)
+        is_second = np.zeros(len(blocks), dtype=bool)
+        is_second[order[len(order) // 2 :]] = True
+        rims = (~is_second & (tied @ is_second > 0), is_second & (tied @ ~is_second > 0))
+        is_between = min(rims, key=np.count_nonzero)
+        halves = [np.flatnonzero(half & ~is_between) for half in (~is_second, is_second)]
+        if all(map(len, halves)):
+            for rows in halves:
+                yield from _dissected(csr_array(tied[rows][:, rows]), blocks[rows])
+            blocks = blocks[is_between]
+    if len(blocks):
+        yield blocks
+
+
+def cost_of_factor(tied: csr_array) -> float:
+    """Return the number of multiplications of a factor, up to a constant factor, with blocks of one column.
+
+    Args:
+        tied: (n, n) as for ``fronts_of``.
+    """
+    fronts = fronts_of(tied, np.zeros(tied.shape[0], dtype=bool))
+    return float(sum(len(front.own) * float(len(front.own) + len(front.boundary)) ** 2 for front in fronts))
+
+
+class _Shape(NamedTuple):
+    """A front by columns.
+
+    Attributes:
+        columns: (size,) places in the order of elimination, ascending; the first ``num_own`` are eliminated here.
+        children: as of the front.
+    """
+
+    columns: Indices
+    num_own: int
+    children: tuple[int, ...]
+
+    @property
+    def own(self) -> slice:
+        first = int(self.columns[0])
+        return slice(first, first + self.num_own)
+
+    @property
+    def rest(self) -> Indices:
+        return self.columns[self.num_own :]
+
+
+class _Eliminated(NamedTuple):
+    """The eliminated part of a front.
+
+    Attributes:
+        lower: (m, m) Cholesky factor of its own part. tie: (m, rest) ``lower``'s inverse times the tie to the rest.
+    """
+
+    lower: Array
+    tie: Array
+
+    def solved(self, right: Array, *, transposed: bool = False) -> Array:
+        """Return the inverse of ``lower``, or of its transpose, times (m, k)."""
+        return np.asarray(
+            linalg.solve_triangular(self.lower, right, lower=True, trans=int(transposed), check_finite=False)
+        )
+
+    def inverse_times(self, right: Array) -> Array:
+        """Return the inverse of the front's own part times (m, k)."""
+        return self.solved(self.solved(right), transposed=True)
+
+
+class NestedFactor:
+    """A Cholesky factor of a symmetric positive definite matrix.
+
+    Attributes:
+        pivots: (size,) of the columns.
+    """
+
+    pivots: Array
+
+    def __init__(self, matrix: Array | csr_array, starts: Indices, is_last: Mask) -> None:
+        """Factor a matrix; a dense one is one front, and is overwritten.
+
+        Args:
+            matrix: (size, size). starts: (n + 1,) first column of each of n blocks, and the size.
+            is_last: (n,) as for ``fronts_of``.
+
+        Raises:
+            SingularError: the matrix is singular, by rounding or exactly.
+        """
+        if isinstance(matrix, np.ndarray):
+            fronts = [Front(np.arange(len(is_last)), np.zeros(0, dtype=np.int64), ())] if len(matrix) else []
+        else:
+            fronts = fronts_of(_tied_blocks(matrix, starts), is_last)
+        self._order = _columns_of([front.own for front in fronts], starts)
+        place = np.argsort(self._order)
+        sizes = np.diff(starts)
+        self._shapes = [
+            _Shape(place[_columns_of([f.own, f.boundary], starts)], int(sizes[f.own].sum()), f.children) for f in fronts
+        ]
+        self._starts, self._place, self._eliminated = starts, place, list[_Eliminated]()
+        self._from_below(matrix, self._eliminate)
+        squares = [np.square(np.diag(front.lower)) for front in self._eliminated]
+        self.pivots = np.concatenate([np.zeros(0), *squares])[place]
+
+    def _from_below(self, matrix: Array | csr_array, rest_of: Callable[[int, Array], Array]) -> None:
+        """Assemble a matrix front by front; ``rest_of`` returns what a front adds to the next one, on its rest."""
+        is_dense, rests = isinstance(matrix, np.ndarray), dict[int, Array]()
+        ordered = matrix if is_dense else csr_array(matrix[self._order][:, self._order])
+        for number, shape in enumerate(self._shapes):
+            full = ordered if is_dense else _rows_of_front(ordered, shape)
+            for child in shape.children:
+                at = np.searchsorted(shape.columns, self._shapes[child].rest)
+                full[np.ix_(at, at)] += rests.pop(child)
+            rests[number] = rest_of(number, full)
+
+    def _eliminate(self, number: int, full: Array) -> Array:
+        shape = self._shapes[number]
+        own = slice(shape.num_own)
+        # The matrix is symmetric, so its transpose has the memory order of LAPACK. SciPy's own function reports the
+        # failing column only in a text that differs between versions.
+        lower, info = linalg.lapack.dpotrf(full[own, own].T, lower=True, overwrite_a=True, clean=True)
+        if info > 0:
+            raise SingularError(int(self._order[shape.own.start + info - 1]))
+        front = _Eliminated(lower, np.zeros((shape.num_own, 0)))
+        front = front._replace(tie=front.solved(full[own, shape.num_own :]))
+        self._eliminated.append(front)
+        return full[shape.num_own :, shape.num_own :] - front.tie.T @ front.tie
+
+    def solve(self, right: Array) -> Array:
+        """Solve for a right side of shape (size, k) or (size,)."""
+        found = right.reshape(len(right), -1)[self._order]
+        for shape, front in zip(self._shapes, self._eliminated, strict=True):
+            found[shape.own] = front.solved(found[shape.own])
+            found[shape.rest] -= front.tie.T @ found[shape.own]
+        for shape, front in zip(reversed(self._shapes), reversed(self._eliminated), strict=True):
+            found[shape.own] = front.solved(found[shape.own] - front.tie @ found[shape.rest], transposed=True)
+        return found[self._place].reshape(right.shape)
+
+    def blocks_of_sandwich(self, between: csr_array) -> list[Array]:
+        """Return the diagonal blocks of inverse + inverse @ between @ inverse.
+
+        Args:
+            between: (size, size), symmetric, with no entries where the factored matrix has none.
+        """
+        changes = self._changes(between)
+        blocks: list[Array] = [np.zeros((0, 0))] * (len(self._starts) - 1)
+        parent_of = {child: number for number, shape in enumerate(self._shapes) for child in shape.children}
+        of_fronts: dict[int, tuple[Array, Array]] = {}
+        for number in reversed(range(len(self._shapes))):
+            shape, of_rest = self._shapes[number], (np.zeros((0, 0)), np.zeros((0, 0)))
+            if (parent := parent_of.get(number)) is not None:
+                at = np.ix_(*[np.searchsorted(self._shapes[parent].columns, shape.rest)] * 2)
+                of_rest = of_fronts[parent][0][at], of_fronts[parent][1][at]
+                if number == self._shapes[parent].children[0]:  # the last one that needs it
+                    del of_fronts[parent]
+            inverse, product = _upwards(self._eliminated[number], *changes.pop(), *of_rest)
+            own = inverse[: shape.num_own, : shape.num_own] + product[: shape.num_own, : shape.num_own]
+            for block in np.unique(np.searchsorted(self._starts, self._order[shape.own], side="right") - 1).tolist():
+                rows = self._place[self._starts[block] : self._starts[block + 1]] - shape.own.start
+                blocks[block] = own[np.ix_(rows, rows)]
+            if shape.children:
+                of_fronts[number] = inverse, product
+        return blocks
+
+    def _changes(self, matrix: csr_array) -> list[tuple[Array, Array]]:
+        """Return the parts (m, m), (m, rest) by which each front changes if a multiple of a matrix is added."""
+        changes: list[tuple[Array, Array]] = []
+
+        def rest_of(number: int, full: Array) -> Array:
+            num, front = self._shapes[number].num_own, self._eliminated[number]
+            own, tie = full[:num, :num].copy(), full[:num, num:].copy()
+            changes.append((own, tie))
+            by_rest = front.solved(front.tie, transposed=True)
+            crossed = (tie - 0.5 * own @ by_rest).T @ by_rest
+            return np.asarray(full[num:, num:] - crossed - crossed.T)
+
+        self._from_below(matrix, rest_of)
+        return changes
+
+
+def _upwards(
+    front: _Eliminated, own_change: Array, tie_change: Array, inverse: Array, product: Array
+) -> tuple[Array, Array]:
+    """Return inverse, and inverse @ matrix @ inverse, of a whole front, given those of its rest.
+
+    The second one is minus the derivative of the first one as a multiple of the matrix is added.
+
+    Args:
+        own_change, tie_change: derivatives of the front's parts.
+    """
+    by_rest = front.solved(front.tie, transposed=True)
+    by_rest_change = front.inverse_times(tie_change - own_change @ by_rest)
+    inverse_tie = -by_rest @ inverse
+    product_tie = by_rest_change @ inverse - by_rest @ product
+    inverse_own = front.inverse_times(np.eye(len(front.lower))) - inverse_tie @ by_rest.T
+    of_own = front.inverse_times(front.inverse_times(own_change).T)
+    product_own = of_own - product_tie @ by_rest.T + inverse_tie @ by_rest_change.T
+    return (
+        np.block([[inverse_own, inverse_tie], [inverse_tie.T, inverse]]),
+        np.block([[product_own, product_tie], [product_tie.T, product]]),
+    )
+
+
+def _tied_blocks(matrix: csr_array, starts: Indices) -> csr_array:
+    """Return the (n, n) matrix of blocks, nonzero where a block of a matrix has entries."""
+    entries = matrix.tocoo()
+    row, column = (np.searchsorted(starts, of, side="right") - 1 for of in (entries.row, entries.col))
+    num = len(starts) - 1
+    return csr_array((np.ones(len(row)), (row, column)), shape=(num, num))
+
+
+def _columns_of(blocks: Sequence[Indices], starts: Indices) -> Indices:
+    """Return the columns of some blocks, block by block."""
+    first = np.concatenate([np.zeros(0, dtype=np.int64), *blocks])
+    sizes = starts[first + 1] - starts[first]
+    within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return np.asarray(np.repeat(starts[first], sizes) + within)
+
+
+def _rows_of_front(ordered: csr_array, shape: _Shape) -> Array:
+    """Return a front with the rows of a matrix that are eliminated in it, (size, size), of which the rest is 0."""
+    full = np.zeros((len(shape.columns),) * 2)
+    rows = ordered[shape.own].tocoo()
+    is_later = rows.col >= shape.own.start
+    full[rows.row[is_later], np.searchsorted(shape.columns, rows.col[is_later])] = rows.data[is_later]
+    return full

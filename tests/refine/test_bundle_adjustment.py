@@ -1,0 +1,33 @@
+"""The bundle adjustment of photos that the ranges are added to."""
+
+from __future__ import annotations
+
+import numpy as np
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import orbit_path
+
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.refine.bundle_adjustment import bundle_adjustment
+
+
+def test_points_that_are_left_out_take_no_part_and_stay_in_the_model() -> None:
+    times, path = np.arange(6.0), orbit_path(8.0)
+    poses = (times, path.centers(times), path.world_from_cam(times))
+    model = synthetic_model(*poses, num_observations=20, pixel_stddev=1.0).reconstruction
+    before = {point_id: (point.xyz.copy(), point.track.length()) for point_id, point in model.points3D.items()}
+    num_seen = {image_id: image.num_points3D for image_id, image in model.images.items()}
+    left_out = sorted(before)[2:5]
+    bundle = bundle_adjustment(
+        model, CameraOptions(), RefineOptions(), fixed_frame_id=None, num_threads=1, left_out_ids=left_out
+    )
+    problem = bundle.adjuster.problem
+    takes_part = {point_id for point_id, point in model.points3D.items() if problem.has_parameter_block(point.xyz)}
+    assert takes_part == before.keys() - set(left_out)
+    assert problem.num_residuals() == 2 * sum(num for point_id, (_, num) in before.items() if point_id in takes_part)
+    assert {image_id: image.num_points3D for image_id, image in model.images.items()} == num_seen
+    for point_id, (xyz, length) in before.items():
+        point = model.point3D(point_id)
+        np.testing.assert_array_equal(point.xyz, xyz)
+        assert point.track.length() == length
+        for element in point.track.elements:
+            assert model.image(element.image_id).point2D(element.point2D_idx).point3D_id == point_id
