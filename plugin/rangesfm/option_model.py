@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rangesfm.arrays import Array, Mask
 
 Same = TypeVar("Same", bound="Options")
-PathRole = Literal["file", "log", "photos", "model", "output"]
+PathRole = Literal["file", "file_or_photos", "log", "photos", "model", "output"]
 _NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path", dict: "a table"}
 _TABLE_OF = "a table in which each value is "
 _UNITS = {

@@ -334,10 +334,11 @@ class PointOptions(Options, table="points"):
 class PositionOptions(Options, table="positions"):
     """Positions of an antenna on the camera: by satellites, by a radio that hands out positions, or a total station."""
 
-    path: Annotated[Path | None, KeyMeta(flag="positions", role="file")] = None
+    path: Annotated[Path | None, KeyMeta(flag="positions", role="file_or_photos")] = None
     """CSV timestamp_s,x_m,y_m,z_m[,stddev_m] (or image_name in place of timestamp_s; stddev_x_m, stddev_y_m and
     stddev_z_m, or a covariance cov_xx_m2, cov_xy_m2, ..), another table, a TUM trajectory, NMEA sentences, a solution
-    of RTKLIB, a log of Marvelmind's dashboard, or a database of COLMAP with pose priors, such as those from EXIF."""
+    of RTKLIB, a log of Marvelmind's dashboard, or a database of COLMAP with pose priors; or the folder of photos, for
+    those in their EXIF data."""
     format: Annotated[str | None, KeyMeta(flag="positions_format")] = None
     """Format of the file: table, tum, nmea, rtklib, marvelmind or colmap (default: recognised by content)."""
     columns: Annotated[dict[str, str], KeyMeta(flag="position_columns", metavar="QUANTITY=NAME,..")] = Field(

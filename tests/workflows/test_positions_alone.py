@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from PIL import Image
 from tests.known import assert_scale, known
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
@@ -19,6 +21,7 @@ from rangesfm.progress import SilentProgress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.run import refine_model, scale_model
+from rangesfm.workflows.run_results import RunResult
 
 Array = npt.NDArray[np.float64]
 QUIET = SilentProgress()
@@ -51,6 +54,31 @@ class Walk:
         rows = (f"{t + clock_ahead_s:.3f},{x:.4f},{y:.4f},{z:.4f}\n" for t, (x, y, z) in zip(times, at_m, strict=True))
         path.write_text(f"timestamp_s,x_m,y_m,z_m\n{''.join(rows)}")
         return path
+
+    def ranges(self, where: Path, too_long: float) -> Path:
+        """Write ranges to three anchors in turn, each too long by this factor."""
+        rng, path = np.random.default_rng(8), where / "uwb.csv"
+        times = np.arange(0.2, self.path.end_s - 1.2, 0.1)
+        tags_m = self.path.centers(times) + self.path.world_from_cam(times) @ ANTENNA_IN_CAM_M
+        names = [list(ANCHORS_M)[k % len(ANCHORS_M)] for k in range(len(times))]
+        range_m = too_long * np.linalg.norm(tags_m - [ANCHORS_M[name] for name in names], axis=1)
+        range_m += 0.05 * rng.standard_normal(len(times))
+        rows = (f"{t:.3f},{name},{at_m:.4f}\n" for t, name, at_m in zip(times, names, range_m, strict=True))
+        path.write_text(f"timestamp_s,anchor_id,range_m\n{''.join(rows)}")
+        return path
+
+    def with_both(self, where: Path, too_long: float) -> Survey:
+        """Return a survey with positions and such ranges, whose antennas are one."""
+        arm = tuple(ANTENNA_IN_CAM_M.tolist())
+        return self.survey(
+            where,
+            positions__path=self.positions(where),
+            positions__antenna_in_cam_m=arm,
+            positions__time_offset=0.0,
+            ranges__path=self.ranges(where, too_long),
+            ranges__time_offset=0.0,
+            tag__tag_in_cam_m=arm,
+        )
 
 
 @pytest.fixture(scope="module")
@@ -120,25 +148,7 @@ def test_clocks_that_are_apart_by_leap_seconds_are_named(walk: Walk, tmp_path: P
 def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(
     walk: Walk, tmp_path: Path, too_long: float
 ) -> None:
-    rng, rows = np.random.default_rng(8), "timestamp_s,anchor_id,range_m\n"
-    times = np.arange(0.2, walk.path.end_s - 1.2, 0.1)
-    tags_m = walk.path.centers(times) + walk.path.world_from_cam(times) @ ANTENNA_IN_CAM_M
-    for k, (time, tag_m) in enumerate(zip(times.tolist(), tags_m, strict=True)):
-        anchor_id = list(ANCHORS_M)[k % len(ANCHORS_M)]
-        range_m = too_long * np.linalg.norm(tag_m - ANCHORS_M[anchor_id]) + 0.05 * rng.standard_normal()
-        rows += f"{time:.3f},{anchor_id},{range_m:.4f}\n"
-    (tmp_path / "uwb.csv").write_text(rows)
-    arm = tuple(ANTENNA_IN_CAM_M.tolist())
-    survey = walk.survey(
-        tmp_path,
-        positions__path=walk.positions(tmp_path),
-        positions__antenna_in_cam_m=arm,
-        positions__time_offset=0.0,
-        ranges__path=tmp_path / "uwb.csv",
-        ranges__time_offset=0.0,
-        tag__tag_in_cam_m=arm,
-    )
-    summary = refine_model(survey, progress=QUIET).summary
+    summary = refine_model(walk.with_both(tmp_path, too_long), progress=QUIET).summary
     found = next(test for test in summary.tests if test.name == "positions against ranges")
     assert found.rejected == (too_long > 1)
     assert (summary.scale.verdict == "good") == (too_long == 1)
@@ -150,3 +160,38 @@ def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(
     assert_scale(summary, walk.made.metric_from_sfm.scale, 0.02)
     for anchor_id, at_m in ANCHORS_M.items():
         assert np.linalg.norm(np.array(known(summary.anchors[anchor_id].position_m)) - at_m) < 0.3
+
+
+@pytest.mark.parametrize("run", [scale_model, refine_model])
+def test_ranges_and_positions_have_the_say_on_the_scale_that_their_errors_allow(
+    walk: Walk, tmp_path: Path, run: Callable[..., RunResult]
+) -> None:
+    scale = run(walk.with_both(tmp_path, 1.03), progress=QUIET).summary.scale
+    values = {kind: np.log(entry.value) for kind, entry in scale.by_kind.items()}
+    information = {kind: (entry.value / known(entry.stddev)) ** 2 for kind, entry in scale.by_kind.items()}
+    mean = sum(information[kind] * values[kind] for kind in values) / sum(information.values())
+    apart = abs(values["ranges"] - values["positions"])
+    assert apart > 0.02
+    assert abs(np.log(scale.value) - mean) < 0.2 * apart
+    low, high = known(scale.interval_95)
+    assert (high - low) / scale.value < 2 * 1.96 / np.sqrt(information["positions"])
+
+
+def test_positions_in_the_photos_exif_data_place_the_map_without_times(walk: Walk, tmp_path: Path) -> None:
+    rng, photos, made = np.random.default_rng(3), tmp_path / "photos", walk.made
+    photos.mkdir()
+    at_m = 10 * made.centers_m + rng.standard_normal(3) + 0.3 * rng.standard_normal(made.centers_m.shape)
+    for name, (east_m, north_m, up_m) in zip(made.timestamps_s, at_m.tolist(), strict=True):
+        exif = Image.Exif()
+        metres = {2: 1e5 + north_m, 4: 1e5 + east_m}  # near the equator, some 110.6 and 111.3 km a degree
+        degrees = {2: metres[2] / 110_574.3, 4: metres[4] / 111_319.5}
+        exif[0x8825] = {1: "N", 3: "E", 5: b"\0", 6: 400.0 + up_m} | {k: (v, 0.0, 0.0) for k, v in degrees.items()}
+        Image.new("L", (16, 12)).save(photos / name, exif=exif)
+    survey = walk.survey(tmp_path, positions__path=photos, images__times=None)
+    summary = scale_model(survey, progress=QUIET).summary
+    assert_scale(summary, 10 * made.metric_from_sfm.scale, 0.02)
+    entry = known(summary.positions)
+    assert (entry.num, summary.frame, summary.scale.method) == (len(at_m), "site", "positions")
+    # What three metres, which last, may do to a path of a hundred metres is in the interval.
+    low, high = known(summary.scale.interval_95)
+    assert 0.01 < (high - low) / 2 / summary.scale.value < 0.1

@@ -98,7 +98,7 @@ class _Switch(argparse.Action):
 def _metavar(item: Key) -> str:
     hint = item.type
     if item.role is not None:
-        return "CSV" if item.role == "file" else "FOLDER"
+        return "CSV" if item.role.startswith("file") else "FOLDER"
     if get_origin(hint) is tuple:
         return "A,B,.." if get_args(hint)[-1] is Ellipsis else "X,Y,Z"
     if hint is int or int in get_args(hint):

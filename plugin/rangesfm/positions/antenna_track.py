@@ -82,7 +82,7 @@ class AntennaTrack:
         # The times of positions are those of a system's own epochs, so that they are exact.
         on_path = places_on_path(path, arms_m, before, after, fraction, time_resolution_s=0.0, options=self.association)
         if times_s is None or len(path) < 2:
-            at_s = np.full(k, np.nan)
+            at_s = before.astype(np.float64)
         else:
             velocity = _velocities(times_s, path.centers, before)
             at_s = times_s[before] if self.log.timestamp_s is None else self._times_s[rows]

@@ -38,7 +38,8 @@ class KnownPositions:
         places: (k, 3) in the model's world and unit. arms_m: (k, 3) lever arms in the axes of the model's world.
         own_covariance: (k, 3, 3) of the places, in the model's world and unit, without errors of the poses.
         arm_stddev_m: (k,) of each coordinate of the arms.
-        time_s: (k,) on the photos' clock; NaN without a time. clock_stddev_s: (k,) of the time offset that all share.
+        time_s: (k,) on the photos' clock, or the number of the photo where these have no times; NaN for marks.
+        clock_stddev_s: (k,) of the time offset that all share.
         velocity: (k, 3) of the antenna, model units per second; 0 for marks.
         world_from_cam: (k, 3, 3) rotations of the camera; 0 for marks.
         by_pose, arms_by_pose: (3 k, 6 n) sparse derivatives of places and arms by the n poses of a path: for each, a

@@ -44,9 +44,11 @@ DEGREES = Bounds(-360, 360, "degrees")
 _SLOWEST_S = 120.0
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
 _SECONDS_OF_DAY = 86400.0
+AUTONOMOUS_STDDEV_M = 3.0
+"""Standard deviation of a coordinate by satellites without corrections, metres."""
 # Standard deviations of positions by the quality that NMEA's GGA reports, metres: autonomous, differential, fixed RTK,
 # float RTK. Receivers that send GST sentences say it themselves.
-_NMEA_STDDEVS_M = {1: 3.0, 2: 1.0, 4: 0.02, 5: 0.3}
+_NMEA_STDDEVS_M = {1: AUTONOMOUS_STDDEV_M, 2: 1.0, 4: 0.02, 5: 0.3}
 _NMEA = re.compile(r"\$(?:[A-Z]{2})(GGA|RMC|GST|ZDA),([^*\r\n]*)(?:\*([0-9A-Fa-f]{2}))?\s*")
 
 Reader = Callable[[Path, PositionOptions], PositionLog]

@@ -31,6 +31,7 @@ from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import input_paths
+from rangesfm.vision.exif_positions import read_exif_positions
 from rangesfm.vision.image_times import (
     ImageTimes,
     find_image_times,
@@ -149,11 +150,9 @@ def _surveyed_positions(
     Raises:
         InputError: a file is wrong, or only one of anchors and points has a coordinate system.
     """
-    points, log, asked = (
-        read_control_points(survey.points, survey.scale.markers),
-        read_positions(survey.positions),
-        survey.positions,
-    )
+    points, asked = read_control_points(survey.points, survey.scale.markers), survey.positions
+    folder = asked.path if asked.path is not None and asked.path.is_dir() else None
+    log = read_positions(asked) if folder is None else read_exif_positions(folder)
     if points is None and log is None:
         return site, SurveyedPositions()
     if frame == "first_camera":

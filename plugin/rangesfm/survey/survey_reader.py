@@ -187,5 +187,7 @@ def input_paths(survey: Survey) -> Iterator[InputPath]:
         path = getattr(getattr(survey, table), name)
         if path is not None and role == "log":
             yield from (InputPath(dotted_key, "log" if file.is_dir() else "file", file) for file in files_of_log(path))
+        elif path is not None and role == "file_or_photos":
+            yield InputPath(dotted_key, "photos" if path.is_dir() else "file", path)
         elif path is not None and role != "output":
             yield InputPath(dotted_key, role, path)

@@ -15,12 +15,13 @@ from typing import Any
 from rangesfm.errors import InputError
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.ranging.readers.lists import UnclearListError
+from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, Survey
 from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, POINTS, POSITIONS, Found, look_into, short_path
 from rangesfm.vision.image_times import list_images
-from rangesfm.vision.photo_files import usable_photos
+from rangesfm.vision.photo_files import gps_data, usable_photos
 
 # A file or folder with such a name (without suffix, in lower case) is chosen among several candidates for a key.
 _USUAL_NAMES = {
@@ -116,6 +117,7 @@ def understand(
     if not {PHOTOS, LOG, "scale.distances", POINTS, POSITIONS} & values.keys():
         raise InputError("found no photos, no radio log and no lengths in it", folders[0], advice=notes)
     _add_camera(values, found, notes)
+    _add_exif_positions(values, notes)
     return Understood(values, tuple(notes))
 
 
@@ -208,6 +210,20 @@ def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
     else:
         sizes = ", ".join(" x ".join(map(str, camera.size_px)) for camera in cameras if camera.size_px)
         notes.append(f"{path.name}: {len(fitting)} of its cameras ({sizes} pixels) fit the photos, so none is used")
+
+
+def _add_exif_positions(values: dict[str, Any], notes: list[str]) -> None:
+    """Take the positions in the photos' EXIF data where nothing else is in metres."""
+    if PHOTOS not in values or POSITIONS in values or is_source(folder := values[PHOTOS]):
+        return
+    num = sum(gps_data(folder / name) is not None for name in list_images(folder))
+    if num < MIN_NUM_POSITIONS:
+        return
+    if {LOG, POINTS, "scale.distances"} & values.keys():
+        notes.append(f"{num} photos have positions in their EXIF data: --positions {folder} uses them, too")
+    else:
+        values[POSITIONS] = folder
+        notes.append(f"the positions are those in the EXIF data of {num} photos")
 
 
 def _size_px(values: Mapping[str, Any]) -> tuple[int, int] | None:

@@ -125,22 +125,53 @@ def exif_tags(path: Path) -> dict[int, Any]:
         return {}
 
 
+@dataclass(frozen=True)
+class GpsData:
+    """Position in the data of a photo.
+
+    Attributes:
+        degrees: latitude and longitude (WGS 84). altitude_m: None if not given.
+        tags: of the GPS part of EXIF, by number. xmp: further data, as XML.
+    """
+
+    degrees: tuple[float, float]
+    altitude_m: float | None
+    tags: Mapping[int, Any]
+    xmp: bytes
+
+    def number(self, tag: int) -> float | None:
+        """Return the value of a tag; None if it is not there or is no positive number."""
+        try:
+            value = float(self.tags[tag])
+        except (LookupError, TypeError, ValueError, ZeroDivisionError):
+            return None
+        return value if math.isfinite(value) and value > 0 else None
+
+
+def gps_data(path: Path) -> GpsData | None:
+    """Return the position in the EXIF data of a photo, or None if it has no usable one."""
+    try:
+        with opened_image(path) as image:
+            tags, xmp = image.getexif().get_ifd(_GPS_IFD), image.info.get("xmp", b"")
+        latitude = _degrees(tags[_LATITUDE], tags.get(_LATITUDE_REF) == "S")
+        longitude = _degrees(tags[_LONGITUDE], tags.get(_LONGITUDE_REF) == "W")
+        altitude = float(tags[_ALTITUDE]) if _ALTITUDE in tags else None
+    except (*UNREADABLE, LookupError, TypeError, ZeroDivisionError):
+        return None
+    if altitude is not None and tags.get(_ALTITUDE_REF) in (1, b"\x01"):
+        altitude = -altitude
+    if not all(map(math.isfinite, (latitude, longitude, altitude or 0.0))):
+        return None
+    return GpsData((latitude, longitude), altitude, tags, xmp if isinstance(xmp, bytes) else b"")
+
+
 def exif_position(path: Path) -> tuple[float, float, float] | None:
     """Return the EXIF position: latitude and longitude in degrees (WGS 84), and altitude in metres, 0 if not given.
 
     None if the photo has no usable position.
     """
-    try:
-        with opened_image(path) as image:
-            tags = image.getexif().get_ifd(_GPS_IFD)
-        latitude = _degrees(tags[_LATITUDE], tags.get(_LATITUDE_REF) == "S")
-        longitude = _degrees(tags[_LONGITUDE], tags.get(_LONGITUDE_REF) == "W")
-        below = tags.get(_ALTITUDE_REF) in (1, b"\x01")
-        altitude_m = float(tags.get(_ALTITUDE, 0.0)) * (-1 if below else 1)
-    except (*UNREADABLE, LookupError, TypeError, ZeroDivisionError):
-        return None
-    place = latitude, longitude, altitude_m
-    return place if all(map(math.isfinite, place)) else None
+    data = gps_data(path)
+    return None if data is None else (*data.degrees, data.altitude_m or 0.0)
 
 
 def _degrees(parts: Any, is_negative: bool) -> float:
