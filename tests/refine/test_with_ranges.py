@@ -612,7 +612,10 @@ class TestWithNoise:
         log, noise = survey.observations.log, np.random.default_rng(1).standard_normal(len(survey.observations.log))
         log = replace(log, range_m=log.range_m + 0.4 * noise * (log.anchor_index == 0))
         observations = replace(survey.observations, log=log, center_stddev=np.zeros(len(log)))
-        told = {"observations": observations, "errors": known_errors(observations, 0.2, is_estimated=True)}
+        told: dict[str, Any] = {
+            "observations": observations,
+            "errors": known_errors(observations, 0.2, is_estimated=True),
+        }
         refined, first = survey.refine(survey.anchors(0.0), scale_error=1.1, **told)
         again, second = survey.refine(survey.anchors(0.0), refined=refined, **told)
         assert rmse(survey.centers(again) - survey.centers(refined)) < 1e-4
