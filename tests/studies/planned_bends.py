@@ -3,9 +3,9 @@
 Run: python -m tests.studies.planned_bends --rows FILE [--num_seeds 40] [--surveys NAME]
 
 Simulated features of known noise are mapped, scaled and refined with ranges by the stages themselves. Prints for each
-survey the predicted stddev of keyframes (root mean square over the path) for a map whose photos are not planned, and for
-one that can bend as its photos allow; the spread of the refined keyframes about the truth, with its stddev by chance; and
-the map's bend alone, predicted and as found in the maps before any range is used.
+survey the predicted stddev of keyframes (root mean square over the path) for a map whose photos are not planned, and
+for one that can bend as its photos allow; the spread of the refined keyframes about the truth, with its stddev by
+chance; and the map's bend alone, predicted and as found in the maps before any range is used.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ measured and its scale found again and again, every time with other errors of it
 anchors and another bend of its map. The first eight runs of each are whole scale stages; others begin at the truth.
 FILE keeps the runs that are done, one line each; when started again, the study continues there.
 
-Prints for each survey the predicted stddev of the scale over the median that whole runs state, and over the spread of all
-runs' errors; that of the place (of the keyframe known least) over the spread; and how many runs were refused.
+Prints for each survey the predicted stddev of the scale over the median that whole runs state, and over the spread of
+all runs' errors; that of the place (of the keyframe known least) over the spread; and how many runs were refused.
 """
 
 from __future__ import annotations
@@ -194,7 +194,8 @@ def main() -> None:
             off[what] += [ratio - 1] if np.isfinite(ratio) else []
         print(
             f"{name:34}{100 * scale:8.2f} %{100 * median:7.2f} %{ratios['stated scale']:7.2f}"
-            f"{100 * scale_spread:7.2f} %{ratios['scale']:7.2f} +-{ratios['scale'] * by_chance:4.2f}{place_m:8.3f} m{place_spread_m:7.3f} m"
+            f"{100 * scale_spread:7.2f} %{ratios['scale']:7.2f} +-{ratios['scale'] * by_chance:4.2f}"
+            f"{place_m:8.3f} m{place_spread_m:7.3f} m"
             f"{ratios['place']:7.2f} +-{ratios['place'] * of_place:4.2f}{sum('refused' in row for row in rows):9}",
             flush=True,
         )

@@ -35,6 +35,9 @@ _BATCH = 500
 _ROBUST_WIDTH = 3.0
 # Smallest plausible depth, as a share of the median depth: lenses are not sharp at less.
 _MIN_DEPTH = 0.01
+# Residual, in standard deviations, beyond which a feature says nothing of the photos' gradient: that of a camera out of
+# its place is not linear. COLMAP's mapper leaves out features beyond 4 px, which is some 8 standard deviations.
+_FARTHEST = 10.0
 # Largest plausible ratio of depths of a point in two photos: features of so different sizes are not matched.
 _MAX_DEPTH_RATIO = 10.0
 
@@ -273,9 +276,10 @@ def photo_gradient(observations: Observations, poses: Poses) -> Array:
     The numbers of a pose are a turn in its own frame and a shift. In a refined map the ranges balance this gradient.
     """
     in_rig, in_cam, derivative = project(observations, poses, observations.points)
-    is_seen = in_cam[:, 2] > 0
-    residuals = np.where(is_seen[:, None], ray_residuals(observations, in_cam), 0.0)
-    to_rig = np.where(is_seen[:, None, None], derivative, 0.0) @ observations.cam_from_rig_rotation
+    residuals = ray_residuals(observations, in_cam)
+    fits = (in_cam[:, 2] > 0) & (np.linalg.norm(residuals, axis=1) < _FARTHEST)
+    residuals = np.where(fits[:, None], residuals, 0.0)
+    to_rig = np.where(fits[:, None, None], derivative, 0.0) @ observations.cam_from_rig_rotation
     rig_from_world = np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
     to_point = to_rig @ rig_from_world
     information, slope = np.zeros((len(observations.points), 3, 3)), np.zeros((len(observations.points), 3))
