@@ -185,13 +185,14 @@ def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
     # Each range has an error of its own with a variance of 1.7, and there are three errors that all share.
     by_error = np.hstack([np.eye(num_ranges), rng.standard_normal((num_ranges, 3))])
     of_errors = np.diag(np.concatenate([np.full(num_ranges, 1.7), np.ones(3)]))
-    errors = ResidualErrors(rows, csr_array(by_error), of_errors)
+    errors = ResidualErrors(rows, csr_array(by_error), of_errors, np.arange(num - 1, num))
     found = joint_covariance(
         survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, errors=errors
     )
     jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
     of_residuals = np.eye(num)
     of_residuals[np.ix_(rows, rows)] = by_error @ of_errors @ by_error.T
+    of_residuals[-1, -1] = 0.0  # a prior without error
     gain = covariance_of_all(survey.problem, variable(survey)) @ jacobian.T
     expected = gain @ of_residuals @ gain.T
     first = 6 * (NUM_FRAMES - 1)
@@ -410,7 +411,7 @@ def test_priors_may_err_otherwise_than_the_residuals_of_photos() -> None:
     usual, better = (
         joint_covariance(
             survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases,
-            errors=ResidualErrors(rows, nothing, np.eye(1), variance),
+            errors=ResidualErrors(rows, nothing, np.eye(1), rows, variance),
         )
         for variance in (1.0, 0.0)
     )  # fmt: skip

@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.few_links import leave_few_links
+from tests.known import known
 from tests.known_errors import known_errors
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import lap_path, loop_path, sequence_path
@@ -443,6 +444,26 @@ class TestDistances:
         held, summary = survey.refine(survey.anchors(np.inf), 1.04, observations=long, tape=tape)
         assert summary.converged
         np.testing.assert_allclose(located_m(tape, held), lengths, atol=2 * stddev_m)
+
+    def test_ranges_that_share_an_error_keep_the_shape_and_leave_the_scale_to_a_distance(self) -> None:
+        """All ranges are 4 % long; a distance of 1 % says so, if the ranges may share such an error."""
+        survey, exact = (
+            make_survey("first_camera", pixel_stddev=0.5, radio=radio, num_epochs=10, seed=2)
+            for radio in (Radio(range_stddev_m=RANGE_STDDEV_M), None)
+        )
+        names, length = survey.trajectory.image_names, float(np.linalg.norm(survey.centers_m[2] - survey.centers_m[11]))
+        tape = Tape((TapedDistance((names[2], names[11]), length, 0.01 * length, "control", 2),))
+        told: dict[str, Any] = {"observations": with_long_ranges(survey), "tape": tape}
+        alike_m = 0.04 * exact.observations.log.range_m[:, None]
+        stiff, _ = survey.refine(survey.anchors(np.inf), 1.04, **told)
+        free, summary = survey.refine(survey.anchors(np.inf), 1.04, **told, shared_errors_m=alike_m)
+        assert summary.converged
+        assert survey.scale_error(stiff) > 0.02
+        assert abs(survey.scale_error(free)) < 0.01
+        residuals_m = summary.predicted_m - told["observations"].log.range_m
+        assert np.median(np.abs(residuals_m)) < 2 * RANGE_STDDEV_M
+        covariance = known(summary.covariance)
+        assert 0.005 < covariance.relative_scale_stddev < 0.02
 
     def test_control_distances_between_markers_do_so_as_well_and_leave_no_trace(self) -> None:
         survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))

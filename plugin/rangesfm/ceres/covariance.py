@@ -41,12 +41,14 @@ class ResidualErrors:
         rows: (k,) indices of these residuals in the problem; they do not depend on 3-D points.
         by_error: (k, m) sparse derivatives by m errors, in standard deviations of the residuals.
         covariance: (m, m) of these errors, which replace those of the residuals.
+        exact: indices of residuals without errors: priors of errors that ``covariance`` has already.
         variance_without_points: variance of all other residuals that do not depend on 3-D points, such as priors.
     """
 
     rows: Indices
     by_error: csr_array
     covariance: Array
+    exact: Indices
     variance_without_points: float = 1.0
 
 
@@ -282,10 +284,13 @@ class _Excess:
         if errors is None:
             return cls(csr_array((len(kept), 0)), np.zeros((0, 0)), csr_array((len(kept), len(kept))))
         has_point = np.diff(csr_array(jacobian[:, columns.num_kept_columns :]).indptr) > 0
-        has_point[errors.rows] = True
+        has_point[errors.rows] = has_point[errors.exact] = True
         of_all = csr_array(jacobian[:, kept])
         rows, without = of_all[errors.rows], of_all[np.flatnonzero(~has_point)]
-        independent = csr_array(rows.T @ rows) + (1 - errors.variance_without_points) * csr_array(without.T @ without)
+        replaced = of_all[np.concatenate([errors.rows, errors.exact])]
+        independent = csr_array(replaced.T @ replaced) + (1 - errors.variance_without_points) * csr_array(
+            without.T @ without
+        )
         return cls(csr_array(rows.T @ errors.by_error), errors.covariance, independent)
 
     def times(self, right: Array) -> Array:

@@ -203,11 +203,13 @@ class AddedRadio:
     Attributes:
         blocks: of the ranges; the solver changes them in place. others: of other residuals.
         residual_rows: (k,) indices of the ranges' residuals among those of the problem.
+        shared_prior_rows: indices of the residuals of the shared errors' prior.
     """
 
     blocks: ceres.RangeBlocks
     others: list[Array]
     residual_rows: Indices
+    shared_prior_rows: Indices
 
     @property
     def all_but_anchors(self) -> list[Array]:
@@ -272,12 +274,15 @@ def add_radio_priors(
     common_bias_stddev_m: float,
     blocks: ceres.RangeBlocks,
     options: RefineOptions,
-) -> None:
+) -> Indices:
     """Fix each radio parameter, add its prior, or leave it free; standard deviations are scaled to pixels.
 
     Args:
         tags_in_cam_m: (num_tags, 3) lever arms as given, the means of their priors.
         common_bias_stddev_m: of the bias that all ranges share.
+
+    Returns:
+        indices of the residuals of the shared errors' prior.
     """
     for anchor, position in zip(radio.anchors, blocks.anchors, strict=True):
         bundle.add_prior(position, anchor.prior_position_m, anchor.prior_position_stddev_m)
@@ -286,8 +291,11 @@ def add_radio_priors(
         bundle.add_prior(block, given, options.lever_arm_stddev_m)
     bundle.add_prior(blocks.time_shift, np.zeros(1), options.time_offset_stddev_s)
     bundle.add_prior(blocks.amplitude, np.zeros(1), options.short_range_stddev_m)
+    rows = [np.zeros(0, dtype=np.int64)]
     for numbers in blocks.shared:
+        rows.append(bundle.adjuster.problem.num_residuals() + np.arange(len(numbers)))
         bundle.add_prior(numbers, np.zeros(len(numbers)), 1.0)
+    return np.concatenate(rows)
 
 
 def _add_bias_priors(

@@ -100,7 +100,9 @@ class RefinementProblem:
             lever_arm_stddev_m=self.options.lever_arm_stddev_m,
             loss_scale=self.options.range_loss_scale,
         )
-        add_radio_priors(bundle, radio, self.radio.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options)
+        prior_rows = add_radio_priors(
+            bundle, radio, self.radio.tags_in_cam_m, errors.common_bias_stddev_m, blocks, self.options
+        )
         add_calibration(bundle, self.camera)
         if self.gravity is not None:  # measured upward direction in the first camera; its stddev is scaled to pixels
             cost = ceres.direction_cost(
@@ -110,7 +112,7 @@ class RefinementProblem:
             )
             pose = pose_of(self.metric.frame(self.first_frame_id)).params
             ceres.add_residual_block(bundle.adjuster, cost, None, [pose])
-        return AddedRadio(blocks, others, rows)
+        return AddedRadio(blocks, others, rows, prior_rows)
 
     def residual_errors(self, added: AddedRadio, errors: RangeErrors, bending_factor: float) -> ResidualErrors | None:
         """Return the errors of the k ranges' residuals, as in the scale's uncertainty; None if they were not learnt.
@@ -126,7 +128,13 @@ class RefinementProblem:
         covariance_m2, has_bin = learned.covariance_m2, np.flatnonzero(learned.of_range >= 0)
         places = (has_bin, learned.of_range[has_bin])
         of_bins = csr_array((in_residuals[has_bin], places), shape=(len(scaled), len(covariance_m2)))
-        return ResidualErrors(added.residual_rows, of_bins, covariance_m2 / bending_factor**2, bending_factor**-2)
+        return ResidualErrors(
+            added.residual_rows,
+            of_bins,
+            covariance_m2 / bending_factor**2,
+            added.shared_prior_rows,
+            bending_factor**-2,
+        )
 
     def residuals_m(self, radio: RadioEstimate) -> Array:
         """Return the (n,) residuals, predicted minus measured, metres, shared errors included; NaN without a place."""
