@@ -9,6 +9,7 @@ from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 from scipy.spatial.transform import Rotation
 from tests.simulated.path import loop_path
 from tests.simulated.surveys import LASTING_S, error_curve, lasting
@@ -102,7 +103,8 @@ SITES = (
 class Given:
     """A survey as it is handed over, right or wrong, and the truth; times in seconds of the camera's clock.
 
-    ``needs_search`` is set if the truth is not a valid start for the solution of the scale.
+    ``needs_search`` is set if the truth is not a valid start for the solution of the scale; ``sfm`` is the model of the
+    photos, None without any.
     """
 
     trajectory: Trajectory
@@ -119,6 +121,7 @@ class Given:
     metres_per_unit: float = METRES_PER_UNIT
     time_offset_s: float = 0.0
     needs_search: bool = False
+    sfm: pycolmap.Reconstruction | None = None
 
     @property
     def ids(self) -> list[str]:

@@ -1,11 +1,13 @@
 """Measure how often a mistake in a survey is found and rightly named, and how often a clean survey is doubted.
 
 Run: python -m tests.studies.mistakes --out FILE [--num_seeds 20] [--num_clean 67] [--surveys hall] [--kinds anchor]
-     [--room FOLDER --model FOLDER]
+     [--photos] [--room FOLDER --model FOLDER]
      python -m tests.studies.mistakes --out FILE --report
 
 Three simulated surveys without photos, whose path is the true one with a smooth bend: a hall with six surveyed anchors,
-a yard with four, a drone with one unknown anchor; and the real room, mapped before, with a tenth of its ranges. The
+a yard with four, a drone with one unknown anchor; and the real room, mapped before, with a tenth of its ranges. With
+``--photos`` the hall and the yard are mapped from noisy features instead, so that their maps bend as maps do (30
+features a photo, tracks of eight photos, no loops), and all stages run, refinement included. The
 range errors are like those of real radios: white noise, errors that last for seconds, errors that depend on direction
 and on distance, and ranges without line of sight. Each seed gives first a clean survey, then one with each kind of
 mistake that the survey allows. The mistake's size is one of several multiples of the smallest size that the tests of
@@ -27,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tests.studies.erring_photos import run_with_photos, surveyed_with_photos
 from tests.studies.erring_surveys import SITES, X_FORWARD, Z_UP, Array, Given, Run, run, surveyed
 from tests.studies.real_room import real_room
 
@@ -363,6 +366,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="the first")
     parser.add_argument("--surveys", default="", help="only those whose name begins so")
     parser.add_argument("--kinds", default="", help="only those whose name has this in it")
+    parser.add_argument("--photos", action="store_true", help="map the hall and the yard from noisy features")
     parser.add_argument("--room", type=Path, help="folder of the real room's data")
     parser.add_argument("--model", type=Path, help="folder of the model of its photos")
     args = parser.parse_args()
@@ -372,6 +376,12 @@ def main() -> None:
         report(list(done.values()))
         return
     sites = [(site.name, site.frame, list(site.anchors_m), partial(surveyed, site)) for site in SITES]
+    if args.photos:
+        sites = [
+            (f"{site.name}, photos", "site", list(site.anchors_m), partial(surveyed_with_photos, site))
+            for site in SITES
+            if site.frame == "site"
+        ]
     if args.room:
         sites = [
             (
@@ -390,13 +400,17 @@ def main() -> None:
                         out.flush()
 
 
+def outcome(given: Given, seed: int) -> Run:
+    return run(given, seed) if given.sfm is None else run_with_photos(given, seed)
+
+
 def runs_of_seed(
     survey: str, all_kinds: list[Kind], make: Callable[[int], Given], seed: int, args: argparse.Namespace, done: Lines
 ) -> Iterator[Line]:
     """Yield the runs of a seed that are not done yet."""
     clean = done.get((survey, CLEAN, seed))
     if clean is None:
-        clean = told(run(make(seed), seed), survey, CLEAN, seed)
+        clean = told(outcome(make(seed), seed), survey, CLEAN, seed)
         yield clean
     for number, kind in enumerate(all_kinds):
         if args.kinds not in kind.name or (survey, kind.name, seed) in done or seed >= args.seed + args.num_seeds:
@@ -408,9 +422,11 @@ def runs_of_seed(
                 continue
             size = factor * smallest
         given = make(seed)
+        if given.sfm is not None and kind.make is _map_breaks:  # its photos would have to break, too
+            continue
         kind.make(given, size, np.random.default_rng([seed, 7]))
         given.needs_search = kind.of is None
-        yield told(run(given, seed), survey, kind.name, seed, kind.right, factor if kind.of else None, size)
+        yield told(outcome(given, seed), survey, kind.name, seed, kind.right, factor if kind.of else None, size)
 
 
 def told(

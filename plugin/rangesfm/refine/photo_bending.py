@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,9 @@ MAX_NUM_IMAGES = 1500
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
 # independent errors of features, as in simulations; 8 to 12 in three scenes of real photos (Strecha et al. 2008).
 _FACTOR, _SPREAD = 2.0, 0.8
+# Standard deviation of the scale of one part of a map relative to another from which the photos do not hold them
+# together: parts of a map that share six points are held to 0.01, those that share five may have any scale.
+_HELD = 0.1
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,20 @@ class PhotoBending:
         found = bending_part("bending", covariance, _FACTOR, _SPREAD)
         shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else shift_m
         return BendingOfBins(() if found is None else (found,), covariance, shift_m)
+
+    def hold_together(self, image_names: Collection[str]) -> bool:
+        """Return whether the photos determine the scale of a part of the map relative to the rest.
+
+        Args:
+            image_names: photos of the part, of which the path has two or more, and two or more of the rest.
+        """
+        is_part = np.isin(self.path.image_names, list(image_names))
+        by_pose = np.zeros((len(self.path), 6))
+        for part, sign in ((is_part, 1.0), (~is_part, -1.0)):  # derivatives of the logarithms of both sizes
+            off = self.path.centers[part] - self.path.centers[part].mean(axis=0)
+            by_pose[part, 3:] = sign * off / np.sum(off**2)
+        covariance = self.of_functions(by_pose.reshape(1, -1), frame_is_free=True).formal_m2
+        return bool(covariance[0, 0] < _HELD**2)
 
 
 def bending_of_model(

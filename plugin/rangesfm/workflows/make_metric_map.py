@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.colmap.pieces import loose_pieces
+from rangesfm.colmap.pieces import LoosePiece, loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
@@ -37,7 +37,7 @@ from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.noise import NORMAL_95
-from rangesfm.refine.photo_bending import bending_of_model, by_photos
+from rangesfm.refine.photo_bending import PhotoBending, bending_of_model, by_photos
 from rangesfm.refine.positions import HeldPositions
 from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, LoopClosing, RefineSummary, refine_with_ranges
@@ -96,7 +96,7 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         GeometryError: the scale is not determined, or is less certain than asked for.
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
-    of_pieces = doubts_of_pieces(loose_pieces(path.sfm), path.sfm.num_reg_images())
+    of_pieces = doubts_of_pieces(_pieces_not_held(run, path), path.sfm.num_reg_images())
     run.journal.warn(*(doubt.reason for doubt in of_pieces))
     with run.journal.stage("scale"):
         metric = scale_by_survey(run, path, is_a_start=refine)
@@ -111,6 +111,15 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
             metric = closed(run, found, metric, again)
     with run.journal.timed("judgement"):
         return judge_map(run, metric, of_pieces)
+
+
+def _pieces_not_held(run: SurveyRun, path: PathOfModel) -> tuple[LoosePiece, ...]:
+    """Return the parts of a model that share few points with the rest, which do not determine their scale."""
+    pieces = loose_pieces(path.sfm)
+    bending = bending_by_survey(run.survey, path) if pieces else None
+    if not isinstance(bending, PhotoBending):  # the photos determine nothing, or are too many to tell
+        return pieces
+    return tuple(piece for piece in pieces if not bending.hold_together(piece.image_names))
 
 
 def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> MetricResult:
