@@ -159,8 +159,8 @@ def test_ranges_writes_the_canonical_csv_from_mapped_columns(folder: Path) -> No
         (["export", "photos"], "photos"),
         (["export", "photos", "--formats", "tum,dxf"], "dxf"),
         (["export", "a", "--input_path", "b"], "two result folders"),
-        (["demo", "--num_photos", "2"], "--num_photos is 2, expected 10 to 40"),
-        (["demo", "--num_photos", "41"], "--num_photos is 41, expected 10 to 40"),
+        (["demo", "--num_photos", "19"], "--num_photos is 19, expected 20 to 40"),
+        (["demo", "--num_photos", "41"], "--num_photos is 41, expected 20 to 40"),
         (["demo", "--seed", "-2"], "--seed is -2"),
     ],
 )

@@ -14,6 +14,7 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
 from rangesfm.diagnostics.preflight import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
+from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 
@@ -85,6 +86,23 @@ def test_two_anchors_in_one_place_are_told(complete: Survey) -> None:
         )
     )
     assert notes[0].startswith("anchors A1 and A2 have the same position")
+
+
+def test_a_taped_distance_that_contradicts_the_coordinates_of_its_anchors_is_told(complete: Survey) -> None:
+    inputs = read_ranging_inputs(complete)
+    at_m = {anchor.anchor_id: known(anchor.position_m) for anchor in inputs.anchors}
+    apart_m = float(np.linalg.norm(at_m["A1"] - at_m["A3"]))
+
+    def notes(off_m: float, anchor_stddev_m: float = 0.0) -> list[str]:
+        anchors = tuple(replace(anchor, position_stddev_m=anchor_stddev_m) for anchor in inputs.anchors)
+        tape = Tape((TapedDistance(("A1", "A3"), apart_m + off_m, 0.01, "check", 2),))
+        return list(notes_before_work(complete, replace(inputs, anchors=anchors, tape=tape)))
+
+    (note,) = notes(0.2)
+    assert note.startswith(f"the taped distance from A1 to A3 is {apart_m + 0.2:.3f} m, but their coordinates are")
+    assert "(+0.200 m, expected within 0.023 m by the stated errors)" in note
+    assert not notes(0.02)
+    assert not notes(0.2, anchor_stddev_m=0.1)
 
 
 def test_an_anchor_that_repeats_one_value_is_told_and_a_tag_that_stands_still_is_not(complete: Survey) -> None:

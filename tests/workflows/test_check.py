@@ -105,3 +105,28 @@ def test_masks_a_database_and_options_of_colmap_are_looked_at(folder: Path) -> N
     (unknown,) = check_survey(survey_of(folder, mapper__features={"max_features": 3})).faults
     assert "max_features" in str(unknown)
     assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("ends", "marks", "said"),
+    [
+        ("A1,A9", "", "taped.csv:2: an end is 'A9', expected a photo that is in the model, a marker or an anchor"),
+        ("A1,{first}", "", "expected two anchors, or two ends that are not anchors"),
+        ("{first},door", "", "taped.csv:2: an end is 'door', expected a photo that is in the model, a marker"),
+        ("{first},door", "door,{first},1,2\ndoor,gone.jpg,1,2\n", "marker 'door' is marked in 1 photos of the survey"),
+        ("{first},tag7.0", "", "an end is 'tag7.0'"),
+        ("{first},{last}", "", ""),
+    ],
+)
+def test_an_end_of_a_taped_distance_that_does_not_exist_is_a_fault(
+    ends: str, marks: str, said: str, folder: Path
+) -> None:
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    photos = {"first": names[0], "last": names[-1]}
+    (folder / "taped.csv").write_text(f"from,to,distance_m\n{ends.format(**photos)},2.5\n")
+    (folder / "marks.csv").write_text(f"marker,image_name,x_px,y_px\n{marks.format(**photos)}")
+    tape = {"scale__distances": folder / "taped.csv", **({"scale__markers": folder / "marks.csv"} if marks else {})}
+    checked = check_survey(survey_of(folder, anchors__path=folder / "anchors.csv", **tape))
+    assert [said in str(fault) for fault in checked.faults] == ([True] if said else [])
+    if "tag" in ends:
+        assert not check_survey(survey_of(folder, **tape, markers__dictionary="APRILTAG_36h11")).faults

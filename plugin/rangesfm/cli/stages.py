@@ -22,7 +22,7 @@ _SCALE_KEYS = (
     "output",
 )
 _DEMO_FOLDER = "rangesfm_demo"
-_NUM_PHOTOS = range(10, 41)  # fewer photos do not make a map, and the package has no more
+_NUM_PHOTOS = range(20, 41)  # fewer walk too short a way to tell the time offset, and the package has no more
 _JOIN_KEYS = (
     *("ranges.range_stddev_m", "ranges.range_bias_stddev_m", "ranges.common_bias_stddev_m", "anchors", "scale"),
     *("mapper.num_threads", "refine", "export", "report", "output"),
@@ -38,7 +38,7 @@ def add_stages_commands(commands: Commands) -> None:
         "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"folder to write to (default: {_DEMO_FOLDER})"
     )
     demo.add_argument(
-        "--num_photos", type=int, default=40, metavar="N", help="use the first N of 40 photos (default: 40)"
+        "--num_photos", type=int, default=40, metavar="N", help="use the first N of 40 photos, 20 or more (default: 40)"
     )
     demo.add_argument("--seed", type=int, default=0, metavar="N", help="seed of radio and run (default: 0)")
     demo.add_argument("--num_threads", type=int, metavar="N", help="number of threads; -1: one for each core")

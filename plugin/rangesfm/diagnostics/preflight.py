@@ -8,11 +8,15 @@ from itertools import combinations
 
 import numpy as np
 import pycolmap
+from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
+from rangesfm.distances.tape import Tape
+from rangesfm.errors import number_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import RangeKind, RangeLog
+from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 
@@ -70,6 +74,28 @@ def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     surveyed = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors if anchor.position_m is not None}
     yield from _on_positions(surveyed, is_site=inputs.anchor_frame == "site")
     yield from notes_on_distances(inputs.log, inputs.anchors)
+    if inputs.tape is not None:
+        yield from _on_taped_anchors(inputs.tape, inputs.anchors)
+
+
+def _on_taped_anchors(tape: Tape, anchors: Sequence[Anchor]) -> Iterator[str]:
+    """Yield a note for each taped distance that coordinates of its two anchors contradict, by their stated errors."""
+    surveyed = {anchor.anchor_id: anchor for anchor in anchors if anchor.position_m is not None}
+    between = [taped for taped in tape.distances if surveyed.keys() >= {*taped.ends}]
+    threshold = np.sqrt(special.chdtri(1, LENGTH_FALSE_ALARM_RATE / max(len(between), 1)))
+    for taped in between:
+        first, second = (surveyed[end] for end in taped.ends)
+        assert first.position_m is not None
+        assert second.position_m is not None
+        apart_m = float(np.linalg.norm(first.position_m - second.position_m))
+        stddevs_m = (taped.stddev_m, first.position_stddev_m, second.position_stddev_m)
+        off_m, expected_m = taped.distance_m - apart_m, float(threshold * np.linalg.norm(stddevs_m))
+        if abs(off_m) > expected_m:
+            yield (
+                f"the taped distance from {taped.ends[0]} to {taped.ends[1]} is {taped.distance_m:.3f} m, but their "
+                f"coordinates are {apart_m:.3f} m apart ({number_text(off_m, '+.3f')} m, expected within "
+                f"{expected_m:.3f} m by the stated errors): look for a mistake in either"
+            )
 
 
 def _on_positions(positions_m: Mapping[str, Array], *, is_site: bool) -> Iterator[str]:

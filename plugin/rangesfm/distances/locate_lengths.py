@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ _MIN_TRIANGULATION_ANGLE_DEG = 0.5
 _MEDIAN_OVER_MEAN = 1.2533
 # Smallest standard deviation of a length between anchors, because lengths are weighted by its inverse.
 _MIN_STDDEV_M = 1e-3
+# Names of printed tags' corners, as ``find_tags`` gives them.
+_TAG = re.compile(r"tag\d+\.[0-3]")
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,28 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
     )
 
 
+def check_ends(tape: Tape, photos: Collection[str], anchor_ids: Collection[str], *, may_be_tags: bool) -> None:
+    """Check that the ends of measured lengths exist, before there is a model.
+
+    Args:
+        photos: names of those that may be in the model. anchor_ids: of the log.
+        may_be_tags: whether printed tags will be looked for, so that an end such as ``tag7.0`` may be found.
+
+    Raises:
+        InputError: an end does not, or a marker is in fewer than two photos. The error gives the line.
+    """
+    points = {*photos, *tape.markers}
+    for taped in tape.distances:
+        known = points | {end for end in taped.ends if may_be_tags and _TAG.fullmatch(end)}
+        if not any(ends >= {*taped.ends} for ends in (known, {*anchor_ids})):
+            raise InputError(_what_is_wrong(taped, known, anchor_ids), tape.distances_path, taped.line)
+        for end in {*taped.ends} & tape.markers.keys() - {*photos}:
+            marker = tape.markers[end]
+            if (num := len({*marker.image_names} & {*photos})) < 2:
+                message = f"marker {end!r} is marked in {num} photos of the survey, expected two or more"
+                raise InputError(message, tape.markers_path, marker.lines[0])
+
+
 def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:
     """Return the tape with only the lengths whose two ends are both in this model, or are both anchors."""
     images = images_by_name(model)
@@ -153,7 +178,7 @@ def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
     return replace(tape, distances=tuple(within))
 
 
-def _what_is_wrong(taped: TapedDistance, points: dict[str, Array], anchor_ids: Sequence[str]) -> str:
+def _what_is_wrong(taped: TapedDistance, points: Collection[str], anchor_ids: Collection[str]) -> str:
     for name in taped.ends:
         if name not in points and name not in anchor_ids:
             return f"an end is {name!r}, expected a photo that is in the model, a marker or an anchor of the log"

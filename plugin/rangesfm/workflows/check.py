@@ -24,7 +24,7 @@ from rangesfm.vision.image_times import ImageTimes, list_images
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.rigs import read_rigs
-from rangesfm.workflows.map_photos import begin_run, checked_keyframes, read_registered
+from rangesfm.workflows.map_photos import begin_run, check_taped_ends, checked_keyframes, read_registered
 
 # Largest number of photo sizes and of cameras that are listed.
 _MAX_NUM_SIZES = 4
@@ -89,6 +89,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
             checked.facts.append(f"model: {sfm.num_reg_images()} photos and {sfm.num_points3D()} points in {model}")
             keyframes = tuple(image.name for image in sfm.images.values())
             times = times_of_model(survey, sfm, model) if inputs.needs_times else None
+            check_taped_ends(run, keyframes)
         _tell_of_times(survey, inputs, keyframes, times, checked)
         if photos is not None:
             _check_mapper(survey, photos.of(keyframes), checked)

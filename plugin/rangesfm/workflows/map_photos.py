@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ import pycolmap
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.diagnostics.preflight import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
+from rangesfm.distances.locate_lengths import check_ends
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
@@ -58,8 +59,16 @@ def checked_keyframes(run: SurveyRun) -> tuple[tuple[str, ...], ImageTimes | Non
     n, timestamps_s = len(keyframes), None if times is None else times.timestamps_s
     nowhere = Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
     check_times(run, nowhere)
+    check_taped_ends(run, keyframes if run.survey.images.rig_config is None else list_images(run.survey.photos_path))
     tell_of_times(run, times)
     return keyframes, times
+
+
+def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
+    """Check that the ends of taped distances are among these photos, markers, tags or anchors; raises InputError."""
+    if (tape := run.inputs.tape) is not None:
+        may_be_tags = run.survey.markers.dictionary is not None
+        check_ends(tape, photos, run.inputs.log.anchor_ids, may_be_tags=may_be_tags)
 
 
 def tell_of_times(run: SurveyRun, times: ImageTimes | None) -> None:
