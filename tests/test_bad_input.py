@@ -537,7 +537,7 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(
         lambda: lock.exists() and {"_core", "pyceres"} <= loaded(maps.read_text()), process, by=signal.SIGTERM
     )
     assert lines[-1] == "rangesfm: error: interrupted; stages that were done are kept"
-    assert all(line.startswith(("scale", "refinement", "rangesfm: error")) for line in lines)
+    assert all(line.startswith(("scale", "refinement", "judgement", "rangesfm: error")) for line in lines)
     assert not (own_survey.folder / "out").exists()
 
 

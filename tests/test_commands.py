@@ -288,7 +288,7 @@ class TestRefineInASiteFrame:
 
     def test_progress_goes_to_stderr_line_by_line_and_the_summary_to_stdout(self, refined: Left) -> None:
         stages = [line.removesuffix(" ...") for line in refined.stderr.splitlines() if line.endswith(" ...")]
-        assert stages == ["scale", "refinement", "results"]
+        assert stages == ["scale", "refinement", "judgement", "advice", "results", "report"]
         assert "\r" not in refined.stderr
         assert "\033" not in refined.stderr
         assert f"\nscale: {refined.result['scale']['value']:.6g} m per SfM unit" in refined.stdout
@@ -601,16 +601,19 @@ class TestRunOnPhotos:
     def test_tells_of_each_stage(self, first_run: Left) -> None:
         lines = first_run.stderr.splitlines()
         stages = [line.removesuffix(" ...") for line in lines if line.endswith(" ...")]
-        assert stages == ["features", "matching", "mapping", "scale", "refinement", "results"]
-        for stage in stages:
-            assert any(line.startswith(f"{stage}: ") and line.endswith(" s") for line in lines)
+        of_map = ["features", "matching", "mapping"]
+        assert stages == [*of_map, "scale", "refinement", "judgement", "advice", "results", "report"]
+        told = dict(line.split(": ", 1) for line in lines if line.endswith(" s") and ": " in line)
+        assert told.keys() >= {*stages}
+        for stage in ("scale", "refinement", "judgement", "advice"):  # the same clock as in the result
+            assert float(told[stage].removesuffix(" s")) == pytest.approx(first_run.result["seconds"][stage], abs=0.3)
 
     def test_result_has_every_key(self, first_run: Left) -> None:
         result = copy.deepcopy(first_run.result)
         assert_has(result, {**RESULT, "refine": REFINE})
         total_s = result["seconds"].pop("total")
-        stages = {"keyframes", "features", "matching", "mapping", "scale", "refinement", "judgement", "results"}
-        assert result["seconds"].keys() == stages
+        stages = {"keyframes", "features", "matching", "mapping", "scale", "refinement", "judgement", "advice"}
+        assert result["seconds"].keys() == stages | {"results"}
         assert 0 < sum(result["seconds"].values()) <= total_s
 
     def test_map_is_true_to_scale_and_to_the_site_frame(self, photo_run: PhotoRun, first_run: Left) -> None:

@@ -6,10 +6,16 @@ import inspect
 import json
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
+from tests.export.models import synthesized
 
 import rangesfm
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 
 # Packages that are slow to import, and not needed to see which names exist.
 HEAVY = {"numpy", "scipy", "pycolmap", "pyceres", "PIL", "jinja2", "vl_convert"}
@@ -74,6 +80,37 @@ def test_import_is_silent_and_leaves_logging_alone() -> None:
     code = "import logging, rangesfm, rangesfm.workflows.run\nassert not logging.getLogger().handlers"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
+
+
+class Elsewhere:
+    """A path of another library."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = str(path)
+
+    def __fspath__(self) -> str:
+        return self._path
+
+
+@pytest.mark.parametrize("kind", [str, Path, Elsewhere])
+def test_every_path_may_be_a_text_or_a_path_of_any_library(kind: Callable[[Path], Any], tmp_path: Path) -> None:
+    path, folder = kind(tmp_path / "missing"), kind(tmp_path / "export")
+    readers = (rangesfm.read_anchors, rangesfm.read_image_times_csv, rangesfm.read_plan, rangesfm.read_ranges)
+    for read in (*readers, rangesfm.read_reference, rangesfm.read_survey, rangesfm.write_report):
+        with pytest.raises(rangesfm.InputError, match="missing"):
+            read(path)
+    with pytest.raises(rangesfm.InputError, match="missing"):
+        rangesfm.read_ranges([path, path])
+    with pytest.raises(rangesfm.InputError, match="missing"):
+        rangesfm.measure(path, [("a", "b")], markers=path)
+    with pytest.raises(rangesfm.InputError, match="missing"):
+        rangesfm.export_result(path, ["ply"], folder, images_path=path)
+    with pytest.raises(rangesfm.InputError, match="missing"):
+        rangesfm.find_image_times(path, ["a.jpg"], path)
+    with pytest.raises(rangesfm.ReconstructionError, match="missing"):
+        rangesfm.reconstruct(path, ["a.jpg", "b.jpg"], folder, camera=CameraOptions(), mapper=MapperOptions())
+    written = rangesfm.export_model(synthesized(3, 20, seed=0), ["ply"], folder)
+    assert written == (tmp_path / "export" / "points.ply",)
 
 
 def test_version_is_that_of_the_package() -> None:

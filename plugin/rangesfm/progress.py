@@ -44,17 +44,21 @@ class Journal:
         seconds: by name of the stage.
         warnings: one line each.
         start: reading of the monotonic clock, seconds.
+        stage_name: stage that was announced last.
     """
 
     progress: Progress
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     start: float = field(default_factory=time.monotonic)
+    stage_name: str = ""
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Announce a stage to the listener and time it."""
-        self.progress.stage(name)
+        """Announce a stage to the listener, unless it is the one that was announced last, and time it."""
+        if name != self.stage_name:
+            self.stage_name = name
+            self.progress.stage(name)
         with self.timed(name):
             yield
 

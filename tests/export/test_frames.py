@@ -63,6 +63,16 @@ def test_level_puts_up_up_and_the_first_camera_ahead(map_: MetricMap) -> None:
     assert ahead[1] > 0.5
 
 
+def test_level_leaves_a_map_in_the_site_as_it_is_and_only_tilts_it_to_another_up(map_: MetricMap) -> None:
+    in_site = replace(map_, is_site=True)
+    level = in_frame(in_site, ExportOptions(frame="level"))
+    np.testing.assert_allclose(level.trajectory.centers, map_.trajectory.centers, atol=1e-12)
+    tilted = in_frame(in_site, ExportOptions(frame="level", up="0,0.1,1"))
+    moved = tilted.trajectory.centers - map_.trajectory.centers
+    np.testing.assert_allclose(moved[:, 0], 0.0, atol=1e-12)  # the shortest turn is about x
+    assert np.abs(moved[:, 1]).max() > 0.01
+
+
 def test_what_is_up_is_seen_by_the_cameras(map_: MetricMap) -> None:
     up = up_in_world(map_.trajectory, "cameras")
     assert np.rad2deg(np.arccos(up[2])) < 10

@@ -99,7 +99,7 @@ def files_of(folder: Path) -> set[str]:
 
 def test_result_and_summary_are_returned_as_written(refined: Done) -> None:
     done = refined.result
-    assert refined.listener.stages == ["scale", "refinement", "results"]
+    assert refined.listener.stages == ["scale", "refinement", "judgement", "advice", "results", "report"]
     assert done.output_path == refined.survey.output.path
     written = ResultSummary.read(done.output_path / "result.json")
     assert written == done.summary
@@ -361,6 +361,8 @@ def test_journal_times_stages_and_all_of_it() -> None:
     with journal.timed("quick"):
         pass
     journal.warn("careful")
+    with journal.stage("scale"):
+        pass
     assert listener.stages == ["scale"]
     assert listener.messages == journal.warnings == ["careful"]
     seconds = journal.all_seconds()

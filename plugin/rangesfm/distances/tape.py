@@ -13,6 +13,7 @@ from pydantic import AliasChoices, Field
 from rangesfm.arrays import Array
 from rangesfm.distances.measured_lists import LENGTHS, MARKS, MeasuredList
 from rangesfm.errors import InputError, number_text
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.text_tables import repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
@@ -107,7 +108,7 @@ class Tape:
         return replace(self, distances=tuple(distances))
 
 
-def read_tape(distances_path: str | Path, markers_path: str | Path | None = None) -> Tape:
+def read_tape(distances_path: AnyPath, markers_path: AnyPath | None = None) -> Tape:
     """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``, or other tables of these.
 
     A length without a kind is a control length. Without a standard deviation it gets DEFAULT_STDDEV_M.
@@ -138,7 +139,7 @@ def _distances(listed: MeasuredList) -> tuple[TapedDistance, ...]:
     return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
 
 
-def read_markers(path: str | Path, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
+def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
     """Read ``marker,image_name,x_px,y_px``, or another table of marks in photos.
 
     Args:

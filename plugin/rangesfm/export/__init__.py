@@ -24,6 +24,7 @@ from rangesfm.export.photogrammetry import NERFSTUDIO_IMAGES, write_nerfstudio, 
 from rangesfm.export.ply import write_anchor_vertices, write_cameras, write_points
 from rangesfm.export.trajectories import COVARIANCE_FORMATS, write_covariances, write_kitti, write_trajectory
 from rangesfm.files.atomic import make_output_folder
+from rangesfm.files.contents import AnyPath
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
 
@@ -104,7 +105,7 @@ EXPORTED_NAMES: dict[str, tuple[str, ...]] = {
 def export_model(
     reconstruction: pycolmap.Reconstruction,
     formats: Iterable[str],
-    output_path: Path,
+    output_path: AnyPath,
     *,
     timestamps_s: Mapping[str, float] | None = None,
     anchors_m: Mapping[str, Array] | None = None,
@@ -127,7 +128,7 @@ def export_model(
         InputError: a format is unknown or needs something that is not given, or the folder cannot be written to.
     """
     map_ = MetricMap(reconstruction, timestamps_s, anchors_m, metric_from_sfm)
-    return export_map(map_, output_path, ExportOptions(formats=tuple(formats)))
+    return export_map(map_, Path(output_path), ExportOptions(formats=tuple(formats)))
 
 
 def export_map(map_: MetricMap, output_path: Path, options: ExportOptions) -> tuple[Path, ...]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
@@ -218,9 +219,12 @@ def _unit(vector: Array) -> Array:
 def _level_from_world(map_: MetricMap, up: str) -> Array:
     """Return the rotation (3, 3) into a level frame: z up, y along the view of the first camera.
 
-    Where the first camera looks almost straight up or down, y is along the upper edge of its image instead.
+    Where the first camera looks almost straight up or down, y is along the upper edge of its image instead. A map in
+    the site is only tilted, not turned about z, because its heading is that of the site.
     """
     vertical = up_in_world(map_.trajectory, up, is_site=map_.is_site)
+    if map_.is_site:
+        return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [vertical])[0].as_matrix())
     first = map_.trajectory.world_from_cam[0]
     for ahead in (first[:, 2], -first[:, 1]):
         level = ahead - (ahead @ vertical) * vertical

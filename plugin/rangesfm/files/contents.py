@@ -11,8 +11,11 @@ from typing import Any, BinaryIO
 
 CHUNK_BYTES = 1 << 20
 
+AnyPath = str | os.PathLike[str]
+"""A path as a caller of the library may give it; ``Path(path)`` makes it one of this package's own."""
 
-def open_regular(path: str | Path) -> BinaryIO:
+
+def open_regular(path: AnyPath) -> BinaryIO:
     """Open a file to be read, if it is a regular one. A device or a pipe may never end, or never begin.
 
     Raises:

@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from rangesfm.errors import InputError, printable
 from rangesfm.files.atomic import new_file
-from rangesfm.files.contents import open_regular
+from rangesfm.files.contents import AnyPath, open_regular
 from rangesfm.option_model import Bounds
 
 MAX_NUMBER = 1e100
@@ -183,7 +183,7 @@ class TextTable:
 
 
 def read_table(
-    path: str | Path,
+    path: AnyPath,
     required: Sequence[str],
     optional: Sequence[str] = (),
     *,
@@ -300,7 +300,7 @@ def repeated(keys: Iterable[Hashable]) -> tuple[int, int] | None:
     return next(((k, first[key]) for k, key in enumerate(keys) if first.setdefault(key, k) != k), None)
 
 
-def read_text(path: str | Path, *, errors: str = "strict") -> str:
+def read_text(path: AnyPath, *, errors: str = "strict") -> str:
     """Read a whole text file with line feeds as line ends, without a byte order mark.
 
     It is UTF-8, UTF-16 with its byte order mark, or Windows-1252, in which many spreadsheets save CSV.
@@ -319,7 +319,7 @@ def read_text(path: str | Path, *, errors: str = "strict") -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
-def read_head(path: str | Path) -> str:
+def read_head(path: AnyPath) -> str:
     """Read the first part of a file like ``read_text``; bytes that are not text are replaced."""
     data = _read_bytes(path, _HEAD_BYTES)
     encoding = _WINDOWS if _is_windows_text(data) else _encoding(data)
@@ -352,7 +352,7 @@ def guess_separator(row: str) -> str:
     return separator if separator in row else " "
 
 
-def _read_bytes(path: str | Path, num: int = -1) -> bytes:
+def _read_bytes(path: AnyPath, num: int = -1) -> bytes:
     try:
         with open_regular(path) as file:
             if os.fstat(file.fileno()).st_size == 0:  # like the kernel's own files, some of which never end

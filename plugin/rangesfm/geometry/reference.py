@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import (
     TextTable,
     has_columns,
@@ -148,7 +149,7 @@ def is_reference_file(head: str) -> bool:
     return any(has_columns(head, [key, *POSITION_COLUMNS]) for key in ("image_name", "timestamp_s"))
 
 
-def read_reference(path: str | Path) -> Reference:
+def read_reference(path: AnyPath) -> Reference:
     """Read ``reference.csv`` or a TUM trajectory.
 
     The CSV file has a header row: ``image_name`` or ``timestamp_s``, then ``x_m,y_m,z_m`` and optionally

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
+from rangesfm.files.contents import AnyPath
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import KeyMeta, Options
 from rangesfm.options import LENGTH_M, RangeModelOptions, TagOptions, Uncertainty
@@ -127,7 +128,7 @@ PLAN_TABLES: dict[str, type[Options]] = {
 }
 
 
-def read_plan(path: str | Path) -> PlannedSurvey:
+def read_plan(path: AnyPath) -> PlannedSurvey:
     """Read a plan file; paths in it are relative to the file's folder.
 
     Raises:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rangesfm.files.atomic import sole_writer
+from rangesfm.files.contents import AnyPath
 from rangesfm.report.chart import write_pictures
 from rangesfm.report.content import Content
 from rangesfm.report.report_page import render_report, sections_of, write_page
@@ -13,7 +14,7 @@ from rangesfm.result.result_folder import REPORT_NAME, read_result_folder
 __all__ = ["write_report", "write_report_of", "write_report_pictures"]
 
 
-def write_report(result_folder: Path, *, images_path: Path | None = None) -> Path:
+def write_report(result_folder: AnyPath, *, images_path: AnyPath | None = None) -> Path:
     """Write ``report.html`` into the output folder of a run.
 
     Args:
@@ -27,8 +28,9 @@ def write_report(result_folder: Path, *, images_path: Path | None = None) -> Pat
     Raises:
         InputError: the folder is not a result, a file in it cannot be read, or a run is writing there.
     """
-    with sole_writer(result_folder):
-        return write_report_of(Content(read_result_folder(result_folder), images_path=images_path), result_folder)
+    folder, images = Path(result_folder), None if images_path is None else Path(images_path)
+    with sole_writer(folder):
+        return write_report_of(Content(read_result_folder(folder), images_path=images), folder)
 
 
 def write_report_of(content: Content, folder: Path) -> Path:
@@ -38,7 +40,7 @@ def write_report_of(content: Content, folder: Path) -> Path:
     return path
 
 
-def write_report_pictures(result_folder: Path) -> list[Path]:
+def write_report_pictures(result_folder: AnyPath) -> list[Path]:
     """Write the report's figures as PNG and SVG files into the subfolder ``figures`` of a result folder.
 
     Returns:
@@ -47,7 +49,8 @@ def write_report_pictures(result_folder: Path) -> list[Path]:
     Raises:
         InputError: as in ``write_report``.
     """
-    with sole_writer(result_folder):
-        result = read_result_folder(result_folder)
+    folder = Path(result_folder)
+    with sole_writer(folder):
+        result = read_result_folder(folder)
         figures = [figure for section in sections_of(Content(result)) for figure in section.figures]
-        return write_pictures(figures, result_folder / "figures")
+        return write_pictures(figures, folder / "figures")

@@ -12,6 +12,7 @@ from typing import Any
 
 from rangesfm.errors import InputError, OptionError, nearest_known, printable, shown
 from rangesfm.files.atomic import path_of
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import read_text
 from rangesfm.option_model import PathRole
 from rangesfm.options import CameraOptions
@@ -56,7 +57,7 @@ def parse_inline_table(text: str) -> dict[str, Any]:
 
 
 def read_survey(
-    path: str | Path, overrides: Mapping[str, object] | None = None, base_folder: str | Path | None = None
+    path: AnyPath, overrides: Mapping[str, object] | None = None, base_folder: AnyPath | None = None
 ) -> Survey:
     """Read a survey file.
 
@@ -77,7 +78,7 @@ def read_survey(
 
 def survey_from_tables(
     tables: Mapping[str, Any],
-    base_folder: str | Path,
+    base_folder: AnyPath,
     overrides: Mapping[str, object] | None = None,
     source: OptionsOrigin | None = None,
 ) -> Survey:

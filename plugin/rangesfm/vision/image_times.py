@@ -16,6 +16,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.folders import IMAGE_EXTENSIONS, natural_order, walk
 from rangesfm.files.text_tables import TextTable
 from rangesfm.options import TIME_S
@@ -70,7 +71,7 @@ class ImageTimes:
         return dict(zip(self.image_names, self.timestamps_s.tolist(), strict=True))
 
 
-def list_images(folder: str | Path) -> tuple[str, ...]:
+def list_images(folder: AnyPath) -> tuple[str, ...]:
     """Return the sorted names of all photos in a folder and its subfolders, including linked ones but not hidden ones.
 
     Raises:
@@ -94,9 +95,9 @@ def list_images(folder: str | Path) -> tuple[str, ...]:
 
 
 def find_image_times(
-    folder: str | Path,
+    folder: AnyPath,
     names: Sequence[str],
-    csv_path: str | Path | None = None,
+    csv_path: AnyPath | None = None,
     frames: Mapping[str, Sequence[str]] | None = None,
     *,
     rate_hz: float | None = None,
@@ -142,7 +143,7 @@ def times_at_rate(names: Sequence[str], rate_hz: float) -> ImageTimes:
 
 
 def read_image_times_csv(
-    path: str | Path,
+    path: AnyPath,
     names: Sequence[str] | None = None,
     frames: Mapping[str, Sequence[str]] | None = None,
     *,
@@ -218,7 +219,7 @@ def _names_of_photos(listed: Sequence[str], photos: Collection[str]) -> list[str
     return found
 
 
-def times_from_exif(folder: str | Path, names: Sequence[str]) -> ImageTimes:
+def times_from_exif(folder: AnyPath, names: Sequence[str]) -> ImageTimes:
     """Read times from EXIF DateTimeOriginal, its fraction SubSecTimeOriginal and its zone OffsetTimeOriginal.
 
     The times are seconds since 1970 in UTC. Photos without a zone take the zone of a photo that has one. If none has,

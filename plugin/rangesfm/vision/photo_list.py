@@ -12,6 +12,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.readers import vocabulary as terms
@@ -50,9 +51,7 @@ class PhotoList:
     notes: tuple[str, ...] = ()
 
 
-def read_photo_list(
-    path: str | Path, *, columns: Mapping[str, str] | None = None, unit: str | None = None
-) -> PhotoList:
+def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None) -> PhotoList:
     """Read ``image_name,timestamp_s``, or another table with names of photos and times.
 
     Args:

@@ -11,6 +11,7 @@ import pycolmap
 
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.files.atomic import scratch_folder, sole_writer
+from rangesfm.files.contents import AnyPath
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.vision.camera import cameras_of_photos, check_camera
@@ -48,9 +49,9 @@ class ReconstructionSummary:
 
 
 def reconstruct(
-    image_path: str | Path,
+    image_path: AnyPath,
     image_names: Sequence[str],
-    output_path: str | Path,
+    output_path: AnyPath,
     *,
     camera: CameraOptions,
     mapper: MapperOptions,

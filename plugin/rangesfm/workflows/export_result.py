@@ -12,6 +12,7 @@ from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats, export_map, refuse_metric
 from rangesfm.export.metric_map import in_frame
 from rangesfm.files.atomic import sole_writer
+from rangesfm.files.contents import AnyPath
 from rangesfm.options import ExportOptions
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
@@ -20,12 +21,12 @@ from rangesfm.vision.steps import DATABASE_NAME
 
 
 def export_result(
-    output_path: Path,
+    output_path: AnyPath,
     formats: Iterable[str],
-    destination: Path,
+    destination: AnyPath,
     *,
     options: ExportOptions | None = None,
-    images_path: Path | None = None,
+    images_path: AnyPath | None = None,
 ) -> tuple[Path, ...]:
     """Export the final metric model of a result folder: the refined one, else the scaled one.
 
@@ -45,9 +46,9 @@ def export_result(
     """
     options = (options or ExportOptions()).changed(formats=tuple(formats))
     check_formats(options.formats)
-    result = read_result_folder(output_path)
-    with sole_writer(destination):
-        return export_map(_read_map(result, images_path), destination, options)
+    result, folder = read_result_folder(Path(output_path)), Path(destination)
+    with sole_writer(folder):
+        return export_map(_read_map(result, None if images_path is None else Path(images_path)), folder, options)
 
 
 def apply_result(

@@ -109,7 +109,7 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
                 with run.journal.stage("refinement"):
                     again = refine_map(run, metric, found.closing)
             metric = closed(run, found, metric, again)
-    with run.journal.timed("judgement"):
+    with run.journal.stage("judgement"):
         return judge_map(run, metric, of_pieces)
 
 

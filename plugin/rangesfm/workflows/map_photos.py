@@ -110,7 +110,7 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
         raise InputError("its images have their own times, expected no [images] times", path)
     rate_hz, topic = survey.images.extraction_rate_hz, survey.images.topic
     places = places_for_photos(survey.output.path)
-    with journal.timed("photos"):
+    with journal.stage("photos"):
         taken_before = (place for place in places if earlier_photos(path, place, rate_hz=rate_hz, topic=topic))
         folder = places[0] if restart else next(taken_before, places[0])
         taken = take_photos(path, folder, rate_hz=rate_hz, topic=topic, progress=journal.progress, restart=restart)

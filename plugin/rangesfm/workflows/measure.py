@@ -12,6 +12,7 @@ from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.measured_lists import PAIRS
 from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
 from rangesfm.errors import InputError, number_text
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import align_rows, write_table
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.measurements import Interval, MeasuredMap, Measurement, up_in_map
@@ -64,7 +65,7 @@ class Measurements:
 
 @with_one_blas_thread
 def measure(
-    result_folder: Path | str, pairs: Iterable[tuple[str, str]], *, markers: Path | str | None = None
+    result_folder: AnyPath, pairs: Iterable[tuple[str, str]], *, markers: AnyPath | None = None
 ) -> Measurements:
     """Measure distances and height differences in the final map of a result.
 

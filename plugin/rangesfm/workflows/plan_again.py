@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.metric_map import colored_points, up_in_world
+from rangesfm.files.contents import AnyPath
 from rangesfm.geometry.gravity import UP_IN_SITE
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.planning.advice import advise, best_words
@@ -33,7 +34,7 @@ _MOST_OF_POINTS = (0.01, 0.99)
 _BEHIND_M = 0.05
 
 
-def plan_of_result(path: str | Path) -> PlannedSurvey:
+def plan_of_result(path: AnyPath) -> PlannedSurvey:
     """Return the plan of a survey with the path, the anchors and the number of ranges of a finished one.
 
     Path and anchors are those of the result's map, and the errors of the radio are those that the run has learnt. For a

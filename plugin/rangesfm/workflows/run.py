@@ -145,7 +145,7 @@ def map_in_metres(
     Returns:
         The survey, with the lengths that are in the map, and corrected if a mistake was adopted; and the map.
     """
-    with run.journal.timed("scale"):
+    with run.journal.stage("scale"):
         path, verdicts = join_by_survey(run, paths, must_join=must_join)
         images = run.survey.images
         baselines = read_rigs(images.rig_config).baselines(path.sfm, images.baseline_stddev_m)
@@ -161,4 +161,6 @@ def map_in_metres(
 
 def with_results(run: SurveyRun, made: MetricResult) -> RunResult:
     """Add advice for the next survey to a map, compare it with the reference, and write all results."""
-    return write_results(run, with_advice(made, run.inputs.tag_in_cam_m))
+    with run.journal.stage("advice"):
+        advised = with_advice(made, run.inputs.tag_in_cam_m)
+    return write_results(run, advised)

@@ -98,8 +98,9 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
         )
         summary.write(staged / summary.NAME)
         if survey.report.enabled:
-            content = Content(read_result_folder(staged), images_path=survey.images.path, home=folder)
-            write_report_of(content, staged)
+            with journal.stage("report"):
+                content = Content(read_result_folder(staged), images_path=survey.images.path, home=folder)
+                write_report_of(content, staged)
     lines = [*summary.lines(folder, format_table(comparison) if comparison else None)]
     if survey.report.enabled:
         lines.append(f"report: {folder / REPORT_NAME}")

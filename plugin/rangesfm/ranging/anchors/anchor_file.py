@@ -10,6 +10,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, read_table, repeated, write_user_table
 from rangesfm.option_model import Bounds
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
@@ -51,15 +52,13 @@ class AnchorList:
 
 
 def read_anchors(
-    path: str | Path, *, columns: Mapping[str, str] | None = None, unit: str | None = None
+    path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None
 ) -> tuple[Anchor, ...]:
     """Read the anchors in a file; see ``read_anchor_list``."""
     return read_anchor_list(path, columns=columns, unit=unit).anchors
 
 
-def read_anchor_list(
-    path: str | Path, *, columns: Mapping[str, str] | None = None, unit: str | None = None
-) -> AnchorList:
+def read_anchor_list(path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None) -> AnchorList:
     """Read ``anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m]``, or another table of points.
 
     Coordinates are empty for an anchor of unknown position. The optional cells may be empty as well. In other tables,
@@ -103,7 +102,7 @@ def is_canonical_anchor_file(head: str) -> bool:
     return is_plain_table(head, _REQUIRED, _ALIASES)
 
 
-def write_anchors(anchors: Sequence[Anchor], path: str | Path) -> None:
+def write_anchors(anchors: Sequence[Anchor], path: AnyPath) -> None:
     """Write an anchor file that ``read_anchors`` reads, with empty cells for unknown values.
 
     Raises:

@@ -9,6 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import has_columns, read_table, write_table
 from rangesfm.options import BIAS_M, LENGTH_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.range_log import RangeLog
@@ -68,7 +69,7 @@ def correct_ranges(log: RangeLog, curve: ErrorCurve) -> tuple[RangeLog, list[str
     return replace(log, range_m=distance, shared_stddev_m=stddev), notes
 
 
-def write_error_curve(curve: ErrorCurve, path: str | Path) -> None:
+def write_error_curve(curve: ErrorCurve, path: AnyPath) -> None:
     """Write a table with columns ``distance_m,error_m,stddev_m,noise_stddev_m``."""
     rows = np.column_stack([curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m])
     write_table(Path(path), COLUMNS, ([f"{value:.5f}" for value in row] for row in rows.tolist()))
@@ -79,7 +80,7 @@ def is_error_curve_file(head: str) -> bool:
     return has_columns(head, COLUMNS)
 
 
-def read_error_curve(path: str | Path) -> ErrorCurve:
+def read_error_curve(path: AnyPath) -> ErrorCurve:
     """Read a file in the format of ``write_error_curve``.
 
     Raises:

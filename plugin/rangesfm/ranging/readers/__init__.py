@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag_folder
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.folders import natural_order
 from rangesfm.files.text_tables import read_head
 from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, LogOptions
@@ -35,7 +37,7 @@ def reader_names() -> tuple[str, ...]:
 
 
 def read_ranges(
-    path: str | Path | Sequence[str | Path],
+    path: AnyPath | Sequence[AnyPath],
     options: LogOptions | None = None,
     *,
     anchor_ids: Collection[str] = (),
@@ -78,7 +80,7 @@ def read_ranges(
     return replace(log, range_stddev_m=np.maximum(log.range_stddev_m, least_m))
 
 
-def read_anchors_in_log(path: str | Path | Sequence[str | Path], *, format: str | None = None) -> tuple[Anchor, ...]:
+def read_anchors_in_log(path: AnyPath | Sequence[AnyPath], *, format: str | None = None) -> tuple[Anchor, ...]:
     """Return the anchors whose positions a log contains, as logs of the DWM1001 do; empty if it contains none.
 
     The position of an anchor is the median of its positions in the log. It is unknown if several anchors have the same
@@ -114,8 +116,8 @@ def _check_numbers(log: RangeLog) -> None:
             raise InputError(message, log.source, int(log.line[row]))
 
 
-def _paths(path: str | Path | Sequence[str | Path]) -> list[Path]:
-    paths = [path] if isinstance(path, (str, Path)) else [*path]
+def _paths(path: AnyPath | Sequence[AnyPath]) -> list[Path]:
+    paths = [path] if isinstance(path, (str, os.PathLike)) else [*path]
     if "" in paths:
         raise InputError("a log's name is empty, expected a file")
     return [*map(Path, paths)]

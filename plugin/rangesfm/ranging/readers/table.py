@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError, printable
+from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import header_names, read_head, write_user_table
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.columns import QUANTITIES, STAMPS, RangeColumns, read_columns
@@ -177,7 +178,7 @@ def _spanned(text: str) -> list[str]:
     return [f"{span[1]}{number}" for number in range(int(span[2]), int(span[4]) + 1)]
 
 
-def write_ranges_csv(log: RangeLog, path: str | Path) -> None:
+def write_ranges_csv(log: RangeLog, path: AnyPath) -> None:
     """Write a log as canonical CSV; optional columns are written only if the log has values for them.
 
     For a range between two anchors or two tags, the other end is in the column of the tag or of the anchor.
