@@ -19,9 +19,15 @@ _LIKE_OURS = 0.85
 class MapperOptions(Options, table="mapper"):
     """Mapping of the photos to an unscaled model by COLMAP. Other keys are passed to pycolmap as in pipeline."""
 
-    method: Annotated[Literal["incremental", "global", "hierarchical"], KeyMeta(flag="mapper_method")] = "incremental"
-    """COLMAP's mapper. incremental: photo by photo; global: all photos at once; hierarchical: photo by photo in
-    clusters, which are then merged."""
+    method: Annotated[Literal["incremental", "global", "hierarchical", "external"], KeyMeta(flag="mapper_method")] = (
+        "incremental"
+    )
+    """COLMAP's mapper, or another one. incremental: photo by photo; global: all photos at once; hierarchical: photo by
+    photo in clusters, which are then merged; external: the program of command."""
+    command: Annotated[str | None, KeyMeta(flag="mapper_command", metavar="COMMAND")] = None
+    """External mapper with its arguments, quoted as in a shell, but run without one. It is run in a folder with a copy
+    of the database as database.db, and writes a COLMAP model to sparse/0. {images} stands for the folder of the
+    photos."""
     matching: Literal["sequential", "exhaustive", "spatial", "vocabtree", "auto"] = "auto"
     """Pairs of photos that are matched. sequential: neighbours in time; exhaustive: all pairs; spatial: neighbours by
     EXIF position; vocabtree: photos that look alike; auto: exhaustive up to 60 keyframes, sequential above."""
@@ -70,6 +76,11 @@ class MapperOptions(Options, table="mapper"):
         if by_tree and self.vocab_tree_path is None and "vocab_tree_path" not in self.pairing:
             message = "[mapper] vocab_tree_path is not given, expected COLMAP's vocabulary tree for this matching"
             raise OptionError(message, "mapper", "matching" if self.matching == "vocabtree" else "pairing")
+        if (self.method == "external") != (self.command is not None):
+            where = "is not given" if self.command is None else f"is given beside method {self.method}"
+            raise self.refused("command", f"{where}, expected it with method external, and only there")
+        if self.method == "external" and self.pipeline:
+            raise self.refused("pipeline", "is given, expected none: an external mapper takes its options in command")
         if self.mask_path is not None and self.database_path is not None:
             why = "is given beside database_path, expected one of them: there are features already"
             raise self.refused("mask_path", why)

@@ -105,6 +105,19 @@ def _end_with(parent: int) -> None:
         threading.Thread(target=lambda: (sys.stdin.buffer.read(), os._exit(1)), daemon=True).start()
 
 
+def end_group_with_parent() -> None:
+    """Have this child process, and all processes that it starts, killed when it is interrupted or its parent ends.
+
+    Only on Linux are they killed too if the parent is.
+    """
+    if sys.platform == "win32":
+        return
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os.killpg(0, signal.SIGKILL))
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
 @dataclass(frozen=True)
 class Ended:
     """End of a child process.

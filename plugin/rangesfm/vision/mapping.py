@@ -1,11 +1,14 @@
-"""Step 3: mapping by COLMAP's mappers, and their models on disk."""
+"""Step 3: mapping by COLMAP's mappers or another one, and their models on disk."""
 
 from __future__ import annotations
 
 import copy
+import os
+import shlex
 import shutil
-from collections.abc import Sequence
-from contextlib import closing
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +18,7 @@ from rangesfm.colmap.calibrated_cameras import cameras_as_given
 from rangesfm.colmap.colmap_log import append_log
 from rangesfm.colmap.model_files import read_model, write_binary_model
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.errors import ReconstructionError
+from rangesfm.errors import InputError, ReconstructionError, shown
 from rangesfm.files.atomic import new_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.processes.supervision import run_children
@@ -23,17 +26,49 @@ from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.device import uses_gpu
 from rangesfm.vision.incremental_mapping import adjust_whole, incremental_mapping
-from rangesfm.vision.own_process import MODULE, WholeMapping, WholePipelineOptions
+from rangesfm.vision.own_process import MODULE, ExternalMapping, WholeMapping, WholePipelineOptions
 from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot
-from rangesfm.vision.steps import Workspace
+from rangesfm.vision.steps import DATABASE_NAME, MODELS_NAME, Workspace
 
 # With several threads Ceres adds up in the order in which they finish, also with a fixed number of threads: every run
 # would give another map. Two threads would save 7 to 21 % of the mapping's time (see "One thread for the
 # mapping" in examples/measured.md). [mapper.pipeline] num_threads overrides this.
 _NUM_THREADS = 1
-PipelineOptions = pycolmap.IncrementalPipelineOptions | WholePipelineOptions
+_MAX_LINE = 200
+
+
+@dataclass(frozen=True)
+class ExternalMapper:
+    """A mapper that is a program of its own.
+
+    Attributes:
+        words: the program and its arguments, in which {images} stands for the folder of the photos.
+    """
+
+    words: tuple[str, ...]
+
+    @classmethod
+    def of(cls, command: str) -> ExternalMapper:
+        """Return the mapper of a command line.
+
+        Raises:
+            InputError: there is no such program.
+        """
+        try:
+            words = shlex.split(command)
+        except ValueError as error:
+            raise InputError(f"[mapper] command is not a command line ({error}): {shown(command)}") from error
+        program = words[0] if words else ""
+        is_anywhere = Path(program).name == program or Path(program).is_absolute()
+        if (found := shutil.which(program)) is None or not is_anywhere:
+            expected = "expected a program on the PATH, or the absolute path of one"
+            raise InputError(f"[mapper] command begins with {shown(program)}, {expected}")
+        return cls((found, *words[1:]))
+
+
+PipelineOptions = pycolmap.IncrementalPipelineOptions | WholePipelineOptions | ExternalMapper
 
 
 @dataclass(frozen=True)
@@ -54,9 +89,11 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
     """Return the options of the chosen mapper.
 
     Raises:
-        InputError: a key or value that COLMAP does not have.
+        InputError: a key or value that COLMAP does not have, or there is no such external mapper.
     """
-    options: PipelineOptions
+    if mapper.command is not None:
+        return ExternalMapper.of(mapper.command)
+    options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions
     if mapper.method == "global":
         options = pycolmap.GlobalPipelineOptions(num_threads=_NUM_THREADS, random_seed=seed)
         positioning, adjustment = options.mapper.global_positioning, options.mapper.bundle_adjustment
@@ -87,7 +124,7 @@ def mapping_options(
     because with rigs held fixed COLMAP 4.2's global positioning gives a senseless map, even from perfect matches.
     """
     growing = pipeline_options(camera, mapper, seed)
-    if isinstance(growing, pycolmap.GlobalPipelineOptions):
+    if isinstance(growing, pycolmap.GlobalPipelineOptions | ExternalMapper):
         return MappingOptions(growing, None)
     options = growing
     if isinstance(options, pycolmap.HierarchicalPipelineOptions):
@@ -134,6 +171,8 @@ def map_photos(space: Workspace, photos: Photos, options: MappingOptions) -> Non
     growing, whole = options.growing, options.whole
     if isinstance(growing, pycolmap.IncrementalPipelineOptions):
         models = _map_incrementally(space, photos, growing)
+    elif isinstance(growing, ExternalMapper):
+        models = _map_by_program(space, photos.folder, growing)
     else:
         models = _map_at_once(space, photos.folder, growing)
     if whole is not None:
@@ -192,16 +231,62 @@ def _map_incrementally(
 
 def _map_at_once(space: Workspace, image_path: Path, options: WholePipelineOptions) -> list[pycolmap.Reconstruction]:
     """Return all models of a mapper that takes all photos at once, and append COLMAP's messages to the log."""
+    with _folder_with_database(space) as folder:
+        _run_in_child(space, WholeMapping(folder / DATABASE_NAME, image_path, options))
+        return [read_model(path) for path in sorted(folder.iterdir()) if path.is_dir()]
+
+
+def _map_by_program(space: Workspace, image_path: Path, mapper: ExternalMapper) -> list[pycolmap.Reconstruction]:
+    """Return the models that an external mapper writes, and append what it prints to the log.
+
+    Raises:
+        ReconstructionError: it failed, wrote no model, or a model of other photos.
+    """
+    words = [word.replace("{images}", str(image_path.resolve())) for word in mapper.words]
+    name = f"the external mapper {Path(mapper.words[0]).name}"
+    with _folder_with_database(space) as folder:
+        status = _run_in_child(space, work := ExternalMapping(folder, words, dict(os.environ)))
+        if status:
+            how = f"status {status}" if status > 0 else signal.Signals(-status).name
+            printed = work.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            raise ReconstructionError(f"{name} ended with {how}" + (f": {printed[-1][:_MAX_LINE]}" if printed else ""))
+        if not (folder / MODELS_NAME / "0").is_dir():
+            raise ReconstructionError(f"{name} ended without an error, but wrote no model to sparse/0")
+        try:
+            models = list(read_mapped_models(folder / MODELS_NAME))
+        except InputError as error:
+            raise ReconstructionError(f"{name} wrote a model that cannot be used: {error}") from error
+        with pycolmap.Database.open(space.database) as database:
+            name_of = {image.image_id: image.name for image in database.read_all_images()}
+    for model in models:
+        for image_id, image in model.images.items():
+            if name_of.get(image_id) != image.name:
+                expected = "none" if image_id not in name_of else shown(name_of[image_id])
+                raise ReconstructionError(
+                    f"{name} wrote a model with {shown(image.name)} as image {image_id}, expected the images of "
+                    f"database.db, where that is {expected}"
+                )
+    return models
+
+
+@contextmanager
+def _folder_with_database(space: Workspace) -> Iterator[Path]:
+    """Yield a folder with a copy of the database, into which a mapper may write what it finds about pairs."""
     space.progress.message("mapping: this mapper shows no progress, and starts anew after an interruption")
     with scratch_folder(space.output / "mapping") as folder:
-        # The mapper works on a copy of the database, because it writes what it finds about pairs into it.
-        work = WholeMapping(Path(shutil.copyfile(space.database, folder / "database.db")), image_path, options)
-        try:
-            with closing(run_children(MODULE, [work], 1, lambda _: None)) as ended:
-                list(ended)
-        finally:
-            append_log(work.log, space.log)
-        return [read_model(path) for path in sorted(folder.iterdir()) if path.is_dir()]
+        shutil.copyfile(space.database, folder / DATABASE_NAME)
+        yield folder
+
+
+def _run_in_child(space: Workspace, work: WholeMapping | ExternalMapping) -> int:
+    """Do a piece of work in a process of its own, append its log to that of the workspace, and return its result."""
+    num_done: list[int] = [0]
+    try:
+        with closing(run_children(MODULE, [work], 1, num_done.append)) as ended:
+            list(ended)
+    finally:
+        append_log(work.log, space.log)
+    return num_done[-1]
 
 
 def read_mapped_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:

@@ -1,4 +1,4 @@
-"""Work that COLMAP does in a process of its own: features, a share of the matching, and mappers that take all photos.
+"""Work in a process of its own: features, a share of the matching, mappers that take all photos, and external ones.
 
 When the disk is full, a library that writes from its own thread ends the whole process. Here that is a child process,
 whose end is noticed.
@@ -9,14 +9,15 @@ whose end is noticed.
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+import subprocess
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
 
 from rangesfm.colmap.colmap_log import colmap_log
-from rangesfm.processes.supervision import MessagesToParent, work_for_parent
+from rangesfm.processes.supervision import MessagesToParent, end_group_with_parent, work_for_parent
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import copy_matches, copy_photos
@@ -132,7 +133,40 @@ class WholeMapping:
             return len(pycolmap.hierarchical_mapping(*where, self.options))
 
 
-def _run(work: FeatureExtraction | MatchingShare | WholeMapping, parent: MessagesToParent) -> int:
+@dataclass(frozen=True)
+class ExternalMapping:
+    """A mapping by a program that reads ``database.db`` in a folder, and writes ``sparse/0`` there.
+
+    Attributes:
+        folder: with the database. words: the program and its arguments. environment: its environment variables.
+    """
+
+    folder: Path
+    words: Sequence[str]
+    environment: Mapping[str, str]
+
+    @property
+    def log(self) -> Path:
+        """File with all that the program prints."""
+        return self.folder / "mapper.log"
+
+    def run(self, _: Progress) -> int:
+        """Run the program until it ends, and return its exit status."""
+        end_group_with_parent()
+        with self.log.open("wb") as log:
+            done = subprocess.run(
+                self.words,
+                cwd=self.folder,
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                check=False,
+            )
+        return done.returncode
+
+
+def _run(work: FeatureExtraction | MatchingShare | WholeMapping | ExternalMapping, parent: MessagesToParent) -> int:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C may end the process at once: files written so far are intact
     return work.run(parent)
 

@@ -130,7 +130,8 @@ def _map(
         of_matches: fingerprint of the matches.
     """
     intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
-    inputs = fingerprint(of_matches, mapper.method, mapper.pipeline, *intrinsics)
+    command = [] if mapper.command is None else [mapper.command]
+    inputs = fingerprint(of_matches, mapper.method, *command, mapper.pipeline, *intrinsics)
     with space.logged():
         if not all(rigs.are_known):
             space.steps.run(
