@@ -161,6 +161,7 @@ def test_ranges_writes_the_canonical_csv_from_mapped_columns(folder: Path) -> No
         (["export", "a", "--input_path", "b"], "two result folders"),
         (["demo", "--num_photos", "19"], "--num_photos is 19, expected 20 to 40"),
         (["demo", "--num_photos", "41"], "--num_photos is 41, expected 20 to 40"),
+        (["demo", "--scene", "corridor", "--num_photos", "97"], "--num_photos is 97, expected 20 to 96"),
         (["demo", "--seed", "-2"], "--seed is -2"),
     ],
 )

@@ -75,7 +75,16 @@ def test_quiet_run_prints_the_summary_alone(calls: Calls, capsys: pytest.Capture
     assert capsys.readouterr() == ("reconstruct_survey is done\nscale 2.5\n", "")
 
 
-def test_demo_makes_a_survey_and_runs_it_against_the_truth(calls: Calls, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("flags", "maker", "num_photos"),
+    [
+        (["--num-photos", "12"], "survey.make_demo_survey", 12),
+        (["--scene", "corridor"], "corridor.make_corridor_survey", 96),
+    ],
+)
+def test_demo_makes_a_survey_and_runs_it_against_the_truth(
+    flags: list[str], maker: str, num_photos: int, calls: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def make(folder: Path, *, num_photos: int, seed: int) -> SimpleNamespace:
         folder.mkdir()
         (folder / "reference.csv").touch()
@@ -83,11 +92,11 @@ def test_demo_makes_a_survey_and_runs_it_against_the_truth(calls: Calls, monkeyp
         survey_path.write_text(f"[images]\nevery_nth = {num_photos}\n[output]\nseed = 1\n")
         return SimpleNamespace(survey_path=survey_path)
 
-    monkeypatch.setattr("rangesfm.demo.survey.make_demo_survey", make)
-    assert main(["demo", "yard", "--num-photos", "12", "--seed", "5", "--num-threads", "2"]) == 0
+    monkeypatch.setattr(f"rangesfm.demo.{maker}", make)
+    assert main(["demo", "yard", *flags, "--seed", "5", "--num-threads", "2"]) == 0
     ((name, survey, options),) = calls.made
     assert (name, options) == ("run_survey", {"restart": False})
-    assert (survey.images.every_nth, survey.output.seed, survey.mapper.num_threads) == (12, 5, 2)
+    assert (survey.images.every_nth, survey.output.seed, survey.mapper.num_threads) == (num_photos, 5, 2)
     assert survey.report.reference == Path.cwd() / "yard" / "reference.csv"
     assert survey.output.path == Path.cwd() / "yard" / "out"
 

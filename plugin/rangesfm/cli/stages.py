@@ -22,7 +22,7 @@ _SCALE_KEYS = (
     "output",
 )
 _DEMO_FOLDER = "rangesfm_demo"
-_NUM_PHOTOS = range(20, 41)  # fewer walk too short a way to tell the time offset, and the package has no more
+_MIN_NUM_PHOTOS = 20  # fewer walk too short a way to tell the time offset
 _JOIN_KEYS = (
     *("ranges.range_stddev_m", "ranges.range_bias_stddev_m", "ranges.common_bias_stddev_m", "anchors", "scale"),
     *("mapper.num_threads", "refine", "export", "report", "output"),
@@ -38,7 +38,14 @@ def add_stages_commands(commands: Commands) -> None:
         "folder", nargs="?", default=_DEMO_FOLDER, metavar="DIR", help=f"folder to write to (default: {_DEMO_FOLDER})"
     )
     demo.add_argument(
-        "--num_photos", type=int, default=40, metavar="N", help="use the first N of 40 photos, 20 or more (default: 40)"
+        "--scene",
+        choices=("yard", "corridor"),
+        default="yard",
+        help="yard: 40 photos, five surveyed anchors; corridor: 96 photos whose map drifts, one anchor, and a path "
+        "that comes back to its start (default: yard)",
+    )
+    demo.add_argument(
+        "--num_photos", type=int, metavar="N", help="use the first N of the photos, 20 or more (default: all)"
     )
     demo.add_argument("--seed", type=int, default=0, metavar="N", help="seed of radio and run (default: 0)")
     demo.add_argument("--num_threads", type=int, metavar="N", help="number of threads; -1: one for each core")
@@ -83,21 +90,27 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
-    """Make a small survey (photos that come with rangesfm, simulated UWB log, truth) and run it.
+    """Make a small survey (photos, simulated UWB log, truth) and run it. The photos of the yard come with rangesfm.
+    Those of the corridor are rendered; their map shows drift, which the range to one anchor and then loops take out.
 
     example:
       rangesfm demo my_demo
+      rangesfm demo my_corridor --scene corridor
     """
-    if args.num_photos not in _NUM_PHOTOS:
-        raise InputError(f"--num_photos is {args.num_photos}, expected {_NUM_PHOTOS[0]} to {_NUM_PHOTOS[-1]}")
-    if args.seed < 0:
-        raise InputError(f"--seed is {args.seed}, expected 0 or more")
-    from rangesfm.demo.survey import make_demo_survey
+    from rangesfm.demo import corridor
+    from rangesfm.demo import survey as yard
     from rangesfm.survey.survey_reader import read_survey
     from rangesfm.workflows.run import run_survey
 
+    most = corridor.NUM_PHOTOS if args.scene == "corridor" else yard.NUM_PHOTOS
+    num_photos = most if args.num_photos is None else args.num_photos
+    if not _MIN_NUM_PHOTOS <= num_photos <= most:
+        raise InputError(f"--num_photos is {num_photos}, expected {_MIN_NUM_PHOTOS} to {most}")
+    if args.seed < 0:
+        raise InputError(f"--seed is {args.seed}, expected 0 or more")
+    make = corridor.make_corridor_survey if args.scene == "corridor" else yard.make_demo_survey
     folder = Path(args.folder)
-    made = make_demo_survey(folder, num_photos=args.num_photos, seed=args.seed)
+    made = make(folder, num_photos=num_photos, seed=args.seed)
     overrides: dict[str, object] = {"output.seed": args.seed, "report.reference": folder / "reference.csv"}
     if args.num_threads is not None:
         overrides["mapper.num_threads"] = args.num_threads

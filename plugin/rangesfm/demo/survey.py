@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from rangesfm.ranging.readers import write_ranges_csv
 
 PHOTOS = Path(__file__).with_name("photos")
 PATH_FILE = PHOTOS / "path.csv"
+NUM_PHOTOS = 40
 
 CAMERA_MODEL = "SIMPLE_RADIAL"
 CAMERA_PARAMS = (748.8, 480.0, 320.0, -0.04)
@@ -81,7 +83,7 @@ class DemoSurvey:
         return self.folder / "survey.toml"
 
 
-def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> DemoSurvey:
+def make_demo_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: int = 0) -> DemoSurvey:
     """Write the demo survey into a folder; a folder that already holds the same survey is left as it is.
 
     Args:
@@ -94,9 +96,36 @@ def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> De
         InputError: the folder holds something else or cannot be written to.
     """
     survey = _plan(folder, num_photos, seed)
-    text = _survey_file(num_photos, seed)
-    if _is_there(survey, text):
-        return survey
+    write_demo(
+        survey,
+        Reference(survey.centers_m, image_names=survey.image_names),
+        _survey_file(num_photos, seed),
+        {"anchors.csv": _anchor_file(seed)},
+        lambda number, path: shutil.copyfile(PHOTOS / survey.image_names[number], path),
+    )
+    return survey
+
+
+def write_demo(
+    survey: DemoSurvey,
+    reference: Reference,
+    survey_file: str,
+    files: Mapping[str, str],
+    take_photo: Callable[[int, Path], object],
+) -> None:
+    """Write a survey into its folder; a folder that already holds the same survey is left as it is.
+
+    Args:
+        reference: the truth, for ``reference.csv``.
+        survey_file: text of ``survey.toml``. files: texts of further files, by name.
+        take_photo: writes the photo with this number, from 0 on, to a path.
+
+    Raises:
+        InputError: the folder holds something else or cannot be written to.
+    """
+    folder = survey.folder
+    if _is_there(survey, survey_file):
+        return
     if folder.exists() and not folder.is_dir():
         raise InputError(_EXPECTED, folder)
     with sole_writer(folder) as output:
@@ -105,14 +134,14 @@ def make_demo_survey(folder: Path, *, num_photos: int = 40, seed: int = 0) -> De
         if survey.survey_path.exists() or not all(output.is_own(path) for path in others):
             raise InputError(_EXPECTED, folder)
         with new_folder(folder / "images") as images:
-            for name in survey.image_names:
-                shutil.copyfile(PHOTOS / name, images / name)
+            for number, name in enumerate(survey.image_names):
+                take_photo(number, images / name)
         write_ranges_csv(survey.ranges.log, folder / "uwb.csv")
-        write_text(_anchor_file(seed), folder / "anchors.csv")
-        write_reference(Reference(survey.centers_m, image_names=survey.image_names), folder / "reference.csv")
+        write_reference(reference, folder / "reference.csv")
+        for name, text in files.items():
+            write_text(text, folder / name)
         # The survey file is written last, so that its presence shows that the survey is complete.
-        write_text(text, survey.survey_path)
-    return survey
+        write_text(survey_file, survey.survey_path)
 
 
 def _plan(folder: Path, num_photos: int, seed: int) -> DemoSurvey:

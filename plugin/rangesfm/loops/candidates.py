@@ -17,8 +17,9 @@ from rangesfm.loops.relative_errors import RelativeErrors
 
 # Points of a photo that stand for all that it sees, evenly chosen from them.
 _NUM_POINTS = 40
-# Smallest share of them that has to fall into the other photo. Neighbours in time usually share more than half.
-_MIN_OVERLAP = 0.3
+MIN_OVERLAP = 0.3
+"""Smallest share of them that has to fall into the other photo. Neighbours in time usually share more than half."""
+
 # SIFT features are hardly found again from a direction that differs by more, or at another size than this: Lowe,
 # "Distinctive image features from scale-invariant keypoints", IJCV 2004, section 3.3 and figure 8.
 _MAX_ANGLE_DEG, _MAX_SIZE_RATIO = 45.0, 2.0
@@ -124,7 +125,7 @@ def propose_pairs(
         if not len(others):
             continue
         overlap = views.overlaps(first, others, np.hypot(stddev_m[first], stddev_m[others]))
-        others, overlap = others[overlap >= _MIN_OVERLAP], overlap[overlap >= _MIN_OVERLAP]
+        others, overlap = others[overlap >= MIN_OVERLAP], overlap[overlap >= MIN_OVERLAP]
         unknown_px = _unknown_px(views, errors, first, others)
         worth = np.where(unknown_px > pixel_stddev, overlap * unknown_px, 0.0)
         for second in _best_apart(others, worth, views.image_ids, known, max_num):
