@@ -198,10 +198,15 @@ def place_of_map(
     found = None if summary is None else summary.covariance
     of_one_piece = by_similarity(estimate.placement, centers_m)
     of_map, of_keyframes = of_one_piece if found is None else (found.similarity, found.centers)
+    keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
+    if estimate.positions is not None:
+        # The refined problem has no errors of known positions that last, which shift or turn the map as a whole.
+        of_map = of_one_piece[0]
+        keyframes_m2 = np.maximum(keyframes_m2, np.trace(of_one_piece[1], axis1=1, axis2=2))
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))
     bent_m2 = np.square(bent_by_m) if found is None and len(bent_by_m) else 0.0
-    worst_m = float(np.sqrt((np.trace(of_keyframes, axis1=1, axis2=2) + bent_m2).max()))
+    worst_m = float(np.sqrt((keyframes_m2 + bent_m2).max()))
     surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
     size_m = float(np.linalg.norm(np.ptp(np.vstack([centers_m, *surveyed]), axis=0)))
     summary_of_place = (

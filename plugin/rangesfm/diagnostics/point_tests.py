@@ -21,7 +21,8 @@ from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.positions.control_points import ControlPoint, ControlPoints, marks_seen
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.scale_by_positions import POINT_FALSE_ALARM_RATE, MistakeInPositions
+from rangesfm.scale.position_equations import MistakeInPositions
+from rangesfm.scale.scale_by_positions import POINT_FALSE_ALARM_RATE
 
 _ONE_FRAME = "look whether points and anchors are in one frame, and measured to the same height of the antennas"
 _ALL = "frame of the points"

@@ -13,13 +13,8 @@ from rangesfm.diagnostics.hypothesis import in_axes
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
 from rangesfm.diagnostics.length_tests import against_other
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.scale_by_positions import (
-    MIN_NUM_POSITIONS,
-    POINT_FALSE_ALARM_RATE,
-    MistakeInPositions,
-    PositionScale,
-    at_point,
-)
+from rangesfm.scale.position_equations import MistakeInPositions, at_point
+from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, POINT_FALSE_ALARM_RATE, PositionScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"

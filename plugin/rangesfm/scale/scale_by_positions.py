@@ -9,12 +9,12 @@ given are estimated by restricted likelihood (``ComponentLikelihood``), as for r
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
-from scipy.sparse import block_diag, csr_array, diags_array, kron
+from scipy.sparse import csr_array, diags_array, kron
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
@@ -25,10 +25,22 @@ from rangesfm.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.ranging.errors.learned import ROUNDING, ComponentLikelihood, ErrorParts
+from rangesfm.ranging.errors.learned import ErrorParts
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.placement_prior import PlacementPrior
+from rangesfm.scale.position_equations import (
+    NUM_TIMES,
+    OUTLYING,
+    ErrorPart,
+    PositionEquations,
+    at_point,
+    covariance_of_groups,
+    errors_of_sizes,
+    grouped_by_time,
+    learnt_sizes,
+    times_of_groups,
+)
 from rangesfm.scale.range_equation import Columns
 from rangesfm.scale.scale_by_kind import ScaleByKind
 from rangesfm.scale.scale_by_lengths import LengthScale
@@ -42,107 +54,13 @@ POINT_FALSE_ALARM_RATE = 0.02
 _NUM_SUSPECTS = 3
 # Median length of a vector of three normally distributed numbers, in their standard deviation.
 _MEDIAN_LENGTH = 1.538
-# Robust weight below which a position is an outlier.
-OUTLYING = 0.1
 _MAX_NUM_TRIPLES, _NUM_ROUNDS = 300, 30
 # Standard deviation of the logarithm of what a system says of its own errors, and of what is guessed of them; and the
 # share of the noise that lasts, before anything is known.
 _SPREAD_GIVEN, _SPREAD_GUESSED, _LASTING_SHARE = 0.5, 1.0, 0.3
-# An antenna's positions are averaged to at most this many groups for the estimate of their errors, and the correlation
-# of two groups is the mean over this many times of each.
-_MAX_NUM_GROUPS, _NUM_TIMES = 150, 8
 # Extent of positions across their line, as a share of that along it, below which it is only rounding; and the largest
 # standard deviation of a turn of the map, radians, for which its effect is linear.
 _ON_LINE, _MAX_TURN_STDDEV = 1e-6, 0.3
-
-
-@dataclass(frozen=True)
-class ErrorPart:
-    """One component of the errors: its covariance, and the lognormal prior of its size; a spread of 0: it is known."""
-
-    name: str
-    covariance_m2: Array
-    median: float = 1.0
-    spread: float = 0.0
-
-
-@dataclass(frozen=True)
-class PositionEquations:
-    """Linear equations of g groups of positions about a similarity, three coordinates each.
-
-    Attributes:
-        linear: the equations, for the logarithm of the scale, a turn and a shift about the first camera.
-        parts: components of the errors of all coordinates. errors: as learnt.
-        is_used: (3 g,) coordinates that take part in the estimate.
-        grouping: (3 g, 3 k) sparse weights of the positions in the groups.
-    """
-
-    linear: LinearMap
-    parts: tuple[ErrorPart, ...]
-    errors: ErrorParts
-    is_used: Mask
-    grouping: csr_array
-
-    def with_mistake_learnt(self, columns: Array) -> PositionEquations:
-        """Return the equations with errors learnt again, as if a mistake with (3 k, m) ``columns`` was made.
-
-        Otherwise the errors that the mistake causes are taken for noise, in which it then hides.
-        """
-        design = np.hstack([self.linear.design, self.grouping @ columns])
-        more = np.zeros((len(self.linear.prior_design), columns.shape[1]))
-        linear = replace(self.linear, design=design, prior_design=np.hstack([self.linear.prior_design, more]))
-        return replace(self, errors=_errors_of(self.parts, _sizes(self.parts, linear, self.is_used)))
-
-    def of(self, rows: Mask) -> tuple[LinearMap, ErrorParts]:
-        """Return the equations and errors of some coordinates (3 g,)."""
-        linear, parts = self.linear, self.errors
-        chosen = parts.covariances_m2[:, rows][:, :, rows]
-        return replace(linear, off_m=linear.off_m[rows], design=linear.design[rows]), replace(
-            parts, covariances_m2=chosen
-        )
-
-    def of_mistake(self, columns: Array) -> MistakeInPositions:
-        """Estimate a mistake that changes the known positions by (3 k, m) ``columns`` times its m numbers.
-
-        Positions that it changes are taken into the equations, whether they take part or not.
-        """
-        by_groups = self.grouping @ columns
-        rows = self.is_used | np.any(by_groups != 0, axis=1)
-        linear, parts = self.of(rows)
-        by, covariance = by_groups[rows], parts.covariance_m2
-        inverse = np.linalg.inv(covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance)))
-        best, gains, _ = best_estimate(covariance, linear.design, linear.prior_design)
-        whitened = inverse @ linear.design
-        pulls = inverse @ linear.off_m
-        pulls -= whitened @ (best @ (linear.design.T @ pulls + linear.prior_design.T @ linear.prior_off))
-        information = by.T @ (inverse - whitened @ best @ whitened.T) @ by
-        values, vectors = np.linalg.eigh(information)
-        is_seen = values > _UNSEEN * np.trace(by.T @ inverse @ by)
-        root = vectors[:, is_seen] / np.sqrt(values[is_seen])
-        sizes = root @ (root.T @ (by.T @ pulls))
-        return MistakeInPositions(sizes, root, float(sizes @ information @ sizes), gains @ by, bool(is_seen.all()))
-
-
-# Share of a mistake's effect below which what the similarity leaves of it is only rounding.
-_UNSEEN = 1e-7
-
-
-@dataclass(frozen=True)
-class MistakeInPositions:
-    """A mistake of m numbers, as estimated.
-
-    Attributes:
-        sizes: (m,). root: (m, r) root of their covariance, without directions that are not seen.
-        statistic: chi-square distributed with r degrees of freedom where no such mistake was made.
-        by_unknowns: (7, m) change of the similarity by the mistake.
-        is_seen: whether no direction is hidden.
-    """
-
-    sizes: Array
-    root: Array
-    statistic: float
-    by_unknowns: Array
-    is_seen: bool
 
 
 @dataclass(frozen=True)
@@ -307,21 +225,21 @@ class _Problem:
         """Fit the similarity robustly, and learn the errors from what it leaves."""
         similarity, weights, stddev_m = self.robust(used, start)
         before, bending = self.equations(used, similarity, weights, stddev_m)
-        sizes = _sizes(before.parts, before.linear, before.is_used)
-        equations = replace(before, errors=_errors_of(before.parts, sizes))
+        sizes = learnt_sizes(before.parts, before.linear, before.is_used)
+        equations = replace(before, errors=errors_of_sizes(before.parts, sizes))
         return _Fit(similarity, used, weights, stddev_m, equations, bending, sizes)
 
     def equations(
         self, used: Mask, similarity: Similarity, weights: Array, stddev_m: Array
     ) -> tuple[PositionEquations, BendingOfBins]:
         """Return the equations about a similarity with the errors to expect before any is learnt, and the bending."""
-        grouping = _grouping(self.known, weights)
+        grouping = grouped_by_time(self.known, weights)
         by_pose = groups_by_pose(self.known, similarity, self.path, grouping)
         bending = self.bending.of_functions(by_pose, frame_is_free=True)
         linear = self._linear(similarity, grouping, bending)
         parts = tuple(self._parts(similarity, grouping, stddev_m, bending))
         takes_part = (abs(grouping) @ np.repeat(used & (weights >= OUTLYING) | used & self.known.is_mark, 3)) > 0
-        errors = _errors_of(parts, {part.name: part.median * float(np.exp(part.spread**2)) for part in parts})
+        errors = errors_of_sizes(parts, {part.name: part.median * float(np.exp(part.spread**2)) for part in parts})
         return PositionEquations(linear, parts, errors, takes_part, grouping), bending
 
     def robust(self, used: Mask, start: Similarity | None) -> tuple[Similarity, Array, Array]:
@@ -398,9 +316,9 @@ class _Problem:
         ):
             if not of_kind.any():
                 continue
-            yield ErrorPart(names_of_place, _grouped(grouping, places, of_kind))
+            yield ErrorPart(names_of_place, covariance_of_groups(grouping, places, of_kind))
             is_known = bool(np.isfinite(covariance[of_kind]).all())
-            own = _grouped(grouping, covariance if is_known else assumed, of_kind)
+            own = covariance_of_groups(grouping, covariance if is_known else assumed, of_kind)
             spread = 0.0 if known.is_stated[of_kind].all() and name == "points" else _SPREAD_GIVEN
             yield ErrorPart(name, own, spread=spread if is_known else _SPREAD_GUESSED)
         if known.clock_stddev_s.any():
@@ -409,10 +327,10 @@ class _Problem:
             yield ErrorPart(CLOCKS, np.outer(of_clock, of_clock))
         if (rows := np.flatnonzero(~known.is_mark & np.isfinite(known.time_s))).size:
             size_m = np.where(np.isfinite(_stddev_of(covariance)), _stddev_of(covariance), stddev_m)
-            of_groups, times_s = _times_of_groups(grouping, known, size_m, rows)
+            of_groups, times_s = times_of_groups(grouping, known, size_m, rows)
             for lasting_s in self.lasting_s:
                 apart = np.exp(-np.abs(times_s.reshape(-1, 1) - times_s.ravel()) / lasting_s)
-                alike = apart.reshape(len(times_s), _NUM_TIMES, -1, _NUM_TIMES).mean(axis=(1, 3))
+                alike = apart.reshape(len(times_s), NUM_TIMES, -1, NUM_TIMES).mean(axis=(1, 3))
                 own = np.kron(alike * np.outer(of_groups, of_groups), np.eye(3))
                 yield ErrorPart(f"positions_{lasting_s:g}s", own, _LASTING_SHARE, _SPREAD_GUESSED)
 
@@ -511,13 +429,6 @@ _SMALL_STEP = 1e-10
 _LEAST_STDDEV_M = 1e-9
 
 
-def at_point(known: KnownPositions, row: int) -> Array:
-    """Return the (3 k, 3) effect of a known position that is too large by a metre in each coordinate."""
-    columns = np.zeros((3 * len(known), 3))
-    columns[3 * row : 3 * row + 3] = np.eye(3)
-    return columns
-
-
 def moved_similarity(similarity: Similarity, step: Array, path: Trajectory) -> Similarity:
     """Return a similarity moved by (7,) logarithm of the scale, turn and shift about the first camera of a path."""
     origin = similarity.apply(path.centers[:1])[0]
@@ -558,69 +469,6 @@ def _triples(num: int) -> Iterator[tuple[int, ...]]:
     rng = np.random.default_rng(0)
     for _ in range(_MAX_NUM_TRIPLES):
         yield tuple(rng.choice(num, MIN_NUM_POSITIONS, replace=False).tolist())
-
-
-def _grouping(known: KnownPositions, weights: Array) -> csr_array:
-    """Return the (3 g, 3 k) weights of positions in groups: marks alone, an antenna's averaged in the order of time."""
-    marks = np.flatnonzero(known.is_mark)
-    others = np.flatnonzero(~known.is_mark & (weights >= OUTLYING))
-    order = (
-        others[np.argsort(known.time_s[others], kind="stable")] if np.isfinite(known.time_s[others]).all() else others
-    )
-    groups = [np.array([row]) for row in marks]
-    groups += [part for part in np.array_split(order, min(len(order), _MAX_NUM_GROUPS) or 1) if len(part)]
-    shares = [np.ones(1) if known.is_mark[rows[0]] else weights[rows] / weights[rows].sum() for rows in groups]
-    lines = np.repeat(np.arange(len(groups)), [len(rows) for rows in groups])
-    shape = (len(groups), len(known))
-    alone = csr_array((np.concatenate(shares), (lines, np.concatenate(groups))), shape=shape)
-    return kron(alone, np.eye(3), format="csr")
-
-
-def _grouped(grouping: csr_array, covariances: Array, rows: Mask) -> Array:
-    """Return the (3 g, 3 g) covariance of groups from independent (k, 3, 3) ones of the positions in ``rows``."""
-    blocks = block_diag(list(np.where(rows[:, None, None], covariances, 0.0)), format="csr")
-    return np.asarray((grouping @ blocks @ grouping.T).toarray())
-
-
-def _times_of_groups(grouping: csr_array, known: KnownPositions, size_m: Array, rows: Indices) -> tuple[Array, Array]:
-    """Return (g,) mean standard deviations of the antenna's positions in each group (0: marks), and (g, 8) times."""
-    of_groups = grouping[::3, ::3]
-    is_timed = np.zeros(len(known))
-    is_timed[rows] = 1.0
-    times = np.zeros((of_groups.shape[0], _NUM_TIMES))
-    for group in range(of_groups.shape[0]):
-        members = of_groups.indices[of_groups.indptr[group] : of_groups.indptr[group + 1]]
-        if is_timed[members].all():
-            times[group] = np.quantile(known.time_s[members], np.linspace(0, 1, _NUM_TIMES))
-    return of_groups @ (is_timed * size_m), times
-
-
-def _sizes(parts: Sequence[ErrorPart], linear: LinearMap, rows: Mask) -> dict[str, float]:
-    """Return the size of each component, by restricted likelihood over some coordinates (3 g,)."""
-    learnt = [part for part in parts if part.spread > 0]
-    sizes = {part.name: 1.0 for part in parts}
-    if not learnt:
-        return sizes
-    at = np.ix_(rows, rows)
-    known_m2 = [part.covariance_m2[at] for part in parts if part.spread == 0]
-    likelihood = ComponentLikelihood(
-        np.array([part.covariance_m2[at] for part in learnt]),
-        np.log([part.median for part in learnt]),
-        np.array([part.spread for part in learnt]),
-        np.sum([np.zeros((rows.sum(),) * 2), *known_m2], axis=0),
-        linear.off_m[rows],
-        linear.design[rows],
-        linear.prior_design,
-    )
-    found = likelihood.mean_stddevs(likelihood.most_likely())
-    return sizes | dict(zip((part.name for part in learnt), found.tolist(), strict=True))
-
-
-def _errors_of(parts: Sequence[ErrorPart], sizes: Mapping[str, float]) -> ErrorParts:
-    """Return the errors with components of these sizes."""
-    of_all = np.array([sizes[part.name] ** 2 * part.covariance_m2 for part in parts])
-    stddevs = np.sqrt(np.trace(of_all, axis1=1, axis2=2) / of_all.shape[1])
-    return ErrorParts(tuple(part.name for part in parts), stddevs, of_all)
 
 
 def _stddev_of(covariances: Array) -> Array:

@@ -184,9 +184,7 @@ def _check_rigs_are_metric(survey: Survey) -> None:
     Raises:
         InputError: it has none.
     """
-    is_measured = survey.scale.distances or survey.markers.side_m or survey.ranges.path
-    is_placed = survey.points.path or survey.positions.path
-    if is_measured is None and is_placed is None and not read_rigs(survey.images.rig_config).are_metric:
+    if not survey.metric_keys and not read_rigs(survey.images.rig_config).are_metric:
         raise InputError(
             "gives no distance between cameras of a rig, and there are no ranges and no lengths: expected "
             "cam_from_rig_translation in metres, or a radio's log (--ranges LOG)",

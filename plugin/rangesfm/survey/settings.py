@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,9 @@ from rangesfm.options import (
     ScaleOptions,
     TagOptions,
 )
+
+METRIC_KEYS = ("ranges.path", "scale.distances", "markers.side_m", "points.path", "positions.path")
+"""Keys of the measurements from which the map gets its metres."""
 
 
 @dataclass(frozen=True)
@@ -143,21 +147,25 @@ class Survey(BaseModel):
             raise InputError("no model: give [images] model in a survey file, or --input_path MODEL, such as sparse/0")
         return self.images.model
 
+    @property
+    def metric_keys(self) -> list[str]:
+        """Dotted keys of the measurements in metres that the survey has."""
+        return [key for key in METRIC_KEYS if attrgetter(key)(self) is not None]
+
     def require_metres(self) -> None:
         """Check that the survey has something measured in metres.
 
         Raises:
             InputError: it has nothing, or only printed tags of unknown size.
         """
-        given = (self.scale.distances, self.markers.side_m, self.points.path, self.positions.path)
-        if any(each is not None for each in given):
+        if {*self.metric_keys} - {"ranges.path"}:
             return
         if self.markers.dictionary is not None:
             raise InputError(
                 "[markers] side_m is not given: give the tags' side in metres (--marker_side_m), or taped distances "
                 "between their corners (--distances CSV)"
             )
-        if self.ranges.path is None and self.images.rig_config is None:
+        if not self.metric_keys and self.images.rig_config is None:
             raise InputError(
                 "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), "
                 "control points (--points CSV), positions (--positions FILE), the size of printed tags "

@@ -17,7 +17,7 @@ from rangesfm.ranging.readers import read_ranges
 from rangesfm.ranging.readers.lists import UnclearListError
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.sources.source import is_source, open_source
-from rangesfm.survey.settings import KEYS, Survey
+from rangesfm.survey.settings import KEYS, METRIC_KEYS, Survey
 from rangesfm.survey.survey_reader import survey_from_tables
 from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, POINTS, POSITIONS, Found, look_into, short_path
 from rangesfm.vision.image_times import list_images
@@ -114,7 +114,7 @@ def understand(
         for path in found.models
         if path != values.get(MODEL)
     ]
-    if not {PHOTOS, LOG, "scale.distances", POINTS, POSITIONS} & values.keys():
+    if not {PHOTOS, *METRIC_KEYS} & values.keys():
         raise InputError("found no photos, no radio log and no lengths in it", folders[0], advice=notes)
     _add_camera(values, found, notes)
     _add_exif_positions(values, notes)
@@ -219,7 +219,7 @@ def _add_exif_positions(values: dict[str, Any], notes: list[str]) -> None:
     num = sum(gps_data(folder / name) is not None for name in list_images(folder))
     if num < MIN_NUM_POSITIONS:
         return
-    if {LOG, POINTS, "scale.distances"} & values.keys():
+    if {*METRIC_KEYS} & values.keys():
         notes.append(f"{num} photos have positions in their EXIF data: --positions {folder} uses them, too")
     else:
         values[POSITIONS] = folder

@@ -1,0 +1,178 @@
+"""Linear equations of known positions about a similarity: components of their errors, and the tests of mistakes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import block_diag, csr_array, kron
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.positions.known_positions import KnownPositions
+from rangesfm.ranging.errors.learned import ROUNDING, ComponentLikelihood, ErrorParts
+from rangesfm.scale.uncertainty import LinearMap, best_estimate
+
+OUTLYING = 0.1
+"""Robust weight below which a position is an outlier."""
+NUM_TIMES = 8
+"""Number of times of a group, over which its correlation with others is averaged."""
+# An antenna's positions are averaged to at most this many groups for the estimate of their errors.
+_MAX_NUM_GROUPS = 150
+# Share of a mistake's effect below which what the similarity leaves of it is only rounding.
+_UNSEEN = 1e-7
+
+
+@dataclass(frozen=True)
+class ErrorPart:
+    """One component of the errors: its covariance, and the lognormal prior of its size; a spread of 0: it is known."""
+
+    name: str
+    covariance_m2: Array
+    median: float = 1.0
+    spread: float = 0.0
+
+
+@dataclass(frozen=True)
+class PositionEquations:
+    """Linear equations of g groups of positions about a similarity, three coordinates each.
+
+    Attributes:
+        linear: the equations, for the logarithm of the scale, a turn and a shift about the first camera.
+        parts: components of the errors of all coordinates. errors: as learnt.
+        is_used: (3 g,) coordinates that take part in the estimate.
+        grouping: (3 g, 3 k) sparse weights of the positions in the groups.
+    """
+
+    linear: LinearMap
+    parts: tuple[ErrorPart, ...]
+    errors: ErrorParts
+    is_used: Mask
+    grouping: csr_array
+
+    def with_mistake_learnt(self, columns: Array) -> PositionEquations:
+        """Return the equations with errors learnt again, as if a mistake with (3 k, m) ``columns`` was made.
+
+        Otherwise the errors that the mistake causes are taken for noise, in which it then hides.
+        """
+        design = np.hstack([self.linear.design, self.grouping @ columns])
+        more = np.zeros((len(self.linear.prior_design), columns.shape[1]))
+        linear = replace(self.linear, design=design, prior_design=np.hstack([self.linear.prior_design, more]))
+        return replace(self, errors=errors_of_sizes(self.parts, learnt_sizes(self.parts, linear, self.is_used)))
+
+    def of(self, rows: Mask) -> tuple[LinearMap, ErrorParts]:
+        """Return the equations and errors of some coordinates (3 g,)."""
+        linear, parts = self.linear, self.errors
+        chosen = parts.covariances_m2[:, rows][:, :, rows]
+        return replace(linear, off_m=linear.off_m[rows], design=linear.design[rows]), replace(
+            parts, covariances_m2=chosen
+        )
+
+    def of_mistake(self, columns: Array) -> MistakeInPositions:
+        """Estimate a mistake that changes the known positions by (3 k, m) ``columns`` times its m numbers.
+
+        Positions that it changes are taken into the equations, whether they take part or not.
+        """
+        by_groups = self.grouping @ columns
+        rows = self.is_used | np.any(by_groups != 0, axis=1)
+        linear, parts = self.of(rows)
+        by, covariance = by_groups[rows], parts.covariance_m2
+        inverse = np.linalg.inv(covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance)))
+        best, gains, _ = best_estimate(covariance, linear.design, linear.prior_design)
+        whitened = inverse @ linear.design
+        pulls = inverse @ linear.off_m
+        pulls -= whitened @ (best @ (linear.design.T @ pulls + linear.prior_design.T @ linear.prior_off))
+        information = by.T @ (inverse - whitened @ best @ whitened.T) @ by
+        values, vectors = np.linalg.eigh(information)
+        is_seen = values > _UNSEEN * np.trace(by.T @ inverse @ by)
+        root = vectors[:, is_seen] / np.sqrt(values[is_seen])
+        sizes = root @ (root.T @ (by.T @ pulls))
+        return MistakeInPositions(sizes, root, float(sizes @ information @ sizes), gains @ by, bool(is_seen.all()))
+
+
+@dataclass(frozen=True)
+class MistakeInPositions:
+    """A mistake of m numbers, as estimated.
+
+    Attributes:
+        sizes: (m,). root: (m, r) root of their covariance, without directions that are not seen.
+        statistic: chi-square distributed with r degrees of freedom where no such mistake was made.
+        by_unknowns: (7, m) change of the similarity by the mistake.
+        is_seen: whether no direction is hidden.
+    """
+
+    sizes: Array
+    root: Array
+    statistic: float
+    by_unknowns: Array
+    is_seen: bool
+
+
+def at_point(known: KnownPositions, row: int) -> Array:
+    """Return the (3 k, 3) effect of a known position that is too large by a metre in each coordinate."""
+    columns = np.zeros((3 * len(known), 3))
+    columns[3 * row : 3 * row + 3] = np.eye(3)
+    return columns
+
+
+def grouped_by_time(known: KnownPositions, weights: Array) -> csr_array:
+    """Return the (3 g, 3 k) weights of positions in groups: marks alone, an antenna's averaged in the order of time."""
+    marks = np.flatnonzero(known.is_mark)
+    others = np.flatnonzero(~known.is_mark & (weights >= OUTLYING))
+    order = (
+        others[np.argsort(known.time_s[others], kind="stable")] if np.isfinite(known.time_s[others]).all() else others
+    )
+    groups = [np.array([row]) for row in marks]
+    groups += [part for part in np.array_split(order, min(len(order), _MAX_NUM_GROUPS) or 1) if len(part)]
+    shares = [np.ones(1) if known.is_mark[rows[0]] else weights[rows] / weights[rows].sum() for rows in groups]
+    lines = np.repeat(np.arange(len(groups)), [len(rows) for rows in groups])
+    shape = (len(groups), len(known))
+    alone = csr_array((np.concatenate(shares), (lines, np.concatenate(groups))), shape=shape)
+    return kron(alone, np.eye(3), format="csr")
+
+
+def covariance_of_groups(grouping: csr_array, covariances: Array, rows: Mask) -> Array:
+    """Return the (3 g, 3 g) covariance of groups from independent (k, 3, 3) ones of the positions in ``rows``."""
+    blocks = block_diag(list(np.where(rows[:, None, None], covariances, 0.0)), format="csr")
+    return np.asarray((grouping @ blocks @ grouping.T).toarray())
+
+
+def times_of_groups(grouping: csr_array, known: KnownPositions, size_m: Array, rows: Indices) -> tuple[Array, Array]:
+    """Return (g,) mean standard deviations of the antenna's positions in each group (0: marks), and (g, 8) times."""
+    of_groups = grouping[::3, ::3]
+    is_timed = np.zeros(len(known))
+    is_timed[rows] = 1.0
+    times = np.zeros((of_groups.shape[0], NUM_TIMES))
+    for group in range(of_groups.shape[0]):
+        members = of_groups.indices[of_groups.indptr[group] : of_groups.indptr[group + 1]]
+        if is_timed[members].all():
+            times[group] = np.quantile(known.time_s[members], np.linspace(0, 1, NUM_TIMES))
+    return of_groups @ (is_timed * size_m), times
+
+
+def learnt_sizes(parts: Sequence[ErrorPart], linear: LinearMap, rows: Mask) -> dict[str, float]:
+    """Return the size of each component, by restricted likelihood over some coordinates (3 g,)."""
+    learnt = [part for part in parts if part.spread > 0]
+    sizes = {part.name: 1.0 for part in parts}
+    if not learnt:
+        return sizes
+    at = np.ix_(rows, rows)
+    known_m2 = [part.covariance_m2[at] for part in parts if part.spread == 0]
+    likelihood = ComponentLikelihood(
+        np.array([part.covariance_m2[at] for part in learnt]),
+        np.log([part.median for part in learnt]),
+        np.array([part.spread for part in learnt]),
+        np.sum([np.zeros((rows.sum(),) * 2), *known_m2], axis=0),
+        linear.off_m[rows],
+        linear.design[rows],
+        linear.prior_design,
+    )
+    found = likelihood.mean_stddevs(likelihood.most_likely())
+    return sizes | dict(zip((part.name for part in learnt), found.tolist(), strict=True))
+
+
+def errors_of_sizes(parts: Sequence[ErrorPart], sizes: Mapping[str, float]) -> ErrorParts:
+    """Return the errors with components of these sizes."""
+    of_all = np.array([sizes[part.name] ** 2 * part.covariance_m2 for part in parts])
+    stddevs = np.sqrt(np.trace(of_all, axis1=1, axis2=2) / of_all.shape[1])
+    return ErrorParts(tuple(part.name for part in parts), stddevs, of_all)
