@@ -1,47 +1,64 @@
 """Check whether scale and place by control points and positions are in their stated intervals, and mistakes are found.
 
-Run: python -m tests.studies.known_positions [--with points positions ...] [--mistakes lever_arm ...] [--num_seeds 60]
+Run: python -m tests.studies.known_positions [--with points positions+ranges ...] [--mistakes leap ...] [--num_seeds 60]
 
 Each survey is mapped from noisy features by COLMAP's bundle adjustment in a frame of its own, as in
-``measured_distances``, then placed by what is known of it and refined, with all defaults. Known are, by ``--with``:
-marks that somebody clicked in up to four photos with an error of one pixel and surveyed to 1 cm (half of those in the
-scene are control points, the others check points); positions of an antenna on the camera, 1 Hz, with 5 cm of noise and
-as much that lasts for 20 s; or both, also beside ranges. ``--mistakes`` makes one mistake in each survey.
+``measured_distances``, then placed by what is known of it and refined, with all defaults. Known are, by ``--with``, one
+or several of these, joined by "+":
 
-Prints for each kind of survey the share of scales in their 95 % interval, the median half width of that, the root mean
-square error of scale and place in stated standard deviations, and the RMSE of check points; of surveys with a mistake,
-in how many it was found and named. Exit status 1 if less than 90 % of the scales are covered.
+- ``points``: marks that somebody clicked in up to four photos with an error of one pixel and surveyed to 1 cm (half of
+  those in the scene are control points, the others check points);
+- ``positions``: of an antenna on the camera, 1 Hz, with 5 cm of noise and as much that lasts for 20 s;
+- ``exif``: a position of each photo, with 0.5 m of noise and 3 m that last for 100 s;
+- ``ranges``, of a radio drawn from the population; ``anchors``: those have surveyed anchors.
+
+``--mistakes`` makes one mistake in each survey.
+
+Prints for each kind of survey the shares of scales and of coordinates of the place in their 95 % intervals, the root
+mean square errors of both, also over the Cramer-Rao bound of points and positions with their true errors (without
+ranges), and in stated standard deviations; the RMSE of keyframes and of check points; in how many a mistake was found
+and named, and which were. Exit status 1 if less than 90 % of the scales are covered.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import json
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from tests.studies.drifting_maps import Made
-from tests.studies.measured_distances import KINDS, Kind, marks_in, simulated
-from tests.studies.simulated_survey import TAG_IN_CAM_M
+from tests.studies.measured_distances import KINDS, marks_in, simulated
+from tests.studies.simulated_survey import TAG_IN_CAM_M, photos_adjuster
 from tests.studies.simulated_survey import Survey as Truth
 
+from rangesfm.ceres.covariance import PhotosAlone
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
-from rangesfm.geometry.similarity import align_points
+from rangesfm.geometry.similarity import align_points, similarity_motions
+from rangesfm.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
 from rangesfm.options import RangesOptions
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.positions.position_formats import AUTONOMOUS_STDDEV_M
 from rangesfm.positions.position_log import PositionLog
 from rangesfm.positions.surveyed_positions import PointsEntry, SurveyedPositions
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.range_log import RangeLog
+from rangesfm.refine.photo_bending import PhotoBending
 from rangesfm.result.metric_result import MetricResult
+from rangesfm.scale.scale_by_positions import scale_by_positions
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
@@ -52,9 +69,30 @@ Line = dict[str, Any]
 
 POINT_STDDEV_M = 0.01
 LEAST_COVERED = 0.9
-NOISE_M, LASTING_S = 0.05, 20.0
+LEAP_S = 18.0
 NO_RANGES = RangeLog.from_arrays([], [], image_name=[])
 KINDS_OF_SURVEY = ("yard", "room", "orbit of a drone", "way that never returns")
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """Errors of positions: noise, and a Gauss-Markov process of this size and duration."""
+
+    noise_m: float
+    lasting_m: float
+    lasting_s: float
+
+    def covariance_m2(self, times_s: Array) -> Array:
+        """Return the (n, n) covariance of one coordinate."""
+        alike = np.exp(-np.abs(times_s[:, None] - times_s) / self.lasting_s)
+        return np.asarray(self.lasting_m**2 * alike + self.noise_m**2 * np.eye(len(times_s)))
+
+    def errors_m(self, times_s: Array, rng: np.random.Generator) -> Array:
+        """Draw (n, 3) errors."""
+        return np.asarray(np.linalg.cholesky(self.covariance_m2(times_s)) @ rng.standard_normal((len(times_s), 3)))
+
+
+RECEIVERS = {"positions": Receiver(0.05, 0.05, 20.0), "exif": Receiver(0.5, 3.0, 100.0)}
 
 
 def points_of(truth: Truth, rng: np.random.Generator) -> ControlPoints:
@@ -67,17 +105,25 @@ def points_of(truth: Truth, rng: np.random.Generator) -> ControlPoints:
     return ControlPoints(points, markers)
 
 
-def track_of(survey: Made, path: CameraPath, rng: np.random.Generator, shift_s: float = 0.0) -> AntennaTrack:
-    """Return positions of the antenna, whose clock is ``shift_s`` ahead of the camera's; the offset is not known."""
+def track_of(survey: Made, path: CameraPath, rng: np.random.Generator) -> AntennaTrack:
+    """Return positions of the antenna once a second; their time offset is not known."""
     assert survey.trajectory.timestamps_s is not None
     first_s, last_s = survey.trajectory.timestamps_s[[0, -1]].tolist()
-    times = np.arange(first_s, last_s, 1.0)
+    times, receiver = np.arange(first_s, last_s, 1.0), RECEIVERS["positions"]
     true_m = path.centers(times) + path.world_from_cam(times) @ TAG_IN_CAM_M
-    alike = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / LASTING_S) + 1e-9 * np.eye(len(times)))
-    errors_m = NOISE_M * (rng.standard_normal(true_m.shape) + alike @ rng.standard_normal(true_m.shape))
-    covariances = np.tile(NOISE_M**2 * np.eye(3), (len(times), 1, 1))
-    log = PositionLog(true_m + errors_m, covariances, times + shift_s, None, np.arange(len(times)))
+    covariances = np.tile(receiver.noise_m**2 * np.eye(3), (len(times), 1, 1))
+    log = PositionLog(true_m + receiver.errors_m(times, rng), covariances, times, None, np.arange(len(times)))
     return AntennaTrack(log, TAG_IN_CAM_M, None, RangesOptions())
+
+
+def exif_of(survey: Made, rng: np.random.Generator) -> AntennaTrack:
+    """Return a position of each photo, with the accuracy that is taken for EXIF positions without a word about it."""
+    path = survey.trajectory
+    assert path.timestamps_s is not None
+    covariances = np.tile(AUTONOMOUS_STDDEV_M**2 * np.eye(3), (len(path), 1, 1))
+    at_m = survey.truth_m + RECEIVERS["exif"].errors_m(path.timestamps_s, rng)
+    log = PositionLog(at_m, covariances, None, path.image_names, np.arange(len(path)))
+    return AntennaTrack(log, np.zeros(3), None, RangesOptions())
 
 
 def arm_off(surveyed: SurveyedPositions) -> SurveyedPositions:
@@ -95,12 +141,17 @@ def datum_off(surveyed: SurveyedPositions) -> SurveyedPositions:
     return replace(surveyed, antenna=replace(surveyed.antenna, log=shifted))
 
 
-def clock_off(surveyed: SurveyedPositions) -> SurveyedPositions:
-    """Return the positions with times that are said to be the camera's, and are a second ahead."""
+def clock_off(surveyed: SurveyedPositions, ahead_s: float = 1.0) -> SurveyedPositions:
+    """Return the positions with times that are said to be the camera's, and are ahead of it."""
     assert surveyed.antenna is not None
     assert surveyed.antenna.log.timestamp_s is not None
-    log = replace(surveyed.antenna.log, timestamp_s=surveyed.antenna.log.timestamp_s + 1.0)
+    log = replace(surveyed.antenna.log, timestamp_s=surveyed.antenna.log.timestamp_s + ahead_s)
     return replace(surveyed, antenna=replace(surveyed.antenna, log=log, offset_s=0.0))
+
+
+def leap_off(surveyed: SurveyedPositions) -> SurveyedPositions:
+    """Return the positions with times that are ahead by leap seconds."""
+    return clock_off(surveyed, LEAP_S)
 
 
 def one_point_off(surveyed: SurveyedPositions) -> SurveyedPositions:
@@ -111,84 +162,133 @@ def one_point_off(surveyed: SurveyedPositions) -> SurveyedPositions:
     return replace(surveyed, points=replace(surveyed.points, points=(wrong, *others)))
 
 
-MISTAKES: dict[str, tuple[Callable[[SurveyedPositions], SurveyedPositions], tuple[str, str]]] = {
-    "none": (lambda surveyed: surveyed, ("", "")),
-    "lever_arm": (arm_off, ("antenna's lever arm", "")),
-    "datum": (datum_off, ("datum shift", "")),
-    "clock": (clock_off, ("antenna's clock", "")),
-    "one_point": (one_point_off, ("control point", "mark0")),
+MISTAKES: dict[str, tuple[Callable[[SurveyedPositions], SurveyedPositions], str]] = {
+    "none": (lambda surveyed: surveyed, "nothing"),
+    "lever_arm": (arm_off, "the antenna sits elsewhere"),
+    "datum": (datum_off, "frames that are shifted"),
+    "clock": (clock_off, "the times of the positions are"),
+    "leap": (leap_off, f"their clock is {LEAP_S:.1f} s ahead"),
+    "one_point": (one_point_off, "the control point mark0 is"),
 }
 
 
-def run(survey: Made, surveyed: SurveyedPositions, *, with_ranges: bool, seed: int) -> MetricResult:
-    """Run all stages from the scale on, with all defaults."""
-    settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
-    log, arms = (survey.log, survey.tag_in_cam_m[None]) if with_ranges else (NO_RANGES, np.zeros((0, 3)))
-    anchors = tuple(Anchor(name) for name in log.anchor_ids)
-    inputs = RangingInputs(log, arms, anchors, "unknown", Site(np.zeros(3)), None, None, (), positions=surveyed)
-    path = PathOfModel("sparse/0", survey.sfm, survey.trajectory, associate(log, survey.trajectory, arms))
-    return map_in_metres(SurveyRun(settings, inputs, Journal(SilentProgress())), [path], refine=True)[1]
+@dataclass(frozen=True)
+class Known:
+    """A survey with what is known of it, by the names in ``--with``."""
+
+    names: tuple[str, ...]
+    truth: Truth
+    survey: Made
+    surveyed: SurveyedPositions
+
+    @classmethod
+    def of(cls, names: Sequence[str], truth: Truth, survey: Made, path: CameraPath, seed: int) -> Known:
+        """Draw errors, which are the same whatever else is known."""
+        rng = np.random.default_rng([seed, 31])
+        points, track = points_of(truth, rng), track_of(survey, path, rng)
+        if "points" not in names:
+            points = replace(points, points=tuple(replace(point, kind="check") for point in points.points))
+        tracks = {"positions": track, "exif": exif_of(survey, rng)}
+        chosen = [tracks[name] for name in tracks if name in names]
+        return cls(tuple(names), truth, survey, SurveyedPositions(points, chosen[0] if chosen else None))
+
+    def run(self, surveyed: SurveyedPositions, seed: int) -> MetricResult:
+        """Run all stages from the scale on, with all defaults."""
+        settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
+        survey, frame = self.survey, "site" if "anchors" in self.names else "unknown"
+        log, arms = (survey.log, survey.tag_in_cam_m[None]) if "ranges" in self.names else (NO_RANGES, np.zeros((0, 3)))
+        anchors = tuple(Anchor(name, survey.anchors_m[name] if frame == "site" else None) for name in log.anchor_ids)
+        inputs = RangingInputs(log, arms, anchors, frame, Site(np.zeros(3)), None, None, (), positions=surveyed)
+        path = PathOfModel("sparse/0", survey.sfm, survey.trajectory, associate(log, survey.trajectory, arms))
+        return map_in_metres(SurveyRun(settings, inputs, Journal(SilentProgress())), [path], refine=True)[1]
+
+    def bound(self, pixel_stddev: float) -> tuple[float, float]:
+        """Return the Cramer-Rao bound of the scale (relative) and of a coordinate of the place, without ranges.
+
+        The errors of points, marks and positions are the true ones, and the bending is that which the photos allow.
+        """
+        truth = self.truth.model
+        path = trajectory_from_reconstruction(truth.reconstruction, truth.timestamps_s)
+        antenna = self.surveyed.antenna
+        known_offset = antenna and replace(antenna, offset_s=None if antenna.log.timestamp_s is None else 0.0)
+        known = replace(self.surveyed, antenna=known_offset).located(truth.reconstruction, path)
+        assert known is not None
+        photos = PhotosAlone(
+            photos_adjuster(self.truth, truth.reconstruction).problem, truth.reconstruction, pixel_stddev
+        )
+        bending = PhotoBending(photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, True)
+        found = scale_by_positions(known, path, bending)
+        parts = {part.name: part.covariance_m2 for part in found.equations.parts}
+        covariance = found.bending_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))
+        grouping, at = found.equations.grouping, np.flatnonzero(~known.is_mark)
+        own = np.zeros((len(known), len(known)))
+        for name in RECEIVERS.keys() & {*self.names}:
+            own[np.ix_(at, at)] = RECEIVERS[name].covariance_m2(known.time_s[at])
+        covariance = covariance + grouping @ np.kron(own, np.eye(3)) @ grouping.T
+        rows, design = np.ix_(found.equations.is_used, found.equations.is_used), found.equations.linear.design
+        design = design[found.equations.is_used]
+        of_map = np.linalg.inv(design.T @ np.linalg.solve(covariance[rows], design))
+        motions = similarity_motions(path.centers - path.centers[0]).mean(axis=0)
+        return float(np.sqrt(of_map[0, 0])), float(np.sqrt(np.trace(motions @ of_map @ motions.T) / 3))
 
 
-def told(kind: Kind, known: str, mistake: str, seed: int) -> Line:
-    """Make and run a survey, and return its errors in stated standard deviations."""
-    truth, survey = simulated(replace(kind, frame="site"), seed)
+def told(known: Known, mistake: str, pixel_stddev: float, seed: int) -> Line:
+    """Run a survey, and return its errors: absolute, and in stated standard deviations."""
     change, wanted = MISTAKES[mistake]
-    rng = np.random.default_rng([seed, 31])
-    points = points_of(truth, rng)
-    if "points" not in known:
-        points = replace(points, points=tuple(replace(point, kind="check") for point in points.points))
-    track = track_of(survey, kind.path(seed), rng) if "positions" in known else None
-    surveyed = change(SurveyedPositions(points, track))
     try:
-        metric = run(survey, surveyed, with_ranges="ranges" in known, seed=seed)
+        metric = known.run(change(known.surveyed), seed)
     except (GeometryError, SolverError) as error:
-        return {"refused": str(error)}
-    final_m = metric.trajectory.as_in(metric.final).centers
-    off = np.log(align_points(survey.truth_m, final_m).scale)
+        return {"refused": str(error), "found": wanted in str(error)}
+    final_m, truth_m = metric.trajectory.as_in(metric.final).centers, known.survey.truth_m
+    off = float(np.log(align_points(final_m, truth_m).scale))
     low, high = metric.estimate.uncertainty.interval_95
     errors = PointsEntry.of(metric.positions, metric.final, metric.trajectory.as_in(metric.final))
     assert errors is not None
-    assert metric.place is not None
-    named = [
-        (test.name, test.subject) for test in (metric.diagnosis.tests if metric.diagnosis else ()) if test.rejected
-    ]
-    shift_m = np.mean(final_m - survey.truth_m, axis=0)
+    shift_m = np.mean(final_m - truth_m, axis=0)
+    in_stddevs = shift_m / (metric.place.stddev_m if metric.place is not None else np.nan)
+    has_bound = "ranges" not in known.names and mistake == "none"
+    bounds = known.bound(pixel_stddev) if has_bound else (np.nan, np.nan)
+    tests = () if metric.diagnosis is None else metric.diagnosis.tests
     return {
         "refused": "",
-        "off": -off / metric.estimate.uncertainty.empirical,
-        "covered": low <= -off <= high,
+        "scale": (off, (off - (low + high) / 2) / metric.estimate.uncertainty.empirical, off / bounds[0]),
         "half": (high - low) / 2,
-        "place": float(np.sqrt(np.mean((shift_m / np.array(metric.place.stddev_m)) ** 2))),
-        "rmse_m": float(np.sqrt(np.mean(np.sum((final_m - survey.truth_m) ** 2, axis=1)))),
+        "covered": bool(low <= off <= high),
+        "place": (rms(shift_m), rms(in_stddevs), rms(shift_m) / bounds[1]),
+        "placed": float(np.mean(np.abs(in_stddevs) <= NORMAL_95)),
+        "rmse_m": float(np.sqrt(np.mean(np.sum((final_m - truth_m) ** 2, axis=1)))),
         "check_m": errors.check.rmse_3d_m,
         "verdict": metric.estimate.verdict,
-        "named": named,
-        "found": wanted in named,
+        "named": [f"{test.name} {test.subject}".strip() for test in tests if test.rejected],
+        "found": wanted in "; ".join(metric.estimate.reasons),
     }
+
+
+def rms(values: npt.ArrayLike) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def summary_of(lines: Sequence[Line]) -> str:
     """Return the figures of some surveys as a line."""
     kept = [line for line in lines if not line["refused"]]
+    found = f"mistake found in {sum(line['found'] for line in lines)}"
     if not kept:
-        return f"all refused: {lines[0]['refused']}"
-
-    def rms(name: str) -> float:
-        return float(np.sqrt(np.mean([line[name] ** 2 for line in kept])))
-
-    covered, good = np.mean([line["covered"] for line in kept]), np.mean([line["verdict"] == "good" for line in kept])
-    half, found = np.median([line["half"] for line in kept]), sum(line["found"] for line in kept)
-    others = sorted({name for line in kept for name in line["named"]})
-    return (
-        f"{len(kept)} of {len(lines)}: scale covered {100 * covered:.0f} %, half width {100 * half:.2f} %, error "
-        f"{rms('off'):.2f} stddevs, place {rms('place'):.2f} stddevs, map {_median(kept, 'rmse_m'):.3f} m, "
-        f"check points {_median(kept, 'check_m'):.3f} m, good {100 * good:.0f} %, found {found}, {others}"
+        return f"all refused: {lines[0]['refused']}, {found}"
+    (off, off_stddevs, off_bounds), (shift_m, shift_stddevs, shift_bounds) = (
+        [rms([line[name][k] for line in kept]) for k in range(3)] for name in ("scale", "place")
     )
-
-
-def _median(lines: Sequence[Line], name: str) -> float:
-    return float(np.median([line[name] for line in lines]))
+    covered, placed, good = (
+        100 * float(np.mean(values))
+        for values in zip(*((line["covered"], line["placed"], line["verdict"] == "good") for line in kept), strict=True)
+    )
+    rmse_m, check_m, half = (float(np.median([line[name] for line in kept])) for name in ("rmse_m", "check_m", "half"))
+    named = dict(Counter(name for line in kept for name in line["named"]))
+    return (
+        f"{len(kept)} of {len(lines)}: scale covered {covered:.1f} %, half width {100 * half:.2f} %, error "
+        f"{100 * off:.2f} %, {off_stddevs:.2f} stddevs, {off_bounds:.2f} bounds; place covered {placed:.1f} %, error "
+        f"{shift_m:.3f} m, {shift_stddevs:.2f} stddevs, {shift_bounds:.2f} bounds; map {rmse_m:.3f} m, check points "
+        f"{check_m:.3f} m; good {good:.0f} %, {found}, named {named}"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -199,16 +299,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--mistakes", nargs="+", default=["none"], choices=MISTAKES)
     parser.add_argument("--num_seeds", type=int, default=15)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="lines of surveys, which are not run again")
     asked = parser.parse_args(arguments)
-    covered = []
-    for mistake in asked.mistakes:
-        for known in asked.known:
-            for name in asked.kinds:
-                seeds = range(asked.seed, asked.seed + asked.num_seeds)
-                lines = [told(KINDS[name], known, mistake, seed) for seed in seeds]
-                print(f"{known}, {name}, mistake: {mistake}: {summary_of(lines)}", flush=True)
-                covered += [line["covered"] for line in lines if not line["refused"] and mistake == "none"]
-    return int(bool(covered) and np.mean(covered) < LEAST_COVERED)
+    before = asked.out.read_text(encoding="utf-8").splitlines() if asked.out is not None and asked.out.exists() else []
+    done = {tuple(line["which"]): line for line in map(json.loads, before)}
+    for name, seed in itertools.product(asked.kinds, range(asked.seed, asked.seed + asked.num_seeds)):
+        kind, made = KINDS[name], None
+        for known, mistake in itertools.product(asked.known, asked.mistakes):
+            if (which := (known, mistake, name, seed)) in done:
+                continue
+            made = made or simulated(replace(kind, frame="site"), seed)
+            of_survey = Known.of(known.split("+"), *made, kind.path(seed), seed)
+            done[which] = told(of_survey, mistake, kind.pixel_stddev, seed)
+            if asked.out is not None:
+                with asked.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"which": which, **done[which]}) + "\n")
+    for known, mistake, name in itertools.product(asked.known, asked.mistakes, [*asked.kinds, "all"]):
+        lines = [line for which, line in done.items() if which[:2] == (known, mistake) and name in ("all", which[2])]
+        print(f"{known}, {name}, mistake: {mistake}: {summary_of(lines)}", flush=True)
+    clean = [line for which, line in done.items() if which[1] == "none" and not line["refused"]]
+    return int(bool(clean) and np.mean([line["covered"] for line in clean]) < LEAST_COVERED)
 
 
 if __name__ == "__main__":

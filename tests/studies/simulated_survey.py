@@ -279,7 +279,7 @@ def covariance_at_truth(
     survey: Survey, truth: pycolmap.Reconstruction, pixel_stddev: float, *, with_ranges: bool = True
 ) -> JointCovariance:
     """Return the covariance of a model that has the truth's poses, as ``rmse_bound_m`` needs it."""
-    adjuster, anchors, biases = _adjuster(survey, truth), _anchor_blocks(survey), _bias_blocks(survey)
+    adjuster, anchors, biases = photos_adjuster(survey, truth), _anchor_blocks(survey), _bias_blocks(survey)
     if with_ranges:
         _add_ranges(adjuster, truth, survey, true_ranges_m(survey), anchors, biases, pixel_stddev)
     return joint_covariance(adjuster.problem, truth, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
@@ -295,7 +295,7 @@ def likeliest_path(survey: Survey, pixel_errors: Array, log: RangeLog, *, pixel_
         log: of ``range_log``, in the order of time.
     """
     model = _with_noisy_features(survey, pixel_errors)
-    adjuster = _adjuster(survey, model)
+    adjuster = photos_adjuster(survey, model)
     ranges_m = {name: log.range_m[log.anchor_index == k] for k, name in enumerate(log.anchor_ids)}
     _add_ranges(adjuster, model, survey, ranges_m, _anchor_blocks(survey), _bias_blocks(survey), pixel_stddev)
     adjuster.solve()
@@ -309,7 +309,7 @@ def true_ranges_m(survey: Survey) -> dict[str, Array]:
     return {name: np.linalg.norm(antenna - anchor, axis=1) for name, anchor in survey.anchors_m.items()}
 
 
-def _adjuster(survey: Survey, model: pycolmap.Reconstruction) -> pycolmap.CeresBundleAdjuster:
+def photos_adjuster(survey: Survey, model: pycolmap.Reconstruction) -> pycolmap.CeresBundleAdjuster:
     """Return an adjuster of the features, with a gauge that leaves the rest to the ranges."""
     config = pycolmap.BundleAdjustmentConfig()
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)

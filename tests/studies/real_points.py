@@ -1,0 +1,113 @@
+"""Check control points on real photos: the RMSE of check points beside what the photos allow.
+
+Run: python -m tests.studies.real_points --data FOLDER --model sparse/0 [--num_points 12] [--seed 0]
+
+FOLDER has photos' true poses and their camera (fountain-P11 of Strecha et al. 2008: groundtruth.csv, camera.json), and
+the model is of its photos (``rangesfm reconstruct FOLDER/images``). Points of the model that are seen in six photos or
+more, spread over the scene, are taken for marks: what the true poses make of their features are their coordinates.
+Three of them are control points, the others check points. The model is refined with all defaults.
+
+Prints the RMSE of control and check points, and that of all points of the unrefined model after the best similarity,
+which is as good as the photos alone allow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from rangesfm.geometry.reference import read_reference
+from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.survey.settings import Survey
+from rangesfm.workflows.run import refine_model
+
+Array = npt.NDArray[np.float64]
+NUM_PHOTOS, NUM_CONTROL, STDDEV_M = 6, 3, 0.005
+# Share of the points that are nearest to their middle; far ones are in the background.
+SHARE_NEAR = 0.9
+
+
+def spread_points(model: pycolmap.Reconstruction, num: int, seed: int) -> list[int]:
+    """Return the ids of points, each the farthest from those before it, after a first one drawn at random."""
+    ids = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= NUM_PHOTOS]
+    places = np.array([model.point3D(i).xyz for i in ids])
+    from_middle = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    near = np.flatnonzero(from_middle < np.quantile(from_middle, SHARE_NEAR))
+    chosen = [int(np.random.default_rng(seed).choice(near))]
+    while len(chosen) < num:
+        apart = np.linalg.norm(places[near, None] - places[chosen], axis=2).min(axis=1)
+        chosen.append(int(near[np.argmax(apart)]))
+    return [ids[k] for k in chosen]
+
+
+def pixels_of(model: pycolmap.Reconstruction, point_id: int) -> dict[str, Array]:
+    """Return the features of a point, by photo."""
+    images = ((model.image(e.image_id), e.point2D_idx) for e in model.point3D(point_id).track.elements)
+    return {image.name: np.ravel(image.points2D[index].xy) for image, index in images}
+
+
+def triangulated(rays: Array, centers_m: Array) -> Array:
+    """Return the point (3,) with the least squared distance from rays (n, 3) of length 1."""
+    across = np.eye(3) - rays[:, :, None] * rays[:, None]
+    return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centers_m))
+
+
+def main() -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--model", type=Path, required=True)
+    parser.add_argument("--num_points", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    model, truth = pycolmap.Reconstruction(asked.model), read_reference(asked.data / "groundtruth.csv")
+    assert truth.image_names is not None
+    assert truth.world_from_cam is not None
+    given = json.loads((asked.data / "camera.json").read_text(encoding="utf-8"))
+    camera = pycolmap.Camera(
+        model=given["camera_model"], width=given["width"], height=given["height"], params=given["params"]
+    )
+    row_of = {name: row for row, name in enumerate(truth.image_names)}
+    points, marks, true_m, ids = "", "", [], spread_points(model, asked.num_points, asked.seed)
+    for number, point_id in enumerate(ids):
+        seen = pixels_of(model, point_id)
+        rows = [row_of[name] for name in seen]
+        rays = np.column_stack([camera.cam_from_img(np.array([*seen.values()])), np.ones(len(rows))])
+        rays = np.einsum("nij,nj->ni", truth.world_from_cam[rows], rays / np.linalg.norm(rays, axis=1)[:, None])
+        true_m.append(triangulated(rays, truth.positions_m[rows]))
+        x_m, y_m, z_m = true_m[-1].tolist()
+        points += (
+            f"P{number},{x_m:.5f},{y_m:.5f},{z_m:.5f},{STDDEV_M},{'control' if number < NUM_CONTROL else 'check'}\n"
+        )
+        marks += "".join(f"P{number},{name},{x_px:.3f},{y_px:.3f}\n" for name, (x_px, y_px) in seen.items())
+    places = np.array([model.point3D(i).xyz for i in ids])
+    by_photos_m = rmse(align_points(places, np.array(true_m)).apply(places) - np.array(true_m))
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        (folder / "points.csv").write_text(f"marker,x_m,y_m,z_m,stddev_m,kind\n{points}")
+        (folder / "marks.csv").write_text(f"marker,image_name,x_px,y_px\n{marks}")
+        values = {
+            "images.model": asked.model,
+            "points.path": folder / "points.csv",
+            "scale.markers": folder / "marks.csv",
+            "output.path": folder / "out",
+            "report.enabled": False,
+        }
+        found = refine_model(Survey().changed(values)).summary.points
+    assert found is not None
+    print(
+        f"control points {found.control.rmse_3d_m:.4f} m, check points {found.check.rmse_3d_m:.4f} m; all points of "
+        f"the photos alone, after the best similarity, {by_photos_m:.4f} m"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
