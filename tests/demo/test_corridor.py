@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from scipy import ndimage
 from scipy.spatial.distance import cdist
+from tests.known import known
 from tests.outputs import names_in
 
 from rangesfm.demo.corridor import FOCAL_PX, NUM_PHOTOS, SIZE_PX, _walk, make_corridor_survey, render
@@ -32,7 +33,7 @@ def test_it_is_a_whole_survey_of_photos_that_are_matched_with_neighbours_alone(m
     assert (survey.mapper.matching, survey.mapper.close_loops) == ("sequential", True)
     times = read_image_times_csv(made.folder / "images.csv")
     assert (times.image_names, times.timestamps_s.tolist()) == (made.image_names, made.timestamps_s.tolist())
-    size = pycolmap.Bitmap.read(made.folder / "images" / made.image_names[0], as_rgb=False)
+    size = known(pycolmap.Bitmap.read(made.folder / "images" / made.image_names[0], as_rgb=False))
     assert (size.width, size.height) == SIZE_PX
     reference = read_reference(made.folder / "reference.csv")
     np.testing.assert_allclose(reference.positions_m, made.centers_m, atol=1e-6)

@@ -63,7 +63,7 @@ def make_corridor_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: in
         InputError: the folder holds something else or cannot be written to.
     """
     centers, world_from_cam = _walk(num_photos + 2 * _NUM_AROUND)
-    times = _START_S + np.arange(len(centers))
+    times = np.arange(len(centers), dtype=np.float64) + _START_S
     ranges = simulate_ranges(
         CameraPath.through(times, centers, world_from_cam), {"A1": _ANCHOR_M}, TAG_IN_CAM_M, _RADIO, seed
     )
@@ -161,7 +161,7 @@ def _spots(shape: tuple[int, ...], rng: np.random.Generator) -> Array:
     for texels, contrast in _SPOTS:
         coarse = rng.standard_normal([num // texels + 3 for num in shape])
         picture += contrast * ndimage.zoom(coarse, texels, order=1)[: shape[0], : shape[1]]
-    return np.clip(picture, 0.0, 1.0)
+    return np.asarray(np.clip(picture, 0.0, 1.0))
 
 
 def _halved(picture: Array) -> Iterator[Array]:
