@@ -118,6 +118,19 @@ def test_the_coordinate_that_was_typed_wrong_is_named(axis: int, letter: str, se
     assert found.causes[0].correction.anchors_m == {"S": None}
 
 
+@pytest.mark.parametrize(("axis", "factor"), [(0, 10.0), (1, -1.0)], ids=["point", "sign"])
+def test_a_coordinate_without_its_point_or_its_sign_is_named(axis: int, factor: float) -> None:
+    """No range to that anchor fits then, so that none has a weight."""
+    given = surveyed(HALL, SEED)
+    wrong, right = given.anchors_m["A6"].copy(), given.anchors_m["A6"]
+    wrong[axis] *= factor
+    given.anchors_m["A6"] = wrong
+    cause = diagnosis(given).causes[0]
+    assert (cause.name, cause.subject) in {("anchor place", "A6"), ("anchor coordinate", "A6 " + "xyz"[axis])}
+    assert cause.correction.anchors_m == {"A6": None}
+    np.testing.assert_allclose(cause.state.anchors_m[5], right, atol=0.5)
+
+
 def test_two_labels_that_were_swapped_are_named() -> None:
     given = surveyed(YARD, SEED)
     anchors = given.anchors_m

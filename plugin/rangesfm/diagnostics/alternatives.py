@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis import Correction, corrected
+from rangesfm.diagnostics.hypothesis import MEASURE_AGAIN, Correction, corrected, in_axes, where_ranges_meet
 from rangesfm.diagnostics.linearized import RangesOnMap
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.ranging.anchors.point_fit import multilaterate
@@ -18,6 +18,8 @@ from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ra
 from rangesfm.scale.starts import spread_rows
 
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
+# Robust weight of a range that fits, and share of an anchor's ranges that fit if it is about where it is said to be.
+_FITS, _MOST_FIT = 0.1, 0.5
 _FOOT_M = 0.3048
 _UNITS_M = {
     "the anchors' coordinates are in feet": _FOOT_M,
@@ -63,6 +65,7 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
     given = {on_map.anchor_ids[k]: given_m[k] for k in heard if np.isfinite(given_m[k]).all()}
     yield from _of_labels([name for name in on_map.order_given if name in given], given)
     yield from _of_coordinates(given)
+    yield from _of_places(on_map, given)
     if on_map.velocity is not None:  # as where the photos' order was taken from names that count down
         times = on_map.time_s
         yield Alternative(
@@ -115,6 +118,22 @@ def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Alternative]:
         yield Alternative("anchors' unit", "", words, remedy, grown)
 
 
+def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Alternative]:
+    """Yield for each anchor that hardly any range fits: it is far from its coordinates, as without a sign or a point.
+
+    A linear test does not see this, as the ranges have no weight.
+    """
+    for name, at in given.items():
+        k = on_map.anchor_ids.index(name)
+        if np.mean(on_map.weights[on_map.problem.anchor_index == k] > _FITS) < _MOST_FIT:
+            off_m = where_ranges_meet(on_map, k) - at
+            words = (
+                f"anchor {name} is about {np.linalg.norm(off_m):.2f} m from where its coordinates say "
+                f"(by {in_axes(off_m)} in x, y, z)"
+            )
+            yield Alternative("anchor place", name, words, MEASURE_AGAIN, Correction({name: None}))
+
+
 class Refits:
     """Solutions of corrected problems, each started from where the map itself sees the anchors.
 
@@ -137,7 +156,7 @@ class Refits:
         thin, seen = self._thinned(right), self._seen
         if np.any(correction.time_shift_s):
             seen = _anchors_by_map(thin)
-        starts = [(_cost(thin, state), state) for state in self._starts(thin, *seen)]
+        starts = [(_cost(thin, state), state) for state in self._starts(thin, right.state.anchors_m, *seen)]
         cost, state = min(starts, key=lambda each: each[0])
         return cost, replace(right, state=state)
 
@@ -148,10 +167,16 @@ class Refits:
         )
         return fit.cost, replace(start, state=fit.state)
 
-    def _starts(self, problem: RangeProblem, placed: Similarity, seen_m: Array) -> Iterator[RangeState]:
-        """Yield starting states: the map as it is, and moved to where it sees the anchors (``seen_m``, (m, 3))."""
+    def _starts(
+        self, problem: RangeProblem, unknown_m: Array, placed: Similarity, seen_m: Array
+    ) -> Iterator[RangeState]:
+        """Yield starting states: the map as it is, and moved to where it sees the anchors (``seen_m``, (m, 3)).
+
+        Args:
+            unknown_m: (m, 3) places of the anchors whose positions are not given.
+        """
         known = np.asarray(np.isfinite(problem.anchor_mean_m).all(axis=1))
-        anchors_m = np.where(known[:, None], problem.anchor_mean_m, self._on_map.state.anchors_m)
+        anchors_m = np.where(known[:, None], problem.anchor_mean_m, unknown_m)
         yield replace(self._on_map.state, anchors_m=anchors_m)
         is_seen = np.asarray(np.isfinite(seen_m).all(axis=1))
         if not problem.frame_is_free and not known.any():

@@ -8,6 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import (
+    MEASURE_AGAIN,
     Correction,
     Effect,
     Hypothesis,
@@ -38,7 +39,6 @@ _LARGEST_RIG_M = 3.0
 _MOST_WARMING_M = 5.0
 # Largest excess of a range past the person with the camera: the way round the body, and a weak signal found late.
 _MOST_BODY_M = 2.0
-_MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
 
 
 def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
@@ -66,7 +66,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
                 f"anchor {name}'s {letter} is given as {at[axis]:.3f} where about "
                 f"{at[axis] + size[0]:.2f} fits ({size[0]:+.2f} m)"
             ),
-            remedy=f"check its {letter}, or {_MEASURE_AGAIN}",
+            remedy=f"check its {letter}, or {MEASURE_AGAIN}",
             correction=lambda size: Correction({name: at + size[0] * direction}),
             most=most_m,
             adoption=unknown,
@@ -81,7 +81,7 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
             f"anchor {name} is about {np.linalg.norm(size):.2f} m from where its coordinates say "
             f"(by {in_axes(size)} in x, y, z)"
         ),
-        remedy=_MEASURE_AGAIN,
+        remedy=MEASURE_AGAIN,
         correction=lambda size: Correction({name: at + size}),
         most=most_m,
         adoption=unknown,

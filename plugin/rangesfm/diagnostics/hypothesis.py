@@ -9,9 +9,15 @@ import numpy as np
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap
+from rangesfm.ranging.anchors.point_fit import multilaterate
+from rangesfm.scale.range_equation import antenna_positions
 
 # Step, in the unit of a hypothesis, of the difference quotient for its effect.
 _SMALL = 1e-4
+
+
+MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
+"""Remedy for an anchor that is not where its coordinates say."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +25,7 @@ class Correction:
     """Changes of the input that undo a mistake.
 
     Attributes:
-        anchors_m: corrected positions, (3,) by id; None: the anchor counts as unknown.
+        anchors_m: corrected positions, (3,) by id; None: the anchor counts as unknown, and is where its ranges meet.
         tag_moves_m: (3,) additions to lever arms in the camera's frame, by tag id.
         time_shift_s: addition to the times of the ranges, one for all or (n,).
         left_out: (n,) mask of ranges that are not used.
@@ -177,12 +183,13 @@ def in_axes(shift: Array) -> str:
 def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
     """Return the ranges with anchors, lever arms, times and lengths corrected; ``left_out`` is not applied."""
     problem, mean_m = on_map.problem, on_map.problem.anchor_mean_m.copy()
-    anchors_m = on_map.state.anchors_m.copy()
+    anchors_m, stddevs_m = on_map.state.anchors_m.copy(), problem.anchor_stddev_m.copy()
     for name, position in correction.anchors_m.items():
         k = on_map.anchor_ids.index(name)
         mean_m[k] = np.full(3, np.nan) if position is None else position
-        anchors_m[k] = anchors_m[k] if position is None else position
-    problem = replace(problem, anchor_mean_m=mean_m)
+        anchors_m[k] = where_ranges_meet(on_map, k) if position is None else position
+        stddevs_m[k] = np.inf if position is None else stddevs_m[k]
+    problem = replace(problem, anchor_mean_m=mean_m, anchor_stddev_m=stddevs_m)
     on_map = replace(on_map, problem=problem, state=replace(on_map.state, anchors_m=anchors_m))
     if on_map.velocity is not None and np.any(correction.time_shift_s):
         on_map = _taken_later(on_map, np.broadcast_to(correction.time_shift_s, len(on_map.time_s)), on_map.velocity)
@@ -194,6 +201,13 @@ def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
         turned = np.einsum("nij,nj->ni", on_map.model_from_cam, moves[on_map.tag_index])
         problem = replace(problem, tag_from_center=problem.tag_from_center + turned)
     return replace(on_map, problem=problem)
+
+
+def where_ranges_meet(on_map: RangesOnMap, k: int) -> Array:
+    """Return the place (3,) of an anchor by its ranges alone, from the tag's places on the map."""
+    problem, rows = on_map.problem, on_map.problem.anchor_index == k
+    tags_m = antenna_positions(problem, on_map.state.metric_from_model)[rows]
+    return multilaterate(tags_m, problem.range_m[rows] - problem.bias_mean_m[k])[0]
 
 
 def _taken_later(on_map: RangesOnMap, shift_s: Array, velocity: Array) -> RangesOnMap:

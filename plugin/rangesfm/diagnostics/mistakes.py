@@ -271,7 +271,8 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Alternativ
     for _, refitted, each in [fit for fit in fits if fit[0] < as_given][:_NUM_TRIED]:
         moved = _settled(at_state(problem, refitted))
         gain = before - Factorization(_learnt(moved, [])).deviance()
-        penalty = 2 * float(np.log(len(tried)))
+        num_free = 3 * sum(place is None for place in each.correction.anchors_m.values())
+        penalty = 2 * float(np.log(len(tried))) + num_free * float(np.log(len(problem.residual_m)))
         if gain > penalty + _AS_LIKELY:
             yield Cause(**vars(each), gain=gain, penalty=penalty, state=moved.on_map.state, test=None)
 
