@@ -226,8 +226,10 @@ class Known:
             own[np.ix_(at, at)] = RECEIVERS[name].covariance_m2(known.time_s[at])
         covariance = covariance + grouping @ np.kron(own, np.eye(3)) @ grouping.T
         rows, design = np.ix_(found.equations.is_used, found.equations.is_used), found.equations.linear.design
+        if known.velocity.any():  # the time offset is unknown, too
+            design = np.column_stack([design, grouping @ known.velocity.ravel()])
         design = design[found.equations.is_used]
-        of_map = np.linalg.inv(design.T @ np.linalg.solve(covariance[rows], design))
+        of_map = np.linalg.inv(design.T @ np.linalg.solve(covariance[rows], design))[:7, :7]
         motions = similarity_motions(path.centers - path.centers[0]).mean(axis=0)
         return float(np.sqrt(of_map[0, 0])), float(np.sqrt(np.trace(motions @ of_map @ motions.T) / 3))
 

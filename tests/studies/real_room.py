@@ -25,7 +25,7 @@ MAX_GAP_S = 0.05
 
 def real_room(folder: Path, model: Path, seed: int) -> Given:
     """Read a tenth of the ranges: every tenth, starting at another one for each seed."""
-    trajectory, times, centers_m, rotations = _path_and_truth(folder, model)
+    trajectory, times, centers_m, rotations = path_and_truth(folder, model)
     log = read_ranges(folder / "uwb.csv")
     rows = np.arange(seed % EVERY, len(log), EVERY)
     assert log.timestamp_s is not None
@@ -38,7 +38,7 @@ def real_room(folder: Path, model: Path, seed: int) -> Given:
         anchor.anchor_id: np.asarray(anchor.position_m) for anchor in read_anchors(folder / "anchors_surveyed.csv")
     }
     anchors_m = {name: anchors_m[name] for name in log.anchor_ids}
-    at_photos = _interpolated(times, centers_m, np.asarray(trajectory.timestamps_s))
+    at_photos = interpolated(times, centers_m, np.asarray(trajectory.timestamps_s))
     is_known = np.isfinite(at_photos).all(axis=1)
     return Given(
         trajectory=trajectory,
@@ -57,7 +57,7 @@ def real_room(folder: Path, model: Path, seed: int) -> Given:
 
 
 @cache
-def _path_and_truth(
+def path_and_truth(
     folder: Path, model: Path
 ) -> tuple[Trajectory, npt.NDArray[np.float64], npt.NDArray[np.float64], Slerp]:
     with (folder / "images.csv").open(encoding="utf-8") as file:
@@ -70,7 +70,7 @@ def _path_and_truth(
     return trajectory, reference.timestamps_s, reference.positions_m, rotations
 
 
-def _interpolated(
+def interpolated(
     times: npt.NDArray[np.float64], places: npt.NDArray[np.float64], at: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
     """(n, 3) positions, NaN across gaps."""
