@@ -144,6 +144,17 @@ def test_clocks_that_are_apart_by_leap_seconds_are_named(walk: Walk, tmp_path: P
     assert "s behind, as by leap seconds" in said
 
 
+def test_positions_by_a_clock_that_the_motion_contradicts_leave_the_map_to_the_ranges(
+    walk: Walk, tmp_path: Path
+) -> None:
+    survey = walk.with_both(tmp_path, 1.0).changed({"positions.time_offset": 8.0})
+    walk.positions(tmp_path, clock_ahead_s=-18.0)
+    summary = scale_model(survey, progress=QUIET).summary
+    assert "s behind, as by leap seconds, or a time zone; they are not used" in "; ".join(summary.scale.reasons)
+    assert_scale(summary, walk.made.metric_from_sfm.scale, 0.02)
+    assert (summary.frame, summary.scale.verdict) == ("first_camera", "doubtful")
+
+
 @pytest.mark.parametrize("too_long", [1.0, 1.1])
 def test_positions_and_ranges_to_unknown_anchors_hold_the_map_together(
     walk: Walk, tmp_path: Path, too_long: float

@@ -65,7 +65,7 @@ class SurveyedPositions:
         return self if self.antenna is None else replace(self, antenna=self.antenna.with_offset(path))
 
     def located(self, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions | None:
-        """Find the positions in a model; None if none of them is there.
+        """Find the positions in a model; None if none of them is there. Those by a wrong clock are left out.
 
         Args:
             model: in any world. path: of its keyframes.
@@ -74,7 +74,8 @@ class SurveyedPositions:
             InputError: the marks of a point are not of one point, or are seen from one direction only.
         """
         marks = None if self.points is None else locate_points(self.points, model, path)
-        return joined_positions([marks, None if self.antenna is None else self.antenna.located(path)])
+        is_on_path = self.antenna is not None and self.antenna.other_offset_s is None
+        return joined_positions([marks, self.antenna.located(path) if self.antenna and is_on_path else None])
 
     def with_more_markers(self, markers: Mapping[str, Marker]) -> SurveyedPositions:
         """Return the positions with more marks in photos."""
@@ -92,7 +93,7 @@ class SurveyedPositions:
             yield (
                 f"the positions fit the photos' path at a time offset of {track.other_offset_s:+.2f} s, not at the "
                 f"given {track.offset_s:+.2f} s: their clock is {abs(ahead_s):.1f} s "
-                f"{'ahead' if ahead_s > 0 else 'behind'}, as by leap seconds, or a time zone"
+                f"{'ahead' if ahead_s > 0 else 'behind'}, as by leap seconds, or a time zone; they are not used"
             )
 
     def notes_on(self, model: pycolmap.Reconstruction) -> Iterator[str]:

@@ -89,7 +89,8 @@ def initialize_scale(
                 by_positions, lengths, observations, trajectory, bending, lasting_s, range_model, options
             )
         if lengths is None:
-            raise GeometryError("the scale is not determined: no measured length has both its ends in the map")
+            what = "known position is used" if distances is None else "measured length has both its ends in the map"
+            raise GeometryError(f"the scale is not determined: no {what}")
         alone = _by_lengths_alone(lengths, observations, trajectory, range_model, options)
         return replace(alone, reasons=(*alone.reasons, *remarks), remarks=remarks)
     given = _Given(
