@@ -14,15 +14,15 @@ from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.run import scale_model
 
-ARM_M = (0.05, -0.2, -0.08)
+ARM_M, ARM_DOWN_M = (0.05, -0.2, -0.08), (0.0, 0.22, 0.0)
 
 
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("sign", "arm_m", "seed"), [(1, ARM_M, 0), (-1, ARM_M, 0), (-1, ARM_DOWN_M, 3)])
 def test_the_sign_of_a_short_lever_arm_is_found_though_no_other_test_sees_it(
-    sign: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sign: int, arm_m: tuple[float, ...], seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demo, "TAG_IN_CAM_M", ARM_M)
-    walk = demo._plan(tmp_path, 40, seed=0)
+    monkeypatch.setattr(demo, "TAG_IN_CAM_M", arm_m)
+    walk = demo._plan(tmp_path, 40, seed)
     times = walk.timestamps_s
     made = synthetic_model(
         times, walk.centers_m, walk.world_from_cam, num_observations=60, max_track_length=8, pixel_stddev=0.5, seed=1
@@ -30,7 +30,7 @@ def test_the_sign_of_a_short_lever_arm_is_found_though_no_other_test_sees_it(
     (tmp_path / "sparse").mkdir()
     made.reconstruction.write(tmp_path / "sparse")
     write_ranges_csv(walk.ranges.log, tmp_path / "uwb.csv")
-    (tmp_path / "anchors.csv").write_text(demo._anchor_file(0))
+    (tmp_path / "anchors.csv").write_text(demo._anchor_file(seed))
     rows = "".join(f"{name},{time!r}\n" for name, time in made.timestamps_s.items())
     (tmp_path / "images.csv").write_text(f"image_name,timestamp_s\n{rows}")
     survey = Survey().changed(
@@ -40,7 +40,7 @@ def test_the_sign_of_a_short_lever_arm_is_found_though_no_other_test_sees_it(
             "ranges.path": tmp_path / "uwb.csv",
             "ranges.time_offset": demo.TIME_OFFSET_S,
             "anchors.path": tmp_path / "anchors.csv",
-            "tag.tag_in_cam_m": tuple(sign * x for x in ARM_M),
+            "tag.tag_in_cam_m": tuple(sign * x for x in arm_m),
             "output.path": tmp_path / "out",
             "report.enabled": False,
         }

@@ -75,7 +75,7 @@ def test_what_no_survey_with_one_unknown_anchor_can_show_is_not_claimed() -> Non
     given.range_m = 1.05 * given.range_m
     found = diagnosis(given)
     assert found.reasons == ()
-    share = next(test for test in found.tests if test.name == "range share")
+    share = next(test for test in found.tests if test.name == "range scale")
     assert share.effect_on_scale is None or share.effect_on_scale > 0.2
 
 
@@ -164,7 +164,7 @@ def test_labels_that_are_one_line_off_are_named(site: Site) -> None:
 def test_long_ranges_and_small_coordinates_are_named_together() -> None:
     given = surveyed(YARD, SEED)
     given.range_m = 1.06 * given.range_m
-    assert {cause.name for cause in diagnosis(given).causes} == {"range share", "anchors' scale"}
+    assert {cause.name for cause in diagnosis(given).causes} == {"range scale", "anchors' scale"}
 
 
 @pytest.mark.parametrize(("factor", "words"), [(0.94, "small"), (1.06, "large")])

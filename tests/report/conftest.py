@@ -260,7 +260,7 @@ def _summary(
         "tests": [
             _test("anchor coordinate", f"{anchor_ids[0]} y", 38.2, rejected=True),
             _test("lever arm", "", 4.1, rejected=False),
-            {**_test("range share", "", 0.3, rejected=False), "smallest_detectable": None, "effect_on_scale": None},
+            {**_test("range scale", "", 0.3, rejected=False), "smallest_detectable": None, "effect_on_scale": None},
         ],
         "versions": {"rangesfm": "0.1.0", "pycolmap": "4.2.1", "pyceres": "2.6", "numpy": "2.3.1"},
         "settings": {

@@ -75,7 +75,7 @@ def kinds(ids: list[str]) -> list[Kind]:
         right = (f"anchor stretch {name}", f"anchor step {name}")
         made.append(Kind(f"{name} blocked", _stretch(name, (0.2, 0.5, 0.7)[k]), right, ("anchor stretch", name)))
     for name in ids[:2]:
-        right = (f"anchor share {name}", f"anchor hardly used {name}")
+        right = (f"anchor range scale {name}", f"anchor hardly used {name}")
         made.append(Kind(f"{name} reads a constant", _stuck(name), right))
         right = (
             f"anchor's outliers {name}",
@@ -112,11 +112,11 @@ def kinds(ids: list[str]) -> list[Kind]:
         Kind("noise of half a metre", _noisy, ("range noise",)),
     ]  # fmt: skip
     if ids:
-        pair = ("range share", "anchors' scale")
+        pair = ("range scale", "anchors' scale")
         places = tuple(f"anchor {what} {name}" for name in (*ids[1:3], ids[-1]) for what in ("place", "coordinate"))
         mixed = (f"anchor mixed up {ids[0]}",)
         made += [
-            Kind("ranges long by a share", _range_share, pair, ("range share", "")),
+            Kind("ranges long by a share", _range_share, pair, ("range scale", "")),
             Kind("anchors too small by a share", _anchor_share, pair, ("anchors' scale", "")),
             Kind("ranges in feet", _ranges_times(1 / 0.3048), ("anchors' unit", *pair)),
             Kind("ranges of both ways", _ranges_times(2.0), ("anchors' unit", *pair)),

@@ -116,7 +116,7 @@ def range_shares(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield for all ranges and for each anchor's: they grow by more or less than the distance does."""
     distance_m = problem.on_map.problem.range_m
     yield Hypothesis(
-        "range share",
+        "range scale",
         of_bins(problem, -problem.gradient.distance_m),
         words=lambda size: f"all ranges read about {100 * abs(size[0]):.1f} % too {'long' if size[0] > 0 else 'short'}",
         remedy="check the unit, and the propagation speed that the radio assumes, against a taped distance",
@@ -145,7 +145,7 @@ def _share_of_anchor(problem: Linearized, k: int) -> Hypothesis:
         return Correction(longer_m=np.where(of_ranges, size[0] * grown_m, 0.0))
 
     return Hypothesis(
-        "anchor share",
+        "anchor range scale",
         of_bins(problem, np.where(is_of, -distance_m + mean, 0.0)),
         subject=name,
         words=words,

@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives, lever_arms_in_other_axes
 from rangesfm.diagnostics.catalogue import STANDING
-from rangesfm.diagnostics.hypothesis import Correction, Effect, Hypothesis, corrected, of_bins
+from rangesfm.diagnostics.hypothesis import Effect, Hypothesis, corrected, of_bins
 from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized
 from rangesfm.diagnostics.scale_bound import HiddenMistake, hidden_among
@@ -265,10 +265,10 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Alternativ
     if not tried:
         return
     refits = Refits(on_map, problem.scatter_m)
-    as_given, _ = refits.of(refits.start(Correction())[1])
     starts = sorted(((*refits.start(each.correction), each) for each in tried), key=lambda start: start[0])
     fits = sorted(((*refits.of(start), each) for _, start, each in starts[:_NUM_FITTED]), key=lambda fit: fit[0])
-    for _, refitted, each in [fit for fit in fits if fit[0] < as_given][:_NUM_TRIED]:
+    # Its squares do not decide: by the errors that last, an explanation with larger squares may be the likelier one.
+    for _, refitted, each in fits[:_NUM_TRIED]:
         moved = _settled(at_state(problem, refitted))
         gain = before - Factorization(_learnt(moved, [])).deviance()
         num_free = 3 * sum(place is None for place in each.correction.anchors_m.values())
