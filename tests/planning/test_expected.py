@@ -25,7 +25,7 @@ from rangesfm.scale.scale_by_lengths import BENDING
 def test_the_expected_stddev_of_the_scale_is_what_runs_state(
     anchors_m: tuple[Place, ...], frame: str, rate_hz: float
 ) -> None:
-    plan = planned(anchors_m, frame, rate_hz=rate_hz)
+    plan = planned(anchors_m, frame, loop(30.0, 60), rate_hz=rate_hz)
     assert plan.num_alike == 1
     expected = expect(plan)
     path = plan.trajectory
@@ -39,7 +39,7 @@ def test_the_expected_stddev_of_the_scale_is_what_runs_state(
 
 
 def test_the_expected_place_is_as_certain_as_runs_state() -> None:
-    plan = planned(FIVE_ANCHORS_M, "site")
+    plan = planned(FIVE_ANCHORS_M, "site", loop(30.0, 60))
     expected = expect(plan)
     stated = []
     for seed in range(3):

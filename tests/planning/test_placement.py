@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from tests.planning.plans import loop, planned
 
-from rangesfm.errors import GeometryError
 from rangesfm.planning.expected import expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.placement import place_anchors, places_in_box, places_on_walls, spread_anchors
@@ -39,7 +37,8 @@ def test_places_on_walls_lie_on_them_at_both_heights() -> None:
 def test_placed_anchors_stand_in_the_box_and_know_more_than_a_bad_choice() -> None:
     # All in one corner, at one height.
     crowded = [(-7.0, -6.0, 0.3), (-7.0, -2.0, 0.3), (-2.333, -6.0, 0.3)]
-    before = planned(crowded, "site", loop(30.0, 60), allowed_m=places_in_box(LOW, HIGH), is_placed=False)
+    some = places_in_box(LOW, HIGH)[::2]
+    before = planned(crowded, "site", loop(30.0, 60), allowed_m=some, is_placed=False)
     after = place_anchors(before)
     assert np.all((after.anchors_m >= LOW) & (after.anchors_m <= HIGH))
     assert expect(after).worst_keyframe_m < 0.7 * expect(before).worst_keyframe_m
@@ -51,8 +50,10 @@ def test_anchors_that_stand_where_they_do_are_left_there() -> None:
     assert place_anchors(fixed) is fixed
 
 
-def test_a_path_with_hardly_any_range_is_refused_wherever_anchors_stand() -> None:
+def test_a_path_with_hardly_any_range_is_refused_with_advice_wherever_anchors_stand() -> None:
     short = path_through([(0.0, 0.0, 1.6), (0.5, 0.0, 1.6)], speed_m_per_s=0.5, photo_rate_hz=2.0)
     survey = planned([LOW, HIGH], "site", short, rate_hz=1.0, allowed_m=places_in_box(LOW, HIGH), is_placed=False)
-    with pytest.raises(GeometryError, match="ranges"):
-        plan_survey(place_anchors(survey))
+    plan = plan_survey(place_anchors(survey))
+    assert plan.verdict == "refused"
+    assert "ranges lie on the path" in plan.reasons[0]
+    assert any(advice.words == "walk the path 5 times, there and back" for advice in plan.advice_for_scale)

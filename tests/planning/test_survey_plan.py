@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
+from rangesfm.planning.advice import advise
 from rangesfm.planning.expected import expect
-from rangesfm.planning.survey_plan import SurveyPlan, plan_survey
+from rangesfm.planning.survey_plan import SurveyPlan, mistake_in_words, plan_survey, size_in_words
 from rangesfm.report.plan_page import write_plan
 
 
@@ -76,7 +77,7 @@ def test_advice_stays_within_the_walls() -> None:
 
     def widths(share: float) -> set[str]:
         corners = share * half_m * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-        advice = plan_survey(replace(survey, walls_m=(corners,))).advice
+        advice = advise(expect(replace(survey, walls_m=(corners,))))
         return {each.words for each in advice if each.kind == "wider path"}
 
     assert widths(3.0) == {"walk 1.5 times as wide", "walk 1.25 times as wide"}
@@ -96,10 +97,10 @@ def test_mistakes_that_would_be_found_have_a_size_and_an_effect(plan: SurveyPlan
 
 
 def test_ten_times_the_ranges_average_out_their_noise_and_hardly_anything_else() -> None:
-    few, many = (plan_survey(planned(FIVE_ANCHORS_M, "site", rate_hz=rate)) for rate in (1.0, 10.0))
-    assert many.num_ranges == 10 * few.num_ranges
-    assert many.components["white"] < 0.7 * few.components["white"]
-    assert 0.8 * few.scale_stddev < many.scale_stddev < 1.05 * few.scale_stddev
+    few, many = (expect(planned(FIVE_ANCHORS_M, "site", rate_hz=rate)) for rate in (1.0, 10.0))
+    assert many.planned.num_ranges == 10 * few.planned.num_ranges
+    assert many.uncertainty.components["white"] < 0.7 * few.uncertainty.components["white"]
+    assert 0.8 * few.uncertainty.empirical < many.uncertainty.empirical < 1.05 * few.uncertainty.empirical
 
 
 def test_plan_json_holds_it_all_and_what_is_open_is_null(tmp_path: Path) -> None:
@@ -116,4 +117,32 @@ def test_a_survey_with_unknown_anchors_has_no_place() -> None:
     plan = plan_survey(planned(FIVE_ANCHORS_M[:2], "unknown"))
     assert plan.frame == "first_camera"
     assert plan.place is None
-    assert not plan.advice_for_place
+    assert {advice.kind for advice in plan.advice_for_place} == {"control points"}
+
+
+def test_a_plan_has_the_verdicts_of_a_run_in_its_words(plan: SurveyPlan) -> None:
+    assert plan.place is not None
+    assert (plan.verdict, plan.place.verdict) == ("good", "good")
+    (words,) = plan.place.reasons
+    worst = f"{1.96 * plan.place.worst_keyframe_stddev_m:.2g}"
+    assert words.startswith("the map's place is known to ")
+    assert words.endswith(f"each keyframe to {worst} m or better (95 %)")
+    assert {f"  {words}", f"  {plan.reasons[0]}"} < set(plan.lines)
+    coarse = tuple(replace(anchor, position_stddev_m=2.0) for anchor in planned(FIVE_ANCHORS_M, "site").anchors)
+    vague = plan_survey(replace(planned(FIVE_ANCHORS_M, "site", loop(30.0, 60)), anchors=coarse)).place
+    assert vague is not None
+    assert vague.verdict == "doubtful"
+
+
+def test_every_mistake_of_the_catalogue_has_plain_words(plan: SurveyPlan) -> None:
+    level = tuple((x, y, 2.0) for x, y, _ in FIVE_ANCHORS_M)
+    expected = plan_survey(planned(level, "site", loop(30.0, 60)))
+    for mistake in (*plan.mistakes, *expected.mistakes):
+        words = mistake_in_words(mistake)
+        assert "share A" not in words
+        assert mistake.subject in words or not mistake.subject
+    names = [mistake.name for mistake in expected.largest_mistakes]
+    assert "anchor heights" in names
+    assert len(set(names)) == len(names)
+    assert size_in_words(0.031, "1") == "3.1 %"
+    assert size_in_words(None, "m") == "never found"

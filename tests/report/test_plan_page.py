@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 from dataclasses import replace
 
@@ -9,7 +10,10 @@ import numpy as np
 import pytest
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
-from rangesfm.planning.survey_plan import SurveyPlan, plan_survey
+from rangesfm.planning.paths import path_through
+from rangesfm.planning.planned_photos import PlannedPhotos
+from rangesfm.planning.survey_plan import SurveyPlan, mistake_in_words, plan_survey
+from rangesfm.positions.control_points import ControlPoint
 from rangesfm.report.plan_page import accuracy_views, render_plan
 
 
@@ -55,7 +59,8 @@ def test_the_page_ranks_the_advice_and_fetches_nothing(plan: SurveyPlan) -> None
     first = plan.advice_for_place[0].words.replace("'", "&#39;")
     assert f"1. {first}" in page
     assert "default-src &#39;none&#39;" in page
-    assert f"{100 * plan.scale_stddev:.2g}\u00a0%" in page
+    low, high = plan.scale_interval_95
+    assert f"± {50 * (high - low):.2g}\u00a0%" in page
 
 
 def test_what_is_open_is_called_so() -> None:
@@ -64,3 +69,37 @@ def test_what_is_open_is_called_so() -> None:
     plan = plan_survey(planned(COPLANAR_M, "site", level))
     assert [series.name for series in accuracy_views(plan).panels[0].series][-1] == "open"
     assert "open" in render_plan(plan)
+
+
+def test_page_and_terminal_list_the_same_advice_and_the_same_mistakes(plan: SurveyPlan) -> None:
+    page, lines = html.unescape(render_plan(plan)), "\n".join(plan.lines)
+    for advice in (*plan.advice_for_scale, *plan.advice_for_place):
+        assert advice.words in page
+        assert advice.words in lines
+    for text in (page, lines):
+        assert "range share" not in text
+    for mistake in plan.largest_mistakes:
+        assert mistake_in_words(mistake) in page
+        assert mistake_in_words(mistake) in lines
+    num_advised = len(plan.advice_for_scale) + len(plan.advice_for_place)
+    assert len(re.findall(r"^  \d+\. ", lines, re.MULTILINE)) == num_advised
+    assert len(re.findall(r'<th scope="row">\d+\. ', page)) == num_advised
+
+
+def test_the_page_of_a_refused_plan_says_what_would_make_it_possible() -> None:
+    short = path_through([(0.0, 0.0, 1.6), (0.5, 0.0, 1.6)], speed_m_per_s=0.5, photo_rate_hz=2.0)
+    page = html.unescape(render_plan(plan_survey(planned(FIVE_ANCHORS_M[:2], "site", short, rate_hz=1.0))))
+    assert "Scale: refused" in page
+    assert "ranges lie on the path" in page
+    assert "walk the path 5 times, there and back" in page
+
+
+def test_control_points_are_drawn_and_both_kinds_of_measurement_compared() -> None:
+    places = PlannedPhotos().aside(loop(30.0, 40), np.array([0, 13, 26]))
+    points = tuple(ControlPoint(f"C{k}", at, 0.01, "control", k) for k, at in enumerate(places[:3]))
+    beside = plan_survey(replace(planned(FIVE_ANCHORS_M, "site", loop(30.0, 40)), points=points))
+    marks = [mark.label for mark in accuracy_views(beside).panels[0].marks if mark.name == "control point"]
+    assert marks == ["C0", "C1", "C2"]
+    page = render_plan(beside)
+    assert "What each kind of measurement would give" in page
+    assert "control points and positions alone" in page

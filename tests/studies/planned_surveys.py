@@ -195,8 +195,8 @@ def main() -> None:
         print(
             f"{name:34}{100 * scale:8.2f} %{100 * median:7.2f} %{ratios['stated scale']:7.2f}"
             f"{100 * scale_spread:7.2f} %{ratios['scale']:7.2f} +-{ratios['scale'] * by_chance:4.2f}"
-            f"{place_m:8.3f} m{place_spread_m:7.3f} m"
-            f"{ratios['place']:7.2f} +-{ratios['place'] * of_place:4.2f}{sum('refused' in row for row in rows):9}",
+            f"{place_m:8.3f} m{place_spread_m:7.3f} m{ratios['place']:7.2f} +-{ratios['place'] * of_place:4.2f}"
+            f"{sum('refused' in row for row in rows):9}",
             flush=True,
         )
     for what, each in off.items():

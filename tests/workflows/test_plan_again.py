@@ -46,7 +46,7 @@ def test_the_plan_is_of_the_map_that_the_run_found(
     assert expect(planned).uncertainty.empirical == pytest.approx(stated, rel=0.3)
     printed = rangesfm_command("plan", "--from", out, cwd=tmp_path).stdout
     assert "what would gain most for the scale" in printed
-    assert ("place: x" in printed) == (anchors[-1] == "site")
+    assert ("place: good; x" in printed) == (anchors[-1] == "site")
 
 
 def test_a_doubtful_survey_is_told_what_its_plan_would_change(
@@ -66,7 +66,7 @@ def test_a_doubtful_survey_is_told_what_its_plan_would_change(
 
 
 def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None:
-    """A room of 8 x 6 x 2.6 m has no place farther out or above, and a yard has."""
+    """Nobody can say what is behind or above path, anchors and the surfaces that the photos show."""
     times = np.linspace(0.0, 40.0, 41)
     centers = np.column_stack([2 * np.cos(times / 6), 1.5 * np.sin(times / 6), 1.5 + 0.1 * np.sin(times)])
     names = tuple(f"{k:02d}.jpg" for k in range(41))
@@ -75,15 +75,18 @@ def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None
     rng = np.random.default_rng(2)
     room = rng.uniform((-4.0, -3.0, 0.0), (4.0, 3.0, 2.6), size=(500, 3))
     yard = rng.uniform((-40.0, -40.0, 0.0), (40.0, 40.0, 0.4), size=(500, 3))
-    told = {}
-    for name, points in (("room", room), ("yard", yard)):
+    for name, points, highest_m in (("room", room, 2.65), ("yard", yard, 1.85)):
         planned = _planned(path, points, anchors, "site", np.zeros(3), 2000, {})
-        told[name] = [advice.words for advice in advise(expect(planned))]
-    outward = "put the anchors 1.5 times as far out"
-    assert outward in told["yard"]
-    assert outward not in told["room"]
-    raised = [words for words in told["room"] if words.startswith("raise anchor")]
-    assert not any(words.endswith(" by 1 m, to 2.8 m") or " by 2 m" in words for words in raised)
+        assert planned.walls_are == "edge of what the photos show"
+        advice = advise(expect(planned))
+        assert any(each.kind == "anchor place" for each in advice), name
+        moved = [each.planned.anchors_m for each in advice if each.kind in ("anchor place", "one more anchor")]
+        for anchors_m in moved:
+            # Photos show something to fix the anchor to.
+            away_m = np.linalg.norm(anchors_m[:, None] - points, axis=2).min(axis=1)
+            assert np.count_nonzero(away_m < 1e-9) == 1
+        assert max(each.planned.anchors_m[:, 2].max() for each in advice) <= highest_m
+        assert not any(each.kind == "wider anchors" for each in advice)
 
 
 def test_a_folder_that_holds_no_result_is_refused(tmp_path: Path, rangesfm_command: Command) -> None:

@@ -45,5 +45,7 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
 
         planned = plan_of_result(args.result)
     plan = plan_survey(planned)
+    for warning in plan.warnings:
+        progress.message(warning)
     written = [] if args.output_path is None else map(str, write_plan(plan, Path(args.output_path)))
     return Outcome([*plan.lines, *written], GeometryError.exit_status if plan.verdict == REFUSED else 0)

@@ -34,7 +34,7 @@ _MOST_CLOCK_DRIFT = 2e-4
 # scale of coordinates. Larger factors, as from feet or two-way ranges, are tried as alternatives.
 _MOST_SHARE, _MOST_SHARE_OF_ANCHOR = 0.5, 2.0
 # Largest distance between the lens and a tag on anything that is carried or driven.
-_LARGEST_RIG_M = 3.0
+LARGEST_RIG_M = 3.0
 # Largest change of a radio's delay as it warms up, far more than was ever seen.
 _MOST_WARMING_M = 5.0
 # Largest excess of a range past the person with the camera: the way round the body, and a weak signal found late.
@@ -243,7 +243,7 @@ def _lever_arm(problem: Linearized, k: int) -> Hypothesis:
         words=words,
         remedy="measure where the tag's antenna sits, x to the right, y down, z forward (--tag_in_cam)",
         correction=lambda size: Correction(tag_moves_m={on_map.tag_ids[k]: size}),
-        most=_LARGEST_RIG_M + length_m,
+        most=LARGEST_RIG_M + length_m,
         max_unnoticed=to_other_side_m(length_m),
     )
 

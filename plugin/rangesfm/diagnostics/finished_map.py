@@ -209,15 +209,27 @@ def place_of_map(
     worst_m = float(np.sqrt((keyframes_m2 + bent_m2).max()))
     surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
     size_m = float(np.linalg.norm(np.ptp(np.vstack([centers_m, *surveyed]), axis=0)))
-    summary_of_place = (
-        f"the map's place is known to {NORMAL_95 * np.linalg.norm(stddevs[4:]):.2g} m, its heading to "
-        f"{NORMAL_95 * heading_deg:.2g} deg, each keyframe to {NORMAL_95 * worst_m:.2g} m or better (95 %)"
-    )
-    # The scale's own limit, applied to the site's size and to a radian: then no length and no place is less certain.
-    is_wide = NORMAL_95 * worst_m > DOUBTFUL_ABOVE * size_m or NORMAL_95 * stddevs[3] > DOUBTFUL_ABOVE
-    reasons = (*((summary_of_place,) if is_wide or not doubts else ()), *(doubt.reason for doubt in doubts))
+    in_words, is_wide = place_in_words(stddevs, worst_m, size_m)
+    reasons = (*((in_words,) if is_wide or not doubts else ()), *(doubt.reason for doubt in doubts))
     x_m, y_m, z_m = stddevs[4:].tolist()
     return Place("doubtful" if is_wide or doubts else "good", reasons, (x_m, y_m, z_m), heading_deg, worst_m)
+
+
+def place_in_words(stddevs: Array, worst_m: float, size_m: float) -> tuple[str, bool]:
+    """Return how well a map's place is known, in words, and whether that is too little to call it good.
+
+    Args:
+        stddevs: (7,) of the map's similarity about its middle. worst_m: standard deviation of the position of the least
+            certain keyframe. size_m: of the site.
+    """
+    half_widths = NORMAL_95 * np.array([np.linalg.norm(stddevs[4:]), np.rad2deg(stddevs[3]), worst_m])
+    place, heading, worst = (
+        f"{half_width:.2g} {unit}" if np.isfinite(half_width) else "nothing"
+        for half_width, unit in zip(half_widths, ("m", "deg", "m"), strict=True)
+    )
+    words = f"the map's place is known to {place}, its heading to {heading}, each keyframe to {worst} or better (95 %)"
+    # The scale's own limit, applied to the site's size and to a radian: then no length and no place is less certain.
+    return words, bool(half_widths[2] > DOUBTFUL_ABOVE * size_m or NORMAL_95 * stddevs[3] > DOUBTFUL_ABOVE)
 
 
 def by_similarity(placement: Array, centers_m: Array) -> tuple[Array, Array]:

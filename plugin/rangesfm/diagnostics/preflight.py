@@ -21,15 +21,15 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 
 # No survey finds the same height for three anchors to within a millimetre, and no two anchors are in one place.
-_SAME_HEIGHT_M, _SAME_PLACE_M = 1e-3, 0.01
+_SAME_HEIGHT_M, SAME_PLACE_M = 1e-3, 0.01
 _MIN_ANCHORS_ALIKE = 3
 # UWB radios reach some 200 m. The unit is doubted if this share of the ranges is longer than the limit.
-_FAR_M, _FAR_SHARE = 300.0, 0.95
+FAR_M, _FAR_SHARE = 300.0, 0.95
 # An anchor is stuck if one value makes up the first share of its ranges, while in the other anchors' ranges (median)
 # the commonest value stays below the second share. If the tag stands still, all anchors repeat their values.
 _STUCK_SHARE, _MOVING_SHARE, _MIN_RANGES = 0.5, 0.2, 20
 # Length of a lever arm, metres, above which it is doubted. A pole that somebody carries is 2 m long.
-_LONG_ARM_M = 2.5
+LONG_ARM_M = 2.5
 # A gap between photos longer than this many median gaps is a pause between two walks.
 _PAUSE = 30.0
 # Clocks that count seconds since 1970 show more than this.
@@ -63,7 +63,7 @@ def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
             "its distance from there; measure from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
         )
     for tag_id, arm_m in zip(inputs.log.tag_ids, np.linalg.norm(inputs.tag_in_cam_m, axis=1), strict=True):
-        if arm_m > _LONG_ARM_M:
+        if arm_m > LONG_ARM_M:
             yield (
                 f"the lever arm of {tag_id or 'the tag'} is {arm_m:.3g} m long, more than a camera carries: give it in "
                 "metres from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
@@ -106,7 +106,7 @@ def _on_positions(positions_m: Mapping[str, Array], *, is_site: bool) -> Iterato
             "height and tilt rest on a guess, and the ranges cannot show it; measure the heights of the antennas"
         )
     for one, other in combinations(positions_m, 2):
-        if np.linalg.norm(positions_m[one] - positions_m[other]) < _SAME_PLACE_M:
+        if np.linalg.norm(positions_m[one] - positions_m[other]) < SAME_PLACE_M:
             yield (
                 f"anchors {one} and {other} have the same position: one of them stands elsewhere; "
                 "correct it, or leave its coordinates empty"
@@ -116,7 +116,7 @@ def _on_positions(positions_m: Mapping[str, Array], *, is_site: bool) -> Iterato
 def _on_ranges(log: RangeLog) -> Iterator[str]:
     rows = log.kind == RangeKind.TAG_ANCHOR
     long_m = float(np.quantile(log.range_m[rows], 1 - _FAR_SHARE)) if rows.any() else 0.0
-    if long_m > _FAR_M:
+    if long_m > FAR_M:
         yield (
             f"nearly all ranges are longer than {long_m:.4g} m, farther than UWB radios reach: their unit is probably "
             "not the metre; give it ([ranges] range_unit)"

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
 import numpy as np
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array
+from rangesfm.distances.tape import CONTROL
+from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.expected import Expected, expect_roughly
 from rangesfm.planning.paths import way_along
 from rangesfm.planning.placement import spread_places
 from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.planned_photos import PlannedPhotos
+from rangesfm.planning.walls import lead_through
+from rangesfm.positions.control_points import ControlPoint
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.scale.scale_verdict import CALIBRATE
 
 # Changes of an anchor's height that are tried, metres.
@@ -36,6 +41,11 @@ _SURVEYED_M = 0.02
 _CLEARANCE_M = 0.3
 # Smallest distance of a new anchor from the others, metres; a nearer one adds almost no information.
 _NEAR_M = 1.0
+# Standard deviation of each coordinate of a control point, metres; fewest photos that show one, so that marks in some
+# may fail; number of places that are tried.
+_POINT_STDDEV_M, _MIN_NUM_SHOWING, _NUM_TRIED_POINTS = 0.01, 3, 24
+# With fewer ranges, ranging so many times as often is worth trying, and so is walking the path so many times.
+_FEW_RANGES, _MORE_OFTEN, _NUM_AGAIN = 50, (10, 50), 5
 # Number of changes that a result recommends.
 _NUM_BEST = 3
 # Number of places, of all allowed ones, that are tried for an anchor.
@@ -80,11 +90,15 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
 
     What the photos see is assumed to be the same with each change.
     """
-    before = expect_roughly(expected.planned, expected.vision)
-    possible = (
-        change for change in _changes(expected.planned) if not _leads_through_walls(expected.planned, change[3])
-    )
-    found = (_advice(change, expect_roughly(change[3], expected.vision), before, expected) for change in possible)
+    before = expected if expected.refusal else expect_roughly(expected.planned, expected.vision)
+    found = []
+    for change in _changes(expected.planned):
+        if _leads_through_walls(expected.planned, change[3]):
+            continue
+        try:
+            found.append(_advice(change, expect_roughly(change[3], expected.vision), before, expected))
+        except GeometryError:  # a run will find too few ranges
+            continue
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
 
 
@@ -116,17 +130,20 @@ def _advice(change: _Change, after: Expected, before: Expected, stated: Expected
         after, before: quick computations with and without the change.
         stated: the full computation without the change.
     """
-    scale_ratio = after.uncertainty.empirical / before.uncertainty.empirical
+    scale_before, scale_after = before.uncertainty.empirical, after.uncertainty.empirical
     after_m, before_m, stated_m = after.worst_keyframe_m, before.worst_keyframe_m, stated.worst_keyframe_m
-    # A position that is not determined is still known to be on the site.
+    # A position that is not determined, or of a map without a place, is still known to be on the site.
     size_m = float(np.linalg.norm(np.ptp(stated.planned.places_m, axis=0)))
-    place_ratio = min(after_m, size_m) / min(before_m, size_m)
+    place_ratio = float(np.fmin(after_m, size_m) / np.fmin(before_m, size_m))
+    is_known = np.isfinite([after_m, before_m]).all()
     return Advice(
         *change,
-        scale_stddev=stated.uncertainty.empirical * scale_ratio,
-        place_stddev_m=place_ratio * stated_m if np.isfinite([after_m, before_m]).all() else after_m,
-        scale_gain=1 - scale_ratio,
-        place_gain=0.0 if np.isnan(place_ratio) else 1 - place_ratio,
+        scale_stddev=stated.uncertainty.empirical * scale_after / scale_before
+        if np.isfinite(scale_before)
+        else scale_after,
+        place_stddev_m=place_ratio * stated_m if is_known else after_m,
+        scale_gain=1 - scale_after / scale_before,
+        place_gain=1 - place_ratio,
     )
 
 
@@ -147,36 +164,35 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
         yield "bend", "", f"walk a bend, up to {off_m:.2g} m off the line", replace(planned, trajectory=bent)
     for factor in (_WIDER, 1 + (_WIDER - 1) / 2):
         yield "wider path", "", f"walk {factor:g} times as wide", replace(planned, trajectory=_wider(path, factor))
-    yield "rate", "", "range twice as often", replace(planned, rate_hz=2 * planned.rate_hz)
-    if planned.allowed_m is None:
+    if planned.anchors:
+        yield "rate", "", "range twice as often", replace(planned, rate_hz=2 * planned.rate_hz)
+    if planned.allowed_m is None and planned.anchors:
         yield "wider anchors", "", f"put the anchors {_WIDER:g} times as far out", _with_wider_anchors(planned)
-    if planned.curve_stddev_m is None:
+    if planned.curve_stddev_m is None and planned.anchors:
         yield "calibration", "", f"{CALIBRATE}, to {_LEARNT_CURVE_M:g} m", _calibrated(planned)
+    if planned.num_ranges < _FEW_RANGES and planned.anchors:
+        again = f"walk the path {_NUM_AGAIN} times, there and back"
+        yield "again", "", again, replace(planned, trajectory=_there_and_back(path, _NUM_AGAIN))
+        for factor in _MORE_OFTEN:
+            often = replace(planned, rate_hz=factor * planned.rate_hz)
+            yield "rate", "", f"range {factor} times as often", often
+    yield from _with_control_points(planned)
     length_m, stddev_m = _TAPED_M
     tape = f"tape a length of {length_m:g} m to {1000 * stddev_m:g} mm between two points of the map"
-    yield "tape", "", tape, replace(planned, taped=(*planned.taped, _TAPED_M))
+    if planned.anchors:
+        yield "tape", "", tape, replace(planned, taped=(*planned.taped, _TAPED_M))
 
 
 def _leads_through_walls(before: PlannedSurvey, after: PlannedSurvey) -> bool:
     """Return whether an anchor or a keyframe moves through a wall, or a keyframe nearer to it than people walk."""
-    start, end = before.trajectory.centers[:, :2], after.trajectory.centers[:, :2]
+    start = before.trajectory.centers[:, :2]
+    end = after.trajectory.centers[: len(start), :2]  # a path that is walked again begins with itself
     moved_m = np.linalg.norm(end - start, axis=1, keepdims=True)
     end = end + _CLEARANCE_M * (end - start) / np.maximum(moved_m, _CLEARANCE_M)
     num = min(len(before.anchors), len(after.anchors))  # a new anchor moves nowhere
     start = np.vstack([start, before.anchors_m[:num, :2]])
     end = np.vstack([end, after.anchors_m[:num, :2]])
-    return any(np.any(_cross(start, end, *wall)) for line in before.walls_m for wall in itertools.pairwise(line))
-
-
-def _cross(start: Array, end: Array, from_: Array, to: Array) -> Mask:
-    """Return for each of n straight lines (n, 2) in a plane whether it crosses another one, with ends (2,) each."""
-
-    def side(a: Array, b: Array, point: Array) -> Array:
-        (x, y), (dx, dy) = (point - a).T, (b - a).T
-        return np.asarray(np.sign(dx * y - dy * x))
-
-    apart = side(start, end, from_) * side(start, end, to) < 0
-    return np.asarray(apart & (side(from_, to, start) * side(from_, to, end) < 0))
+    return bool(lead_through(start, end, before.walls_m).any())
 
 
 def _calibrated(planned: PlannedSurvey) -> PlannedSurvey:
@@ -217,6 +233,8 @@ def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
 
 
 def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
+    if not planned.anchors:
+        return
     stddev_m = float(np.median([anchor.position_stddev_m for anchor in planned.anchors]))
     taken = {anchor.anchor_id for anchor in planned.anchors}
     name = next(name for name in (f"new{number or ''}" for number in range(len(taken) + 1)) if name not in taken)
@@ -224,6 +242,31 @@ def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
         more = (*planned.anchors, Anchor(name, place, stddev_m))
         words = f"add an anchor at {_told(place)}"
         yield "one more anchor", "", words, replace(planned, anchors=more)
+
+
+def _with_control_points(planned: PlannedSurvey) -> Iterator[_Change]:
+    """Yield the plan with three more control points, far apart, in front of photos that show them."""
+    photos, path = planned.photos or PlannedPhotos(), planned.trajectory
+    some = np.unique(np.linspace(0, len(path) - 1, _NUM_TRIED_POINTS).astype(np.int64))
+    places = photos.aside(path, some)
+    from_m = np.tile(path.centers[some], (2, 1))
+    is_in_site = ~lead_through(from_m[:, :2], places[:, :2], planned.walls_m)
+    if len(planned.anchors) >= MIN_NUM_POSITIONS:  # they show where the site ends
+        low, high = planned.places_m.min(axis=0), planned.places_m.max(axis=0)
+        is_in_site &= np.all((places >= low) & (places <= high), axis=1)
+    places = places[is_in_site & (photos.num_showing(path, places) >= _MIN_NUM_SHOWING)]
+    if len(places) < MIN_NUM_POSITIONS:
+        return
+    taken = {point.name for point in planned.points}
+    names = [name for name in (f"C{k}" for k in range(1, len(taken) + MIN_NUM_POSITIONS + 1)) if name not in taken]
+    outermost_first = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1), kind="stable")
+    spread = spread_places(MIN_NUM_POSITIONS, places[outermost_first])
+    more = tuple(ControlPoint(name, at, _POINT_STDDEV_M, CONTROL, 0) for name, at in zip(names, spread, strict=False))
+    where = "; ".join(map(_told, spread))
+    words = f"survey three control points that the photos show, such as {where}, to {_POINT_STDDEV_M:g} m"
+    anchor_frame = "site" if planned.anchor_frame == "site" else "unknown"
+    with_points = replace(planned, points=(*planned.points, *more), anchor_frame=anchor_frame)
+    yield "control points", "", words, with_points
 
 
 def _free_places(planned: PlannedSurvey) -> list[Array]:
@@ -261,6 +304,23 @@ def _bent(path: Trajectory) -> tuple[Trajectory, float]:
     aside = across / max(float(np.linalg.norm(across)), 1e-9)
     arc = np.cos(np.pi * (along - (along.max() + along.min()) / 2) / max(length_m, 1e-9))
     return replace(path, centers=path.centers + length_m / 4 * arc[:, None] * aside), length_m / 4
+
+
+def _there_and_back(path: Trajectory, num: int) -> Trajectory:
+    """Return a path that is walked several times, every second time backwards, with the same directions of view."""
+    times, last = path.timestamps_s, len(path) - 1
+    assert times is not None
+    order = np.arange(num * last + 1) % (2 * last)
+    order = np.where(order > last, 2 * last - order, order)
+    steps_s = np.abs(np.diff(times[order]))
+    return replace(
+        path,
+        frame_ids=np.arange(1, len(order) + 1),
+        image_names=tuple(f"{k:06d}" for k in range(len(order))),
+        timestamps_s=np.concatenate([times[:1], times[0] + np.cumsum(steps_s)]),
+        centers=path.centers[order],
+        world_from_cam=path.world_from_cam[order],
+    )
 
 
 def _wider(path: Trajectory, factor: float) -> Trajectory:

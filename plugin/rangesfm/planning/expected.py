@@ -92,6 +92,7 @@ class Expected:
             ranges and known positions have straightened the map; inf if not determined.
         num_positions: number of known positions that hold the map.
         notes: why known positions are not used, in words.
+        refusal: why a run will find nothing at all; empty if it will.
     """
 
     planned: PlannedSurvey
@@ -102,6 +103,18 @@ class Expected:
     keyframe_stddevs_m: Array
     num_positions: int
     notes: tuple[str, ...]
+    refusal: str = ""
+
+    @classmethod
+    def nothing(cls, planned: PlannedSurvey, refusal: str) -> Expected:
+        """Return that a run will refuse the survey, and know nothing of its map."""
+        none, is_placed = np.zeros(0, dtype=np.int64), planned.anchor_frame == "site"
+        known = KnownMap(
+            ScaleUncertainty(np.inf, {}), OPEN**4 * np.eye(7), Columns(0, 1 if is_placed else -1, none, none, 7)
+        )
+        errors = ErrorParts((), np.zeros(0), np.zeros((0, 0, 0)))
+        open_m = np.full(len(planned.trajectory), np.inf)
+        return cls(replace(planned, photos=None), None, None, known, errors, open_m, 0, (), refusal)
 
     @property
     def uncertainty(self) -> ScaleUncertainty:
@@ -120,6 +133,8 @@ class Expected:
         Raises:
             GeometryError: the run will refuse the scale.
         """
+        if self.refusal:
+            raise GeometryError(self.refusal)
         if self.ranges is None:
             has_check = any(point.kind == CHECK for point in self.planned.points)
             return judge_positions(self.num_positions, self.uncertainty, ScaleOptions(), has_check=has_check)
@@ -140,12 +155,14 @@ class Expected:
         """
         if self.ranges is None or self.num_positions or self.frame != "site":
             return None
-        solution = solution_from(self.planned.posed(self.turned_out(0)), self.ranges.state)
-        mirrored = mirrored_map(solution.problem, solution.fit.state)
+        mirrored = mirrored_map(self.ranges.posed.ranges, self.ranges.state)
+        if mirrored is None:
+            return None
         try:
             # For a path in that plane the height is not determined, and the solver divides 0 by 0.
             with np.errstate(invalid="ignore", divide="ignore"):
-                refuse_ambiguity(solution, [] if mirrored is None else [mirrored], None)
+                solution = solution_from(self.planned.posed(self.turned_out(0)), self.ranges.state)
+                refuse_ambiguity(solution, [mirrored], None)
         except GeometryError as error:
             return str(error)
         return None
@@ -239,7 +256,10 @@ def expect(
     the_map = _BendingMap(planned, WalkBending(first) if vision is None else GraphBending(vision, first), num_keyframes)
     positions, placement, notes = _positions(planned, the_map)
     ranges = _ranges(planned, placement, max_num_bins) if planned.anchors else None
-    observed = [*([] if ranges is None else [_of_ranges(ranges)]), *([] if positions is None else [positions])]
+    observed = [] if ranges is None else [_of_ranges(ranges)]
+    if positions is not None:
+        # Beside known positions, a run gives ranges no more say on the scale than their errors allow.
+        observed = [*(the_map.with_honest_weights(each) for each in observed), positions]
     known, errors, keyframe_stddevs_m = the_map.solved(observed)
     num_positions = 0 if positions is None else len(positions.linear.design) // 3
     return Expected(planned, vision, ranges, known, errors, keyframe_stddevs_m, num_positions, notes)
@@ -349,6 +369,13 @@ class _BendingMap:
         stddevs_m = np.sqrt(np.maximum(variances.reshape(-1, 3).sum(axis=1), 0.0))
         of_all = np.interp(np.arange(len(self.planned.trajectory)), self._some, stddevs_m)
         return known, errors, np.where(of_all < OPEN, of_all, np.inf)
+
+    def with_honest_weights(self, observed: _Observed) -> _Observed:
+        """Return observations whose simple weights claim no more about the scale than their errors allow."""
+        linear, known = observed.linear, self.solved([observed])[0]
+        claimed, _, _ = best_estimate(observed.simple_m2, linear.design, linear.prior_design)
+        excess = max(known.uncertainty.empirical**2 / float(claimed[0, 0]), 1.0)
+        return replace(observed, simple_m2=excess * observed.simple_m2)
 
     def _bent(self, observed: Sequence[_Observed], *, is_free: bool) -> dict[str, Array]:
         """Return by name the covariance of the observations and of the keyframes' coordinates due to the bending."""

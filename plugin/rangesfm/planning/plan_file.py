@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,15 +10,18 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array
+from rangesfm.distances.tape import CONTROL
 from rangesfm.errors import InputError, OptionError
 from rangesfm.files.contents import AnyPath
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import KeyMeta, Options
-from rangesfm.options import LENGTH_M, RangeModelOptions, TagOptions, Uncertainty
+from rangesfm.options import LENGTH_M, PointOptions, RangeModelOptions, TagOptions, Uncertainty
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
-from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.planning.plan_checks import oddities, require_possible
+from rangesfm.planning.planned import PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
+from rangesfm.positions.control_points import ControlPoint, read_control_points
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
@@ -27,6 +31,8 @@ _Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 _Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
 _Spot = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False)]
 _MAX_NUM_ANCHORS = 64
+# Keys in [path] that give a path, each instead of the others.
+_PATHS = ("waypoints", "loop_inside_m", "file", "model")
 _MAX_DURATION_S = 1e5
 
 
@@ -106,6 +112,33 @@ class PlannedPathOptions(Options, table="path"):
     """True if the camera cannot go up and down, as on a rover."""
 
 
+class PlannedPointOptions(Options, table="points"):
+    """Planned control points: marks whose coordinates in the site will be known, beside anchors or without any."""
+
+    path: Annotated[Path | None, KeyMeta(role="file")] = None
+    """CSV file marker,x_m,y_m,z_m[,stddev_m,kind]."""
+    places: Annotated[dict[str, _Place], KeyMeta(expected="a table in which each value is a list of 3 numbers")] = (
+        Field(default_factory=dict)
+    )
+    """Coordinates x, y, z of control points by name, instead of path. Photos must show them ([photos], its defaults
+    without that table)."""
+    stddev_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.01
+    """Standard deviation of each coordinate of a point for which the file has none."""
+
+
+class PlannedPositionOptions(Options, table="positions"):
+    """Planned positions of an antenna on the camera: by satellites, a radio or a total station."""
+
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
+    """Positions per second."""
+    stddev_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.03
+    """Standard deviation of each coordinate."""
+    antenna_in_cam_m: _Place = (0.0, 0.0, 0.0)
+    """Lever arm: position of the antenna in the camera frame (right, down, forward), metres."""
+    lasting_s: Annotated[float, Field(ge=1e-2, le=1e5)] | None = None
+    """Time for which an error of the positions lasts (default: a mixture of 3, 30 and 300 s)."""
+
+
 class PlannedRadioOptions(RangeModelOptions, table="radio"):
     """Planned radio."""
 
@@ -125,7 +158,11 @@ PLAN_TABLES: dict[str, type[Options]] = {
     "radio": PlannedRadioOptions,
     "tag": TagOptions,
     "photos": PlannedPhotos,
+    "points": PlannedPointOptions,
+    "positions": PlannedPositionOptions,
 }
+# Tables that say nothing where they are missing.
+_OPTIONAL_TABLES = ("photos", "points", "positions")
 
 
 def read_plan(path: AnyPath) -> PlannedSurvey:
@@ -142,9 +179,35 @@ def read_plan(path: AnyPath) -> PlannedSurvey:
         options: dict[str, Any] = {
             name: model(**_absolute(tables.get(name, {}), model, folder))
             for name, model in PLAN_TABLES.items()
-            if name != "photos" or name in tables
+            if name not in _OPTIONAL_TABLES or name in tables
         }
-        return _planned(**options)
+        planned = _planned(**options)
+        odd = _checked(planned, options["anchors"], options["path"], options.get("points"))
+    return replace(planned, warnings=tuple(str(source.located(error)) for error in odd))
+
+
+def _checked(
+    planned: PlannedSurvey,
+    anchors: PlannedAnchorOptions,
+    path: PlannedPathOptions,
+    points: PlannedPointOptions | None,
+) -> list[OptionError]:
+    """Return what is odd about a plan.
+
+    Raises:
+        OptionError: it cannot be.
+    """
+
+    def anchor_key(anchor_id: str) -> str:
+        return f"places.{anchor_id}" if anchors.places else "path" if anchors.path else "num_to_place"
+
+    def point_key(name: str) -> str:
+        return "path" if points is None or points.path else f"places.{name}"
+
+    path_key = next(name for name in _PATHS if getattr(path, name) is not None)
+    floors_m = [] if path.loop_inside_m is None else [planned.walls_m[-1]]
+    require_possible(planned, floors_m, path_key, anchor_key, point_key)
+    return list(oddities(planned, [np.array(wall) for wall in anchors.walls_m or ()], path_key, anchor_key))
 
 
 def _absolute(table: dict[str, Any], model: type[Options], folder: Path) -> dict[str, Any]:
@@ -162,6 +225,8 @@ def _planned(
     radio: PlannedRadioOptions,
     tag: TagOptions,
     photos: PlannedPhotos | None = None,
+    points: PlannedPointOptions | None = None,
+    positions: PlannedPositionOptions | None = None,
 ) -> PlannedSurvey:
     if tag.lever_arms_m:
         raise tag.refused("lever_arms_m", "is given, expected tag_in_cam_m: a plan has one tag")
@@ -169,10 +234,13 @@ def _planned(
     if unknown := [name for name in radio.stddevs if name not in known]:
         message = f"[radio] stddevs: there is no component {unknown[0]!r}, expected some of {', '.join(known)}"
         raise OptionError(message, "radio", f"stddevs.{unknown[0]}")
+    has_positions = points is not None or positions is not None
+    if has_positions and anchors.frame == "first_camera":
+        raise anchors.refused("frame", "is 'first_camera', expected site or unknown beside [points] and [positions]")
     allowed_m = _allowed(anchors)
     planned = PlannedSurvey(
         trajectory=_path(path),
-        anchors=_anchors(anchors, allowed_m),
+        anchors=() if has_positions and not anchors.model_fields_set else _anchors(anchors, allowed_m),
         anchor_frame=anchors.frame,
         rate_hz=radio.rate_hz,
         tag_in_cam_m=tag.tag_in_cam_m,
@@ -180,6 +248,8 @@ def _planned(
         curve_stddev_m=radio.curve_stddev_m,
         component_stddevs=({} if radio.like is None else stddevs_in(radio.like)) | radio.stddevs,
         photos=photos,
+        points=() if points is None else _points(points),
+        antenna=None if positions is None else PlannedAntenna(**positions.model_dump()),
         heights_m=anchors.heights_m,
         path_is_level=path.is_level,
         allowed_m=allowed_m,
@@ -202,8 +272,18 @@ def _require_one(options: Options, *names: str) -> None:
         raise OptionError(f"[{options.table}] has {found} of {known}, expected one", options.table)
 
 
+def _points(points: PlannedPointOptions) -> tuple[ControlPoint, ...]:
+    _require_one(points, "path", "places")
+    if points.path is None:
+        places = enumerate(points.places.items())
+        return tuple(ControlPoint(name, np.array(at), points.stddev_m, CONTROL, k) for k, (name, at) in places)
+    found = read_control_points(PointOptions(path=points.path, stddev_m=points.stddev_m), None)
+    assert found is not None, "a path was given"
+    return found.points
+
+
 def _path(path: PlannedPathOptions) -> Trajectory:
-    _require_one(path, "waypoints", "loop_inside_m", "file", "model")
+    _require_one(path, *_PATHS)
     if path.file is not None:
         return path_from_file(path.file, path.photo_rate_hz)
     if path.model is not None:

@@ -76,8 +76,10 @@ class PlannedSurvey:
         points: control and check points in the site. antenna: positions of an antenna on the camera; None without any.
         allowed_m: (k, 3) allowed places for anchors; None: not given.
         walls_m: corners (k, 2) of each wall, as seen from above, through which no advice leads path or anchors.
+        walls_are: what the walls are, in words.
         is_placed: whether the anchors' places are fixed; else they may be moved to any allowed place.
         max_num_ranges: largest number of simulated ranges; if there are more, each stands for several.
+        warnings: what is odd about the plan, a line each.
     """
 
     trajectory: Trajectory
@@ -96,8 +98,10 @@ class PlannedSurvey:
     path_is_level: bool = False
     allowed_m: Array | None = None
     walls_m: tuple[Array, ...] = ()
+    walls_are: str = "walls"
     is_placed: bool = True
     max_num_ranges: int = 2000
+    warnings: tuple[str, ...] = ()
 
     @property
     def anchors_m(self) -> Array:
@@ -171,8 +175,8 @@ class PlannedSurvey:
             marks = (self.photos or PlannedPhotos()).marks_of(self.trajectory, self.points)
             if unseen := [point.name for point in self.points if point.name not in marks.names]:
                 notes = (
-                    f"{len(unseen)} of {len(self.points)} points are left out, as fewer than two photos of the path "
-                    f"show them ([photos] field_of_view_deg, seen_m): {', '.join(unseen)}",
+                    f"{len(unseen)} of {len(self.points)} points are left out, as no two photos of the path show them "
+                    f"from different directions ([photos] field_of_view_deg, seen_m): {', '.join(unseen)}",
                 )
         track = None if self.antenna is None else self.antenna.located(self.trajectory)
         return joined_positions([marks, track]), notes

@@ -16,8 +16,9 @@ import pycolmap
 from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.distances.locate_lengths import images_by_name, triangulate_marker
 from rangesfm.distances.tape import Marker
-from rangesfm.errors import GeometryError
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import KeyMeta, Options
 from rangesfm.positions.control_points import ControlPoint, ControlPoints
@@ -106,8 +107,8 @@ class PlannedPhotos(Options, table="photos"):
     def marks_of(self, path: Trajectory, points: Sequence[ControlPoint]) -> KnownPositions:
         """Return points as a run finds them in the map, from marks in evenly chosen photos that show them.
 
-        Each is marked in up to ``num_photos_of_point`` photos, as exactly as features are found. Points that fewer than
-        two photos show are left out.
+        Each is marked in up to ``num_photos_of_point`` photos, as exactly as features are found. Points that no two
+        photos show from different directions are left out.
         """
         width_px = 1 / self.feature_stddev
         camera = pycolmap.Camera(
@@ -127,14 +128,31 @@ class PlannedPhotos(Options, table="photos"):
             photos = shown[np.linspace(0, len(shown) - 1, num).astype(np.int64)]
             pixels = np.array([camera.img_from_cam(in_cam[photo]) for photo in photos.tolist()]).reshape(-1, 2)
             names = tuple(path.image_names[photo] for photo in photos.tolist())
-            markers[point.name] = Marker(names, pixels, (0,) * len(photos))
+            markers[point.name] = Marker(names, pixels, (0,) * max(len(photos), 1))
             for photo in photos.tolist():
                 if not model.exists_image(photo + 1):
                     image = pycolmap.Image(name=path.image_names[photo], camera_id=1, image_id=photo + 1)
                     rotation = path.world_from_cam[photo].T
                     cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ path.centers[photo])
                     model.add_image_with_trivial_frame(image, cam_from_world)
-        return locate_points(ControlPoints(tuple(points), markers), model, numbered)
+        found = tuple(point for point in points if _is_found(point.name, markers[point.name], model))
+        return locate_points(ControlPoints(found, markers), model, numbered)
+
+    def aside(self, path: Trajectory, photos: Indices) -> Array:
+        """Return points (2 k, 3) at a middle distance, half-way to the left and right edge of each of k photos.
+
+        A point straight ahead is seen from one direction only while the camera walks towards it.
+        """
+        ahead_m = float(np.sqrt(self.seen_m[0] * self.seen_m[1]))
+        right, forward = path.world_from_cam[photos, :, 0], path.world_from_cam[photos, :, 2]
+        sides = [forward + side * self._half_width / 2 * right for side in (-1, 1)]
+        return np.vstack([path.centers[photos] + ahead_m * side for side in sides])
+
+    def num_showing(self, path: Trajectory, places_m: Array) -> Indices:
+        """Return how many photos of a path show each of the points (k, 3)."""
+        off = places_m[:, None] - path.centers
+        in_cam = np.einsum("nji,knj->kni", path.world_from_cam, off).reshape(-1, 3)
+        return np.asarray(self._shows(in_cam).reshape(len(places_m), -1).sum(axis=1), dtype=np.int64)
 
     def _shows(self, in_cam: Array) -> Mask:
         """Return whether photos show points (n, 3) in the axes of their cameras."""
@@ -181,6 +199,14 @@ class PlannedPhotos(Options, table="photos"):
             points,
             np.arange(len(points)),
         )
+
+
+def _is_found(name: str, marker: Marker, model: pycolmap.Reconstruction) -> bool:
+    try:
+        triangulate_marker(name, marker, images_by_name(model), None)
+    except InputError:
+        return False
+    return True
 
 
 def _in_runs(found: npt.NDArray[np.bool_], longest: int) -> npt.NDArray[np.bool_]:

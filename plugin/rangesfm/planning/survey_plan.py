@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rangesfm.diagnostics.catalogue import STANDING
+from rangesfm.diagnostics.finished_map import place_in_words
 from rangesfm.diagnostics.hypothesis_tests import Factorization, MistakeTest, row_of
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
 from rangesfm.errors import GeometryError
@@ -20,9 +21,24 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.ranging.errors.noise import NORMAL_95
 
-REFUSED = "refused"
-"""Verdict of a plan whose scale a run will refuse."""
-_MAX_NUM_SHOWN = 5
+REFUSED, OPEN_PLACE = "refused", "open"
+"""Verdicts of a plan: a run will refuse the scale; it will leave open where the map is."""
+# Largest numbers of changes that are advised for one purpose, of components that the terminal names, and of mistakes.
+_NUM_ADVISED, _NUM_COMPONENTS, _NUM_MISTAKES = 8, 5, 8
+_MISTAKES = {
+    "anchor place": "anchor {} is not where its coordinates say",
+    "anchor bias": "ranges to anchor {} are too long",
+    "common bias": "all ranges are too long by one length",
+    "range share": "all ranges are too long by a share of the distance",
+    "anchor share": "ranges to anchor {} are too long by a share of the distance",
+    "anchors' scale": "the anchors' coordinates are all too small by a share",
+    "anchor heights": "the anchors' one height was guessed, and they differ",
+    "lever arm": "the tag sits elsewhere on the camera",
+    "radio drift": "ranges get longer during the survey",
+    "behind the camera": "ranges to anchors behind the camera are too long",
+    "clock offset": "the clocks are apart",
+    "clock drift": "the radio's clock runs too fast",
+}
 # Columns of a mistake's test that do not depend on the measured ranges.
 _SIZES = ("smallest_detectable", "effect_on_scale", "effect_on_place_m")
 
@@ -32,6 +48,7 @@ class PlannedPlace:
     """Expected uncertainty of the map's placement in the site; inf where it is not determined.
 
     Attributes:
+        verdict: "good" or "doubtful" as in a run, or "open": a run will give the scale only. reasons: why, in words.
         stddev_m: (3,) standard deviations of x, y and z of the map's mean.
         heading_stddev_deg: standard deviation of its rotation about z.
         tilt_stddev_deg: standard deviation of its tilt.
@@ -39,10 +56,25 @@ class PlannedPlace:
         worst_keyframe_stddev_m: root of the summed variances of that keyframe's position.
     """
 
+    verdict: str
+    reasons: tuple[str, ...]
     stddev_m: tuple[float, float, float]
     heading_stddev_deg: float
     tilt_stddev_deg: float
     worst_keyframe: int
+    worst_keyframe_stddev_m: float
+
+
+@dataclass(frozen=True)
+class PlannedByKind:
+    """Uncertainty by one kind of measurement alone.
+
+    Attributes:
+        scale_stddev: relative standard deviation of the scale; inf if a run refuses it.
+        worst_keyframe_stddev_m: as in PlannedPlace; NaN if the map is not placed in the site.
+    """
+
+    scale_stddev: float
     worst_keyframe_stddev_m: float
 
 
@@ -61,10 +93,12 @@ class SurveyPlan:
         components: relative standard deviation of the scale from each component of the range errors, by name.
         place: placement in the site; None if the frame is the first camera's.
         keyframe_stddevs_m: (n,) standard deviation of each keyframe's position in the result's frame.
-        verdict, reasons: the run's verdict on the scale; also "doubtful" if the run will leave the position open, and
-            "refused" if it will refuse the scale.
-        mistakes: for each possible mistake the smallest size that would be found, and its effect, the largest effect on
-            the scale first; None means without limit.
+        verdict, reasons: the run's verdict on the scale; "refused" if it will refuse the scale.
+        by_kind: what ranges alone and known positions alone would give, by "ranges" and "positions"; empty where the
+            plan has one of them.
+        warnings: what is odd about the plan, and what a run will leave out.
+        mistakes: for each possible mistake the smallest size that would be found (None: no size that can happen), and
+            the largest effect of a mistake that is not found, the largest on the scale first (None: without limit).
         advice: changes that would gain something.
         expected: the estimate from which all this is computed.
     """
@@ -81,6 +115,8 @@ class SurveyPlan:
     keyframe_stddevs_m: tuple[float, ...]
     verdict: str
     reasons: tuple[str, ...]
+    by_kind: dict[str, PlannedByKind]
+    warnings: tuple[str, ...]
     mistakes: tuple[MistakeTest, ...]
     advice: tuple[Advice, ...]
     expected: Expected = field(repr=False)
@@ -88,17 +124,36 @@ class SurveyPlan:
     @property
     def advice_for_scale(self) -> list[Advice]:
         """Changes by their gain for the scale, the largest first."""
-        return ranked(self.advice, attrgetter("scale_gain"))
+        return ranked(self.advice, attrgetter("scale_gain"))[:_NUM_ADVISED]
 
     @property
     def advice_for_place(self) -> list[Advice]:
         """Changes by their gain for the position of the least certain keyframe, the largest first."""
-        return ranked(self.advice, attrgetter("place_gain"))
+        return ranked(self.advice, attrgetter("place_gain"))[:_NUM_ADVISED]
+
+    @property
+    def without_advice(self) -> str:
+        """Words in place of advice; empty if there is some."""
+        if self.advice:
+            return ""
+        if self.verdict == REFUSED:
+            return (
+                "no single change is enough: walk farther, range more often, and survey three anchors or control points"
+            )
+        return "no single change gains much"
+
+    @property
+    def largest_mistakes(self) -> list[MistakeTest]:
+        """Mistakes with the largest effects, one of each kind."""
+        of_kind: dict[str, MistakeTest] = {}
+        for mistake in self.mistakes:
+            of_kind.setdefault(mistake.name, mistake)
+        return list(of_kind.values())[:_NUM_MISTAKES]
 
     @property
     def lines(self) -> list[str]:
         """The plan as lines of text for the user."""
-        return [*_known(self), *_budget(self), *_found(self), *_advised(self)]
+        return [*_known(self), *_alone(self), *_budget(self), *_found(self), *_advised(self)]
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values for JSON, with null for numbers that are not finite, and the advice in both orders."""
@@ -116,11 +171,9 @@ class SurveyPlan:
 def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
     """Compute the expected result of a survey by the formulas of a run at the true map, and the changes that gain most.
 
-    Raises:
-        GeometryError: there is nothing to compute, because a run will find too few ranges on the path, or no two
-            photos that see the same point.
+    A survey that a run would refuse has a plan as well, whose advice says what would make it possible.
     """
-    expected = expect(planned)
+    expected = _expect(planned)
     verdict, reasons = _verdict(expected)
     half_width = expected.uncertainty.half_width_95
     return SurveyPlan(
@@ -136,30 +189,53 @@ def plan_survey(planned: PlannedSurvey) -> SurveyPlan:
         keyframe_stddevs_m=tuple(expected.keyframe_stddevs_m.tolist()),
         verdict=verdict,
         reasons=reasons,
+        by_kind=_by_kind(planned),
+        warnings=(*planned.warnings, *expected.notes),
         mistakes=_mistakes(expected),
         advice=advise(expected),
         expected=expected,
     )
 
 
+def _expect(planned: PlannedSurvey) -> Expected:
+    try:
+        return expect(planned)
+    except GeometryError as error:
+        return Expected.nothing(planned, str(error))
+
+
 def _verdict(expected: Expected) -> tuple[str, tuple[str, ...]]:
-    """Return the verdict of the run on scale and position, and its reasons."""
+    """Return the verdict of the run on the scale, and its reasons."""
     try:
         verdict = expected.verdict
     except GeometryError as error:
         return REFUSED, (str(error), *error.advice)
-    open_place = expected.mirror_image()
-    if open_place is None:
-        return verdict.verdict, tuple(verdict.reasons)
-    return "doubtful", (f"a run will give the scale only: {open_place}", *verdict.reasons)
+    return verdict.verdict, tuple(verdict.reasons)
+
+
+def _by_kind(planned: PlannedSurvey) -> dict[str, PlannedByKind]:
+    if not planned.anchors or not (planned.points or planned.antenna):
+        return {}
+    alone = {"ranges": replace(planned, points=(), antenna=None), "positions": replace(planned, anchors=())}
+    found = {kind: _expect(each) for kind, each in alone.items()}
+    return {kind: PlannedByKind(each.uncertainty.empirical, each.worst_keyframe_m) for kind, each in found.items()}
 
 
 def _place(expected: Expected) -> PlannedPlace | None:
     of_map, of_keyframes = expected.map_stddevs, expected.keyframe_stddevs_m
     if of_map is None:
         return None
+    size_m = float(np.linalg.norm(np.ptp(expected.planned.places_m, axis=0)))
+    words, is_wide = place_in_words(of_map, float(of_keyframes.max()), size_m)
+    verdict, reasons = "doubtful" if is_wide else "good", [words]
+    if expected.refusal:
+        verdict, reasons = OPEN_PLACE, ["a run will not place the map: it will refuse its scale"]
+    elif (open_place := expected.mirror_image()) is not None:
+        verdict, reasons = OPEN_PLACE, [f"a run will give the scale only: {open_place}", words]
     x_m, y_m, z_m = of_map[4:].tolist()
     return PlannedPlace(
+        verdict=verdict,
+        reasons=tuple(reasons),
         stddev_m=(x_m, y_m, z_m),
         heading_stddev_deg=float(np.rad2deg(of_map[3])),
         tilt_stddev_deg=float(np.rad2deg(np.linalg.norm(of_map[1:3]))),
@@ -182,60 +258,92 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     found = []
     for test in Factorization(problem).test(hypotheses, seed=0):
         row = row_of(test)
-        unlimited: dict[str, Any] = {name: None for name in _SIZES if (getattr(row, name) or 0.0) > OPEN}
-        found.append(replace(row, **unlimited))
+        sizes: dict[str, Any] = {name: getattr(row, name) for name in _SIZES}
+        if not test.is_checked:  # no size that can happen would be found, and none has a larger effect than the largest
+            share = test.hypothesis.most / test.smallest_detectable if np.isfinite(test.smallest_detectable) else np.inf
+            sizes = {name: None if size is None else share * size for name, size in sizes.items()}
+            sizes["smallest_detectable"] = None
+        limited: dict[str, Any] = {name: None if (size or 0.0) > OPEN else size for name, size in sizes.items()}
+        found.append(replace(row, **limited))
     return tuple(sorted(found, key=lambda each: -np.inf if each.effect_on_scale is None else -each.effect_on_scale))
+
+
+def mistake_in_words(mistake: MistakeTest) -> str:
+    """Return what would be wrong."""
+    return _MISTAKES[mistake.name].format(mistake.subject)
+
+
+def size_in_words(size: float | None, unit: str) -> str:
+    """Return the size of a mistake, with a fraction as a percentage; "never found" where no size would be found."""
+    if size is None:
+        return "never found"
+    return f"{100 * size:.2g} %" if unit == "1" else f"{size:.2g} {unit}"
 
 
 def _known(plan: SurveyPlan) -> Iterator[str]:
     low, high = (100 * end for end in plan.scale_interval_95)
-    yield f"{plan.num_ranges} ranges in {plan.duration_s:.0f} s, result in the {plan.frame.replace('_', ' ')}'s frame"
-    places = (f"{name} {', '.join(f'{x:.4g}' for x in place)}" for name, place in plan.anchors_m.items())
-    yield f"anchors at {'; '.join(places)}"
-    yield f"scale: {low:+.2g} to {high:+.2g} % (95 %); {plan.verdict}"
+    of_anchors = f"{plan.num_ranges} ranges in {plan.duration_s:.0f} s, " if plan.anchors_m else ""
+    yield f"{of_anchors}result in the {plan.frame.replace('_', ' ')}'s frame"
+    if plan.anchors_m:
+        places = (f"{name} {', '.join(f'{x:.4g}' for x in place)}" for name, place in plan.anchors_m.items())
+        yield f"anchors at {'; '.join(places)}"
+    interval = f"{low:+.2g} to {high:+.2g} % (95 %)" if np.isfinite(high) else "open"
+    yield f"scale: {plan.verdict}; {interval}"
     yield from (f"  {reason}" for reason in plan.reasons)
-    if plan.place is not None:
-        place = plan.place
-        x, y, z = (_half_width_95(stddev_m) for stddev_m in place.stddev_m)
-        yield (
-            f"place: x {x}, y {y}, z {z}, heading {_half_width_95(place.heading_stddev_deg, 'deg')}, tilt "
-            f"{_half_width_95(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe + 1} is known least, to "
-            f"{_half_width_95(place.worst_keyframe_stddev_m)} (95 %)"
-        )
+    if plan.place is None:
+        yield "place: none, as neither surveyed anchors nor known positions say where the map is in the site"
+        return
+    place = plan.place
+    x, y, z = (_half_width_95(stddev_m) for stddev_m in place.stddev_m)
+    yield f"place: {place.verdict}" + (
+        f"; x {x}, y {y}, z {z}, heading {_half_width_95(place.heading_stddev_deg, 'deg')}, tilt "
+        f"{_half_width_95(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe + 1} is known least, to "
+        f"{_half_width_95(place.worst_keyframe_stddev_m)} (95 %)"
+        if np.isfinite(place.stddev_m).any()
+        else ""
+    )
+    yield from (f"  {reason}" for reason in place.reasons)
+
+
+def _alone(plan: SurveyPlan) -> Iterator[str]:
+    words = {"ranges": "ranges alone", "positions": "control points and positions alone"}
+    for kind, alone in plan.by_kind.items():
+        scale = f"scale +-{_rough(100 * NORMAL_95 * alone.scale_stddev, '%')}"
+        is_placed = not np.isnan(alone.worst_keyframe_stddev_m)
+        place = f", keyframe known least {_half_width_95(alone.worst_keyframe_stddev_m)}" if is_placed else ", no place"
+        yield f"{words[kind]} (95 %): {scale}{place}"
 
 
 def _budget(plan: SurveyPlan) -> Iterator[str]:
-    largest = sorted(plan.components.items(), key=lambda item: -item[1])[:_MAX_NUM_SHOWN]
+    largest = sorted(plan.components.items(), key=lambda item: -item[1])[:_NUM_COMPONENTS]
     words = component_words(name for name, _ in largest)
-    parts = (f"{words[name]} {100 * NORMAL_95 * stddev:.2g} %" for name, stddev in largest)
-    yield f"what makes the scale uncertain (95 % each): {', '.join(parts)}"
+    parts = [f"{words[name]} {100 * NORMAL_95 * stddev:.2g} %" for name, stddev in largest]
+    if parts:
+        yield f"what makes the scale uncertain (95 % each): {', '.join(parts)}"
 
 
 def _found(plan: SurveyPlan) -> Iterator[str]:
-    yield "mistakes just too small to be found, and their largest effects:"
-    of_kind: dict[str, MistakeTest] = {}
-    for mistake in plan.mistakes:
-        of_kind.setdefault(mistake.name, mistake)
-    for mistake in list(of_kind.values())[:_MAX_NUM_SHOWN]:
-        what = f"  {mistake.name} {mistake.subject}".rstrip()
-        if mistake.smallest_detectable is None:
-            yield f"{what}: never found, whatever its size"
-            continue
-        unit = "" if mistake.unit == "1" else f" {mistake.unit}"
+    if plan.mistakes:
+        yield "mistakes just too small to be found, and their largest effects:"
+    for mistake in plan.largest_mistakes:
+        size = size_in_words(mistake.smallest_detectable, mistake.unit)
         scale = "open" if mistake.effect_on_scale is None else f"{100 * mistake.effect_on_scale:.2g} %"
         place_m = np.inf if mistake.effect_on_place_m is None else mistake.effect_on_place_m
-        yield f"{what}: {mistake.smallest_detectable:.2g}{unit}; scale {scale}, place {_rough(place_m)}"
+        yield f"  {mistake_in_words(mistake)}: {size}; scale {scale}, place {_rough(place_m)}"
 
 
 def _advised(plan: SurveyPlan) -> Iterator[str]:
-    if not plan.advice:
-        yield "no single change gains much"
+    if plan.without_advice:
+        yield plan.without_advice
     for_scale = [f"{each.words}: +-{100 * NORMAL_95 * each.scale_stddev:.2g} %" for each in plan.advice_for_scale]
     for_place = [f"{each.words}: {_half_width_95(each.place_stddev_m)}" for each in plan.advice_for_place]
-    for what, best in {"the scale": for_scale, "the place of the keyframe known least": for_place}.items():
+    now_m = np.inf if plan.place is None else plan.place.worst_keyframe_stddev_m
+    scale, place = f"+-{_rough(100 * NORMAL_95 * plan.scale_stddev, '%')}", _half_width_95(now_m)
+    purposes = {f"the scale, now {scale}": for_scale, f"the place of the keyframe known least, now {place}": for_place}
+    for what, best in purposes.items():
         if best:
             yield f"what would gain most for {what} (95 %):"
-        yield from (f"  {number}. {words}" for number, words in enumerate(best[:_MAX_NUM_SHOWN], 1))
+        yield from (f"  {number}. {words}" for number, words in enumerate(best, 1))
 
 
 def _half_width_95(stddev: float, unit: str = "m") -> str:

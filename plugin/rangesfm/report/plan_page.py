@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest
 from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice
-from rangesfm.planning.survey_plan import SurveyPlan
+from rangesfm.planning.survey_plan import SurveyPlan, mistake_in_words, size_in_words
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.ranging.errors.noise import NORMAL_95
-from rangesfm.report.plot import Figure, Limits, Panel, Pixels, Series, View, equal_view, views_of
+from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, duration, fixed, percent, rough
@@ -29,7 +28,6 @@ _WALL_COLOR = "#6b7280"
 # Ends of the bands of half widths are numbers that begin with one of these. Three bands are a factor of 10.
 _STEPS = np.array([1.0, 2.0, 5.0])
 _AREA_OPACITY, _AREA_WIDTH_PX = 70, 160
-_MAX_NUM_MISTAKES = 12
 
 
 def write_plan(plan: SurveyPlan, folder: Path) -> list[Path]:
@@ -45,20 +43,27 @@ def render_plan(plan: SurveyPlan) -> str:
     """Return the HTML text of the page of a plan."""
     anchors = "1 anchor" if len(plan.anchors_m) == 1 else f"{len(plan.anchors_m)} anchors"
     title = f"{anchors}, {count(len(plan.keyframe_stddevs_m))} keyframes"
+    now = {"scale": percent(NORMAL_95 * plan.scale_stddev), "place": _keyframe_known_least(plan)}
+    of_place = f"What would gain most for the place of the keyframe known least, now ± {now['place']}"
     advice = [
-        _advice("What would gain most for the scale", plan.advice_for_scale),
-        _advice("What would gain most for the place of the keyframe known least", plan.advice_for_place),
+        _advice(f"What would gain most for the scale, now ± {now['scale']}", plan.advice_for_scale),
+        _advice(of_place, plan.advice_for_place),
     ]
     return render_page(
         "plan.html",
         title=f"{title} – rangesfm plan",
         heading=f"Plan: {title}",
         plan=plan,
+        keyframe_known_least=now["place"],
         tiles=_tiles(plan),
         sections=[
             Section("path", "Accuracy", [accuracy_views(plan)]),
             Section("advice", "What to change", tables=advice),
-            Section("expected", "What to expect", tables=[_components(plan), _anchors(plan), _mistakes(plan.mistakes)]),
+            Section(
+                "expected",
+                "What to expect",
+                tables=[_by_kind(plan), _components(plan), _anchors(plan), _points(plan), _mistakes(plan)],
+            ),
         ],
     )
 
@@ -81,13 +86,13 @@ def _tiles(plan: SurveyPlan) -> list[tuple[str, str, str]]:
     worst = int(np.argmax(plan.keyframe_stddevs_m))
     return [
         *of_place,
-        (
-            "Keyframe known least",
-            _half_width_95(plan.keyframe_stddevs_m[worst], "m"),
-            f"number {worst + 1} on the path",
-        ),
-        ("Ranges", count(plan.num_ranges), f"in {duration(plan.duration_s)}"),
+        ("Keyframe known least", _keyframe_known_least(plan), f"number {worst + 1} on the path"),
+        ("Ranges", count(plan.num_ranges if plan.anchors_m else 0), f"in {duration(plan.duration_s)}"),
     ]
+
+
+def _keyframe_known_least(plan: SurveyPlan) -> str:
+    return _half_width_95(max(plan.keyframe_stddevs_m), "m")
 
 
 def accuracy_views(plan: SurveyPlan) -> Figure:
@@ -101,14 +106,22 @@ def accuracy_views(plan: SurveyPlan) -> Figure:
         f"Expected uncertainty of places {whose} (95 %, of the three coordinates together): of the keyframes along the "
         "path, and of points around it that the photos show, at the path's mean height and depth."
     )
+    if plan.expected.planned.walls_m:
+        caption += f" Grey: {plan.expected.planned.walls_are}."
     return Figure("accuracy", caption, views, layout="views")
 
 
 def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
     places, marks = view.anchors(plan.anchors_m)
+    points_m = np.array([point.position_m for point in plan.expected.planned.points]).reshape(-1, 3)
+    spots = view.seen(points_m)
+    marks += tuple(
+        Mark("control point", "reference", "disc", x, y, point.name, f"{point.kind} point {point.name}")
+        for point, (x, y) in zip(plan.expected.planned.points, spots.tolist(), strict=True)
+    )
     line = view.seen(centers)
     walls = [np.insert(wall, 2, centers[:, 2].mean(), axis=1) for wall in plan.expected.planned.walls_m]
-    limits = equal_view(np.vstack([line, places, *map(view.seen, walls)]))
+    limits = equal_view(np.vstack([line, places, spots, *map(view.seen, walls)]))
     of_keyframe = np.digitize(NORMAL_95 * np.array(plan.keyframe_stddevs_m), edges)
     names = _names(edges)
     shown = names if len(edges) in of_keyframe else names[:-1]
@@ -118,7 +131,7 @@ def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
     ]
     if walls and view.axes == (0, 1):
         gaps = [np.vstack([view.seen(wall), [[np.nan, np.nan]]]) for wall in walls]
-        series.append(Series("walls", _WALL_COLOR, np.vstack(gaps), "line"))
+        series.append(Series(plan.expected.planned.walls_are, _WALL_COLOR, np.vstack(gaps), "line"))
     area = _area(plan, view, centers.mean(axis=0), edges, limits)
     return view.panel("the path and the anchors", " m", series, limits, marks=marks, picture=area)
 
@@ -183,7 +196,7 @@ def _advice(caption: str, ranked: Sequence[Advice]) -> ReportTable:
     columns = ["one change", "scale then ± (95 %)", "that keyframe then ± (95 %)"]
     if ranked and np.isnan(ranked[0].place_stddev_m):  # the first camera's frame has no place
         rows, columns = [row[:2] for row in rows], columns[:2]
-    return ReportTable(caption, columns, rows, kind="settings")
+    return ReportTable(caption, columns, rows, kind="worded")
 
 
 def _components(plan: SurveyPlan) -> ReportTable:
@@ -198,17 +211,46 @@ def _anchors(plan: SurveyPlan) -> ReportTable:
     return ReportTable("Anchors", ["anchor", "x m", "y m", "z m"], rows, is_narrow=True)
 
 
-def _mistakes(mistakes: Sequence[MistakeTest]) -> ReportTable:
+def _by_kind(plan: SurveyPlan) -> ReportTable:
+    words = {"ranges": "ranges alone", "positions": "control points and positions alone"}
     rows = [
         [
-            f"{each.name} {each.subject}".strip(),
-            "never found" if each.smallest_detectable is None else f"{each.smallest_detectable:.2g}",
-            "" if each.unit == "1" else each.unit,
+            words[kind],
+            percent(NORMAL_95 * alone.scale_stddev),
+            "no place"
+            if math.isnan(alone.worst_keyframe_stddev_m)
+            else _half_width_95(alone.worst_keyframe_stddev_m, "m"),
+        ]
+        for kind, alone in plan.by_kind.items()
+    ]
+    if rows:
+        rows.append(["all together", percent(NORMAL_95 * plan.scale_stddev), _keyframe_known_least(plan)])
+    header = ["", "scale ± (95 %)", "keyframe known least ± (95 %)"]
+    return ReportTable("What each kind of measurement would give", header, rows, kind="worded")
+
+
+def _points(plan: SurveyPlan) -> ReportTable:
+    rows = [
+        [point.name, *(fixed(x, 2) for x in point.position_m), fixed(NORMAL_95 * point.stddev_m, 3)]
+        for point in plan.expected.planned.points
+    ]
+    header = ["point", "x m", "y m", "z m", "± m (95 %)"]
+    return ReportTable("Control points", header, rows, is_narrow=True)
+
+
+def _mistakes(plan: SurveyPlan) -> ReportTable:
+    rows = [
+        [
+            mistake_in_words(each),
+            size_in_words(each.smallest_detectable, each.unit),
             "open" if each.effect_on_scale is None else percent(each.effect_on_scale),
             rough(each.effect_on_place_m, "m"),
         ]
-        for each in mistakes[:_MAX_NUM_MISTAKES]
+        for each in plan.largest_mistakes
     ]
-    header = ["mistake", "found from", "", "would change the scale by", "places by"]
-    note = "For each possible mistake: the smallest size that will be found, and how much that size changes at most."
-    return ReportTable("Mistakes just too small to be found", header, rows, note)
+    header = ["mistake", "found from", "would change the scale by", "places by"]
+    note = (
+        "For each kind of mistake the one with the largest effect: the smallest size that will be found, and how much "
+        "that size changes at most. A share of 1 % is 1 cm at 1 m and 10 cm at 10 m."
+    )
+    return ReportTable("Mistakes just too small to be found", header, rows, note, kind="worded")

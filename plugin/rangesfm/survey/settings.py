@@ -56,13 +56,17 @@ class OptionsOrigin:
         try:
             yield
         except OptionError as error:
-            key = f"{error.table}.{error.key or ''}".strip(".")
-            if any(f"{key}.".startswith(f"{other}.") for other in self.overridden):
-                raise InputError(str(error)) from None
-            # Unknown keys of [mapper] were moved to its pipeline; an entry of an inline table is on the table's line.
-            places = (key, key.replace("mapper.pipeline", "mapper"), key.rpartition(".")[0])
-            lines = (self._line_of(place) for place in places)
-            raise InputError(str(error), self.path, next(filter(None, lines), None)) from None
+            raise self.located(error) from None
+
+    def located(self, error: OptionError) -> InputError:
+        """Return the error of an option with the file and the line of the option."""
+        key = f"{error.table}.{error.key or ''}".strip(".")
+        if any(f"{key}.".startswith(f"{other}.") for other in self.overridden):
+            return InputError(str(error))
+        # Unknown keys of [mapper] were moved to its pipeline; an entry of an inline table is on the table's line.
+        places = (key, key.replace("mapper.pipeline", "mapper"), key.rpartition(".")[0])
+        lines = (self._line_of(place) for place in places)
+        return InputError(str(error), self.path, next(filter(None, lines), None))
 
     def _line_of(self, wanted: str) -> int | None:
         current, num_seen = "", Counter[str]()

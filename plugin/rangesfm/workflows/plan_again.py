@@ -30,6 +30,8 @@ from rangesfm.scale.scale_verdict import CALIBRATE
 _PHOTO_RATE_HZ = 2.0
 # Shares of the points between which the room is: some points are seen through windows, or wrong.
 _MOST_OF_POINTS = (0.01, 0.99)
+# Largest number of points of the map that are tried as places for anchors.
+_NUM_SURFACES = 500
 # An anchor on a wall is in front of it: distance of the wall behind it, metres.
 _BEHIND_M = 0.05
 
@@ -126,18 +128,23 @@ def _planned(
 
 
 def _inside(planned: PlannedSurvey, points_m: Array) -> PlannedSurvey:
-    """Return the plan with walls around path, anchors and points (n, 3), and below a ceiling if one was photographed.
+    """Return the plan inside what the photos show, with anchors where they show something to fix them to.
 
-    Nobody can say where there is room for an anchor outside of what the photos show.
+    Nobody can say what is outside or above path, anchors and points (n, 3): whether there is room, or a ceiling.
     """
-    if not len(points_m):
-        return planned
-    low, high = np.quantile(points_m, _MOST_OF_POINTS, axis=0)
+    low, high = np.quantile(points_m, _MOST_OF_POINTS, axis=0) if len(points_m) else planned.places_m[:2]
     places = np.vstack([planned.places_m, [low, high]])
     (left, front, lowest), (right, back, highest) = places.min(axis=0) - _BEHIND_M, places.max(axis=0) + _BEHIND_M
     corners = np.array([[left, front], [right, front], [right, back], [left, back], [left, front]])
-    is_below_ceiling = high[2] > planned.trajectory.centers[:, 2].max()
-    return replace(planned, walls_m=(corners,), heights_m=(lowest, highest if is_below_ceiling else np.inf))
+    surfaces_m = points_m[np.all((points_m >= low) & (points_m <= high), axis=1)] if len(points_m) else points_m
+    some = np.linspace(0, len(surfaces_m) - 1, min(len(surfaces_m), _NUM_SURFACES)).astype(np.int64)
+    return replace(
+        planned,
+        walls_m=(corners,),
+        walls_are="edge of what the photos show",
+        heights_m=(lowest, highest),
+        allowed_m=surfaces_m[some] if len(some) else planned.anchors_m,
+    )
 
 
 def _frame(frame: str, *, is_known: bool) -> str:
