@@ -239,7 +239,10 @@ OF_STUDIES = {
     "--calibrated",
     "--data",
     "--leave_radio_out",
+    "--model",
     "--only",
+    "--photos",
+    "--with",
 }
 
 

@@ -465,8 +465,9 @@ class RefineOptions(Options, table="refine"):
     """Standard deviation of an error of short ranges that all anchors share and that decays with a length of 1 m. It is
     refined unless this is 0; with 0, short ranges get less weight instead."""
     covariance: bool = True
-    """Compute the covariance of poses, anchors and scale. It is not computed for more than 1500 photos that see much of
-    the same; along a path it can be computed for some thousands."""
+    """Compute the covariance of poses, anchors and scale. It is not computed for more than 1500 photos that nearly all
+    see the same, or for more than some 7000 over a field with loops everywhere; along a path it can be computed for
+    more."""
     bundle_adjustment: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's BundleAdjustmentOptions."""
 

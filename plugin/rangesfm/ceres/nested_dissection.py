@@ -144,9 +144,10 @@ class _Eliminated(NamedTuple):
         # LAPACK's dtrtrs, SciPy's solve_triangular, differs by some digits more between the kernels of processors.
         return np.asarray(linalg.blas.dtrsm(1.0, self.lower, right, lower=True, trans_a=int(transposed)))
 
-    def inverse_times(self, right: Array) -> Array:
-        """Return the inverse of the front's own part times (m, k)."""
-        return self.solved(self.solved(right), transposed=True)
+    def inverse(self) -> Array:
+        """Return the (m, m) inverse of the front's own part."""
+        lower = np.tril(linalg.lapack.dpotri(self.lower, lower=True)[0])
+        return np.asarray(lower + np.tril(lower, -1).T)
 
 
 class NestedFactor:
@@ -269,13 +270,13 @@ def _upwards(
     Args:
         own_change, tie_change: derivatives of the front's parts.
     """
+    of_own = front.inverse()
     by_rest = front.solved(front.tie, transposed=True)
-    by_rest_change = front.inverse_times(tie_change - own_change @ by_rest)
+    by_rest_change = of_own @ (tie_change - own_change @ by_rest)
     inverse_tie = -by_rest @ inverse
     product_tie = by_rest_change @ inverse - by_rest @ product
-    inverse_own = front.inverse_times(np.eye(len(front.lower))) - inverse_tie @ by_rest.T
-    of_own = front.inverse_times(front.inverse_times(own_change).T)
-    product_own = of_own - product_tie @ by_rest.T + inverse_tie @ by_rest_change.T
+    inverse_own = of_own - inverse_tie @ by_rest.T
+    product_own = of_own @ own_change @ of_own - product_tie @ by_rest.T + inverse_tie @ by_rest_change.T
     return (
         np.block([[inverse_own, inverse_tie], [inverse_tie.T, inverse]]),
         np.block([[product_own, product_tie], [product_tie.T, product]]),
