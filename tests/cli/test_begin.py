@@ -77,6 +77,8 @@ def test_lengths_do_without_a_radio(folder: Path, capsys: pytest.CaptureFixture[
     (folder / "anchors.csv").unlink()
     (folder / "tape.csv").write_text("from,to,distance_m\nIMG_0.jpg,IMG_9.jpg,4.2\ndoor,window,2.5\n")
     (folder / "marks.csv").write_text("marker,image_name,x_px,y_px\ndoor,IMG_1.jpg,5,6\ndoor,IMG_2.jpg,5,7\n")
+    with (folder / "marks.csv").open("a") as marks:
+        marks.write("window,IMG_1.jpg,8,6\nwindow,IMG_2.jpg,8,7\n")
     assert main(["init", str(folder)]) == 0
     told = capsys.readouterr().out
     assert "\ntaped distances: 2, which alone determine the scale (no ranges)\n" in told

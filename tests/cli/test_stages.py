@@ -78,7 +78,7 @@ def test_quiet_run_prints_the_summary_alone(calls: Calls, capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("flags", "maker", "num_photos"),
     [
-        (["--num-photos", "12"], "survey.make_demo_survey", 12),
+        (["--num-photos", "20"], "survey.make_demo_survey", 20),
         (["--scene", "corridor"], "corridor.make_corridor_survey", 96),
     ],
 )
