@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 from scipy import special
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.diagnosis import Diagnosis
@@ -30,25 +30,29 @@ _ALL = "frame of the points"
 
 @dataclass(frozen=True)
 class Placed:
-    """Errors in the site of a map that is not refined.
+    """Errors of a map's place in the site.
 
     Attributes:
         covariance: (7, 7) of the logarithm of the scale, a turn and a shift about the first camera.
-        first_camera_m: (3,) its centre in the site. bent_by_m: how far the map may be bent.
+        first_camera_m: (3,) its centre in the site. bent_by_m: how far a map that is not refined may be bent.
+        by_antenna: whether positions of an antenna place the map, whose errors may last for long.
     """
 
     covariance: Array
     first_camera_m: Array
     bent_by_m: float
+    by_antenna: bool = False
 
-    def of(self, points: Sequence[MapPoint]) -> Array:
-        """Return the (3 k, 3 k) covariance of points of the map."""
+    def of_place(self, points: Sequence[MapPoint]) -> Array:
+        """Return the (3 k, 3 k) covariance of points of a map that is right but for its place and its scale."""
         at_m = np.array([point.position_m for point in points])
         by_map = similarity_motions(at_m - self.first_camera_m).reshape(-1, 7)
-        own = np.zeros((len(by_map),) * 2)
-        for k, point in enumerate(points):
-            own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = point.errors.own_m2 + self.bent_by_m**2 / 3 * np.eye(3)
-        return np.asarray(own + by_map @ self.covariance @ by_map.T)
+        return np.asarray(by_map @ self.covariance @ by_map.T)
+
+    def of(self, points: Sequence[MapPoint]) -> Array:
+        """Return the (3 k, 3 k) covariance of points of a map that is not refined."""
+        own = [point.errors.own_m2 + self.bent_by_m**2 / 3 * np.eye(3) for point in points]
+        return np.asarray(block_diag(*own) + self.of_place(points))
 
 
 @with_one_blas_thread
@@ -79,6 +83,8 @@ def diagnose_points(
     finder = MapPoints(model, {}, points.markers, np.nan, points.markers_path or points.path)
     found = [finder.find_marker(of.name) for of in tested]
     of_map = placed.of(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)[0]
+    if errors is not None and placed.by_antenna:  # the errors of the refined map have none that last
+        of_map = of_map + placed.of_place(found)
     own = np.repeat([of.stddev_m**2 for of in tested], 3)
     off_m = np.ravel([at.position_m - of.position_m for of, at in zip(tested, found, strict=True)])
     root = np.asarray(np.linalg.cholesky(np.diag(own) + of_map), dtype=np.float64)

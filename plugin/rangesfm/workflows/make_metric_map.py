@@ -458,7 +458,12 @@ def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array
             metric.final,
             metric.map_errors,
             estimate.uncertainty.empirical,
-            Placed(estimate.placement, centers_m[0], float(bent_by_m.max(initial=0.0))),
+            Placed(
+                estimate.placement,
+                centers_m[0],
+                float(bent_by_m.max(initial=0.0)),
+                by_antenna=estimate.positions is not None and not estimate.positions.known.is_mark.all(),
+            ),
         )
     )
 
