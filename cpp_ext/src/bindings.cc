@@ -289,13 +289,11 @@ PYBIND11_MODULE(_cpp, m) {
 
   m.def("range_cost", &rangesfm::MakeRangeCost, kOwn, rangesfm::kRangeCostDoc, py::kw_only(), arg("range_m"),
         arg("stddev_m"), arg("tag_in_cam_m"), arg("share") = 1.0, arg("loadings_m") = py::none(),
-        arg("short_range_length_m") = py::none(),
-        arg("loss_scale") = kLeastSquares, arg("loss_is_bounded") = false);
+        arg("short_range_length_m") = py::none(), arg("loss_scale") = kLeastSquares, arg("loss_is_bounded") = false);
   m.def("interpolated_range_cost", &rangesfm::MakeInterpolatedRangeCost, kOwn, rangesfm::kInterpolatedRangeCostDoc,
         py::kw_only(), arg("range_m"), arg("stddev_m"), arg("tag_in_cam_m"), arg("weight"), arg("offset_in_world_m"),
         arg("interval_s") = py::none(), arg("share") = 1.0, arg("loadings_m") = py::none(),
-        arg("short_range_length_m") = py::none(),
-        arg("loss_scale") = kLeastSquares, arg("loss_is_bounded") = false);
+        arg("short_range_length_m") = py::none(), arg("loss_scale") = kLeastSquares, arg("loss_is_bounded") = false);
   m.def("distance_cost", &rangesfm::MakeDistanceCost, kOwn, rangesfm::kDistanceCostDoc, py::kw_only(),
         arg("distance_m"), arg("stddev_m"), arg("a_in_cam_m") = py::none(), arg("b_in_cam_m") = py::none(),
         arg("has_bias") = false, arg("loss_scale") = kLeastSquares);

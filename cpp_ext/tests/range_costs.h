@@ -13,7 +13,8 @@ namespace rangesfm {
 inline Eigen::Vector3d TagInCam() { return {-0.0012, -0.0900, -0.0663}; }
 
 inline MeasuredRanges OneRange(double range, double stddev) {
-  return {Eigen::VectorXd::Constant(1, range), Eigen::VectorXd::Constant(1, stddev), Eigen::VectorXd::Ones(1)};
+  return {Eigen::VectorXd::Constant(1, range), Eigen::VectorXd::Constant(1, stddev), Eigen::VectorXd::Ones(1),
+          Eigen::MatrixXd(1, 0)};
 }
 
 inline RangeModel WithLeverArm(const Eigen::Vector3d& tag_in_cam) {

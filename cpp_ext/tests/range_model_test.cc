@@ -29,7 +29,8 @@ Eigen::Matrix3Xd Vectors(Random& random, int size, double stddev) {
 }
 
 MeasuredRanges Measured(Random& random, int size, double max_range) {
-  return {Uniform(random, size, 0.1, max_range), Uniform(random, size, 0.05, 1.0), Uniform(random, size, 0.2, 2.0)};
+  return {Uniform(random, size, 0.1, max_range), Uniform(random, size, 0.05, 1.0), Uniform(random, size, 0.2, 2.0),
+          Eigen::MatrixXd(size, 0)};
 }
 
 InterpolatedPlace Between(Random& random, int size, double interval) {
@@ -143,10 +144,10 @@ TEST(RangeModel, ManyRangesAreAsManyCostsOfOne) {
   const Evaluation many =
       Evaluate(RangeCost<InterpolatedPlace>(InterpolatedPlace(weight, offset, 0.7), measured, model), blocks);
   for (int i = 0; i < kNumRanges; ++i) {
-    const RangeCost<InterpolatedPlace> cost(
-        InterpolatedPlace(weight.segment(i, 1), offset.col(i), 0.7),
-        MeasuredRanges{measured.range.segment(i, 1), measured.stddev.segment(i, 1), measured.share.segment(i, 1)},
-        model);
+    const RangeCost<InterpolatedPlace> cost(InterpolatedPlace(weight.segment(i, 1), offset.col(i), 0.7),
+                                            MeasuredRanges{measured.range.segment(i, 1), measured.stddev.segment(i, 1),
+                                                           measured.share.segment(i, 1), Eigen::MatrixXd(1, 0)},
+                                            model);
     const Evaluation one = Evaluate(cost, blocks);
     EXPECT_EQ(many.residuals[i], one.residuals[0]);
     for (size_t block = 0; block < blocks.size(); ++block) {

@@ -18,9 +18,9 @@ namespace rangesfm {
 // n measured ranges.
 struct MeasuredRanges {
   Eigen::VectorXd range;
-  Eigen::VectorXd stddev;      // unit of the robust loss
-  Eigen::VectorXd share;       // factor of the robust loss
-  Eigen::MatrixXd loadings{};  // n x k: change by each of k numbers that all ranges share
+  Eigen::VectorXd stddev;    // unit of the robust loss
+  Eigen::VectorXd share;     // factor of the robust loss
+  Eigen::MatrixXd loadings;  // n x k: change by each of k numbers that all ranges share
 };
 
 // Model of a range between two antennas, and which of its parameters are estimated.
