@@ -41,9 +41,9 @@ def test_a_scale_that_a_run_would_refuse_has_a_page_and_advice_too(
     printed = capsys.readouterr()
     assert printed.err == ""
     assert re.search(r"^scale: refused; .* % \(95 %\)\n  the scale is only known to", printed.out, re.MULTILINE)
-    assert "what would gain most for the scale (95 %):\n  1. " in printed.out
+    assert re.search(r"^what would gain most for the scale, now .* \(95 %\):\n  1\. ", printed.out, re.MULTILINE)
     assert json.loads((tmp_path / "plan" / "plan.json").read_text())["verdict"] == "refused"
-    assert "<h2>Refused</h2>" in (tmp_path / "plan" / "plan.html").read_text()
+    assert "<h2>Scale: refused</h2>" in (tmp_path / "plan" / "plan.html").read_text()
 
 
 def test_a_key_that_is_not_known_is_named_with_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
