@@ -172,7 +172,8 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
         yield "calibration", "", f"{CALIBRATE}, to {_LEARNT_CURVE_M:g} m", _calibrated(planned)
     if planned.num_ranges < _FEW_RANGES and planned.anchors:
         again = f"walk the path {_NUM_AGAIN} times, there and back"
-        yield "again", "", again, replace(planned, trajectory=_there_and_back(path, _NUM_AGAIN))
+        if len(path) > 1:
+            yield "again", "", again, replace(planned, trajectory=_there_and_back(path, _NUM_AGAIN))
         for factor in _MORE_OFTEN:
             often = replace(planned, rate_hz=factor * planned.rate_hz)
             yield "rate", "", f"range {factor} times as often", often
