@@ -445,6 +445,8 @@ def _with_stddevs(
     if covariance is None:
         return anchors
     variances = np.trace(covariance.anchors, axis1=1, axis2=2) / 3
+    # Rounding leaves a negative variance where the joint equations hardly determine an anchor: then it is not known.
+    variances[variances < 0] = np.nan
     return tuple(
         replace(anchor, position_stddev_m=float(np.sqrt(variance))) if np.isfinite(anchor.position_m).all() else anchor
         for anchor, variance in zip(anchors, variances, strict=True)
