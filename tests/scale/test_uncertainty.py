@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.sparse import csr_array
 
 from rangesfm.demo.simulated_radio import Radio
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.bending import BendingOfBins
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.uncertainty import known_map, parameter_covariance
@@ -30,11 +29,11 @@ FAR_ANCHORS_M = {"A": (9.0, 2.0, 2.5), "B": (-9.0, 1.0, 0.4), "C": (0.5, 9.0, 3.
 IN_TIME = ("white", "time", "place", "view", "reweighting")
 
 
+@dataclass(frozen=True)
 class Rigid:
     """The bending of a map that is known not to be bent."""
 
-    def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
-        return BendingOfBins((), np.zeros((len(bins), len(bins))), np.zeros(len(bins)))
+    path: Trajectory
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
         return BendingOfBins((), np.zeros((len(by_pose), len(by_pose))), np.zeros(len(by_pose)))
@@ -63,7 +62,8 @@ def in_time(uncertainty: ScaleUncertainty) -> float:
 def test_with_independent_errors_the_formal_stddev_is_the_scatter(make_survey: MakeSurvey) -> None:
     surveys = [make_survey(anchors_m=FAR_ANCHORS_M, radio=Radio(range_stddev_m=0.1), seed=seed) for seed in range(32)]
     estimates = [
-        survey.scale("first_camera", "ABCD", range_model=WITHOUT_BIASES, bending=Rigid()) for survey in surveys
+        survey.scale("first_camera", "ABCD", range_model=WITHOUT_BIASES, bending=Rigid(survey.trajectory))
+        for survey in surveys
     ]
     errors = [survey.relative_error(estimate) for survey, estimate in zip(surveys, estimates, strict=True)]
     formal = float(np.median([estimate.uncertainty.formal for estimate in estimates]))

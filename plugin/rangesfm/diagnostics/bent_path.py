@@ -71,8 +71,6 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     uncertainty, covariance = known.uncertainty, known.covariance
     fit = replace(solution.fit, state=on_map.state, weights=problem.bins.robust_weight)
     judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, (), options)
-    columns = problem.columns
-    of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
     positions = zip(estimate.anchors, on_map.state.anchors_m, strict=True)
     drift = f"the path drifts by {drift_m:.2g} m (root mean square) from where the ranges have it"
     status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
@@ -85,7 +83,7 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
         verdict=judged.verdict,
         reasons=(*judged.reasons, drift, *estimate.remarks),
         advice=judged.advice,
-        placement=None if columns.frame < 0 else covariance[np.ix_(of_map, of_map)],
+        placement=problem.columns.placement(covariance),
         observations=replace(estimate.observations, status=status),
         errors=replace(estimate.errors, stddev_m=stddev_m),
         anchors=tuple(replace(anchor, position_m=at) for anchor, at in positions),

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, by_poses
+from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
 from rangesfm.ranging.errors.components import PLACES
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
@@ -256,7 +256,8 @@ def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float,
 def _bending(on_map: RangesOnMap, bins_of_ranges: RangeBins) -> BendingOfBins | None:
     if on_map.bending is None:
         return None
-    return on_map.bending.of_bins(bins_of_ranges, slopes_by_poses(on_map), frame_is_free=on_map.problem.frame_is_free)
+    slopes = slopes_by_poses(on_map)
+    return bending_in_bins(on_map.bending, bins_of_ranges, slopes, frame_is_free=on_map.problem.frame_is_free)
 
 
 def slopes_by_poses(on_map: RangesOnMap) -> csr_array:

@@ -126,8 +126,7 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
             ends[row] = points[start], points[end]
             marked = [(tape.markers[name], points[name]) for name in taped.ends if name in markers]
             of_ends = [mark_covariance(marker, point, images) for marker, point in marked]
-            along = (ends[row, 1] - ends[row, 0]) / max(float(np.linalg.norm(ends[row, 1] - ends[row, 0])), 1e-12)
-            mark_stddev[row] = np.sqrt(sum(along @ covariance @ along for covariance in of_ends))
+            mark_stddev[row] = np.sqrt(variance_along(ends[row, 0], ends[row, 1], sum(of_ends, np.zeros((3, 3)))))
         elif start in anchor_ids and end in anchor_ids:
             pairs[row] = anchor_ids.index(start), anchor_ids.index(end)
         else:
@@ -165,6 +164,12 @@ def check_ends(tape: Tape, photos: Collection[str], anchor_ids: Collection[str],
             if (num := len({*marker.image_names} & {*photos})) < 2:
                 message = f"marker {end!r} is marked in {num} photos of the survey, expected two or more"
                 raise InputError(message, tape.markers_path, marker.lines[0])
+
+
+def variance_along(start: Array, end: Array, covariance: Array) -> float:
+    """Return the variance of the length between two places (3,) by the sum (3, 3) of their covariances."""
+    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-12)
+    return float(along @ covariance @ along)
 
 
 def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:

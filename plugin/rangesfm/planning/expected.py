@@ -182,7 +182,7 @@ class Expected:
     @property
     def placement(self) -> Array | None:
         """(7, 7) covariance of the map's similarity about the first camera, as of a ScaleEstimate; None: not placed."""
-        return _placement(self.known)
+        return self.known.columns.placement(self.known.covariance)
 
     @property
     def map_stddevs(self) -> Array | None:
@@ -212,18 +212,6 @@ class Expected:
 def _stddevs(variances: Array) -> Array:
     stddevs = np.sqrt(np.maximum(variances, 0.0))
     return np.where(stddevs < OPEN, stddevs, np.inf)
-
-
-def _placement(known: KnownMap) -> Array | None:
-    if known.columns.frame < 0:
-        return None
-    of_map = _of_map(known.columns)
-    return known.covariance[np.ix_(of_map, of_map)]
-
-
-def _of_map(columns: Columns) -> list[int]:
-    """Return the columns of the map as a whole: the logarithm of the scale, a turn and a shift, if they are there."""
-    return [columns.scale, *(range(columns.frame, columns.frame + 6) if columns.frame >= 0 else ())]
 
 
 def expect_roughly(planned: PlannedSurvey, vision: VisionInformation | None = None) -> Expected:
@@ -278,7 +266,8 @@ def _positions(
         by_pose = groups_by_pose(known, IDENTITY, planned.trajectory, equations.grouping)[equations.is_used]
         errors = errors.without(*BENDS)
         observed = _Observed(linear, errors, errors.only(*_NOISE).covariance_m2, by_pose)
-        covariance = _placement(the_map.solved([observed])[0])
+        alone = the_map.solved([observed])[0]
+        covariance = alone.columns.placement(alone.covariance)
         assert covariance is not None, "known positions place the map"
         refuse_open_turn(covariance)
     except GeometryError as error:
@@ -408,7 +397,7 @@ class _BendingMap:
     def _motions(self, columns: Columns) -> Array:
         """Return the derivatives (3 k, p) of these keyframes' coordinates by the unknowns."""
         centers = self.planned.trajectory.centers
-        of_map = _of_map(columns)
+        of_map = columns.of_map
         motions = np.zeros((3 * len(self._some), columns.num))
         motions[:, of_map] = similarity_motions(centers[self._some] - centers[0]).reshape(-1, 7)[:, : len(of_map)]
         return motions
@@ -419,7 +408,7 @@ def _in_columns(design: Array, columns: Columns) -> Array:
     if design.shape[1] == columns.num:
         return design
     widened = np.zeros((len(design), columns.num))
-    widened[:, _of_map(columns)] = design
+    widened[:, columns.of_map] = design
     return widened
 
 

@@ -16,6 +16,7 @@ from rangesfm.distances.locate_lengths import (
     mark_covariance,
     triangulate_marker,
     triangulate_markers,
+    variance_along,
 )
 from rangesfm.distances.tape import Marker, Tape
 from rangesfm.geometry.trajectory import pose_of
@@ -158,14 +159,13 @@ def _add_taped(
         if not set(taped.ends) <= ends.keys():
             continue
         a, b = (ends[name] for name in taped.ends)
-        along = (b.place_m - a.place_m) / max(float(np.linalg.norm(b.place_m - a.place_m)), 1e-12)
-        variance_m2 = taped.stddev_m**2 + float(along @ (a.covariance_m2 + b.covariance_m2) @ along)
+        of_marks_m2 = variance_along(a.place_m, b.place_m, a.covariance_m2 + b.covariance_m2)
         if a.block is b.block or np.shares_memory(a.block, b.block):
             a, b = (_in_rig(bundle.metric, images[name]) for name in taped.ends)
             origins += [end.block for end in (a, b) if end.in_rig_m is None]
         cost = ceres.distance_cost(
             distance_m=taped.distance_m,
-            stddev_m=float(np.sqrt(variance_m2)) / bundle.pixel_stddev,
+            stddev_m=float(np.sqrt(taped.stddev_m**2 + of_marks_m2)) / bundle.pixel_stddev,
             a_in_cam_m=a.in_rig_m,
             b_in_cam_m=b.in_rig_m,
         )

@@ -22,8 +22,7 @@ from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.bending import BendingOfBins, averaged, bending_part, without_similarity
-from rangesfm.ranging.errors.range_bins import RangeBins
+from rangesfm.ranging.errors.bending import BendingOfBins, bending_part, without_similarity
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.refine.bundle_adjustment import farthest, still_to_come
@@ -145,9 +144,6 @@ class GraphBending:
     vision: VisionInformation
     path: Trajectory
 
-    def of_bins(self, bins: RangeBins, by_pose: sparse.csr_array, *, frame_is_free: bool) -> BendingOfBins:
-        return self.of_functions(averaged(bins, by_pose, len(self.path)), frame_is_free=frame_is_free)
-
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
         functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)
         parts = functions.reshape(len(by_pose), -1, 6)
@@ -158,9 +154,7 @@ class GraphBending:
 
     @cached_property
     def _factored(self) -> NestedFactor:
-        _, seen = _relative_poses(self.vision, self.vision.origin)
-        num = len(self.path)
-        return _factor(resized(normal_matrix(seen, self.vision.matrix), 6 * num), 0.0, _pose_blocks(num))
+        return _photos_alone(self.vision)[0]
 
 
 def with_gradient(vision: VisionInformation, gradient: Array) -> VisionInformation:
@@ -169,10 +163,16 @@ def with_gradient(vision: VisionInformation, gradient: Array) -> VisionInformati
     In a map that was bent to its ranges they do not. The gradient has to be that of all observations: those of a part
     of the tracks, or with other weights, have their minimum elsewhere.
     """
+    factored, by_pose = _photos_alone(vision)
+    return replace(vision, from_optimum=by_pose @ factored.solve(gradient))
+
+
+def _photos_alone(vision: VisionInformation) -> tuple[NestedFactor, sparse.bsr_array]:
+    """Return the factor of the photos' normal equations of n poses, and the relative poses' derivatives by these."""
     _, by_pose = _relative_poses(vision, vision.origin)
-    normal = resized(normal_matrix(by_pose, vision.matrix), len(gradient))
-    to_optimum = _factor(normal, 0.0, _pose_blocks(len(gradient) // 6)).solve(-gradient)
-    return replace(vision, from_optimum=-(by_pose @ to_optimum))
+    num = len(vision.origin)
+    blocks = 6 * np.arange(num + 1), np.zeros(num, dtype=bool)
+    return _factor(resized(normal_matrix(by_pose, vision.matrix), 6 * num), 0.0, blocks), by_pose
 
 
 @dataclass(frozen=True)
@@ -372,16 +372,11 @@ def _prior_rows(graph: KeyframeGraph, layout: _Layout, state: GraphState) -> tup
     return np.array(residuals), sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def _pose_blocks(num: int) -> tuple[Indices, Mask]:
-    """Return the blocks of n poses alone."""
-    return 6 * np.arange(num + 1), np.zeros(num, dtype=bool)
-
-
 def _factor(hessian: Array | sparse.csr_array, damping: float, blocks: tuple[Indices, Mask]) -> NestedFactor:
     """Factor a Hessian, with more damping if rounding makes it indefinite, as happens in a meaningless map.
 
     Args:
-        blocks: as ``_Layout.blocks`` and ``_pose_blocks`` give them.
+        blocks: as ``_Layout.blocks``.
     """
     diagonal = hessian.diagonal()
     # The floor keeps a pose without constraints in place.

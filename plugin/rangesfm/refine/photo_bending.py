@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import PhotosAlone
@@ -20,11 +19,9 @@ from rangesfm.ranging.errors.bending import (
     BendingOfBins,
     MapBending,
     WalkBending,
-    averaged,
     bending_part,
     without_similarity,
 )
-from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
@@ -55,9 +52,6 @@ class PhotoBending:
     world_from_model: Array
     metres_per_unit: float
     is_at_optimum: bool
-
-    def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
-        return self.of_functions(averaged(bins, by_pose, len(self.path)), frame_is_free=frame_is_free)
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
         functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)

@@ -143,10 +143,6 @@ def estimate_at(
     known = on_map.known(learned, start.shared_errors_m)
     value = on_map.solution.fit.state.metric_from_model.scale
     judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, (), options)
-    columns, placement = known.columns, None
-    if columns.frame >= 0:
-        of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
-        placement = known.covariance[np.ix_(of_map, of_map)]
     return replace(
         start,
         refined_value=value,
@@ -154,7 +150,7 @@ def estimate_at(
         verdict=judged.verdict,
         reasons=(*judged.reasons, *start.remarks),
         advice=judged.advice,
-        placement=placement,
+        placement=known.columns.placement(known.covariance),
         errors=replace(start.errors, learned=learned.spread(on_map.posed.rows, len(start.observations.log))),
         noise_stddev_m=on_map.solution.noise_stddev_m,
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
@@ -179,6 +179,7 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         robust = solution.fit.state.metric_from_model.scale
         verdict = "doubtful"
         reasons = (f"two-candidate, as asked for; the stddevs are of the robust scale, {robust:.6g}", *reasons)
+    errors = replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log))
     status = observations.status.copy()
     status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
     status[problem.rows] = status_by_weight(solution.fit.weights)
@@ -196,20 +197,18 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         two_candidate=table,
         anchors=found,
         observations=replace(observations, status=status),
-        errors=replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log)),
+        errors=errors,
         noise_stddev_m=solution.noise_stddev_m,
         problem=posed,
         solution=solution,
-        placement=placement_covariance(solution, covariance),
+        placement=solution.fit.columns[0].placement(covariance),
         remarks=remarks,
         lengths=lengths,
         positions=by_positions,
         by_kind=by_kind,
-        shared_errors_m=_of_all(
-            shared_errors_m(solution, learned) if by_kind else np.zeros((len(problem.rows), 0)),
-            problem.rows,
-            len(observations.log),
-        ),
+        shared_errors_m=shared_errors_m(solution, learned, errors.learned.of_range)
+        if by_kind and errors.learned
+        else np.zeros((len(observations.log), 0)),
     )
 
 
@@ -325,20 +324,16 @@ def _with_share(solution: Solution, range_share: float) -> Solution:
     """Return the solution of a rigid map with all ranges weighted by a further factor."""
     problem = solution.problem
     share = range_share * (np.ones(len(problem.range_m)) if problem.share is None else problem.share)
-    problem = replace(problem, share=share)
-    return replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
-
-
-def _of_all(shared_m: Array, rows: Indices, num: int) -> Array:
-    """Return the (num, k) shared errors of all ranges of the log, of which ``rows`` took part; 0 for the others."""
-    of_all = np.zeros((num, shared_m.shape[1]))
-    of_all[rows] = shared_m
-    return of_all
+    return _solved(solution, replace(problem, share=share))
 
 
 def _by_ranges_alone(solution: Solution) -> Solution:
     """Return the solution without lengths between points and known positions, starting from that with them."""
-    problem = _ranges_alone(solution.problem)
+    return _solved(solution, _ranges_alone(solution.problem))
+
+
+def _solved(solution: Solution, problem: RangeProblem) -> Solution:
+    """Return the solution of another problem of the same ranges, starting from this one."""
     return replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
 
 
@@ -353,15 +348,6 @@ def _ranges_alone(problem: RangeProblem) -> RangeProblem:
         return replace(problem, distances=distances)
     is_placed = bool(np.isfinite(problem.anchor_stddev_m).any())
     return replace(problem, distances=distances, placement=None, frame_is_free=is_placed)
-
-
-def placement_covariance(solution: Solution, covariance: Array) -> Array | None:
-    """Return ``ScaleEstimate.placement`` from the (p, p) covariance of all parameters of the fit."""
-    columns = solution.fit.columns[0]
-    if columns.frame < 0:
-        return None
-    of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
-    return np.asarray(covariance[np.ix_(of_map, of_map)])
 
 
 def model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:

@@ -208,6 +208,15 @@ class Columns:
     bias: Indices
     num: int
 
+    @property
+    def of_map(self) -> list[int]:
+        """Columns of the map as a whole: the logarithm of the scale and, if estimated, the turn and the shift."""
+        return [self.scale, *(range(self.frame, self.frame + 6) if self.frame >= 0 else ())]
+
+    def placement(self, covariance: Array) -> Array | None:
+        """Return the part (7, 7) of the map as a whole of a (p, p) covariance; None if its place is not estimated."""
+        return None if self.frame < 0 else np.asarray(covariance[np.ix_(self.of_map, self.of_map)])
+
 
 def columns_of(parts: Sequence[RangeProblem]) -> tuple[Columns, ...]:
     """Return the columns of all unknowns of one problem, or of the joint problem of several models."""
@@ -463,8 +472,7 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
         blocks.append(block)
     if problem.placement is not None and columns.frame >= 0:
         block = np.zeros((7, columns.num))
-        of_map = [columns.scale, *range(columns.frame, columns.frame + 6)]
-        block[:, of_map] = problem.placement.jacobian(similarity, _left_of_step(start, state))
+        block[:, columns.of_map] = problem.placement.jacobian(similarity, _left_of_step(start, state))
         blocks.append(block)
     return np.concatenate(blocks)
 

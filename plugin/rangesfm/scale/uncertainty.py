@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from rangesfm.arrays import Array
-from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, by_poses
+from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
 from rangesfm.ranging.errors.components import BENDS, CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ErrorParts, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisiness, range_bins
@@ -85,7 +85,7 @@ def bending_of_bins(
     problem, on_path = posed.ranges, observations.on_path(posed.rows)
     gradient, arms_m = range_gradient(problem, state), problem.tag_from_center
     slopes = by_poses(gradient, state.metric_from_model, model_from_cam, arms_m, on_path)
-    return bending.of_bins(of_ranges, slopes, frame_is_free=problem.frame_is_free)
+    return bending_in_bins(bending, of_ranges, slopes, frame_is_free=problem.frame_is_free)
 
 
 def _linear(posed: ScaleProblem, solution: Solution) -> LinearMap:
@@ -343,7 +343,7 @@ def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
     return of_bins @ learned.covariance_m2 @ of_bins.T + _by_what_was_given(solution)
 
 
-def shared_errors_m(solution: Solution, learned: LearnedErrors) -> Array:
+def shared_errors_m(solution: Solution, learned: LearnedErrors, of_range: Indices) -> Array:
     """Return the errors (n, k) that ranges share, for k independent standard deviations.
 
     They are the principal axes of the learnt errors, in units of what a bin's ranges scatter by themselves; axes along
@@ -351,6 +351,7 @@ def shared_errors_m(solution: Solution, learned: LearnedErrors) -> Array:
 
     Args:
         solution: by the ranges. learned: their errors; those of the map are left out, as photos see them.
+        of_range: (n,) bins of the ranges; -1 for a range that took no part, which has none of the errors.
     """
     covariance_m2 = learned.without("white", *BENDS).covariance_m2
     errors, bins = solution.errors, learned.bins
@@ -359,7 +360,7 @@ def shared_errors_m(solution: Solution, learned: LearnedErrors) -> Array:
     variances, axes = np.linalg.eigh(covariance_m2 / np.outer(scatter_m, scatter_m))
     matters = variances > 1
     of_bins = scatter_m[:, None] * axes[:, matters] * np.sqrt(variances[matters])
-    return np.where(learned.of_range[:, None] >= 0, of_bins[learned.of_range], 0.0)
+    return np.where(of_range[:, None] >= 0, of_bins[of_range], 0.0)
 
 
 def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:

@@ -11,7 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.errors.bending import WalkBending, averaged, bent_path, by_poses, without_similarity
+from rangesfm.ranging.errors.bending import (
+    WalkBending,
+    averaged,
+    bending_in_bins,
+    bent_path,
+    by_poses,
+    without_similarity,
+)
 from rangesfm.ranging.errors.range_bins import RangeBins, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
@@ -142,6 +149,6 @@ def test_a_path_that_stands_still_is_not_bent(path: Trajectory) -> None:
     still = replace(path, centers=np.zeros_like(path.centers))
     of_ranges = in_bins(path)
     by_range = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, *placed(path)[1:], ON_PATH)
-    found = WalkBending(still).of_bins(of_ranges, by_range, frame_is_free=False)
+    found = bending_in_bins(WalkBending(still), of_ranges, by_range, frame_is_free=False)
     assert {component.name for component in found.components} <= {"heading_drift"}
     assert not found.shift_m.any()

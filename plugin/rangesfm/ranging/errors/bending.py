@@ -106,23 +106,29 @@ class BendingOfBins:
 class MapBending(Protocol):
     """Prior knowledge of how a map is bent."""
 
-    def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
-        """Return the bending in bins of ranges.
+    @property
+    def path(self) -> Trajectory:
+        """Return the path of k poses that is bent, in the model's world."""
+        ...
+
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+        """Return the bending of c functions of the path, such as coordinates.
 
         Args:
-            by_pose: (n, 6 k) derivatives of each range by the path's poses, from ``by_poses``.
+            by_pose: (c, 6 k) derivatives.
             frame_is_free: whether the map's place is estimated; otherwise it is fixed to the first pose.
         """
         ...
 
-    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
-        """Return the bending of c functions of the path, such as coordinates; arguments as for ``of_bins``.
 
-        Args:
-            by_pose: (c, 6 k) derivatives.
-            frame_is_free: as for ``of_bins``.
-        """
-        ...
+def bending_in_bins(bending: MapBending, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
+    """Return the bending in bins of ranges.
+
+    Args:
+        by_pose: (n, 6 k) derivatives of each range by the path's poses, from ``by_poses``.
+        frame_is_free: as for ``MapBending.of_functions``.
+    """
+    return bending.of_functions(averaged(bins, by_pose, len(bending.path)), frame_is_free=frame_is_free)
 
 
 def bending_part(name: str, covariance: Array, factor: float, spread: float) -> BendingPart | None:
@@ -187,15 +193,12 @@ class WalkBending:
         given: the original path, in the model's world.
         steps: (s, 7) corrections at some of the poses: logarithm of the scale, turn and shift, in units of the walks'
             standard deviations from start to end; None: no correction.
-        frame_is_free: as in ``of_bins``, for the corrected path.
+        frame_is_free: as in ``of_functions``, for the corrected path.
     """
 
     given: Trajectory
     steps: Array | None = None
     frame_is_free: bool = False
-
-    def of_bins(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
-        return self.of_functions(averaged(bins, by_pose, len(self.path)), frame_is_free=frame_is_free)
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
         num = len(by_pose)
