@@ -188,6 +188,22 @@ def test_ranges_and_positions_have_the_say_on_the_scale_that_their_errors_allow(
     assert (high - low) / scale.value < 2 * 1.96 / np.sqrt(information["positions"])
 
 
+def test_lengths_beside_ranges_and_positions_count_once_in_the_uncertainty_of_a_refined_map(
+    walk: Walk, tmp_path: Path
+) -> None:
+    (first, *_, last), (start_m, *_, end_m) = walk.made.timestamps_s, walk.made.centers_m
+    between = (list(walk.made.timestamps_s)[12], walk.made.centers_m[12])
+    rows = (
+        f"{name},{between[0]},{np.linalg.norm(at_m - between[1]):.4f},0.01\n"
+        for name, at_m in ((first, start_m), (last, end_m))
+    )
+    (tmp_path / "tape.csv").write_text(f"from,to,distance_m,stddev_m\n{''.join(rows)}")
+    survey = walk.with_both(tmp_path, 1.0).changed({"scale.distances": tmp_path / "tape.csv"})
+    scale = refine_model(survey, progress=QUIET).summary.scale
+    information = {kind: (entry.value / known(entry.stddev)) ** 2 for kind, entry in scale.by_kind.items()}
+    assert (scale.value / known(scale.stddev_empirical)) ** 2 < 1.1 * sum(information.values())
+
+
 def test_positions_in_the_photos_exif_data_place_the_map_without_times(walk: Walk, tmp_path: Path) -> None:
     rng, photos, made = np.random.default_rng(3), tmp_path / "photos", walk.made
     photos.mkdir()

@@ -283,12 +283,14 @@ def refine_map(run: SurveyRun, metric: MetricResult, closing: LoopClosing | None
     held = HeldPositions.of(metric.estimate.positions, metric.positions, metric.trajectory)
 
     def learn_of_positions(rest: AtRest) -> Learnt:
-        placed.append(_positions_at_rest(metric, held.refined(metric.positions), rest))
+        lengths = _lengths_at_rest(metric, rest)
+        placed.append(_positions_at_rest(held.refined(metric.positions), rest, lengths))
         return Learnt(None, placed[0].bending_factor)
 
     def learn(rest: AtRest) -> Learnt:
         if metric.estimate.positions is not None:
-            placed.append(_positions_at_rest(metric, held.refined(metric.positions), rest))
+            # Without the measured lengths, which take part beside the ranges and would count twice.
+            placed.append(_positions_at_rest(held.refined(metric.positions), rest, None))
         at_rest.append(_at_rest(metric, rest, placed[0] if placed else None))
         learned = at_rest[0].learned()
         factor = at_rest[0].bending_factor(learned)
@@ -350,7 +352,7 @@ def _refined(
     )
 
 
-def _positions_at_rest(metric: MetricResult, surveyed: SurveyedPositions, rest: AtRest) -> PositionScale:
+def _positions_at_rest(surveyed: SurveyedPositions, rest: AtRest, lengths: LengthScale | None) -> PositionScale:
     known = surveyed.located(rest.photos.metric, rest.trajectory_m)
     assert known is not None, "the positions placed the map"
     try:
@@ -361,7 +363,7 @@ def _positions_at_rest(metric: MetricResult, surveyed: SurveyedPositions, rest: 
         known,
         rest.trajectory_m,
         bending,
-        lengths=_lengths_at_rest(metric, rest),
+        lengths=lengths,
         refined=IDENTITY,
         lasting_s=surveyed.lasting_s,
     )
