@@ -21,7 +21,6 @@ _SCALE = {
     "verdict": "good",
     "reasons": ["the scale is known to 2 % (95 % interval)"],
     "advice": [],
-    "cutoff_test": [{"min_range_m": 0.0, "scale": 1.5, "stddev": 0.01}],
     "sensitivity": {
         "common_bias_per_cm": 0.01,
         "short_range_per_cm": -0.1,

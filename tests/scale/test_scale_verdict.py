@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from tests.known import known
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_estimate import CutoffTest
-from rangesfm.scale.sensitivity import scale_drift
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey
@@ -117,14 +116,10 @@ def test_a_radio_that_reads_short_at_short_range_is_noticed(make_survey: MakeSur
     survey = make_survey(centers_m=centers, anchors_m=NEAR_ANCHORS_M, radio=Radio(range_stddev_m=0.03), num_epochs=10)
     true = survey.simulated.distance_m
     noise = survey.simulated.log.range_m - true
-    for error, noticed in ((0 * true, False), (-0.4 * np.exp(-true / 1.0), True)):
+    short_m, off = [], []
+    for error in (0 * true, -0.4 * np.exp(-true / 1.0)):
         estimate = survey.scale("unknown", (), survey.log_with(true + noise + error))
-        assert (scale_drift(estimate.cutoff_test) is not None) == noticed
-        assert any("short ranges disagree with long ones" in reason for reason in estimate.reasons) == noticed
-
-
-def test_a_change_is_judged_by_the_variance_that_leaving_out_adds() -> None:
-    tests = (CutoffTest(0.0, 1.00, 0.003), CutoffTest(1.0, 1.011, 0.005), CutoffTest(2.0, 1.0, 0.02))
-    assert scale_drift(tests) == tests[1]
-    assert scale_drift((tests[0], CutoffTest(1.0, 1.009, 0.005))) is None
-    assert scale_drift(tests[:1]) is None
+        short_m.append(known(estimate.errors.learned).stddev_of_component["short"])
+        off.append(abs(np.log(estimate.value)) / estimate.uncertainty.half_width_95)
+    assert short_m[1] > 1.3 * short_m[0]
+    assert max(off) < 1

@@ -70,7 +70,7 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     known = _known(problem, posed, estimate.uncertainty.formal)
     uncertainty, covariance = known.uncertainty, known.covariance
     fit = replace(solution.fit, state=on_map.state, weights=problem.bins.robust_weight)
-    judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, (), options)
+    judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, options)
     positions = zip(estimate.anchors, on_map.state.anchors_m, strict=True)
     drift = f"the path drifts by {drift_m:.2g} m (root mean square) from where the ranges have it"
     status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()

@@ -138,7 +138,7 @@ class Expected:
         if self.ranges is None:
             has_check = any(point.kind == CHECK for point in self.planned.points)
             return judge_positions(self.num_positions, self.uncertainty, ScaleOptions(), has_check=has_check)
-        return judge(self.ranges.posed, self.ranges.solution, self.uncertainty, {}, (), (), ScaleOptions())
+        return judge(self.ranges.posed, self.ranges.solution, self.uncertainty, {}, (), ScaleOptions())
 
     @property
     def learned(self) -> LearnedErrors:

@@ -22,7 +22,7 @@ from rangesfm.options import AssociationOptions
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
-from rangesfm.scale.scale_estimate import CutoffTest, ScaleSensitivity, ScaleUncertainty
+from rangesfm.scale.scale_estimate import ScaleSensitivity, ScaleUncertainty
 from rangesfm.scale.two_candidate import Branch
 
 
@@ -103,7 +103,6 @@ class ScaleEntry(Record):
     verdict: Literal["good", "doubtful"]
     reasons: tuple[Text, ...]
     advice: tuple[Text, ...]
-    cutoff_test: tuple[CutoffTest, ...]
     sensitivity: ScaleSensitivity
     per_anchor: dict[Text, NumberOrNull]
     range_noise_stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("range_noise_stddev_m", "noise_stddev_m"))

@@ -142,7 +142,7 @@ def estimate_at(
     """
     known = on_map.known(learned, start.shared_errors_m)
     value = on_map.solution.fit.state.metric_from_model.scale
-    judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, (), options)
+    judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, options)
     return replace(
         start,
         refined_value=value,

@@ -29,7 +29,7 @@ from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleSensitivity, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from, scale_problem
 from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, levelled_places
-from rangesfm.scale.sensitivity import cutoff_test, scale_sensitivity
+from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import known_map, learned_errors, parameter_covariance, shared_errors_m
@@ -161,16 +161,15 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         alone = _by_ranges_alone(solution)
         by_kind = {"ranges": _by_ranges(problem, alone, learn(solution)), **by_kind}
         solution = _with_share(solution, _range_share(alone, by_kind["ranges"]))
-    learned, (per_anchor, tests) = both(
-        lambda: learn(solution),
-        lambda: (scale_per_anchor(solution, observations.log.anchor_ids), cutoff_test(solution)),
+    learned, per_anchor = both(
+        lambda: learn(solution), lambda: scale_per_anchor(solution, observations.log.anchor_ids)
     )
     posed = problem if lengths is None else _bent(problem, lengths)
     known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
     uncertainty = known.uncertainty
     covariance = parameter_covariance(solution, learned)
     found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
-    judged = judge(problem, solution, uncertainty, per_anchor, found, tests, options)
+    judged = judge(problem, solution, uncertainty, per_anchor, found, options)
     verdict, remarks = judged.verdict, (*open_place, *given.remarks)
     if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
         remarks = (*remarks, *levelled_places(gravity, anchors, found))
@@ -191,7 +190,6 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         verdict=verdict,
         reasons=reasons,
         advice=judged.advice,
-        cutoff_test=tests,
         sensitivity=scale_sensitivity(solution, rotations, observations.log.anchor_ids),
         per_anchor=per_anchor,
         two_candidate=table,
@@ -244,7 +242,6 @@ def _without_ranges(observations: RangeObservations, range_model: RangeModelOpti
         verdict="doubtful",
         reasons=(),
         advice=(),
-        cutoff_test=(),
         sensitivity=ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0)),
         per_anchor={},
         two_candidate=None,

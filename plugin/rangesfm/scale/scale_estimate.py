@@ -66,21 +66,6 @@ class ScaleUncertainty:
 
 
 @dataclass(frozen=True)
-class CutoffTest:
-    """The scale from ranges of at least some length, with short ranges weighted like the others.
-
-    Attributes:
-        min_range_m: shorter ranges are left out.
-        scale: metres per SfM unit.
-        stddev: metres per SfM unit, widened for the correlation of the errors; errors of the range model are not in it.
-    """
-
-    min_range_m: float
-    scale: float
-    stddev: float
-
-
-@dataclass(frozen=True)
 class ScaleSensitivity:
     """Change of the scale, in percent, per error of the range model; estimated biases absorb their part of it.
 
@@ -111,7 +96,6 @@ class ScaleEstimate:
         verdict: "good" or "doubtful" (a refused scale is a GeometryError).
         reasons: why, in words.
         advice: what to do about it, in words; for a finished survey also what would improve the next one most.
-        cutoff_test: how the scale changes as short ranges are left out.
         sensitivity: change of the scale per error of the range model.
         per_anchor: scale from each anchor alone, by id; anchors that do not determine one are missing.
         two_candidate: the paper's table; None where too few ranges have candidates.
@@ -138,7 +122,6 @@ class ScaleEstimate:
     verdict: str
     reasons: tuple[str, ...]
     advice: tuple[str, ...]
-    cutoff_test: tuple[CutoffTest, ...]
     sensitivity: ScaleSensitivity
     per_anchor: dict[str, float]
     two_candidate: TwoCandidate | None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesfm.errors import GeometryError, number_text
+from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
@@ -17,15 +17,12 @@ from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
-from rangesfm.scale.scale_estimate import CutoffTest, ScaleUncertainty
+from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
-from rangesfm.scale.sensitivity import scale_drift
 from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
 
 # A scale is doubtful if half of its relative 95 % interval is wider than this.
 DOUBTFUL_ABOVE = 0.04
-# Relative change of the scale with the minimum range below which it is not mentioned.
-_MIN_DRIFT = 0.01
 _MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
 # Relative standard deviation of the scale from which nothing is known about it.
@@ -61,7 +58,6 @@ def judge(
     uncertainty: ScaleUncertainty,
     per_anchor: dict[str, float],
     anchors: Sequence[AnchorEstimate],
-    cutoff_tests: tuple[CutoffTest, ...],
     options: ScaleOptions,
 ) -> Verdict:
     """Return the verdict by the 95 % interval, and by faults that make the interval itself doubtful.
@@ -71,17 +67,7 @@ def judge(
     """
     half_width = uncertainty.half_width_95
     doubts = [*_doubts_of_survey(problem, solution, half_width), *_doubts_of_ranges(solution.fit, per_anchor)]
-    remarks = _remarks(solution, anchors)
-    if (drift := scale_drift(cutoff_tests)) is not None:
-        change = drift.scale / cutoff_tests[0].scale - 1
-        if abs(change) >= _MIN_DRIFT:
-            reason = (
-                f"short ranges disagree with long ones: without those under {drift.min_range_m:g} m the scale would "
-                f"change by {number_text(100 * change, '+.1f')} %"
-            )
-            doubt = _Doubt(reason, f"{CALIBRATE}, or put the anchors farther from the path")
-            (doubts if abs(change) > half_width else remarks).append(doubt)
-    return _verdict(doubts, remarks, half_width, options)
+    return _verdict(doubts, _remarks(solution, anchors), half_width, options)
 
 
 def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
