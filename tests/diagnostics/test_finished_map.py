@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,6 @@ from rangesfm.diagnostics import finished_map
 from rangesfm.diagnostics.finished_map import doubts_of_map, place_of_map
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
@@ -47,18 +45,6 @@ def estimate(walked: Survey) -> ScaleEstimate:
     return initialize_scale(walked.observations(), walked.trajectory, anchors, anchor_frame="site", options=OPTIONS)
 
 
-def doubts(estimate: ScaleEstimate, *, points: PointErrors = GOOD_POINTS, noise_is_given: bool = False) -> list[str]:
-    found = doubts_of_map(estimate, None, points, noise_is_given=noise_is_given)
-    assert all(doubt.advice for doubt in found)
-    return [doubt.reason for doubt in found]
-
-
-def with_anchor(estimate: ScaleEstimate, index: int, **changes: Any) -> ScaleEstimate:
-    anchors = list(estimate.anchors)
-    anchors[index] = replace(anchors[index], **changes)
-    return replace(estimate, anchors=tuple(anchors))
-
-
 def path_in_site(walked: Survey, estimate: ScaleEstimate) -> Array:
     return estimate.metric_from_sfm.apply(walked.trajectory.centers)
 
@@ -67,7 +53,7 @@ def path_in_site(walked: Survey, estimate: ScaleEstimate) -> Array:
 def test_a_clean_map_is_doubted_of_nothing_and_its_place_is_good(make_survey: MakeSurvey, seed: int) -> None:
     walked = make_survey(num_epochs=4, radio=RADIO, seed=seed)
     estimate = walked.scale("site", tuple(walked.anchors_m), options=OPTIONS)
-    assert doubts(estimate) == []
+    assert list(doubts_of_map(None, GOOD_POINTS)) == []
     place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [], NOT_BENT))
     assert place.verdict == "good"
     off_m = path_in_site(walked, estimate) - walked.centers_m
@@ -75,64 +61,12 @@ def test_a_clean_map_is_doubted_of_nothing_and_its_place_is_good(make_survey: Ma
     assert np.linalg.norm(off_m, axis=1).max() < 3 * place.worst_keyframe_stddev_m
 
 
-def test_an_anchor_of_which_few_ranges_were_used_is_named_with_numbers(estimate: ScaleEstimate) -> None:
-    observations, status = estimate.observations, estimate.observations.status.copy()
-    rows = np.flatnonzero(observations.log.anchor_index == 2)
-    status[rows] = RangeStatus.OUTLIER
-    status[rows[:10]] = RangeStatus.USED
-    hardly = replace(estimate, observations=replace(observations, status=status))
-    assert doubts(hardly) == [f"anchor C: 10 of {len(rows)} ranges used"]
-    status[rows[: len(rows) // 2 + 1]] = RangeStatus.DOWN_WEIGHTED
-    assert doubts(replace(estimate, observations=replace(observations, status=status))) == []
-
-
-def test_ranges_off_the_path_are_no_fault_of_their_anchor(estimate: ScaleEstimate) -> None:
-    observations, status = estimate.observations, estimate.observations.status.copy()
-    status[observations.log.anchor_index == 2] = RangeStatus.OUTSIDE_PATH
-    assert doubts(replace(estimate, observations=replace(observations, status=status))) == []
-
-
-def test_an_anchor_away_from_where_it_was_surveyed_is_named(estimate: ScaleEstimate) -> None:
-    place_m = known(estimate.anchors[3].prior_position_m)
-    (reason,) = doubts(with_anchor(estimate, 3, position_m=place_m - [0.0, 0.12, 0.01]))
-    assert reason == "anchor D fits best 0.12 m from its surveyed position (along y), 6 of its stddevs"
-    assert doubts(with_anchor(estimate, 3, position_m=place_m - [0.0, 0.06, 0.01])) == []
-
-
-def with_residuals(estimate: ScaleEstimate, stddev_m: Array) -> ScaleEstimate:
-    """Return the estimate with residuals of these standard deviations, (k,) for the ranges of its problem."""
-    solution = known(estimate.solution)
-    residuals_m = stddev_m * np.random.default_rng(1).normal(size=len(stddev_m))
-    return replace(estimate, solution=replace(solution, fit=replace(solution.fit, residuals_m=residuals_m)))
-
-
-def test_noise_that_no_radio_has_is_said_unless_somebody_said_it_first(estimate: ScaleEstimate) -> None:
-    index = estimate.observations.log.anchor_index[known(estimate.problem).rows]
-    noisy = with_residuals(estimate, np.full(len(index), 0.55))
-    (reason,) = doubts(noisy)
-    scatter_m = float(reason.removeprefix("the ranges scatter by ").split(" m;")[0])
-    assert scatter_m == pytest.approx(0.55, rel=0.25)
-    assert doubts(noisy, noise_is_given=True) == []
-    (reason,) = doubts(with_residuals(estimate, np.where(index == 4, 4.2, 0.06)))
-    assert reason.startswith("the ranges to E scatter by ")
-
-
-def test_a_weight_is_not_told_as_the_scatter_of_ranges(estimate: ScaleEstimate) -> None:
-    """The standard deviations of weights contain what ranges of one length share, and the places between photos."""
-    errors = estimate.errors
-    assert doubts(replace(estimate, errors=replace(errors, stddev_m=np.full_like(errors.stddev_m, 0.52)))) == []
-
-
-def test_points_that_are_not_of_the_photos_are_said(estimate: ScaleEstimate) -> None:
-    (reason,) = doubts(estimate, points=PointErrors(np.full(9, 82.0), np.zeros((9, 3)), 4.8))
-    assert reason.startswith("the map's points lie 82 px (median) from where the photos show them")
-
-
-def test_a_place_is_no_better_than_the_map(walked: Survey, estimate: ScaleEstimate) -> None:
-    points = PointErrors(np.full(9, 82.0), np.zeros((9, 3)), 4.8)
-    found = doubts_of_map(estimate, None, points, noise_is_given=False)
-    place = known(place_of_map(estimate, None, path_in_site(walked, estimate), found, NOT_BENT))
-    assert (place.verdict, place.reasons) == ("doubtful", (found[0].reason,))
+def test_points_that_are_not_of_the_photos_are_said_of_the_place_too(walked: Survey, estimate: ScaleEstimate) -> None:
+    (doubt,) = doubts_of_map(None, PointErrors(np.full(9, 82.0), np.zeros((9, 3)), 4.8))
+    assert doubt.reason.startswith("the map's points lie 82 px (median) from where the photos show them")
+    assert doubt.advice
+    place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [doubt.reason], NOT_BENT))
+    assert (place.verdict, place.reasons) == ("doubtful", (doubt.reason,))
 
 
 @pytest.mark.parametrize("what", ["shift", "heading"])

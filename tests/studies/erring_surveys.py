@@ -14,11 +14,10 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.path import loop_path
 from tests.simulated.surveys import LASTING_S, error_curve, lasting
 
-from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.diagnostics.bent_path import bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.diagnosis import Diagnosis, diagnose_ranges
-from rangesfm.diagnostics.finished_map import by_similarity, doubts_of_map
+from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
@@ -205,13 +204,11 @@ class Run:
 
     @property
     def doubts(self) -> list[str]:
-        """List everything that speaks against the map of a survey that is not refined."""
+        """List everything that speaks against the map of a survey without photos."""
         assert self.estimate is not None
         assert self.diagnosis is not None
-        no_points = PointErrors(np.zeros(0), np.zeros((0, 3)), np.inf)
-        of_map = doubts_of_map(self.estimate, None, no_points, noise_is_given=False)
         of_scale = self.estimate.reasons if self.estimate.verdict != "good" else ()
-        return [*self.diagnosis.reasons, *of_scale, *(doubt.reason for doubt in of_map)]
+        return [*self.diagnosis.reasons, *of_scale]
 
     @property
     def place_in_stddevs(self) -> float:

@@ -17,20 +17,12 @@ from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.noise import NORMAL_95, robust_stddev
-from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
+from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
-# Largest deviation of an anchor's coordinate, in prior standard deviations: chance exceeds it once in two thousand.
-_MAX_STDDEVS = 3.5
-# Largest noise of ranges, metres. UWB radios in the open have 0.02 to 0.3 m.
-_MAX_NOISE_M = 0.4
-# An anchor is reported if less than this share of its ranges was used, and it has at least this many ranges.
-_MIN_USED, _MIN_RANGES = 0.5, 10
-_CHECK_ANCHOR = "measure the anchors again, and see that each stands in the open and has its own label"
 # Allowance for comparing medians: ``_max_growth`` bounds sums of squares, while medians ignore a few large errors.
 _OF_MEDIANS = 1.5
 # An error is large if it exceeds this many typical errors before the refinement. An increase of the share of points
@@ -69,28 +61,19 @@ class Place:
     worst_keyframe_stddev_m: float
 
 
-def doubts_of_map(
-    estimate: ScaleEstimate,
-    summary: RefineSummary | None,
-    points: PointErrors,
-    *,
-    noise_is_given: bool,
-) -> tuple[Doubt, ...]:
-    """Return the faults of a finished map, each with its numbers; empty if there are none.
+def doubts_of_map(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doubt]:
+    """Yield doubts about points that do not fit the photos, and about the refinement.
 
     Args:
-        estimate: of the scale.
-        summary: of the refinement; None for a map that is only scaled.
-        points: of the final model.
-        noise_is_given: whether the user gave the scatter of the ranges.
+        summary: of the refinement; None for a map that is only scaled. points: of the final model.
     """
-    stage = estimate if summary is None else summary
-    return (
-        *_of_fit(summary, points),
-        *_of_say(stage.observations),
-        *_of_positions(stage.anchors),
-        *(() if noise_is_given else _of_noise(stage.observations, _residuals_m(estimate, summary))),
-    )
+    if not points.fit:
+        yield Doubt(points.apart("the map"), MISMATCHED)
+    if summary is not None and not summary.converged:
+        remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
+        yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
+    for misfit in () if summary is None else summary.misfits:
+        yield Doubt(f"after the refinement {misfit.reason}", misfit.remedy)
 
 
 def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Doubt, ...]:
@@ -110,79 +93,11 @@ def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Dou
     )
 
 
-def _surveyed(anchors: Sequence[AnchorEstimate]) -> Iterator[tuple[str, Array, float]]:
-    """Yield surveyed anchors that may move: id, displacement from the surveyed position (3,), standard deviation."""
-    for anchor in anchors:
-        prior_m, stddev_m = anchor.prior_position_m, anchor.prior_position_stddev_m
-        if prior_m is not None and 0 < stddev_m < np.inf:
-            yield anchor.anchor_id, anchor.position_m - prior_m, stddev_m
-
-
-def _of_fit(summary: RefineSummary | None, points: PointErrors) -> Iterator[Doubt]:
-    """Yield doubts about points that do not fit the photos, and about the convergence of the refinement."""
-    if not points.fit:
-        yield Doubt(points.apart("the map"), MISMATCHED)
-    if summary is not None and not summary.converged:
-        remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
-        yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
-    for misfit in () if summary is None else summary.misfits:
-        yield Doubt(f"after the refinement {misfit.reason}", misfit.remedy)
-
-
-def _of_say(observations: RangeObservations) -> Iterator[Doubt]:
-    """Yield doubts about anchors most of whose ranges were left out."""
-    log, took_part = observations.log, observations.has_place
-    for k, anchor_id in enumerate(log.anchor_ids):
-        of_anchor = took_part & (log.anchor_index == k)
-        num, num_used = of_anchor.sum(), (of_anchor & (observations.status < RangeStatus.OUTLIER)).sum()
-        if num >= _MIN_RANGES and num_used < _MIN_USED * num:
-            yield Doubt(f"anchor {anchor_id}: {num_used} of {num} ranges used", _CHECK_ANCHOR)
-
-
-def _of_positions(anchors: Sequence[AnchorEstimate]) -> Iterator[Doubt]:
-    for anchor_id, moved_m, stddev_m in _surveyed(anchors):
-        worst = int(np.argmax(np.abs(moved_m)))
-        if abs(moved_m[worst]) > _MAX_STDDEVS * stddev_m:
-            reason = (
-                f"anchor {anchor_id} fits best {abs(moved_m[worst]):.2f} m from its surveyed position (along "
-                f"{'xyz'[worst]}), {abs(moved_m[worst]) / stddev_m:.2g} of its stddevs"
-            )
-            yield Doubt(reason, _CHECK_ANCHOR)
-
-
-def _residuals_m(estimate: ScaleEstimate, summary: RefineSummary | None) -> Array:
-    """Return predicted minus measured ranges (n,), NaN for ranges without a place on the path."""
-    if summary is not None:
-        return summary.predicted_m - summary.observations.log.range_m
-    residuals_m = np.full(len(estimate.observations.log), np.nan)
-    if estimate.problem is not None and estimate.solution is not None:
-        residuals_m[estimate.problem.rows] = estimate.solution.fit.residuals_m
-    return residuals_m
-
-
-def _of_noise(observations: RangeObservations, residuals_m: Array) -> Iterator[Doubt]:
-    """Yield a doubt if single ranges scatter more than those of radios, compared with the ranges before and after."""
-    log, order = observations.log, observations.log.own_order
-    order = order[((observations.status < RangeStatus.OUTLIER) & np.isfinite(residuals_m))[order]]
-    of_anchors = {
-        anchor_id: robust_stddev(np.diff(residuals_m[rows])) / float(np.sqrt(2))
-        for k, anchor_id in enumerate(log.anchor_ids)
-        if len(rows := order[log.anchor_index[order] == k]) >= _MIN_RANGES
-    }
-    noisy = {anchor_id: stddev_m for anchor_id, stddev_m in of_anchors.items() if stddev_m > _MAX_NOISE_M}
-    if not noisy:
-        return
-    whose = "the ranges" if len(noisy) == len(of_anchors) else f"the ranges to {', '.join(noisy)}"
-    reason = f"{whose} scatter by {max(noisy.values()):.2f} m; UWB radios scatter by 0.02 to 0.3 m"
-    remedy = "check the unit of the ranges and the radio's calibration (rangesfm ranges calibrate)"
-    yield Doubt(reason, f"{remedy}; if this radio is so coarse, say so (range_stddev_m)")
-
-
 def place_of_map(
     estimate: ScaleEstimate,
     summary: RefineSummary | None,
     centers_m: Array,
-    doubts: Sequence[Doubt],
+    doubts: Sequence[str],
     bent_by_m: Array,
 ) -> Place | None:
     """Return the map's place in the site's frame with its uncertainty; None if the frame is the first camera's.
@@ -190,7 +105,7 @@ def place_of_map(
     Args:
         summary: of the refinement; None for a map that is only scaled.
         centers_m: (n, 3) keyframe centres in the final map, the first in time first.
-        doubts: about the map; with any of them its place is doubtful too.
+        doubts: about the map, in words; with any of them its place is doubtful too.
         bent_by_m: (n,) how far the ranges would bend each keyframe of a map that is only scaled; (0,) if unknown.
     """
     if estimate.placement is None:
@@ -210,7 +125,7 @@ def place_of_map(
     surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
     size_m = float(np.linalg.norm(np.ptp(np.vstack([centers_m, *surveyed]), axis=0)))
     in_words, is_wide = place_in_words(stddevs, worst_m, size_m)
-    reasons = (*((in_words,) if is_wide or not doubts else ()), *(doubt.reason for doubt in doubts))
+    reasons = (*((in_words,) if is_wide or not doubts else ()), *doubts)
     x_m, y_m, z_m = stddevs[4:].tolist()
     return Place("doubtful" if is_wide or doubts else "good", reasons, (x_m, y_m, z_m), heading_deg, worst_m)
 
@@ -309,6 +224,8 @@ def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: 
         if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
             yield f"the difference of ranges and map grew from {old_m:.2g} to {new_m:.2g} m (median)"
     size_m = float(np.linalg.norm(path_shape(path_m).stddevs))
-    for anchor_id, moved_m, stddev_m in _surveyed(summary.anchors):
-        if (far_m := float(np.linalg.norm(moved_m))) > max(size_m, 10 * stddev_m):
-            yield f"anchor {anchor_id} went {far_m:.3g} m from where it was surveyed"
+    for anchor in summary.anchors:
+        if anchor.prior_position_m is not None and np.isfinite(anchor.prior_position_stddev_m):
+            far_m = float(np.linalg.norm(anchor.position_m - anchor.prior_position_m))
+            if far_m > max(size_m, 10 * anchor.prior_position_stddev_m):
+                yield f"anchor {anchor.anchor_id} went {far_m:.3g} m from where it was surveyed"

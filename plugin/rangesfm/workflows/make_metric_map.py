@@ -414,30 +414,26 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     centers_m = metric.trajectory.as_in(metric.final).centers
     bent_by_m = np.zeros(0) if on_map is None else bends_m(on_map)
     of_positions = _diagnose_positions(metric, centers_m, bent_by_m)
-    diagnosis = of_positions.with_more(diagnose_lengths(metric.estimate, metric.tape))
+    diagnosis, of_place = of_positions.with_more(diagnose_lengths(metric.estimate, metric.tape)), of_positions.reasons
     try:
         if (of_ranges := _diagnose(survey, on_map)) is not None:
             diagnosis = of_ranges.with_more(diagnosis)
+            of_place = (*(of_ranges.reasons if any(test.rejected for test in of_ranges.tests) else ()), *of_place)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not tested, because the ranges determine too little: {error}")
     journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *diagnosis.reasons)
-    log, by_rivals = metric.observations.log, () if metric.rivals is None else metric.rivals.doubts
+    by_rivals = () if metric.rivals is None else metric.rivals.doubts
     doubts: list[Doubt] = []
     if metric.why_broken:
         reason = f"the refinement broke the map, so the scaled map is the result: {'; '.join(metric.why_broken)}"
         doubts.append(Doubt(reason, "check the model's points and cameras, clocks, lever arm and anchors"))
-    doubts += doubts_of_map(
-        metric.estimate,
-        metric.kept_refinement,
-        point_errors(metric.final),
-        noise_is_given=survey.ranges.range_stddev_m is not None or bool(np.isfinite(log.range_stddev_m).any()),
-    )
+    doubts += doubts_of_map(metric.kept_refinement, point_errors(metric.final))
     advice = "let the offset be searched for ([positions] time_offset)"
     doubts += [Doubt(reason, advice) for reason in metric.positions.doubts_of_clock()]
     journal.warn(*(doubt.reason for doubt in doubts), *by_rivals)
     doubts += known_doubts
-    of_place = [*(Doubt(reason, "") for reason in of_positions.reasons), *doubts]
-    place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, of_place, bent_by_m)
+    against_place = (*of_place, *(doubt.reason for doubt in doubts))
+    place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, against_place, bent_by_m)
     judged = replace(metric, place=place, diagnosis=diagnosis).doubted(by_rivals)
     judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
     return judged.doubted(diagnosis.reasons)
