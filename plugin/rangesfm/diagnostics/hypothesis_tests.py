@@ -216,12 +216,7 @@ class Factorization:
 @cache
 def noncentrality(num: int) -> float:
     """Return the noncentrality at which a mistake of ``num`` numbers is found (Baarda's lambda_0)."""
-    critical = special.chdtri(num, _ALPHA)
-    low, high = 0.0, 1000.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if special.chndtr(critical, num, middle) > _BETA else (low, middle)
-    return high
+    return float(special.chndtrinc(special.chdtri(num, _ALPHA), num, _BETA))
 
 
 def _redundancy(left: Array, seen: Array) -> float:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import special
+from scipy.optimize import brentq
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Test, noncentrality
@@ -35,7 +36,6 @@ CHECKED_KINDS = (
 # Mistakes that move a test by this many standard deviations beyond its threshold are found for certain. Sizes up to
 # there are tried, so many of them.
 _CERTAINLY_FOUND, _NUM_SIZES = 6.0, 80
-_NUM_BISECTIONS = 50
 
 
 @dataclass(frozen=True)
@@ -121,12 +121,8 @@ def scale_bound(uncertainty: ScaleUncertainty, hidden: Sequence[HiddenMistake]) 
 
 
 def _bound(uncertainty: ScaleUncertainty, changes: Array, missed: Array) -> float:
-    low, high = 0.0, float(np.max(changes)) + abs(uncertainty.lean) + 10 * uncertainty.empirical
-    for _ in range(_NUM_BISECTIONS):
-        middle = (low + high) / 2
-        is_exceeded = np.max(missed * _beyond(uncertainty, changes, middle)) > RISK
-        low, high = (middle, high) if is_exceeded else (low, middle)
-    return high
+    farthest = float(np.max(changes)) + abs(uncertainty.lean) + 10 * uncertainty.empirical
+    return brentq(lambda bound: np.max(missed * _beyond(uncertainty, changes, bound)) - RISK, 0.0, farthest)
 
 
 def _beyond(uncertainty: ScaleUncertainty, changes: Array, bound: float) -> Array:
