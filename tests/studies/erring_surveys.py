@@ -239,7 +239,7 @@ def run(given: Given, seed: int) -> Run:
     assert estimate.problem is not None
     assert estimate.solution is not None
     bending = WalkBending(in_first_camera(given.trajectory))
-    on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, given.trajectory, bending)
+    on_map = ranges_on_map(estimate.problem, estimate.solution, bending)
     on_map = bent_to_ranges(on_map)
     estimate = estimate_by_bent(estimate, on_map, options)
     return Run(given, estimate, diagnose_ranges(on_map, seed=seed), on_map)

@@ -158,7 +158,7 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
 
 def truth(planned: PlannedSurvey, made: Measured, posed: ScaleProblem) -> RangeState:
     """Return a start at the truth; a whole search takes ten times as long and ends at the same solution."""
-    state = planned.state(posed, made.observations.log.anchor_ids)
+    state = planned.state(posed)
     return replace(state, metric_from_model=replace(state.metric_from_model, scale=METRES_PER_UNIT))
 
 

@@ -20,7 +20,6 @@ from tests.studies.real_logs import FACTOR, cases, path_of, placed, read_set
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.components import components
 from rangesfm.ranging.errors.learned import learn_errors
-from rangesfm.scale.initialize import model_from_cam
 from rangesfm.scale.range_equation import predicted_ranges
 from rangesfm.scale.scale_problem import scale_problem
 from rangesfm.scale.solution import solve_scale
@@ -70,7 +69,7 @@ def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
         bias_m=posed.ranges.bias_mean_m,
     )
     solution = replace(solution, fit=replace(solution.fit, state=true))
-    bins = errors_to_expect(posed, solution, observations, model_from_cam(observations, path, posed), {}).bins
+    bins = errors_to_expect(posed, solution, {}).bins
     off_m = posed.ranges.range_m - predicted_ranges(posed.ranges, true)
     nothing_open = np.zeros((len(off_m), 1))
     learned = learn_errors(bins, off_m, nothing_open, np.ones((1, 1)), solution.noise_stddev_m)

@@ -63,7 +63,7 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
     """Yield all alternatives that a map can have."""
     given_m, heard = on_map.problem.anchor_mean_m, np.unique(on_map.problem.anchor_index)
     given = {on_map.anchor_ids[k]: given_m[k] for k in heard if np.isfinite(given_m[k]).all()}
-    yield from _of_labels([name for name in on_map.order_given if name in given], given)
+    yield from _of_labels([name for name in on_map.posed.order_given if name in given], given)
     yield from _of_coordinates(given)
     yield from _of_places(on_map, given)
     if on_map.velocity is not None:  # as where the photos' order was taken from names that count down

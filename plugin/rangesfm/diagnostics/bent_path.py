@@ -74,8 +74,8 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     positions = zip(estimate.anchors, on_map.state.anchors_m, strict=True)
     drift = f"the path drifts by {drift_m:.2g} m (root mean square) from where the ranges have it"
     status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
-    status[on_map.rows] = status_by_weight(problem.bins.robust_weight)
-    stddev_m[on_map.rows] = problem.scatter_m
+    status[posed.rows] = status_by_weight(problem.bins.robust_weight)
+    stddev_m[posed.rows] = problem.scatter_m
     return replace(
         estimate,
         metric_from_sfm=on_map.state.metric_from_model @ posed.first_camera_from_sfm,

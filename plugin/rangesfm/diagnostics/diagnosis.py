@@ -69,7 +69,7 @@ def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     reasons = [f"{row.words}: {row.remedy}" for row in (*before, *(row for row in after if row.rejected))]
     if found.causes:
         reasons.insert(len(before), causes_in_words(found.causes))
-    return Diagnosis(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.rows, found.hidden)
+    return Diagnosis(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.posed.rows, found.hidden)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:

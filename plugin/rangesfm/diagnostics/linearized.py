@@ -9,15 +9,13 @@ from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import similarity_motions
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
 from rangesfm.ranging.errors.components import PLACES
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
-from rangesfm.ranging.range_observations import OnPath, RangeObservations
-from rangesfm.scale.initialize import camera_velocities, model_from_cam
+from rangesfm.ranging.range_observations import OnPath
 from rangesfm.scale.range_equation import (
     Columns,
     RangeProblem,
@@ -30,7 +28,7 @@ from rangesfm.scale.range_equation import (
 )
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
-from rangesfm.scale.uncertainty import ruled_out, times_of_ranges
+from rangesfm.scale.uncertainty import ruled_out
 
 # Fewer bins than for an interval, because the tests learn the errors many times.
 _MAX_NUM_BINS = 160
@@ -55,36 +53,42 @@ class RangesOnMap:
     """n ranges that took part in an estimate, and its state.
 
     Attributes:
-        problem: with standard deviations of 1, so that its residuals and Jacobians are in metres.
+        posed: their scale problem.
+        problem: its ranges, corrected where a mistake is undone, with standard deviations of 1: its residuals and
+            Jacobians are in metres.
         state: the estimate.
         model_from_cam: (n, 3, 3) rotations into the model's world.
         velocity: (n, 3) camera velocities, model units per second; None where ranges have no times.
-        time_s: (n,) on the radio's clock; where the log names photos, from the distance walked (see
-            ``uncertainty.times_of_ranges``).
-        tag_index: (n,). tag_ids, anchor_ids: by index. order_given: anchors in the order of their file.
-        rows: (n,) rows of the log.
+        time_s: (n,) as ``ScaleProblem.times_s``.
         weights: (n,) robust weights in the estimate.
-        placing_m: (n,) standard deviation of each coordinate of the antenna. gap: (n,) the keyframe gap of each range.
-        curve_stddev_m: (n,) of a learnt error curve that was subtracted from the ranges; None if none was.
-        on_path: where the ranges were taken. bending: of the map; None: the map is not bent.
+        bending: of the map; None: the map is not bent.
     """
 
+    posed: ScaleProblem
     problem: RangeProblem
     state: RangeState
     model_from_cam: Array
     velocity: Array | None
     time_s: Array
-    tag_index: Indices
-    tag_ids: tuple[str, ...]
-    anchor_ids: tuple[str, ...]
-    order_given: tuple[str, ...]
-    rows: Indices
     weights: Array
-    placing_m: Array
-    gap: Indices
-    curve_stddev_m: Array | None
-    on_path: OnPath
     bending: MapBending | None
+
+    @property
+    def anchor_ids(self) -> tuple[str, ...]:
+        return self.posed.observations.log.anchor_ids
+
+    @property
+    def tag_ids(self) -> tuple[str, ...]:
+        return self.posed.observations.log.tag_ids
+
+    @property
+    def tag_index(self) -> Indices:
+        return self.posed.observations.log.tag_index[self.posed.rows]
+
+    @property
+    def on_path(self) -> OnPath:
+        """Places of the ranges between keyframes."""
+        return self.posed.observations.on_path(self.posed.rows)
 
     @property
     def world_from_cam(self) -> Array:
@@ -105,31 +109,16 @@ class RangesOnMap:
         return np.asarray(tags_m - self.state.anchors_m[self.problem.anchor_index])
 
 
-def ranges_on_map(
-    posed: ScaleProblem,
-    solution: Solution,
-    observations: RangeObservations,
-    trajectory: Trajectory,
-    bending: MapBending | None,
-) -> RangesOnMap:
+def ranges_on_map(posed: ScaleProblem, solution: Solution, bending: MapBending | None) -> RangesOnMap:
     """Collect the ranges of a problem at its solution."""
-    log, rows = observations.log, posed.rows
     return RangesOnMap(
-        problem=replace(posed.ranges, stddev_m=np.ones(len(rows)), share=None),
+        posed=posed,
+        problem=replace(posed.ranges, stddev_m=np.ones(len(posed.rows)), share=None),
         state=solution.fit.state,
-        model_from_cam=model_from_cam(observations, trajectory, posed),
-        velocity=camera_velocities(observations, trajectory, posed),
-        time_s=times_of_ranges(posed, solution, observations),
-        tag_index=log.tag_index[rows],
-        tag_ids=log.tag_ids,
-        anchor_ids=log.anchor_ids,
-        order_given=posed.order_given,
-        rows=rows,
+        model_from_cam=posed.model_from_cam,
+        velocity=posed.velocity,
+        time_s=posed.times_s(solution.fit.state.metric_from_model.scale),
         weights=solution.fit.weights,
-        placing_m=posed.placing_stddev_m(solution.fit.state.metric_from_model.scale),
-        gap=observations.before[rows],
-        curve_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[rows],
-        on_path=observations.on_path(rows),
         bending=bending,
     )
 
@@ -209,9 +198,10 @@ def linearized(on_map: RangesOnMap, bins_of_ranges: RangeBins | None = None) -> 
     """
     found, scatter_m = _bins(on_map) if bins_of_ranges is None else (bins_of_ranges, 0.0)
     towards = RangeGradient.of(on_map.from_anchor_m).by_tag
-    others_m2 = _wandering(found) | {PLACES: found.shared_by_places(towards, on_map.placing_m, on_map.gap)}
+    placing_m = on_map.posed.placing_stddev_m(on_map.state.metric_from_model.scale)
+    others_m2 = _wandering(found) | {PLACES: found.shared_by_places(towards, placing_m, on_map.on_path.before)}
     expected = ExpectedErrors.of(
-        found, on_map.curve_stddev_m, ruled_out(on_map.problem), others_m2, _bending(on_map, found)
+        found, on_map.posed.curve_stddev_m, ruled_out(on_map.problem), others_m2, _bending(on_map, found)
     )
     return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
 

@@ -30,9 +30,8 @@ from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.keyframe_graph import GraphBending
 from rangesfm.refine.vision_information import VisionInformation
 from rangesfm.scale.anchor_plane import mirrored_map
-from rangesfm.scale.initialize import model_from_cam
 from rangesfm.scale.placement_prior import PlacementPrior
-from rangesfm.scale.range_equation import Columns, RangeState, antenna_positions, fit_at
+from rangesfm.scale.range_equation import Columns, antenna_positions, fit_at
 from rangesfm.scale.scale_by_positions import expected_positions, groups_by_pose, refuse_open_turn
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
@@ -65,14 +64,12 @@ class RangesAtTruth:
     """Planned ranges without errors, on the true map.
 
     Attributes:
-        observations: the ranges. posed: the scale problem. state: its true state.
-        solution: at that state, each range with its weight. learned: errors to expect of the radio.
+        posed: the scale problem. solution: its true state, with the weight of each range.
+        learned: errors to expect of the radio.
         by_pose: (c, 6 n) derivatives of the bins by the poses.
     """
 
-    observations: RangeObservations
     posed: ScaleProblem
-    state: RangeState
     solution: Solution
     learned: LearnedErrors
     by_pose: Array
@@ -155,13 +152,13 @@ class Expected:
         """
         if self.ranges is None or self.num_positions or self.frame != "site":
             return None
-        mirrored = mirrored_map(self.ranges.posed.ranges, self.ranges.state)
+        mirrored = mirrored_map(self.ranges.posed.ranges, self.ranges.solution.fit.state)
         if mirrored is None:
             return None
         try:
             # For a path in that plane the height is not determined, and the solver divides 0 by 0.
             with np.errstate(invalid="ignore", divide="ignore"):
-                solution = solution_from(self.planned.posed(self.turned_out(0)), self.ranges.state)
+                solution = solution_from(self.planned.posed(self.turned_out(0)), self.ranges.solution.fit.state)
                 refuse_ambiguity(solution, [mirrored], None)
         except GeometryError as error:
             return str(error)
@@ -170,7 +167,7 @@ class Expected:
     def turned_out(self, seed: int) -> RangeObservations:
         """Return the ranges with errors drawn from those to expect."""
         assert self.ranges is not None, "a plan with ranges"
-        rng, learned, observations = np.random.default_rng(seed), self.learned, self.ranges.observations
+        rng, learned, observations = np.random.default_rng(seed), self.learned, self.ranges.posed.observations
         values, vectors = np.linalg.eigh(learned.without("white").covariance_m2)
         of_bins = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
         white_m = self.ranges.learned.stddev_of_component["white"] / np.sqrt(self.planned.num_alike)
@@ -278,20 +275,17 @@ def _positions(
 
 
 def _ranges(planned: PlannedSurvey, placement: PlacementPrior | None, max_num_bins: int) -> RangesAtTruth:
-    path, observations = planned.trajectory, planned.observations()
-    posed = planned.posed(observations, placement)
-    state = planned.state(posed, observations.log.anchor_ids)
+    posed = planned.posed(planned.observations(), placement)
+    state = planned.state(posed)
     tags, scale = antenna_positions(posed.ranges, state.metric_from_model), state.metric_from_model.scale
     errors = posed.errors.at(tags, posed.placing_stddev_m(scale))
     problem = weighted(posed.ranges, errors)
     weights = np.full(len(posed.rows), float(planned.num_alike))
     solution = Solution(problem, fit_at(problem, state, weights), errors, errors.noise_m)
     stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)
-    rotations = model_from_cam(observations, path, posed)
-    learned = errors_to_expect(posed, solution, observations, rotations, stddevs, max_num_bins)
-    slopes = slopes_by_poses(ranges_on_map(posed, solution, observations, path, None))
-    by_pose = averaged(learned.bins, slopes, len(path))
-    return RangesAtTruth(observations, posed, state, solution, learned, by_pose)
+    learned = errors_to_expect(posed, solution, stddevs, max_num_bins)
+    by_pose = averaged(learned.bins, slopes_by_poses(ranges_on_map(posed, solution, None)), len(planned.trajectory))
+    return RangesAtTruth(posed, solution, learned, by_pose)
 
 
 @dataclass(frozen=True)

@@ -199,10 +199,11 @@ class PlannedSurvey:
         given = (observations, self.trajectory, told, self.anchor_frame, self.range_model, taped)
         return scale_problem(*given, placement=placement)
 
-    def state(self, posed: ScaleProblem, anchor_ids: tuple[str, ...]) -> RangeState:
+    def state(self, posed: ScaleProblem) -> RangeState:
         """Return the true state in the frame of the problem."""
         at = {anchor.anchor_id: place for anchor, place in zip(self.anchors, self._standing_m, strict=True)}
-        places, first = np.array([at[anchor_id] for anchor_id in anchor_ids]), self.site_from_first_camera
+        places = np.array([at[anchor_id] for anchor_id in posed.observations.log.anchor_ids])
+        first = self.site_from_first_camera
         biases = posed.ranges.bias_mean_m.copy()
         if posed.frame == "site":
             return RangeState(first, places, biases)

@@ -252,7 +252,7 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     ranges = expected.ranges
     if ranges is None:
         return ()
-    on_map = ranges_on_map(ranges.posed, ranges.solution, ranges.observations, expected.planned.trajectory, None)
+    on_map = ranges_on_map(ranges.posed, ranges.solution, None)
     problem = replace(linearized(on_map, expected.learned.bins), errors=expected.learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = []

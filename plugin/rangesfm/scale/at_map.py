@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -15,8 +14,6 @@ from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.initialize import camera_velocities, model_from_cam
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
 from rangesfm.scale.scale_by_lengths import LengthScale
@@ -37,15 +34,12 @@ class MapWithRanges:
     """A map estimated from photos and ranges together.
 
     Attributes:
-        posed: the scale problem of its ranges, in the first camera's frame and the unit of the unscaled model.
-        solution: the state of the map, with its errors. observations: the ranges.
-        trajectory: of the map, in the unit of the unscaled model. bending: of the map.
+        posed: the scale problem of its ranges, on the path of the map, in the unit of the unscaled model.
+        solution: the state of the map, with its errors. bending: of the map.
     """
 
     posed: ScaleProblem
     solution: Solution
-    observations: RangeObservations
-    trajectory: Trajectory
     bending: MapBending
 
     @classmethod
@@ -90,24 +84,17 @@ class MapWithRanges:
             distances=distances,
             placement=placement,
         )
-        posed = replace(start.problem, ranges=problem, first_camera_from_sfm=from_map)
+        posed = replace(start.problem, ranges=problem, trajectory=trajectory)
         state = RangeState(placed, anchors_m, biases_m)
         by_errors = weighted(problem, errors)
         robust = errors.robust_weights(predicted_ranges(problem, state) + shared_m - problem.range_m)
         fit = fit_at(by_errors, state, robust)
         solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
-        return cls(posed, solution, start.observations, trajectory, bending)
-
-    @cached_property
-    def _rotations(self) -> Array:
-        return model_from_cam(self.observations, self.trajectory, self.posed)
+        return cls(posed, solution, bending)
 
     def learned(self) -> LearnedErrors:
         """Estimate the errors of the ranges and of the map from the residuals at this map."""
-        velocities = camera_velocities(self.observations, self.trajectory, self.posed)
-        return learned_errors(
-            self.posed, self.solution, self.observations, self._rotations, velocities, self.bending, MAX_NUM_BINS
-        )
+        return learned_errors(self.posed, self.solution, self.bending, MAX_NUM_BINS)
 
     def bending_factor(self, learned: LearnedErrors) -> float:
         """Return the learnt bending over the bending expected from the photos' residuals; 1 if that is unknown."""
@@ -125,8 +112,7 @@ class MapWithRanges:
         return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.bins), shared_m)
 
     def _bending_of(self, bins: RangeBins) -> BendingOfBins | None:
-        state = self.solution.fit.state
-        return bending_of_bins(self.bending, bins, self.posed, state, self.observations, self._rotations)
+        return bending_of_bins(self.bending, bins, self.posed, self.solution.fit.state)
 
 
 def estimate_at(

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
@@ -150,19 +149,14 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         problem = scale_problem(*posing, place_is_open=True)
         solution = solution_from(problem, error.in_first_camera)
     table = _paper_table(solution)
-    rotations = model_from_cam(observations, trajectory, problem)
-    velocities = camera_velocities(observations, trajectory, problem)
-
-    def learn(fitted: Solution) -> LearnedErrors:
-        return learned_errors(problem, fitted, observations, rotations, velocities, given.bending)
-
     by_kind = _by_other_kinds(lengths, by_positions)
     if by_kind:
         alone = _by_ranges_alone(solution)
-        by_kind = {"ranges": _by_ranges(problem, alone, learn(solution)), **by_kind}
+        by_kind = {"ranges": _by_ranges(problem, alone, learned_errors(problem, solution, given.bending)), **by_kind}
         solution = _with_share(solution, _range_share(alone, by_kind["ranges"]))
     learned, per_anchor = both(
-        lambda: learn(solution), lambda: scale_per_anchor(solution, observations.log.anchor_ids)
+        lambda: learned_errors(problem, solution, given.bending),
+        lambda: scale_per_anchor(solution, observations.log.anchor_ids),
     )
     posed = problem if lengths is None else _bent(problem, lengths)
     known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
@@ -190,7 +184,7 @@ def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
         verdict=verdict,
         reasons=reasons,
         advice=judged.advice,
-        sensitivity=scale_sensitivity(solution, rotations, observations.log.anchor_ids),
+        sensitivity=scale_sensitivity(solution, problem),
         per_anchor=per_anchor,
         two_candidate=table,
         anchors=found,
@@ -345,29 +339,6 @@ def _ranges_alone(problem: RangeProblem) -> RangeProblem:
         return replace(problem, distances=distances)
     is_placed = bool(np.isfinite(problem.anchor_stddev_m).any())
     return replace(problem, distances=distances, placement=None, frame_is_free=is_placed)
-
-
-def model_from_cam(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array:
-    """Return (k, 3, 3) rotations into the first camera's frame of the keyframe nearest to each range."""
-    turned: Array = (
-        problem.first_camera_from_sfm.rotation @ trajectory.world_from_cam[observations.nearest[problem.rows]]
-    )
-    return turned
-
-
-def camera_velocities(observations: RangeObservations, trajectory: Trajectory, problem: ScaleProblem) -> Array | None:
-    """Return the (k, 3) camera velocity at each range, in the first camera's frame, model units per second.
-
-    Returns:
-        None without times, or if the photos' times do not increase along the path.
-    """
-    times = trajectory.timestamps_s
-    if observations.log.timestamp_s is None or times is None or len(times) < 2:
-        return None
-    if (np.diff(times) <= 0).any():  # two photos at once, or a path that goes back in time
-        return None
-    velocities = np.gradient(trajectory.centers, times, axis=0)[observations.nearest[problem.rows]]
-    return np.asarray(velocities @ problem.first_camera_from_sfm.rotation.T)
 
 
 def _paper_table(solution: Solution) -> TwoCandidate | None:

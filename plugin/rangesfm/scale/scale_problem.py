@@ -27,6 +27,8 @@ _MIN_RANGES = 8
 _MIN_KEYFRAMES = 4
 # A position has three unknowns; two more ranges check the fit.
 _MIN_RANGES_OF_UNKNOWN = 5
+# Assumed walking speed where ranges have no times.
+_WALKING_M_PER_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class ScaleProblem:
         errors: prior errors of its ranges, before anything is estimated.
         observations: all ranges of the log.
         rows: (k,) rows of the observations that its ranges are.
-        first_camera_from_sfm: rigid motion from the world of the unscaled model.
+        trajectory: path of the unscaled model.
         frame: metric world of the solution: "site" or "first_camera".
         anchors_are_known: whether given anchor positions are used.
         notes: why the map has no place in the site frame, for the user.
@@ -50,12 +52,55 @@ class ScaleProblem:
     errors: RangeErrors
     observations: RangeObservations
     rows: Indices
-    first_camera_from_sfm: Similarity
+    trajectory: Trajectory
     frame: str
     anchors_are_known: bool
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
     order_given: tuple[str, ...]
+
+    @property
+    def first_camera_from_sfm(self) -> Similarity:
+        """Rigid motion from the world of the unscaled model to the model world of the ranges."""
+        return first_camera_from(self.trajectory)
+
+    @property
+    def model_from_cam(self) -> Array:
+        """(k, 3, 3) rotations of the keyframe nearest to each range."""
+        turned: Array = self.trajectory.world_from_cam[0].T @ self.trajectory.world_from_cam[self._nearest]
+        return turned
+
+    @property
+    def velocity(self) -> Array | None:
+        """(k, 3) camera velocity at each range, model units per second.
+
+        None without times, or if the photos' times do not increase along the path.
+        """
+        times = self.trajectory.timestamps_s
+        # Two photos at once, or a path that goes back in time, have no velocity.
+        if self.observations.log.timestamp_s is None or times is None or len(times) < 2 or (np.diff(times) <= 0).any():
+            return None
+        velocities = np.gradient(self.trajectory.centers, times, axis=0)[self._nearest]
+        return np.asarray(velocities @ self.trajectory.world_from_cam[0])
+
+    @property
+    def curve_stddev_m(self) -> Array | None:
+        """(k,) standard deviations of a learnt error curve that was subtracted from the ranges; None if none was."""
+        of_log = self.observations.log.shared_stddev_m
+        return None if of_log is None else of_log[self.rows]
+
+    @property
+    def _nearest(self) -> Indices:
+        return self.observations.nearest[self.rows]
+
+    def times_s(self, metres_per_unit: float) -> Array:
+        """Return (k,) times of the ranges in seconds; where the log names photos, from the distance walked."""
+        if self.observations.log.timestamp_s is not None:
+            return self.observations.log.timestamp_s[self.rows]
+        before = self.observations.before[self.rows]
+        _, first, of_range = np.unique(before, return_index=True, return_inverse=True)
+        steps_m = metres_per_unit * np.linalg.norm(np.diff(self.ranges.centers[first], axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
     def placing_stddev_m(self, metres_per_unit: float) -> Array:
         """Return the (k,) standard deviation of each coordinate of the antennas, metres, in a map of this scale."""
@@ -99,7 +144,6 @@ def scale_problem(
     # A surveyed anchor whose ranges are all held out keeps its position, so that they can be checked against it.
     placed = known | (given & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
-    first_camera_from_sfm = first_camera_from(trajectory)
     bias_m = np.array([a.range_bias_m for a in in_log])
     bias_stddev_m = np.array([_bias_stddev(a, range_model) for a in in_log])
     measured = [] if distances is None else [distances]
@@ -110,7 +154,7 @@ def scale_problem(
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], trajectory),
-        tag_from_center=observations.tag_from_center[rows] @ first_camera_from_sfm.rotation.T,
+        tag_from_center=observations.tag_from_center[rows] @ trajectory.world_from_cam[0],
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
         stddev_m=errors.stddev_m,
@@ -132,7 +176,7 @@ def scale_problem(
         errors,
         observations,
         rows,
-        first_camera_from_sfm,
+        trajectory,
         frame,
         bool(known.any()),
         tuple(notes),

@@ -7,6 +7,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.scale.range_equation import predicted_ranges, range_gradient
 from rangesfm.scale.scale_estimate import ScaleSensitivity
+from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.uncertainty import scale_influence
 
@@ -15,12 +16,8 @@ _CM = 0.01
 _SHORTER = 1 - 1e-9
 
 
-def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tuple[str, ...]) -> ScaleSensitivity:
-    """Return the changes of the scale in percent, to first order.
-
-    Args:
-        model_from_cam: (n, 3, 3) rotation of the camera at each range, into the problem's model world.
-    """
+def scale_sensitivity(solution: Solution, posed: ScaleProblem) -> ScaleSensitivity:
+    """Return the changes of the scale in percent, to first order."""
     problem, state = solution.problem, solution.fit.state
 
     influence = scale_influence(solution.fit, problem)
@@ -29,13 +26,14 @@ def scale_sensitivity(solution: Solution, model_from_cam: Array, anchor_ids: tup
         return 100 * float(influence @ range_error_m)
 
     distance = predicted_ranges(problem, state)
-    world_from_cam = state.metric_from_model.rotation @ model_from_cam
+    world_from_cam = state.metric_from_model.rotation @ posed.model_from_cam
     along_x, along_y, along_z = range_gradient(problem, state).by_tag_in_cam(world_from_cam).T
     return ScaleSensitivity(
         common_bias_per_cm=percent(np.full(len(distance), _CM)),
         short_range_per_cm=percent(np.where(distance < _SHORTER * np.median(distance), _CM, 0.0)),
         anchor_bias_per_cm={
-            anchor_id: percent(np.where(problem.anchor_index == k, _CM, 0.0)) for k, anchor_id in enumerate(anchor_ids)
+            anchor_id: percent(np.where(problem.anchor_index == k, _CM, 0.0))
+            for k, anchor_id in enumerate(posed.observations.log.anchor_ids)
         },
         range_slope_per_percent=percent(0.01 * distance),
         # A tag further out than assumed lengthens the measured ranges, which then stretch the map.

@@ -13,7 +13,6 @@ from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_i
 from rangesfm.ranging.errors.components import BENDS, CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ROUNDING, ErrorParts, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisiness, range_bins
-from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.range_equation import (
     Columns,
     RangeFit,
@@ -31,32 +30,21 @@ from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 
-# Assumed walking speed where ranges have no times.
-_WALKING_M_PER_S = 1.0
-
 
 def learned_errors(
-    posed: ScaleProblem,
-    solution: Solution,
-    observations: RangeObservations,
-    model_from_cam: Array,
-    velocities: Array | None = None,
-    bending: MapBending | None = None,
-    max_num_bins: int = MAX_NUM_BINS,
+    posed: ScaleProblem, solution: Solution, bending: MapBending | None = None, max_num_bins: int = MAX_NUM_BINS
 ) -> LearnedErrors:
     """Estimate the errors of the ranges from the residuals of a solution.
 
     Args:
         bending: of the map; None: the map is not bent.
-        model_from_cam: (n, 3, 3) rotation of the camera at each range, into the problem's model world.
-        velocities: (n, 3) camera velocities, model units per second; None: the time offset's uncertainty is ignored.
     """
-    linear, taken_off = _linear(posed, solution), observations.log.shared_stddev_m
-    of_ranges = _bins(posed, solution, observations, model_from_cam, max_num_bins)
+    linear, observations, velocity = _linear(posed, solution), posed.observations, posed.velocity
+    of_ranges = _bins(posed, solution, max_num_bins)
     others_m2 = _by_places(posed, solution, of_ranges)
-    if velocities is not None and observations.time_offset_stddev_s:
+    if velocity is not None and observations.time_offset_stddev_s:
         placed, by = solution.fit.state.metric_from_model, range_gradient(solution.problem, solution.fit.state)
-        rates = of_ranges.mean(placed.scale * np.sum(by.by_tag * (velocities @ placed.rotation.T), axis=1))
+        rates = of_ranges.mean(placed.scale * np.sum(by.by_tag * (velocity @ placed.rotation.T), axis=1))
         others_m2[CLOCKS] = observations.time_offset_stddev_s**2 * np.outer(rates, rates)
     return learn_errors(
         of_ranges,
@@ -64,27 +52,22 @@ def learned_errors(
         design=linear.design,
         prior_design=linear.prior_design,
         noise_m=solution.noise_stddev_m,
-        curve_stddev_m=None if taken_off is None else taken_off[posed.rows],
+        curve_stddev_m=posed.curve_stddev_m,
         ruled_out=ruled_out(solution.problem),
         others_m2=others_m2,
-        bending=bending_of_bins(bending, of_ranges, posed, solution.fit.state, observations, model_from_cam),
+        bending=bending_of_bins(bending, of_ranges, posed, solution.fit.state),
     )
 
 
 def bending_of_bins(
-    bending: MapBending | None,
-    of_ranges: RangeBins,
-    posed: ScaleProblem,
-    state: RangeState,
-    observations: RangeObservations,
-    model_from_cam: Array,
+    bending: MapBending | None, of_ranges: RangeBins, posed: ScaleProblem, state: RangeState
 ) -> BendingOfBins | None:
     """Return the bending in the bins of a problem's ranges at a state; None for a map that is not bent."""
     if bending is None:
         return None
-    problem, on_path = posed.ranges, observations.on_path(posed.rows)
+    problem, on_path = posed.ranges, posed.observations.on_path(posed.rows)
     gradient, arms_m = range_gradient(problem, state), problem.tag_from_center
-    slopes = by_poses(gradient, state.metric_from_model, model_from_cam, arms_m, on_path)
+    slopes = by_poses(gradient, state.metric_from_model, posed.model_from_cam, arms_m, on_path)
     return bending_in_bins(bending, of_ranges, slopes, frame_is_free=problem.frame_is_free)
 
 
@@ -106,8 +89,6 @@ def _linear(posed: ScaleProblem, solution: Solution) -> LinearMap:
 def errors_to_expect(
     posed: ScaleProblem,
     solution: Solution,
-    observations: RangeObservations,
-    model_from_cam: Array,
     stddevs: Mapping[str, float],
     max_num_bins: int = MAX_NUM_BINS,
 ) -> LearnedErrors:
@@ -117,14 +98,9 @@ def errors_to_expect(
         stddevs: by name, standard deviations of components of which more is known.
         max_num_bins: fewer bins are coarser and take less time.
     """
-    taken_off = observations.log.shared_stddev_m
-    of_ranges = _bins(posed, solution, observations, model_from_cam, max_num_bins)
-    return ExpectedErrors.of(
-        of_ranges,
-        None if taken_off is None else taken_off[posed.rows],
-        ruled_out(solution.problem),
-        _by_places(posed, solution, of_ranges),
-    ).usual(stddevs)
+    of_ranges = _bins(posed, solution, max_num_bins)
+    placed_m2 = _by_places(posed, solution, of_ranges)
+    return ExpectedErrors.of(of_ranges, posed.curve_stddev_m, ruled_out(solution.problem), placed_m2).usual(stddevs)
 
 
 def _by_places(posed: ScaleProblem, solution: Solution, of_ranges: RangeBins) -> dict[str, Array]:
@@ -142,36 +118,20 @@ def ruled_out(problem: RangeProblem) -> list[str]:
     return [name for name, stddev in stddevs.items() if stddev == 0]
 
 
-def _bins(
-    posed: ScaleProblem,
-    solution: Solution,
-    observations: RangeObservations,
-    model_from_cam: Array,
-    max_num: int = MAX_NUM_BINS,
-) -> RangeBins:
-    problem, state, log = solution.problem, solution.fit.state, observations.log
+def _bins(posed: ScaleProblem, solution: Solution, max_num: int) -> RangeBins:
+    problem, state = solution.problem, solution.fit.state
     by = range_gradient(problem, state)
-    world_from_cam = state.metric_from_model.rotation @ model_from_cam
+    world_from_cam = state.metric_from_model.rotation @ posed.model_from_cam
     return range_bins(
         problem.anchor_index,
-        log.tag_index[posed.rows],
-        times_of_ranges(posed, solution, observations),
+        posed.observations.log.tag_index[posed.rows],
+        posed.times_s(state.metric_from_model.scale),
         by.by_tag * by.distance_m[:, None],
         np.swapaxes(world_from_cam, 1, 2),
         solution.fit.weights,
         noisiness(problem.anchor_index, solution.fit.residuals_m, problem.num_anchors),
         max_num,
     )
-
-
-def times_of_ranges(posed: ScaleProblem, solution: Solution, observations: RangeObservations) -> Array:
-    """Return (n,) times of the ranges in seconds; where the log names photos, from the distance walked between them."""
-    if observations.log.timestamp_s is not None:
-        return observations.log.timestamp_s[posed.rows]
-    _, first, of_range = np.unique(observations.before[posed.rows], return_index=True, return_inverse=True)
-    scale = solution.fit.state.metric_from_model.scale
-    steps_m = scale * np.linalg.norm(np.diff(posed.ranges.centers[first], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.geometry.trajectory import in_first_camera
 from rangesfm.join.join_models import ModelVerdict, join_models
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset
@@ -145,7 +145,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
             raise GeometryError(f"{error}; {doubts}") from None
         raise _refused_with_cause(error, run, path) from None
     on_map, rivals = None, None
-    if not is_a_start and (on_map := _ranges_on_scaled(estimate, path.trajectory, bending)) is not None:
+    if not is_a_start and (on_map := _ranges_on_scaled(estimate, bending)) is not None:
         estimate = estimate_by_bent(estimate, on_map, survey.scale)
     if offset is not None and offset.rivals:
         rivals = scale_by_rivals(run, path, offset, estimate.value)
@@ -182,7 +182,7 @@ def _refused_with_cause(error: GeometryError, run: SurveyRun, path: PathOfModel)
         estimate = lenient.estimate_scale(path, bending)
     except (GeometryError, np.linalg.LinAlgError):
         return error
-    return _with_cause(error, run.survey, _ranges_on_scaled(estimate, path.trajectory, bending))
+    return _with_cause(error, run.survey, _ranges_on_scaled(estimate, bending))
 
 
 def _with_cause(error: GeometryError, survey: Survey, on_map: RangesOnMap | None) -> GeometryError:
@@ -197,15 +197,12 @@ def _with_cause(error: GeometryError, survey: Survey, on_map: RangesOnMap | None
     )
 
 
-def _ranges_on_scaled(
-    estimate: ScaleEstimate, trajectory: Trajectory, bending: MapBending | None
-) -> RangesOnMap | None:
+def _ranges_on_scaled(estimate: ScaleEstimate, bending: MapBending | None) -> RangesOnMap | None:
     """Return the ranges on the scaled map; a path without points is bent to the ranges. None without ranges."""
     if estimate.problem is None or estimate.solution is None:
         return None
-    bending = bending or WalkBending(in_first_camera(trajectory))
-    on_map = ranges_on_map(estimate.problem, estimate.solution, estimate.observations, trajectory, bending)
-    return bent_to_ranges(on_map)
+    bending = bending or WalkBending(in_first_camera(estimate.problem.trajectory))
+    return bent_to_ranges(ranges_on_map(estimate.problem, estimate.solution, bending))
 
 
 def _diagnose(survey: Survey, on_map: RangesOnMap | None) -> Diagnosis | None:
@@ -475,9 +472,9 @@ def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, Rang
     start, at, learned = metric.estimate, metric.refined_with_ranges, None
     if at is not None and metric.kept_refinement is not None:
         learned = metric.kept_refinement.errors.learned
-        on_map: RangesOnMap | None = ranges_on_map(at.posed, at.solution, at.observations, at.trajectory, at.bending)
+        on_map: RangesOnMap | None = ranges_on_map(at.posed, at.solution, at.bending)
     else:
-        on_map = metric.on_map or _ranges_on_scaled(start, metric.trajectory, None)
+        on_map = metric.on_map or _ranges_on_scaled(start, None)
     try:
         if at is not None and learned is not None:
             estimate = estimate_at(at, learned.subset(at.posed.rows), start, survey.scale)
