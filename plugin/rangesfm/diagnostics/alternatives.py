@@ -11,11 +11,10 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import MEASURE_AGAIN, Correction, corrected, in_axes, where_ranges_meet
 from rangesfm.diagnostics.linearized import RangesOnMap
-from rangesfm.geometry.similarity import Similarity, align_points
-from rangesfm.ranging.anchors.point_fit import multilaterate
+from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
-from rangesfm.scale.starts import spread_rows
+from rangesfm.scale.starts import multilaterate_all, spread_rows
 
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
 # Robust weight of a range that fits, and share of an anchor's ranges that fit if it is about where it is said to be.
@@ -26,7 +25,7 @@ _UNITS_M = {
     "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / _FOOT_M,
     "the ranges are of both ways, there and back": 2.0,
 }
-_SCALE_FACTORS = np.geomspace(1 / 4, 4, 7).tolist()
+_SCALE_FACTORS = np.geomspace(1 / 4, 4, 7)
 _AXES_OF_ANCHORS = {
     "x and y are swapped": np.eye(3)[[1, 0, 2]],
     "y and z are swapped": np.eye(3)[[0, 2, 1]],
@@ -201,20 +200,12 @@ def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
         frame_is_free=False,
         gravity=None,
     )
-    starts = [_multilaterated(unknown, factor) for factor in _SCALE_FACTORS]
-    start = min(starts, key=lambda state: _cost(unknown, state))
+    anchors_m, (_, costs) = multilaterate_all(unknown, _SCALE_FACTORS)
+    best = int(np.argmin(costs))
+    heard = np.where(np.isinf(unknown.anchor_stddev_m)[:, None], anchors_m[best], np.nan)
+    start = RangeState(replace(IDENTITY, scale=float(_SCALE_FACTORS[best])), heard, unknown.bias_mean_m)
     state = solve(unknown, start, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS).state
     return state.metric_from_model, state.anchors_m
-
-
-def _multilaterated(problem: RangeProblem, scale: float) -> RangeState:
-    """Locate the anchors from the tag's positions, in a map enlarged by a given scale."""
-    tags = scale * problem.centers + problem.tag_from_center
-    anchors_m = np.full((problem.num_anchors, 3), np.nan)
-    for k in np.unique(problem.anchor_index):
-        rows = problem.anchor_index == k
-        anchors_m[k], _ = multilaterate(tags[rows], problem.range_m[rows] - problem.bias_mean_m[k])
-    return RangeState(Similarity(scale, np.eye(3), np.zeros(3)), anchors_m, problem.bias_mean_m)
 
 
 def _lever_arms_m(on_map: RangesOnMap) -> Mapping[str, Array]:

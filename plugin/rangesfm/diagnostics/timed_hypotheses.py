@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -89,7 +90,6 @@ def _elsewhere(
     most_m: float,
     axes: Callable[[], Array],
     by_shift: Array,
-    around: float | None = None,
 ) -> Iterator[Hypothesis]:
     """Yield moves at unknown times, relative to one anchor or to all.
 
@@ -97,7 +97,6 @@ def _elsewhere(
         name: kind of the move, a key of ``_MOVES``. most_m: largest possible move.
         axes: axes of the move, (3, 3), or (n, 3, 3) for each range.
         by_shift: (c, 3) derivatives of the predicted ranges along these axes.
-        around: as in ``_changes``.
     """
     words, remedy, max_unnoticed = _MOVES[name]
     whose = _name(problem, anchor)
@@ -107,19 +106,20 @@ def _elsewhere(
         grown_m = np.linalg.norm(from_anchor_m + axes() @ size, axis=1) - np.linalg.norm(from_anchor_m, axis=1)
         return Correction(longer_m=np.where(later(), grown_m, 0.0))
 
-    for time, later, after in _changes(problem, anchor, 3 * _MIN_NUM_BINS, around):
-        yield Hypothesis(
+    def moved(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
+        return Hypothesis(
             name,
             of_bins(problem, -after[:, None] * by_shift),
             subject=whose,
-            words=partial(words, whose, _when(problem, time)),
+            words=partial(words, whose, when),
             remedy=remedy,
             correction=partial(back, later),
             most=most_m,
             adoption=partial(_left_out, later),
             max_unnoticed=max_unnoticed,
-            refine_time=partial(_elsewhere, problem, anchor, name, most_m, axes, by_shift, around=time),
         )
+
+    return _changes(problem, anchor, 3 * _MIN_NUM_BINS, moved)
 
 
 def steps(problem: Linearized) -> Iterator[Hypothesis]:
@@ -128,25 +128,26 @@ def steps(problem: Linearized) -> Iterator[Hypothesis]:
         yield from _steps(problem, k)
 
 
-def _steps(problem: Linearized, anchor: int | None, around: float | None = None) -> Iterator[Hypothesis]:
+def _steps(problem: Linearized, anchor: int | None) -> Iterator[Hypothesis]:
     name = _name(problem, anchor)
 
     def words(when: str, size: Array) -> str:
         to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
         return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
 
-    for time, later, after in _changes(problem, anchor, _MIN_NUM_BINS, around):
-        yield Hypothesis(
+    def step(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
+        return Hypothesis(
             "anchor step" if name else "step",
             of_bins(problem, -after),
             subject=name,
-            words=partial(words, _when(problem, time)),
+            words=partial(words, when),
             remedy="see what changed then: a tag that slipped, a restarted radio, a door or a vehicle in between",
             correction=longer(later),
             most=longest_m(problem, anchor),
             is_linear=True,
-            refine_time=partial(_steps, problem, anchor, around=time),
         )
+
+    return _changes(problem, anchor, _MIN_NUM_BINS, step)
 
 
 def stretches(problem: Linearized) -> Iterator[Hypothesis]:
@@ -176,29 +177,25 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
             )
 
 
-def clock_jumps(problem: Linearized, around: float | None = None) -> Iterator[Hypothesis]:
+def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the clocks' offset jumped at some time."""
-    if problem.by_time is None:
-        return
+    by_time = problem.by_time
+    if by_time is None:
+        return iter(())
 
-    def words(when: str, size: Array) -> str:
-        return f"the clocks' offset jumped by about {size[0]:+.2f} s {when}"
-
-    def correction(later: Callable[[], Mask], size: Array) -> Correction:
-        return Correction(time_shift_s=np.where(later(), size[0], 0.0))
-
-    for time, later, after in _changes(problem, None, _MIN_NUM_BINS, around):
-        yield Hypothesis(
+    def jump(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
+        return Hypothesis(
             "clock jump",
-            of_bins(problem, -after * problem.by_time),
-            words=partial(words, _when(problem, time)),
+            of_bins(problem, -by_time * after),
+            words=lambda size: f"the clocks' offset jumped by about {size[0]:+.2f} s {when}",
             remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
-            correction=partial(correction, later),
+            correction=lambda size: Correction(time_shift_s=np.where(later(), size[0], 0.0)),
             most=duration_s(problem),
             unit="s",
             is_linear=True,
-            refine_time=partial(clock_jumps, problem, around=time),
         )
+
+    return _changes(problem, None, _MIN_NUM_BINS, jump)
 
 
 def _name(problem: Linearized, anchor: int | None) -> str:
@@ -226,15 +223,19 @@ def _is_of(anchor_index: Indices, anchor: int | None) -> Mask:
 
 
 def _changes(
-    problem: Linearized, anchor: int | None, least: int, around: float | None = None
-) -> Iterator[tuple[float, Callable[[], Mask], Array]]:
-    """Yield times away from the ends of the survey, with what follows them.
-
-    Each comes with a function that returns the later ranges of one anchor, or of all, and with (c,) shares of the bins
-    that are later.
+    problem: Linearized,
+    anchor: int | None,
+    least: int,
+    change: Callable[[str, Callable[[], Mask], Array], Hypothesis],
+    around: float | None = None,
+) -> Iterator[Hypothesis]:
+    """Yield a change of one anchor, or of all, at times away from the ends of the survey.
 
     Args:
-        least: fewest bins before and after. around: try only times near this one, more closely spaced.
+        least: fewest bins before and after.
+        change: returns the hypothesis, given words for its time, a function that returns the later ranges, and (c,)
+            shares of the bins that are later.
+        around: try only times near this one, more closely spaced.
     """
     ends = _LEAST_SHARE, 1 - _LEAST_SHARE
     of_ranges = _is_of(problem.on_map.problem.anchor_index, anchor)
@@ -246,7 +247,8 @@ def _changes(
     for time, share in zip(times.tolist(), _shares_after(problem, times), strict=True):
         after = np.where(is_of, share, 0.0)
         if min(after.sum(), is_of.sum() - after.sum()) >= least:
-            yield time, partial(_later, problem, anchor, time), after
+            made = change(_when(problem, time), partial(_later, problem, anchor, time), after)
+            yield replace(made, refine_time=partial(_changes, problem, anchor, least, change, time))
 
 
 def _windows(problem: Linearized) -> Iterator[tuple[float, float, Array]]:

@@ -100,7 +100,7 @@ def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
     """Return starts for unknown anchors: a sweep over the scale, in which each anchor is solved linearly."""
     small = spread_subset(problem, _MAX_RANGES_PER_ANCHOR)
     scales = scale_candidates(problem)
-    anchors, costs = _multilaterate_all(small, scales)
+    anchors, costs = multilaterate_all(small, scales)
     best = dict.fromkeys(i for kind in costs for i in _lowest_minima(kind))
     starts = [RangeState(replace(IDENTITY, scale=scales[i]), anchors[i], problem.bias_mean_m.copy()) for i in best]
     return [choose_sides(small, start)[0] for start in starts]
@@ -233,7 +233,7 @@ def anchor_alone(problem: RangeProblem, k: int, metric_from_model: Similarity) -
     )
 
 
-def _multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Array]:
+def multilaterate_all(problem: RangeProblem, scales: Array) -> tuple[Array, Array]:
     """Locate each anchor from the tag's positions, at each of s scales.
 
     Returns:
