@@ -12,10 +12,11 @@ from tests.studies.erring_surveys import SITES, run, surveyed
 from rangesfm.diagnostics import hypothesis_tests
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.hypothesis import Hypothesis
-from rangesfm.diagnostics.hypothesis_tests import FALSE_ALARM_RATE, Factorization, noncentrality, row_of
+from rangesfm.diagnostics.hypothesis_tests import FALSE_ALARM_RATE, Factorization, row_of
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.diagnostics.mistakes import find_mistakes
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
+from rangesfm.scale.linear_map import noncentrality
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def test_the_smallest_detectable_mistake_raises_the_statistic_as_it_must(problem
             made = replace(silent, residual_m=each.effect.columns @ size, prior_residual=each.effect.priors @ size)
             [found] = Factorization(made).test([each], 0)
             assert found.statistic == pytest.approx(noncentrality(1), rel=1e-4)
-            moved = Factorization(made).step()[0]
+            moved = Factorization(made).step[0]
             assert abs(moved) == pytest.approx(found.effect_on_log_scale, rel=1e-3, abs=1e-9)
 
 

@@ -11,8 +11,7 @@ from tests.known import known
 from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.scale.scale_by_kind import ScaleByKind
-from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
+from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind, scale_by_lengths
 
 SCALE, TAPE_M = 0.45, 0.005
 

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, slopes_by_poses
 from rangesfm.geometry.similarity import rmse
 from rangesfm.options import ScaleOptions
@@ -19,7 +18,7 @@ from rangesfm.scale.range_equation import state_after
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import judge
-from rangesfm.scale.uncertainty import KnownMap, LinearMap, bias_covariance
+from rangesfm.scale.uncertainty import KnownMap, bias_covariance
 
 _MAX_NUM_ROUNDS = 8
 # Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
@@ -76,13 +75,10 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
     status[posed.rows] = status_by_weight(problem.bins.robust_weight)
     stddev_m[posed.rows] = problem.scatter_m
-    return replace(
-        estimate,
+    return estimate.judged(
+        replace(judged, reasons=(*judged.reasons, drift)),
         metric_from_sfm=on_map.state.metric_from_model @ posed.first_camera_from_sfm,
         uncertainty=uncertainty,
-        verdict=judged.verdict,
-        reasons=(*judged.reasons, drift, *estimate.remarks),
-        advice=judged.advice,
         placement=problem.columns.placement(covariance),
         observations=replace(estimate.observations, status=status),
         errors=replace(estimate.errors, stddev_m=stddev_m),
@@ -92,11 +88,9 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
 
 def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
     """Return the uncertainty of a path at the estimate with the best weights, compared with simple weights."""
-    errors, off_m, prior_off = problem.errors, -problem.residual_m, -problem.prior_residual
-    simple_m2 = errors.only("white", *BENDS).covariance_m2 + bias_covariance(problem.bins, posed.ranges)
-    linear = LinearMap(off_m, problem.design, prior_off, problem.prior_design, problem.columns)
-    variances, of_bins, of_priors = linear.with_weights(simple_m2, errors.covariance_m2)
-    return linear.known(errors, formal, variances, of_bins @ off_m + of_priors @ prior_off)
+    simple_m2 = problem.errors.only("white", *BENDS).covariance_m2 + bias_covariance(problem.bins, posed.ranges)
+    variances, _ = problem.with_weights(simple_m2, problem.errors.covariance_m2)
+    return KnownMap.between(problem, problem.errors, formal, variances, problem.solved(simple_m2).step)
 
 
 def learnt_at(on_map: RangesOnMap) -> Linearized:
@@ -111,7 +105,7 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
     factors = walk.factors(problem.bins, slopes_by_poses(on_map), frame_is_free=is_free)
-    step = Factorization(problem).step()
+    step = problem.solved(problem.errors.covariance_m2).step
     left_m = problem.residual_m + problem.design @ step
     pulls = cho_solve(cho_factor(problem.errors.covariance_m2), left_m)
     bent = walk.bent_back(factors, pulls, problem.errors.stddev_of_component, frame_is_free=is_free)

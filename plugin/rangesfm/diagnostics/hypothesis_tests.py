@@ -1,16 +1,9 @@
-"""Tests of hypotheses: how much better each explains the observations than chance would (Baarda; Teunissen).
-
-Let e be the residuals, A the design and H the columns of a mistake, all whitened by the residuals' covariance and
-projected off A. The statistic is T = e'H (H'H)^-1 H'e; without a mistake it is chi-square distributed with as many
-degrees of freedom as H has columns. The size of the mistake is estimated as (H'H)^-1 H'e (Teunissen, Network Quality
-Control, 2024). One Cholesky and one QR decomposition serve all tests.
-"""
+"""Tests of all hypotheses together: how much better each explains the observations than chance would."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from scipy import special
@@ -19,43 +12,32 @@ from scipy.linalg import solve_triangular
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.scale.linear_map import NOTHING_LEFT, EstimatedMistake, Solved, noncentrality
 
 FALSE_ALARM_RATE = 0.02
-# Baarda's significance level of a single test, and the probability that it misses a mistake of the smallest size.
-_ALPHA, _BETA = 0.001, 0.2
 _NUM_DRAWS = 1000
-# Squared share of an effect below which what the unknowns leave of it is only rounding.
-_NOTHING_LEFT = 1e-7
 
 
 @dataclass(frozen=True)
-class Test:
+class Test(EstimatedMistake):
     """The result of the test of one hypothesis.
 
     Attributes:
-        statistic: chi-square distributed with ``num`` degrees of freedom if there is no such mistake of any size.
-        threshold: for all hypotheses together.
-        sizes, stddevs: (k,) estimate of the mistake's numbers.
-        smallest_detectable: minimal detectable bias in the worst direction; inf: it cannot be detected.
+        threshold: of the statistic, for all hypotheses together.
         redundancy: how much of the mistake the other observations check, 0 to 1: the share of its information in the
             ranges that the unknowns leave, in the worst direction (Baarda's redundancy number, for several numbers).
-        effect_on_log_scale, effect_on_place_m: largest effect of an undetected mistake of that size.
-        log_scale_by_unit: largest change of the scale's logarithm per unit of the mistake, also where none is found.
-        basis: (c + r, num) orthonormal basis of the effect, whitened and projected.
+        effect_on_place_m: largest effect of an undetected mistake of the smallest detectable size.
     """
 
     hypothesis: Hypothesis
-    statistic: float
     threshold: float
-    num: int
-    sizes: Array
-    stddevs: Array
-    smallest_detectable: float
     redundancy: float
-    effect_on_log_scale: float
     effect_on_place_m: float
-    log_scale_by_unit: float
-    basis: Array
+
+    @property
+    def log_scale_by_unit(self) -> float:
+        """Largest change of the scale's logarithm per unit of the mistake, also where none is found."""
+        return float(np.linalg.norm(self.by_unknowns[0]))
 
     @property
     def is_possible(self) -> bool:
@@ -112,27 +94,21 @@ class MistakeTest:
         return self.statistic > self.threshold
 
 
-class Factorization:
-    """The matrix decompositions that all tests share."""
+class Factorization(Solved):
+    """The solution of a problem, with the tests of all mistakes in it."""
 
     def __init__(self, problem: Linearized):
+        super().__init__(
+            problem.errors.covariance_m2,
+            problem.design,
+            problem.residual_m,
+            problem.prior_design,
+            problem.prior_residual,
+        )
         self.problem = problem
-        self._factor = np.linalg.cholesky(problem.errors.covariance_m2)
-        self._basis, triangle = np.linalg.qr(self._whitened(problem.design, problem.prior_design))
-        scale = np.maximum(np.abs(np.diag(triangle)), 1e-12)
-        self._triangle = triangle + np.diag(np.where(np.abs(np.diag(triangle)) < 1e-9, 1e-9, 0.0) * scale)
         # Quadratic form of the path's mean square displacement in the unknowns.
         place = problem.place.reshape(-1, problem.columns.num)
         self._place = place.T @ place / len(problem.place)
-        self.residual = self._off(self._whitened(problem.residual_m[:, None], problem.prior_residual[:, None]))[:, 0]
-
-    def _whitened(self, bins: Array, priors: Array) -> Array:
-        return np.vstack([solve_triangular(self._factor, bins, lower=True), priors])
-
-    def _off(self, whitened: Array) -> Array:
-        """Project off what the unknowns can explain."""
-        left: Array = whitened - self._basis @ (self._basis.T @ whitened)
-        return left
 
     def deviance(self, made: Test | None = None) -> float:
         """Return -2 times the log-likelihood of observations and errors, up to a constant; with a mistake if given.
@@ -140,18 +116,12 @@ class Factorization:
         It compares two explanations of the same bins, each with the errors that it leaves.
         """
         squares = float(self.residual @ self.residual) - (made.statistic if made else 0.0)
-        return squares + 2 * float(np.sum(np.log(np.diag(self._factor)))) + self.problem.errors.unlikeliness
+        return squares + 2 * float(np.sum(np.log(np.diag(self.lower)))) + self.problem.errors.unlikeliness
 
-    def step(self, made: tuple[Effect, Array] | None = None) -> Array:
+    def step_with(self, effect: Effect, sizes: Array) -> Array:
         """Return the (p,) step from the state to the likeliest one, given a mistake of some size (k,)."""
-        bins, priors = self.problem.residual_m, self.problem.prior_residual
-        if made is not None:
-            effect, sizes = made
-            bins, priors = bins - effect.columns @ sizes, priors - effect.priors @ sizes
-        return -self._solved(self._whitened(bins[:, None], priors[:, None]))[:, 0]
-
-    def _solved(self, whitened: Array) -> Array:
-        return np.asarray(solve_triangular(self._triangle, self._basis.T @ whitened))
+        mistake = self.whitened(effect.columns, effect.priors) @ sizes
+        return self.step - self.by_unknowns(mistake[:, None])[:, 0]
 
     def test(self, hypotheses: Sequence[Hypothesis], seed: int) -> list[Test]:
         """Test all hypotheses, with thresholds that hold for all together."""
@@ -162,61 +132,29 @@ class Factorization:
     def estimates(self, hypotheses: Sequence[Hypothesis]) -> list[Test]:
         """Test all hypotheses without thresholds."""
         effects = Effect.of_all([h.effect for h in hypotheses])
-        whitened = self._whitened(effects.columns, effects.priors)
-        left = self._off(whitened)
+        whitened = self.whitened(effects.columns, effects.priors)
+        left, by_unknowns = self.left(whitened), self.by_unknowns(whitened)
         ends = np.cumsum([h.num for h in hypotheses])
         parts = [slice(end - h.num, end) for end, h in zip(ends, hypotheses, strict=True)]
-        bases = [_basis_of(left[:, part], whitened[:, part]) for part in parts]
-        by_unknowns = -self._solved(whitened)
-        seen = self._seen(hypotheses, whitened, parts)
         return [
-            self._test(h, left[:, part], basis, by_unknowns[:, part], of_ranges)
-            for h, part, basis, of_ranges in zip(hypotheses, parts, bases, seen, strict=True)
-        ]
-
-    def _seen(self, hypotheses: Sequence[Hypothesis], whitened: Array, parts: Sequence[slice]) -> list[Array]:
-        """Return the whitened effects on ranges with a known map, a matrix for each hypothesis."""
-        num = len(self._factor)
-        return [
-            whitened[:num, part] if h.seen is None else solve_triangular(self._factor, h.seen, lower=True)
+            self._test(h, whitened[:, part], left[:, part], by_unknowns[:, part])
             for h, part in zip(hypotheses, parts, strict=True)
         ]
 
-    def _test(self, hypothesis: Hypothesis, left: Array, basis: Array, by_unknowns: Array, seen: Array) -> Test:
-        values, vectors = np.linalg.eigh(left.T @ left)
-        is_seen = values > _NOTHING_LEFT * values[-1]
-        # Root of the inverse, without the directions that cannot be seen.
-        root = vectors[:, is_seen] / np.sqrt(values[is_seen])
-        inverse = root @ root.T
-        is_whole = basis.shape[1] == left.shape[1]
-        worst, on_scale, on_place = np.inf, np.inf, np.inf
-        if is_whole:
-            needed = noncentrality(basis.shape[1])
-            worst = float(np.sqrt(needed / values[is_seen][0]))
-            # The mistake with the largest effect among those that are just detectable.
-            of_unit = by_unknowns @ root
-            on_scale = float(np.sqrt(needed) * np.linalg.norm(of_unit[0]))
-            on_place = float(np.sqrt(needed * max(np.linalg.eigvalsh(of_unit.T @ self._place @ of_unit)[-1], 0.0)))
+    def _test(self, hypothesis: Hypothesis, whitened: Array, left: Array, by_unknowns: Array) -> Test:
+        found, on_place, redundancy = self.estimated(whitened, left, by_unknowns), np.inf, 0.0
+        if found.is_seen:
+            of_unit = by_unknowns @ found.root
+            worst = np.linalg.eigvalsh(of_unit.T @ self._place @ of_unit)[-1]
+            on_place = float(np.sqrt(noncentrality(found.num) * max(worst, 0.0)))
+            # The effect on the ranges of a map that is known.
+            seen = whitened[: len(self.lower)]
+            if hypothesis.seen is not None:
+                seen = solve_triangular(self.lower, hypothesis.seen, lower=True)
+            redundancy = _redundancy(left, seen)
         return Test(
-            hypothesis=hypothesis,
-            statistic=float(np.sum((basis.T @ self.residual) ** 2)),
-            threshold=np.inf,
-            num=basis.shape[1],
-            sizes=inverse @ (left.T @ self.residual),
-            stddevs=np.sqrt(np.diag(inverse)) if is_whole else np.full(len(inverse), np.inf),
-            smallest_detectable=worst,
-            redundancy=_redundancy(left, seen) if is_whole else 0.0,
-            log_scale_by_unit=float(np.linalg.norm(by_unknowns[0])),
-            effect_on_log_scale=on_scale,
-            effect_on_place_m=on_place,
-            basis=basis,
+            **vars(found), hypothesis=hypothesis, threshold=np.inf, redundancy=redundancy, effect_on_place_m=on_place
         )
-
-
-@cache
-def noncentrality(num: int) -> float:
-    """Return the noncentrality at which a mistake of ``num`` numbers is found (Baarda's lambda_0)."""
-    return float(special.chndtrinc(special.chdtri(num, _ALPHA), num, _BETA))
 
 
 def _redundancy(left: Array, seen: Array) -> float:
@@ -227,20 +165,10 @@ def _redundancy(left: Array, seen: Array) -> float:
     """
     of_left, of_seen = left.T @ left, seen.T @ seen
     values, vectors = np.linalg.eigh(of_seen)
-    if values[0] <= _NOTHING_LEFT * values[-1]:
+    if values[0] <= NOTHING_LEFT * values[-1]:
         return 0.0
     root = vectors / np.sqrt(values)
     return float(np.clip(np.linalg.eigvalsh(root.T @ of_left @ root)[0], 0.0, 1.0))
-
-
-def _basis_of(left: Array, whitened: Array) -> Array:
-    """Return a (c + r, k') orthonormal basis of an effect after projection, without what is only rounding."""
-    sizes = np.maximum(np.linalg.norm(whitened, axis=0), 1e-12)
-    if left.shape[1] == 1:
-        length = np.linalg.norm(left)
-        return left / length if (length / sizes[0]) ** 2 > _NOTHING_LEFT else left[:, :0]
-    vectors, values, _ = np.linalg.svd(left / sizes, full_matrices=False)
-    return np.asarray(vectors[:, values**2 > _NOTHING_LEFT])
 
 
 def _thresholds(bases: Sequence[Array], nums: Array, seed: int) -> Array:
@@ -270,28 +198,46 @@ def overlap(first: Test, second: Test) -> float:
 
 def row_of(test: Test) -> MistakeTest:
     """Return the row of the table; an impossible estimate is shown without its size."""
+    hypothesis, words, shown = test.hypothesis, "", test
     if not test.is_possible:
-        row = row_of(replace(test, statistic=0.0, sizes=np.zeros_like(test.sizes)))
-        name, unit = " ".join(test.hypothesis.key).strip(), test.hypothesis.unit.replace("1", "")
-        most = f"{test.hypothesis.most:.2g} {unit}".rstrip()
+        shown = replace(test, statistic=0.0)
+        name, unit = " ".join(hypothesis.key).strip(), hypothesis.unit.replace("1", "")
+        most = f"{hypothesis.most:.2g} {unit}".rstrip()
         words = f"no {name} that can happen ({most} at most) explains the ranges"
-        return replace(row, size=None, stddev=None, words=words)
-    one = len(test.sizes) == 1
-    return MistakeTest(
-        name=test.hypothesis.name,
-        subject=test.hypothesis.subject,
-        statistic=test.statistic,
-        threshold=test.threshold if np.isfinite(test.threshold) else 0.0,
-        size=finite(float(test.sizes[0] if one else np.linalg.norm(test.sizes))),
-        stddev=finite(float(test.stddevs[0] if one else np.linalg.norm(test.stddevs))),
-        unit=test.hypothesis.unit,
-        smallest_detectable=finite(test.smallest_detectable),
-        effect_on_scale=finite(test.effect_on_log_scale),
+    row = row_of_mistake(
+        *hypothesis.key,
+        shown,
+        test.threshold if np.isfinite(test.threshold) else 0.0,
+        words or hypothesis.words(test.sizes),
+        hypothesis.remedy,
+        hypothesis.unit,
+    )
+    if words:
+        row = replace(row, size=None, stddev=None)
+    return replace(
+        row,
         effect_on_place_m=finite(test.effect_on_place_m),
         redundancy=test.redundancy,
         is_checked=test.is_checked,
-        words=test.hypothesis.words(test.sizes),
-        remedy=test.hypothesis.remedy,
+    )
+
+
+def row_of_mistake(
+    name: str, subject: str, found: EstimatedMistake, threshold: float, words: str, remedy: str, unit: str = "m"
+) -> MistakeTest:
+    """Return the row of the table for a mistake: one number with its sign, or the length of a vector."""
+    return MistakeTest(
+        name,
+        subject,
+        found.statistic,
+        threshold,
+        words,
+        remedy,
+        unit,
+        size=float(found.sizes[0] if len(found.sizes) == 1 else np.linalg.norm(found.sizes)) if found.is_seen else None,
+        stddev=finite(float(np.linalg.norm(found.stddevs))),
+        smallest_detectable=finite(found.smallest_detectable),
+        effect_on_scale=finite(found.effect_on_log_scale),
     )
 
 

@@ -8,10 +8,11 @@ import numpy as np
 from scipy import special
 
 from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
+from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite
 from rangesfm.diagnostics.scale_bound import hidden_lengths
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.errors import number_text
+from rangesfm.scale.linear_map import noncentrality
 from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 

@@ -16,8 +16,8 @@ from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
+from rangesfm.scale.linear_map import LinearMap
 from rangesfm.scale.range_equation import (
-    Columns,
     RangeProblem,
     RangeState,
     antenna_positions,
@@ -124,14 +124,12 @@ def ranges_on_map(posed: ScaleProblem, solution: Solution, bending: MapBending |
 
 
 @dataclass(frozen=True)
-class Linearized:
-    """The linear problem of c bins of ranges and r priors with p parameters; the anchors' biases are random errors.
+class Linearized(LinearMap):
+    """The linear problem of c bins of ranges and r priors; the anchors' biases are random errors.
+
+    Its residuals are those of the map as the photos alone would have it. Priors are first those of the anchors' places.
 
     Attributes:
-        residual_m: (c,) predicted minus measured, on the map as the photos alone would have it.
-        design: (c, p) Jacobian of the residuals.
-        prior_residual, prior_design: (r,) and (r, p), in standard deviations; first those of the anchors' positions.
-        columns: position of each parameter; the first is the logarithm of the scale.
         place: (c, 3, p) derivative of the camera's position in each bin.
         bins: how ranges are averaged. time_s: (c,) mean times.
         gradient: of the c distances.
@@ -141,11 +139,6 @@ class Linearized:
         expected: errors to expect before anything is measured. errors: the errors assumed random.
     """
 
-    residual_m: Array
-    design: Array
-    prior_residual: Array
-    prior_design: Array
-    columns: Columns
     place: Array
     bins: RangeBins
     time_s: Array

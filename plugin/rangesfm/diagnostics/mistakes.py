@@ -235,7 +235,7 @@ def _settled_in_steps(problem: Linearized, original: Hypothesis) -> _Settled:
 
 def _stepped(at: Linearized, factorized: Factorization, hypothesis: Hypothesis, sizes: Array) -> RangesOnMap:
     """Return the ranges on the map that is likeliest with a mistake of some size."""
-    step = factorized.step((hypothesis.effect, sizes))
+    step = factorized.step_with(hypothesis.effect, sizes)
     return replace(at.on_map, state=state_after((at.columns,), at.on_map.state, step))
 
 
@@ -280,7 +280,7 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Alternativ
 def _settled(problem: Linearized) -> Linearized:
     """Move to the likeliest state if a linear step improves it; from far away it does not."""
     here = Factorization(problem.with_usual_errors())
-    state = state_after((problem.columns,), problem.on_map.state, here.step())
+    state = state_after((problem.columns,), problem.on_map.state, here.step)
     there = at_state(problem, replace(problem.on_map, state=state))
     return min(problem, there, key=lambda each: Factorization(each.with_usual_errors()).deviance())
 

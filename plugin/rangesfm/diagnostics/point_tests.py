@@ -8,20 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 from scipy import special
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import in_axes
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest
-from rangesfm.diagnostics.position_tests import LOOK_AGAIN, row_of_mistake
+from rangesfm.diagnostics.hypothesis_tests import MistakeTest, row_of_mistake
+from rangesfm.diagnostics.position_tests import LOOK_AGAIN
 from rangesfm.distances.map_points import MapPoint, MapPoints
 from rangesfm.distances.tape import CHECK, CONTROL
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.positions.control_points import ControlPoint, ControlPoints, marks_seen
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.position_equations import MistakeInPositions
+from rangesfm.scale.linear_map import EstimatedMistake, Solved
 from rangesfm.scale.scale_by_positions import POINT_FALSE_ALARM_RATE
 
 _ONE_FRAME = "look whether points and anchors are in one frame, and measured to the same height of the antennas"
@@ -87,53 +87,30 @@ def diagnose_points(
         of_map = of_map + placed.of_place(found)
     own = np.repeat([of.stddev_m**2 for of in tested], 3)
     off_m = np.ravel([at.position_m - of.position_m for of, at in zip(tested, found, strict=True)])
-    root = np.asarray(np.linalg.cholesky(np.diag(own) + of_map), dtype=np.float64)
-    rows = _tested(_Residuals(off_m, root), tested)
+    rows = _tested(off_m, np.diag(own) + of_map, tested)
     reasons = tuple(f"{row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in rows if row.rejected)
     return Diagnosis(tuple(rows), reasons)
 
 
-@dataclass(frozen=True)
-class _Residuals:
-    """Residuals (3 k,) of points, in the map minus known, with the lower root (3 k, 3 k) of their covariance."""
-
-    off_m: Array
-    root: Array
-
-    def mistake(self, columns: Array, others: Sequence[Array]) -> MistakeInPositions:
-        """Estimate a mistake that changes the residuals by (3 k, 3) ``columns``, with others of any size beside it."""
-        of_all = solve_triangular(self.root, np.hstack([columns, *others, self.off_m[:, None]]), lower=True)
-        by, beside, off = of_all[:, :3], of_all[:, 3:-1], of_all[:, -1]
-        if beside.size:
-            basis = np.linalg.qr(beside)[0]
-            by, off = (each - basis @ (basis.T @ each) for each in (by, off))
-        values, vectors = np.linalg.eigh(by.T @ by)
-        is_seen = values > _UNSEEN * np.trace(columns.T @ columns)
-        root: Array = vectors[:, is_seen] / np.sqrt(values[is_seen])
-        sizes = root @ (root.T @ (by.T @ off))
-        statistic = float(np.sum((root.T @ (by.T @ off)) ** 2))
-        return MistakeInPositions(sizes, root, statistic, np.zeros((7, 3)), bool(is_seen.all()))
-
-
-# Information on a mistake of a metre, one over square metres, below which it is only rounding.
-_UNSEEN = 1e-9
-
-
-def _tested(residuals: _Residuals, points: Sequence[ControlPoint]) -> list[MistakeTest]:
+def _tested(off_m: Array, covariance_m2: Array, points: Sequence[ControlPoint]) -> list[MistakeTest]:
     """Return the tests of all points and of their frame, those found first: one is taken off before the next is sought.
 
     A wrong point, and points that are all shifted alike, explain each other's residuals in part; the mistake with the
     largest statistic is the likeliest, as all have three numbers.
+
+    Args:
+        off_m: (3 k,) points in the map minus known ones. covariance_m2: (3 k, 3 k).
     """
     num = len(points)
     columns = [*np.eye(3 * num).reshape(3 * num, num, 3).transpose(1, 0, 2)]
     if num > 1:
         columns.append(np.tile(np.eye(3), (num, 1)))
     threshold = float(special.chdtri(3, POINT_FALSE_ALARM_RATE / len(columns)))
-    found: dict[int, MistakeInPositions] = {}
+    found: dict[int, EstimatedMistake] = {}
     while True:
-        beside = [columns[k] for k in found]
-        left = {k: residuals.mistake(of, beside) for k, of in enumerate(columns) if k not in found}
+        beside = np.hstack([np.zeros((3 * num, 0)), *(columns[k] for k in found)])
+        others = Solved(covariance_m2, beside, off_m)
+        left = {k: others.mistake(of) for k, of in enumerate(columns) if k not in found}
         likeliest = max(left, key=lambda k: left[k].statistic)
         if left[likeliest].statistic <= threshold or len(found) == num - 1:
             break
@@ -142,11 +119,11 @@ def _tested(residuals: _Residuals, points: Sequence[ControlPoint]) -> list[Mista
     return [_row(points[k] if k < num else None, mistake, threshold) for k, mistake in order]
 
 
-def _row(point: ControlPoint | None, found: MistakeInPositions, threshold: float) -> MistakeTest:
+def _row(point: ControlPoint | None, found: EstimatedMistake, threshold: float) -> MistakeTest:
     far = f"{np.linalg.norm(found.sizes):.2f} m from {{}} ({in_axes(found.sizes)})"
     if point is None:
         words = f"the map has all known points {far.format('their coordinates')}, alike"
-        return row_of_mistake(_ALL, "", found, threshold, words, _ONE_FRAME)
+        return replace(row_of_mistake(_ALL, "", found, threshold, words, _ONE_FRAME), effect_on_scale=0.0)
     words = f"the map has the {point.kind} point {point.name} {far.format('its coordinates')}"
     row = row_of_mistake(f"{point.kind} point in the map", point.name, found, threshold, words, LOOK_AGAIN)
-    return row if point.kind == CHECK else replace(row, effect_on_scale=None)
+    return replace(row, effect_on_scale=0.0 if point.kind == CHECK else None)

@@ -10,10 +10,10 @@ from scipy import special
 
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import in_axes
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite, noncentrality
+from rangesfm.diagnostics.hypothesis_tests import MistakeTest, row_of_mistake
 from rangesfm.diagnostics.length_tests import against_other
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.position_equations import MistakeInPositions, at_point
+from rangesfm.scale.position_equations import at_point
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, POINT_FALSE_ALARM_RATE, PositionScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
@@ -121,7 +121,7 @@ def _of_antenna(positions: PositionScale) -> Iterator[MistakeTest]:
     for name, of_all in columns.items():
         by = of_all.reshape(3 * len(known), -1)
         found = positions.equations.with_mistake_learnt(by).of_mistake(by)
-        threshold = float(special.chdtri(max(found.root.shape[1], 1), POINT_FALSE_ALARM_RATE / len(columns)))
+        threshold = float(special.chdtri(max(found.num, 1), POINT_FALSE_ALARM_RATE / len(columns)))
         words, remedy, most, unit = _OF_ANTENNA[name]
         if np.linalg.norm(found.sizes) > most:
             found = replace(found, statistic=0.0)
@@ -129,27 +129,3 @@ def _of_antenna(positions: PositionScale) -> Iterator[MistakeTest]:
         if name == _CLOCK:
             said = said.replace("LATE", "late" if found.sizes[0] < 0 else "early")
         yield row_of_mistake(name, "", found, threshold, said, remedy, unit)
-
-
-def row_of_mistake(
-    name: str, subject: str, found: MistakeInPositions, threshold: float, words: str, remedy: str, unit: str = "m"
-) -> MistakeTest:
-    """Return the row of the table for a mistake in known positions."""
-    worst, effect = np.inf, np.inf
-    if found.is_seen and found.root.size:
-        needed = noncentrality(found.root.shape[1])
-        worst = float(np.sqrt(needed) * np.linalg.norm(found.root, 2))
-        effect = float(np.sqrt(needed) * np.linalg.norm(found.by_unknowns[0] @ found.root))
-    return MistakeTest(
-        name,
-        subject,
-        found.statistic,
-        threshold,
-        words,
-        remedy,
-        unit,
-        size=float(np.linalg.norm(found.sizes)) if found.is_seen else None,
-        stddev=finite(float(np.linalg.norm(found.root))) if found.is_seen else None,
-        smallest_detectable=finite(worst),
-        effect_on_scale=finite(effect),
-    )

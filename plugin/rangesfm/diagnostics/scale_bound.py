@@ -18,7 +18,8 @@ from scipy import special
 from scipy.optimize import brentq
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis_tests import Test, noncentrality
+from rangesfm.diagnostics.hypothesis_tests import Test
+from rangesfm.scale.linear_map import noncentrality
 from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 
@@ -122,7 +123,7 @@ def scale_bound(uncertainty: ScaleUncertainty, hidden: Sequence[HiddenMistake]) 
 
 def _bound(uncertainty: ScaleUncertainty, changes: Array, missed: Array) -> float:
     farthest = float(np.max(changes)) + abs(uncertainty.lean) + 10 * uncertainty.empirical
-    return brentq(lambda bound: np.max(missed * _beyond(uncertainty, changes, bound)) - RISK, 0.0, farthest)
+    return float(brentq(lambda bound: np.max(missed * _beyond(uncertainty, changes, bound)) - RISK, 0.0, farthest))
 
 
 def _beyond(uncertainty: ScaleUncertainty, changes: Array, bound: float) -> Array:

@@ -30,6 +30,7 @@ from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.keyframe_graph import GraphBending
 from rangesfm.refine.vision_information import VisionInformation
 from rangesfm.scale.anchor_plane import mirrored_map
+from rangesfm.scale.linear_map import LinearMap, regular
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import Columns, antenna_positions, fit_at
 from rangesfm.scale.scale_by_positions import expected_positions, groups_by_pose, refuse_open_turn
@@ -37,15 +38,7 @@ from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import Verdict, judge, judge_positions
 from rangesfm.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
-from rangesfm.scale.uncertainty import (
-    KnownMap,
-    LinearMap,
-    best_estimate,
-    bias_covariance,
-    errors_to_expect,
-    linear_map,
-    regular,
-)
+from rangesfm.scale.uncertainty import KnownMap, bias_covariance, errors_to_expect, linear_map
 
 # Numbers of ranges, of bins and of keyframes in the quick computation that compares plans.
 _NUM_COMPARED_RANGES, _NUM_COMPARED_BINS, _NUM_COMPARED_KEYFRAMES = 600, 120, 15
@@ -336,13 +329,12 @@ class _BendingMap:
         bent = self._bent(observed, is_free=columns.frame >= 0)
         num = len(design)
         errors = _joined([each.errors for each in observed], {name: by[:num, :num] for name, by in bent.items()})
-        noise_m2 = errors.only(*_NOISE).covariance_m2
-        formal, _, _ = best_estimate(noise_m2, design, prior_design)
+        formal = float(np.sqrt(linear.solved(errors.only(*_NOISE).covariance_m2).covariance[0, 0]))
         bent_m2 = np.sum([np.zeros((num + 3 * len(self._some),) * 2), *bent.values()], axis=0)
         simple_m2 = block_diag(*(each.simple_m2 for each in observed)) + bent_m2[:num, :num]
-        variances, _, _ = linear.with_weights(simple_m2, errors.covariance_m2)
+        variances, _ = linear.with_weights(simple_m2, errors.covariance_m2)
         # The estimates with different weights will differ by about one standard deviation.
-        known = linear.known(errors, float(np.sqrt(formal[0, 0])), variances, np.full(columns.num, np.inf))
+        known = KnownMap.between(linear, errors, formal, variances, np.full(columns.num, np.inf))
         known = replace(known, uncertainty=replace(known.uncertainty, lean=0.0))
         whitened = cho_solve(cho_factor(regular(errors.covariance_m2)), np.hstack([bent_m2[:num, num:], design]))
         of_places, of_design = whitened[:, : bent_m2.shape[0] - num], whitened[:, bent_m2.shape[0] - num :]
@@ -356,8 +348,8 @@ class _BendingMap:
     def with_honest_weights(self, observed: _Observed) -> _Observed:
         """Return observations whose simple weights claim no more about the scale than their errors allow."""
         linear, known = observed.linear, self.solved([observed])[0]
-        claimed, _, _ = best_estimate(observed.simple_m2, linear.design, linear.prior_design)
-        excess = max(known.uncertainty.empirical**2 / float(claimed[0, 0]), 1.0)
+        claimed = float(linear.solved(observed.simple_m2).covariance[0, 0])
+        excess = max(known.uncertainty.empirical**2 / claimed, 1.0)
         return replace(observed, simple_m2=excess * observed.simple_m2)
 
     def _bent(self, observed: Sequence[_Observed], *, is_free: bool) -> dict[str, Array]:

@@ -129,13 +129,10 @@ def estimate_at(
     known = on_map.known(learned, start.shared_errors_m)
     value = on_map.solution.fit.state.metric_from_model.scale
     judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, options)
-    return replace(
-        start,
+    return start.judged(
+        judged,
         refined_value=value,
         uncertainty=known.uncertainty,
-        verdict=judged.verdict,
-        reasons=(*judged.reasons, *start.remarks),
-        advice=judged.advice,
         placement=known.columns.placement(known.covariance),
         errors=replace(start.errors, learned=learned.spread(on_map.posed.rows, len(start.observations.log))),
         noise_stddev_m=on_map.solution.noise_stddev_m,
@@ -154,12 +151,4 @@ def estimate_by_positions_at(
         GeometryError: as for ``estimate_at``.
     """
     judged = judge_positions(positions.num_used, positions.uncertainty, options, has_check=positions.has_check)
-    return replace(
-        start,
-        refined_value=value,
-        uncertainty=positions.uncertainty,
-        verdict=judged.verdict,
-        reasons=(*judged.reasons, *start.remarks),
-        advice=judged.advice,
-        placement=positions.covariance,
-    )
+    return start.judged(judged, refined_value=value, uncertainty=positions.uncertainty, placement=positions.covariance)

@@ -22,10 +22,9 @@ from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.range_equation import RangeProblem, solve
-from rangesfm.scale.scale_by_kind import ScaleByKind
-from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
+from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind, scale_by_lengths
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
-from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleSensitivity, ScaleUncertainty
+from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from, scale_problem
 from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, levelled_places
 from rangesfm.scale.sensitivity import scale_sensitivity
@@ -80,44 +79,29 @@ def initialize_scale(
         if not len(observations.log) and scale_by_lengths(distances, trajectory.centers) is None:
             raise GeometryError(f"the scale is not determined: {error}") from None
         remarks = (f"the known positions are not used: {error}",)
+    given = _Given(
+        observations, trajectory, anchors, anchor_frame, options, range_model, distances, by_positions, lasting_s,
+        bending, remarks, seed,
+    )  # fmt: skip
     others = [] if by_positions is None else [by_positions.alone]
     lengths = scale_by_lengths(distances, trajectory.centers, others)
     if not len(observations.log):
-        if by_positions is not None:
-            return _by_positions_alone(
-                by_positions, lengths, observations, trajectory, bending, lasting_s, range_model, options
-            )
-        if lengths is None:
-            what = "known position is used" if distances is None else "measured length has both its ends in the map"
-            raise GeometryError(f"the scale is not determined: no {what}")
-        alone = _by_lengths_alone(lengths, observations, trajectory, range_model, options)
-        return replace(alone, reasons=(*alone.reasons, *remarks), remarks=remarks)
-    given = _Given(
-        observations, trajectory, anchors, anchor_frame, options, range_model, distances, by_positions, bending,
-        remarks, seed,
-    )  # fmt: skip
-    found = _with_ranges(given, lengths)
+        return given.without_ranges(lengths)
+    found = given.with_ranges(lengths)
     if lengths is None:
         return found
     if found.by_kind:
         others.append(found.by_kind["ranges"])
     checked = scale_by_lengths(distances, trajectory.centers, others)
     assert checked is not None, "the lengths are the same"
-    return (
-        replace(found, lengths=checked)
-        if np.array_equal(checked.is_kept, lengths.is_kept)
-        else _with_ranges(given, checked)
-    )
+    if np.array_equal(checked.is_kept, lengths.is_kept):
+        return replace(found, lengths=checked)
+    return given.with_ranges(checked)
 
 
 @dataclass(frozen=True)
 class _Given:
-    """Input of the scale by ranges and all else, as for ``initialize_scale``.
-
-    Attributes:
-        by_positions: what the known positions say.
-        remarks: reasons that are known before.
-    """
+    """Arguments of ``initialize_scale``, with what the known positions say and the remarks on them."""
 
     observations: RangeObservations
     trajectory: Trajectory
@@ -127,159 +111,118 @@ class _Given:
     range_model: RangeModelOptions
     distances: LocatedDistances | None
     by_positions: PositionScale | None
+    lasting_s: Sequence[float]
     bending: MapBending
     remarks: tuple[str, ...]
     seed: int
 
+    def without_ranges(self, lengths: LengthScale | None) -> ScaleEstimate:
+        """Return the estimate by known positions in the site, or by lengths in the first camera's frame."""
+        positions, options = self.by_positions, self.options
+        by_kind = _by_kind(lengths, positions)
+        if positions is not None:
+            if lengths is not None and lengths.is_used:
+                positions = scale_by_positions(
+                    positions.known, self.trajectory, self.bending, lengths=lengths, lasting_s=self.lasting_s
+                )
+            metric_from_sfm, uncertainty = positions.site_from_model, positions.uncertainty
+            judged = judge_positions(positions.num_used, uncertainty, options, has_check=positions.has_check)
+        elif lengths is not None:
+            metric_from_sfm = replace(IDENTITY, scale=lengths.value) @ first_camera_from(self.trajectory)
+            uncertainty = ScaleUncertainty(lengths.relative_stddev, lengths.components)
+            by_kind = {"lengths": lengths.alone}
+            judged = judge_lengths(lengths, uncertainty, options)
+        else:
+            no_length = "measured length has both its ends in the map"
+            what = "known position is used" if self.distances is None else no_length
+            raise GeometryError(f"the scale is not determined: no {what}")
+        return ScaleEstimate(
+            metric_from_sfm,
+            frame="first_camera" if positions is None else "site",
+            method="lengths" if positions is None else "positions",
+            uncertainty=uncertainty,
+            verdict=judged.verdict,
+            reasons=(*judged.reasons, *self.remarks),
+            advice=judged.advice,
+            observations=self.observations,
+            errors=RangeErrors.begin(self.observations, self.observations.placed_rows, self.range_model),
+            placement=None if positions is None else positions.covariance,
+            positions=positions,
+            lengths=lengths,
+            by_kind=by_kind if "lengths" in by_kind else {},
+            remarks=self.remarks,
+        )
 
-def _with_ranges(given: _Given, lengths: LengthScale | None) -> ScaleEstimate:
-    """Return the estimate by ranges, and by lengths and positions, if there are any."""
-    observations, trajectory, anchors, options = given.observations, given.trajectory, given.anchors, given.options
-    by_positions, distances, anchor_frame = given.by_positions, given.distances, given.anchor_frame
-    if lengths is not None and distances is not None:
-        distances = lengths.beside_ranges(distances)
-    gravity = gravity_of(options.up_in_first_camera)
-    placement = None if by_positions is None else by_positions.prior(trajectory, first_camera_from(trajectory))
-    posing = (observations, trajectory, anchors, anchor_frame, given.range_model, distances, gravity, placement)
-    problem, open_place = scale_problem(*posing), tuple[str, ...]()
-    try:
-        solution = solve_scale(problem, camera_side=options.camera_side, seed=given.seed)
-    except OpenPlaceError as error:
-        open_place = (f"scale only, in the first camera's frame: {error}",)
-        problem = scale_problem(*posing, place_is_open=True)
-        solution = solution_from(problem, error.in_first_camera)
-    table = _paper_table(solution)
-    by_kind = _by_other_kinds(lengths, by_positions)
-    if by_kind:
-        alone = _by_ranges_alone(solution)
-        by_kind = {"ranges": _by_ranges(problem, alone, learned_errors(problem, solution, given.bending)), **by_kind}
-        solution = _with_share(solution, _range_share(alone, by_kind["ranges"]))
-    learned, per_anchor = both(
-        lambda: learned_errors(problem, solution, given.bending),
-        lambda: scale_per_anchor(solution, observations.log.anchor_ids),
-    )
-    posed = problem if lengths is None else _bent(problem, lengths)
-    known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
-    uncertainty = known.uncertainty
-    covariance = parameter_covariance(solution, learned)
-    found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
-    judged = judge(problem, solution, uncertainty, per_anchor, found, options)
-    verdict, remarks = judged.verdict, (*open_place, *given.remarks)
-    if gravity is not None and problem.frame == "first_camera" and anchor_frame == "site":
-        remarks = (*remarks, *levelled_places(gravity, anchors, found))
-    reasons = (*judged.reasons, *remarks)
-    if options.method == "two-candidate":
-        robust = solution.fit.state.metric_from_model.scale
-        verdict = "doubtful"
-        reasons = (f"two-candidate, as asked for; the stddevs are of the robust scale, {robust:.6g}", *reasons)
-    errors = replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log))
-    status = observations.status.copy()
-    status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
-    status[problem.rows] = status_by_weight(solution.fit.weights)
-    return ScaleEstimate(
-        metric_from_sfm=_by_method(options.method, solution, table) @ problem.first_camera_from_sfm,
-        frame=problem.frame,
-        method=options.method,
-        uncertainty=uncertainty,
-        verdict=verdict,
-        reasons=reasons,
-        advice=judged.advice,
-        sensitivity=scale_sensitivity(solution, problem),
-        per_anchor=per_anchor,
-        two_candidate=table,
-        anchors=found,
-        observations=replace(observations, status=status),
-        errors=errors,
-        noise_stddev_m=solution.noise_stddev_m,
-        problem=posed,
-        solution=solution,
-        placement=solution.fit.columns[0].placement(covariance),
-        remarks=remarks,
-        lengths=lengths,
-        positions=by_positions,
-        by_kind=by_kind,
-        shared_errors_m=shared_errors_m(solution, learned, errors.learned.of_range)
-        if by_kind and errors.learned
-        else np.zeros((len(observations.log), 0)),
-    )
-
-
-def _by_lengths_alone(
-    lengths: LengthScale,
-    observations: RangeObservations,
-    trajectory: Trajectory,
-    range_model: RangeModelOptions,
-    options: ScaleOptions,
-) -> ScaleEstimate:
-    """Return the estimate in the first camera's frame from measured lengths; everything about ranges stays empty."""
-    uncertainty = ScaleUncertainty(lengths.relative_stddev, lengths.components)
-    judged = judge_lengths(lengths, uncertainty, options)
-    return replace(
-        _without_ranges(observations, range_model),
-        metric_from_sfm=replace(IDENTITY, scale=lengths.value) @ first_camera_from(trajectory),
-        uncertainty=uncertainty,
-        verdict=judged.verdict,
-        reasons=judged.reasons,
-        advice=judged.advice,
-        lengths=lengths,
-        by_kind=_by_lengths(lengths),
-    )
-
-
-def _without_ranges(observations: RangeObservations, range_model: RangeModelOptions) -> ScaleEstimate:
-    """Return an estimate about whose ranges nothing is known, as there are none; the rest is to be filled in."""
-    return ScaleEstimate(
-        metric_from_sfm=IDENTITY,
-        frame="first_camera",
-        method="lengths",
-        uncertainty=ScaleUncertainty(np.inf, {}),
-        verdict="doubtful",
-        reasons=(),
-        advice=(),
-        sensitivity=ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0)),
-        per_anchor={},
-        two_candidate=None,
-        anchors=(),
-        observations=observations,
-        errors=RangeErrors.begin(observations, observations.placed_rows, range_model),
-        noise_stddev_m=np.nan,
-    )
-
-
-def _by_positions_alone(
-    alone: PositionScale,
-    lengths: LengthScale | None,
-    observations: RangeObservations,
-    trajectory: Trajectory,
-    bending: MapBending,
-    lasting_s: Sequence[float],
-    range_model: RangeModelOptions,
-    options: ScaleOptions,
-) -> ScaleEstimate:
-    """Return the estimate in the site's frame from known positions and measured lengths; nothing is said of ranges.
-
-    Args:
-        alone: what the positions say without the lengths.
-    """
-    found, by_kind = alone, dict[str, ScaleByKind]()
-    if lengths is not None and lengths.is_used:
-        found = scale_by_positions(alone.known, trajectory, bending, lengths=lengths, lasting_s=lasting_s)
-        by_kind = {"positions": alone.alone, **_by_lengths(lengths)}
-    judged = judge_positions(found.num_used, found.uncertainty, options, has_check=found.has_check)
-    return replace(
-        _without_ranges(observations, range_model),
-        metric_from_sfm=found.site_from_model,
-        frame="site",
-        method="positions",
-        uncertainty=found.uncertainty,
-        verdict=judged.verdict,
-        reasons=judged.reasons,
-        advice=judged.advice,
-        placement=found.covariance,
-        positions=found,
-        lengths=lengths,
-        by_kind=by_kind,
-    )
+    def with_ranges(self, lengths: LengthScale | None) -> ScaleEstimate:
+        """Return the estimate by ranges, and by lengths and positions, if there are any."""
+        observations, trajectory, options = self.observations, self.trajectory, self.options
+        by_positions, distances = self.by_positions, self.distances
+        if lengths is not None and distances is not None:
+            distances = lengths.beside_ranges(distances)
+        gravity = gravity_of(options.up_in_first_camera)
+        placement = None if by_positions is None else by_positions.prior(trajectory, first_camera_from(trajectory))
+        posing = (observations, trajectory, self.anchors, self.anchor_frame, self.range_model, distances, gravity)
+        problem, open_place = scale_problem(*posing, placement), tuple[str, ...]()
+        try:
+            solution = solve_scale(problem, camera_side=options.camera_side, seed=self.seed)
+        except OpenPlaceError as error:
+            open_place = (f"scale only, in the first camera's frame: {error}",)
+            problem = scale_problem(*posing, placement, place_is_open=True)
+            solution = solution_from(problem, error.in_first_camera)
+        table = _paper_table(solution)
+        by_kind = _by_kind(lengths, by_positions)
+        if by_kind:
+            alone = _by_ranges_alone(solution)
+            by_kind = {"ranges": _by_ranges(problem, alone, learned_errors(problem, solution, self.bending)), **by_kind}
+            solution = _with_share(solution, _range_share(alone, by_kind["ranges"]))
+        learned, per_anchor = both(
+            lambda: learned_errors(problem, solution, self.bending),
+            lambda: scale_per_anchor(solution, observations.log.anchor_ids),
+        )
+        posed = problem if lengths is None else _bent(problem, lengths)
+        known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
+        uncertainty = known.uncertainty
+        covariance = parameter_covariance(solution, learned)
+        found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
+        judged = judge(problem, solution, uncertainty, per_anchor, found, options)
+        verdict, remarks = judged.verdict, (*open_place, *self.remarks)
+        if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
+            remarks = (*remarks, *levelled_places(gravity, self.anchors, found))
+        reasons = (*judged.reasons, *remarks)
+        if options.method == "two-candidate":
+            robust = solution.fit.state.metric_from_model.scale
+            verdict = "doubtful"
+            reasons = (f"two-candidate, as asked for; the stddevs are of the robust scale, {robust:.6g}", *reasons)
+        errors = replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log))
+        status = observations.status.copy()
+        status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
+        status[problem.rows] = status_by_weight(solution.fit.weights)
+        return ScaleEstimate(
+            metric_from_sfm=_by_method(options.method, solution, table) @ problem.first_camera_from_sfm,
+            frame=problem.frame,
+            method=options.method,
+            uncertainty=uncertainty,
+            verdict=verdict,
+            reasons=reasons,
+            advice=judged.advice,
+            sensitivity=scale_sensitivity(solution, problem),
+            per_anchor=per_anchor,
+            two_candidate=table,
+            anchors=found,
+            observations=replace(observations, status=status),
+            errors=errors,
+            noise_stddev_m=solution.noise_stddev_m,
+            problem=posed,
+            solution=solution,
+            placement=solution.fit.columns[0].placement(covariance),
+            remarks=remarks,
+            lengths=lengths,
+            positions=by_positions,
+            by_kind=by_kind,
+            shared_errors_m=shared_errors_m(solution, learned, errors.learned.of_range)
+            if by_kind and errors.learned
+            else np.zeros((len(observations.log), 0)),
+        )
 
 
 def _bent(problem: ScaleProblem, lengths: LengthScale) -> ScaleProblem:
@@ -293,16 +236,10 @@ def _bent(problem: ScaleProblem, lengths: LengthScale) -> ScaleProblem:
     return replace(problem, ranges=replace(problem.ranges, distances=distances))
 
 
-def _by_lengths(lengths: LengthScale) -> dict[str, ScaleByKind]:
-    return {"lengths": ScaleByKind(lengths.value, lengths.value * lengths.relative_stddev)}
-
-
-def _by_other_kinds(lengths: LengthScale | None, positions: PositionScale | None) -> dict[str, ScaleByKind]:
+def _by_kind(lengths: LengthScale | None, positions: PositionScale | None) -> dict[str, ScaleByKind]:
     """Return the scale by each kind of measurement besides ranges, if it takes part."""
-    return {
-        **({} if lengths is None or not lengths.is_used else _by_lengths(lengths)),
-        **({} if positions is None else {"positions": positions.alone}),
-    }
+    by_lengths = {} if lengths is None or not lengths.is_used else {"lengths": lengths.alone}
+    return by_lengths if positions is None else {**by_lengths, "positions": positions.alone}
 
 
 def _range_share(alone: Solution, ranges: ScaleByKind) -> float:

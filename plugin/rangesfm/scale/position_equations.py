@@ -10,8 +10,8 @@ from scipy.sparse import block_diag, csr_array, kron
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.positions.known_positions import KnownPositions
-from rangesfm.ranging.errors.learned import ROUNDING, ComponentLikelihood, ErrorParts
-from rangesfm.scale.uncertainty import LinearMap, best_estimate
+from rangesfm.ranging.errors.learned import ComponentLikelihood, ErrorParts
+from rangesfm.scale.linear_map import EstimatedMistake, LinearMap
 
 OUTLYING = 0.1
 """Robust weight below which a position is an outlier."""
@@ -19,8 +19,6 @@ NUM_TIMES = 8
 """Number of times of a group, over which its correlation with others is averaged."""
 # An antenna's positions are averaged to at most this many groups for the estimate of their errors.
 _MAX_NUM_GROUPS = 150
-# Share of a mistake's effect below which what the similarity leaves of it is only rounding.
-_UNSEEN = 1e-7
 
 
 @dataclass(frozen=True)
@@ -64,11 +62,11 @@ class PositionEquations:
         """Return the equations and errors of some coordinates (3 g,)."""
         linear, parts = self.linear, self.errors
         chosen = parts.covariances_m2[:, rows][:, :, rows]
-        return replace(linear, off_m=linear.off_m[rows], design=linear.design[rows]), replace(
+        return replace(linear, residual_m=linear.residual_m[rows], design=linear.design[rows]), replace(
             parts, covariances_m2=chosen
         )
 
-    def of_mistake(self, columns: Array) -> MistakeInPositions:
+    def of_mistake(self, columns: Array) -> EstimatedMistake:
         """Estimate a mistake that changes the known positions by (3 k, m) ``columns`` times its m numbers.
 
         Positions that it changes are taken into the equations, whether they take part or not.
@@ -76,36 +74,7 @@ class PositionEquations:
         by_groups = self.grouping @ columns
         rows = self.is_used | np.any(by_groups != 0, axis=1)
         linear, parts = self.of(rows)
-        by, covariance = by_groups[rows], parts.covariance_m2
-        inverse = np.linalg.inv(covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance)))
-        best, gains, _ = best_estimate(covariance, linear.design, linear.prior_design)
-        whitened = inverse @ linear.design
-        pulls = inverse @ linear.off_m
-        pulls -= whitened @ (best @ (linear.design.T @ pulls + linear.prior_design.T @ linear.prior_off))
-        information = by.T @ (inverse - whitened @ best @ whitened.T) @ by
-        values, vectors = np.linalg.eigh(information)
-        is_seen = values > _UNSEEN * np.trace(by.T @ inverse @ by)
-        root = vectors[:, is_seen] / np.sqrt(values[is_seen])
-        sizes = root @ (root.T @ (by.T @ pulls))
-        return MistakeInPositions(sizes, root, float(sizes @ information @ sizes), gains @ by, bool(is_seen.all()))
-
-
-@dataclass(frozen=True)
-class MistakeInPositions:
-    """A mistake of m numbers, as estimated.
-
-    Attributes:
-        sizes: (m,). root: (m, r) root of their covariance, without directions that are not seen.
-        statistic: chi-square distributed with r degrees of freedom where no such mistake was made.
-        by_unknowns: (7, m) change of the similarity by the mistake.
-        is_seen: whether no direction is hidden.
-    """
-
-    sizes: Array
-    root: Array
-    statistic: float
-    by_unknowns: Array
-    is_seen: bool
+        return linear.solved(parts.covariance_m2).mistake(-by_groups[rows])
 
 
 def at_point(known: KnownPositions, row: int) -> Array:
@@ -163,7 +132,7 @@ def learnt_sizes(parts: Sequence[ErrorPart], linear: LinearMap, rows: Mask) -> d
         np.log([part.median for part in learnt]),
         np.array([part.spread for part in learnt]),
         np.sum([np.zeros((rows.sum(),) * 2), *known_m2], axis=0),
-        linear.off_m[rows],
+        -linear.residual_m[rows],
         linear.design[rows],
         linear.prior_design,
     )

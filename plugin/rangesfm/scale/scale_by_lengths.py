@@ -21,7 +21,6 @@ from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.range_gradient import RangeGradient
-from rangesfm.scale.scale_by_kind import ScaleByKind
 
 # BENDING: relative variation of the scale within a map (stddev). _BENDING_SPREAD: stddev of its logarithm from map to
 # map. _ALIKE_WITHIN: correlation length of the variation, as a share of the path's extent. Source: lengths of 0.5 to
@@ -32,6 +31,18 @@ _NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 21, 8, 2
 # Share of surveys without any mistake in which a correct length is set aside.
 LENGTH_FALSE_ALARM_RATE = 0.02
 _NUM_SUSPECTS = 3
+
+
+@dataclass(frozen=True)
+class ScaleByKind:
+    """The scale by ranges, measured lengths or known positions alone, in metres per SfM unit.
+
+    Attributes:
+        value: middle of its interval. stddev: with all error components; inf where the scale is not determined.
+    """
+
+    value: float
+    stddev: float
 
 
 @dataclass(frozen=True)
@@ -66,6 +77,11 @@ class LengthScale:
         return float(np.linalg.norm(list(self.components.values())))
 
     @property
+    def alone(self) -> ScaleByKind:
+        """The scale, with its standard deviation."""
+        return ScaleByKind(self.value, self.value * self.relative_stddev)
+
+    @property
     def is_used(self) -> bool:
         """Return whether any of the lengths takes part."""
         return bool(self.is_kept.any())
@@ -77,7 +93,7 @@ class LengthScale:
 
     def at_scale(self, metres_per_unit: float) -> LengthScale:
         """Return the lengths for a map whose unit is ``metres_per_unit`` of this one's."""
-        return replace(self, value=self.value / metres_per_unit, by_metre=self.by_metre)
+        return replace(self, value=self.value / metres_per_unit)
 
     def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
         """Return the distances with one length that gives the same scale in place of all those between points, if used.

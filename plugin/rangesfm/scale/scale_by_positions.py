@@ -28,6 +28,7 @@ from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.learned import ErrorParts
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
+from rangesfm.scale.linear_map import LinearMap
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.position_equations import (
     NUM_TIMES,
@@ -42,10 +43,9 @@ from rangesfm.scale.position_equations import (
     times_of_groups,
 )
 from rangesfm.scale.range_equation import Columns
-from rangesfm.scale.scale_by_kind import ScaleByKind
-from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind
 from rangesfm.scale.scale_estimate import ScaleUncertainty
-from rangesfm.scale.uncertainty import LinearMap, best_estimate
+from rangesfm.scale.uncertainty import KnownMap
 
 MIN_NUM_POSITIONS = 3
 """Fewest positions, not on one line, that determine a similarity."""
@@ -261,9 +261,9 @@ class _Problem:
 
     def _step(self, similarity: Similarity, off_m: Array, weights: Array) -> Array:
         root = np.repeat(np.sqrt(weights), 3)
-        off, by = -root * off_m.ravel(), root[:, None] * self._design(similarity)
+        off, by = root * off_m.ravel(), root[:, None] * self._design(similarity)
         prior_off, prior_design = self._priors(similarity)
-        step = np.linalg.lstsq(np.vstack([by, prior_design]), np.append(off, prior_off), rcond=1e-12)[0]
+        step = np.linalg.lstsq(np.vstack([by, prior_design]), -np.append(off, prior_off), rcond=1e-12)[0]
         return np.asarray(step)
 
     def _priors(self, similarity: Similarity) -> tuple[Array, Array]:
@@ -271,7 +271,7 @@ class _Problem:
         if self.lengths is None:
             return np.zeros(0), np.zeros((0, 7))
         design = np.eye(1, 7) / self.lengths.relative_stddev
-        return np.log(self.lengths.value / similarity.scale) * design[:, 0], design
+        return np.log(similarity.scale / self.lengths.value) * design[:, 0], design
 
     def _design(self, similarity: Similarity) -> Array:
         """Return the (3 k, 7) derivatives of the positions by scale, turn and shift about the first camera."""
@@ -294,10 +294,10 @@ class _Problem:
         return stddevs
 
     def _linear(self, similarity: Similarity, grouping: csr_array, bending: BendingOfBins) -> LinearMap:
-        off_m = grouping @ -self.known.misclosures_m(similarity).ravel() - bending.shift_m
+        residual_m = grouping @ self.known.misclosures_m(similarity).ravel() + bending.shift_m
         nothing = np.zeros(0, dtype=np.int64)
         design = grouping @ self._design(similarity)
-        return LinearMap(off_m, design, *self._priors(similarity), Columns(0, 1, nothing, nothing, 7))
+        return LinearMap(residual_m, design, *self._priors(similarity), Columns(0, 1, nothing, nothing, 7))
 
     def _parts(
         self, similarity: Similarity, grouping: csr_array, stddev_m: Array, bending: BendingOfBins
@@ -353,7 +353,7 @@ class _Problem:
         return found
 
     def result(self, fit: _Fit, is_left_out: Mask, threshold: float) -> PositionScale:
-        """Return the scale with its uncertainty, by the rule of ``LinearMap.known``."""
+        """Return the scale with its uncertainty, by the rule of ``KnownMap.between``."""
         rows = fit.equations.is_used
         linear, errors = fit.equations.of(rows)
         variances = fit.stddev_m**2 / np.maximum(fit.weights, OUTLYING)
@@ -361,19 +361,18 @@ class _Problem:
         if self.refined is not None:
             weighed = weighed + fit.bending.formal_m2
         weighed = weighed[np.ix_(rows, rows)]
-        formal, _, _ = best_estimate(weighed, linear.design, linear.prior_design)
-        others, of_groups, _ = linear.with_weights(weighed, errors.covariance_m2)
-        known = linear.known(errors, float(np.sqrt(formal[0, 0])), others)
-        _, best_groups, best_priors = best_estimate(errors.covariance_m2, linear.design, linear.prior_design)
+        formal = float(np.sqrt(linear.solved(weighed).covariance[0, 0]))
+        others, of_groups = linear.with_weights(weighed, errors.covariance_m2)
+        found = KnownMap.between(linear, errors, formal, others)
         return PositionScale(
             site_from_model=fit.similarity,
             known=self.known,
             weights=fit.weights,
             is_left_out=is_left_out,
             threshold=threshold,
-            uncertainty=known.uncertainty,
-            covariance=known.covariance,
-            best_step=best_groups @ linear.off_m + best_priors @ linear.prior_off,
+            uncertainty=found.uncertainty,
+            covariance=found.covariance,
+            best_step=linear.solved(errors.covariance_m2).step,
             equations=fit.equations,
             bending_m2=fit.bending.formal_m2,
             stddev_m=self._own_stddev_m(fit),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,14 +14,14 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.scale_by_kind import ScaleByKind
-from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
 
-if TYPE_CHECKING:  # the scale by positions has a ScaleUncertainty itself
+if TYPE_CHECKING:  # both import this module
     from rangesfm.scale.scale_by_positions import PositionScale
+    from rangesfm.scale.scale_verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -122,13 +122,13 @@ class ScaleEstimate:
     verdict: str
     reasons: tuple[str, ...]
     advice: tuple[str, ...]
-    sensitivity: ScaleSensitivity
-    per_anchor: dict[str, float]
-    two_candidate: TwoCandidate | None
-    anchors: tuple[AnchorEstimate, ...]
     observations: RangeObservations
     errors: RangeErrors
-    noise_stddev_m: float
+    sensitivity: ScaleSensitivity = ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0))
+    per_anchor: Mapping[str, float] = field(default_factory=dict)
+    two_candidate: TwoCandidate | None = None
+    anchors: tuple[AnchorEstimate, ...] = ()
+    noise_stddev_m: float = np.nan
     problem: ScaleProblem | None = None
     solution: Solution | None = None
     placement: Array | None = None
@@ -138,6 +138,11 @@ class ScaleEstimate:
     shared_errors_m: Array = field(default_factory=lambda: np.zeros((0, 0)))
     remarks: tuple[str, ...] = ()
     refined_value: float | None = None
+
+    def judged(self, judged: Verdict, **changes: Any) -> ScaleEstimate:
+        """Return the estimate with a verdict and other changes; remarks stay among the reasons."""
+        reasons = (*judged.reasons, *self.remarks)
+        return replace(self, verdict=judged.verdict, reasons=reasons, advice=judged.advice, **changes)
 
     @property
     def value(self) -> float:

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
 from rangesfm.ranging.errors.components import BENDS, CLOCKS, GIVEN, PLACES, REWEIGHTING
-from rangesfm.ranging.errors.learned import ROUNDING, ErrorParts, ExpectedErrors, LearnedErrors, learn_errors
+from rangesfm.ranging.errors.learned import ErrorParts, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisiness, range_bins
+from rangesfm.scale.linear_map import LinearMap
 from rangesfm.scale.range_equation import (
     Columns,
     RangeFit,
@@ -48,7 +48,7 @@ def learned_errors(
         others_m2[CLOCKS] = observations.time_offset_stddev_s**2 * np.outer(rates, rates)
     return learn_errors(
         of_ranges,
-        off_m=linear.off_m,
+        off_m=-linear.residual_m,
         design=linear.design,
         prior_design=linear.prior_design,
         noise_m=solution.noise_stddev_m,
@@ -78,9 +78,9 @@ def _linear(posed: ScaleProblem, solution: Solution) -> LinearMap:
     only_map = replace(given, bias_stddev_m=np.zeros(given.num_anchors), stddev_m=np.ones(len(given.range_m)))
     columns = columns_of([only_map])[0]
     return LinearMap(
-        given.range_m - predicted_ranges(given, unbiased),
+        predicted_ranges(given, unbiased) - given.range_m,
         range_jacobian(only_map, columns, state, state),
-        -prior_residuals(only_map, columns, state),
+        prior_residuals(only_map, columns, state),
         prior_jacobian(only_map, columns, state, state),
         columns,
     )
@@ -147,39 +147,14 @@ class KnownMap:
     covariance: Array
     columns: Columns
 
-
-@dataclass(frozen=True)
-class LinearMap:
-    """Linear equations of c bins of ranges and r priors for p unknowns of a map, about the map's state.
-
-    Attributes:
-        off_m: (c,) measured minus predicted range, without any bias.
-        design: (c, p) derivatives of the predicted ranges by the unknowns.
-        prior_off, prior_design: (r,), (r, p) the same for the priors, in standard deviations.
-        columns: position of each unknown.
-    """
-
-    off_m: Array
-    design: Array
-    prior_off: Array
-    prior_design: Array
-    columns: Columns
-
-    def with_weights(self, assumed_m2: Array, covariance_m2: Array) -> tuple[Array, Array, Array]:
-        """Return the (p,) variances of the estimate with the weights for other errors, and its gains.
-
-        Args:
-            assumed_m2: (c, c) covariance from which the weights come. covariance_m2: (c, c) covariance of the errors.
-
-        Returns:
-            the variances, and the (p, c) and (p, r) gains of ``best_estimate``.
-        """
-        _, of_bins, of_priors = best_estimate(assumed_m2, self.design, self.prior_design)
-        variances = np.einsum("pi,ij,pj->p", of_bins, covariance_m2, of_bins) + np.sum(of_priors**2, axis=1)
-        return variances, of_bins, of_priors
-
-    def known(
-        self, learned: ErrorParts, formal: float, variance_by_others: Array, change_by_others: Array | None = None
+    @classmethod
+    def between(
+        cls,
+        linear: LinearMap,
+        learned: ErrorParts,
+        formal: float,
+        variance_by_others: Array,
+        change_by_others: Array | None = None,
     ) -> KnownMap:
         """Combine the estimate with the best weights for the errors and the estimate with other weights.
 
@@ -195,16 +170,17 @@ class LinearMap:
             change_by_others: (p,) change from the estimate with the best weights, at which the map is, to the estimate
                 with the other weights; None: the map is at the estimate with the other weights.
         """
-        best, of_bins, of_priors = best_estimate(learned.covariance_m2, self.design, self.prior_design)
-        change = of_bins @ self.off_m + of_priors @ self.prior_off if change_by_others is None else change_by_others
-        chance = np.sqrt(np.maximum(variance_by_others - np.diag(best), 0.0))
+        best = linear.solved(learned.covariance_m2)
+        of_bins, of_priors = best.gains
+        change = best.step if change_by_others is None else change_by_others
+        chance = np.sqrt(np.maximum(variance_by_others - np.diag(best.covariance), 0.0))
         half = np.clip(change, -chance, chance) / 2
         components = learned.stddev_of_bins(of_bins[0])
         if (given := float(np.linalg.norm(of_priors[0]))) > 0:
             components[GIVEN] = given
         components[REWEIGHTING] = abs(float(half[0]))
         uncertainty = ScaleUncertainty(formal, components, float(half[0]))
-        return KnownMap(uncertainty, best + np.outer(half, half), self.columns)
+        return cls(uncertainty, best.covariance + np.outer(half, half), linear.columns)
 
 
 def known_map(
@@ -219,7 +195,7 @@ def known_map(
     linear = linear_map(posed, solution, learned.bins)
     variances = np.diag(parameter_covariance(solution, learned))[: linear.columns.num].copy()
     variances[linear.columns.scale] += (_say_of_lengths(solution) * bending_of_lengths) ** 2
-    return linear.known(learned, solution.fit.log_scale_stddev, variances)
+    return KnownMap.between(linear, learned, solution.fit.log_scale_stddev, variances)
 
 
 def known_refined_map(
@@ -239,18 +215,18 @@ def known_refined_map(
     linear, robust = linear_map(posed, solution, bins), solution.fit.weights / errors.stddev_m**2
     bent_m2 = np.zeros_like(learned.covariance_m2) if bending is None else bending.formal_m2
     alone, weighed = (np.diag(1 / np.maximum(bins.total(each), 1e-12)) for each in (robust, errors.worth * robust))
-    formal, _, _ = best_estimate(alone + bent_m2, linear.design, linear.prior_design)
+    formal = float(np.sqrt(linear.solved(alone + bent_m2).covariance[0, 0]))
     shared = bins.mean(shared_m)
     assumed_m2 = weighed + bent_m2 + bias_covariance(bins, given) + shared @ shared.T
-    variances, _, _ = linear.with_weights(assumed_m2, learned.covariance_m2)
-    at_optimum = linear if bending is None else replace(linear, off_m=linear.off_m - bending.shift_m)
-    return at_optimum.known(learned, float(np.sqrt(formal[0, 0])), variances)
+    variances, _ = linear.with_weights(assumed_m2, learned.covariance_m2)
+    at_optimum = linear if bending is None else replace(linear, residual_m=linear.residual_m + bending.shift_m)
+    return KnownMap.between(at_optimum, learned, formal, variances)
 
 
 def linear_map(posed: ScaleProblem, solution: Solution, bins: RangeBins) -> LinearMap:
     """Return the linear equations of bins of a problem's ranges about its solution."""
     linear = _linear(posed, solution)
-    return replace(linear, off_m=bins.mean(linear.off_m), design=bins.mean(linear.design))
+    return replace(linear, residual_m=bins.mean(linear.residual_m), design=bins.mean(linear.design))
 
 
 def bias_covariance(bins: RangeBins, given: RangeProblem) -> Array:
@@ -259,18 +235,6 @@ def bias_covariance(bins: RangeBins, given: RangeProblem) -> Array:
     return np.asarray(
         given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2, dtype=np.float64
     )
-
-
-def regular(covariance: Array) -> Array:
-    """Return a covariance that is positive definite in spite of rounding."""
-    return np.asarray(covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance)))
-
-
-def best_estimate(covariance: Array, design: Array, prior_design: Array) -> tuple[Array, Array, Array]:
-    """Return the (p, p) covariance of the best estimate for given error covariance, and its (p, c) and (p, r) gains."""
-    whitened = cho_solve(cho_factor(regular(covariance)), design)
-    inverse = invert_information(design.T @ whitened + prior_design.T @ prior_design)
-    return inverse, inverse @ whitened.T, inverse @ prior_design.T
 
 
 def _say_of_lengths(solution: Solution) -> float:
