@@ -22,7 +22,7 @@ from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from
 from rangesfm.scale.scale_verdict import judge, judge_positions
 from rangesfm.scale.solution import Solution, weighted
-from rangesfm.scale.uncertainty import KnownMap, bending_of_bins, known_refined_map, learned_errors
+from rangesfm.scale.uncertainty import KnownMap, bending_of_bins, known_map, learned_errors
 
 # With twice as many bins the learnt errors change by less than a twentieth (hall and laps of
 # ``tests.studies.drifting_maps``), and each bin costs one solution of the photos' normal equations.
@@ -109,7 +109,7 @@ class MapWithRanges:
             shared_errors_m: of all ranges of the log, as in ``ScaleEstimate``, with which the map was made.
         """
         shared_m = shared_errors_m[self.posed.rows]
-        return known_refined_map(self.posed, self.solution, learned, self._bending_of(learned.bins), shared_m)
+        return known_map(self.posed, self.solution, learned, self._bending_of(learned.bins), shared_m)
 
     def _bending_of(self, bins: RangeBins) -> BendingOfBins | None:
         return bending_of_bins(self.bending, bins, self.posed, self.solution.fit.state)

@@ -30,7 +30,7 @@ from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, 
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import known_map, learned_errors, parameter_covariance, shared_errors_m
+from rangesfm.scale.uncertainty import known_map, learned_errors, shared_errors_m
 
 # Smallest factor on the weights of ranges beside other measurements, below which they would have no effect.
 _LEAST_SHARE = 1e-4
@@ -180,10 +180,9 @@ class _Given:
             lambda: scale_per_anchor(solution, observations.log.anchor_ids),
         )
         posed = problem if lengths is None else _bent(problem, lengths)
-        known = known_map(posed, solution, learned, lengths.components["bending"] if lengths else 0.0)
+        known = known_map(posed, solution, learned)
         uncertainty = known.uncertainty
-        covariance = parameter_covariance(solution, learned)
-        found = anchor_estimates(solution, observations.log.anchor_ids, covariance)
+        found = anchor_estimates(solution, observations.log.anchor_ids, known.covariance)
         judged = judge(problem, solution, uncertainty, per_anchor, found, options)
         verdict, remarks = judged.verdict, (*open_place, *self.remarks)
         if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
@@ -214,7 +213,7 @@ class _Given:
             noise_stddev_m=solution.noise_stddev_m,
             problem=posed,
             solution=solution,
-            placement=solution.fit.columns[0].placement(covariance),
+            placement=known.columns.placement(known.covariance),
             remarks=remarks,
             lengths=lengths,
             positions=by_positions,

@@ -155,24 +155,18 @@ class RangeFit:
         state: the estimate.
         residuals_m: (n,) predicted minus measured.
         weights: (n,) of the robust loss; 1 for a range that fits.
-        pulls: (n,) weights times the ranges' shares.
         cost: half the robust sum of squares, priors included.
         information: (p, p) Gauss-Newton approximation with the robust weights, in the parameters of ``columns``.
-        gradients: (n, p) Jacobian of the residuals in standard deviations, each row times its range's pull.
-        gradient: (p,) of the cost; 0 at the minimum.
-        prior_information: (p, p) the part of ``information`` that comes from priors.
+        gradients: (n, p) Jacobian of the residuals in standard deviations, each row times its range's weight and share.
         columns: for each model, which of the p parameters is what; the very first is the logarithm of the scale.
     """
 
     state: RangeState
     residuals_m: Array
     weights: Array
-    pulls: Array
     cost: float
     information: Array
     gradients: Array
-    gradient: Array
-    prior_information: Array
     columns: tuple[Columns, ...]
 
     @property
@@ -183,7 +177,10 @@ class RangeFit:
     @property
     def covariance(self) -> Array:
         """(p, p) formal covariance; undetermined directions get a huge variance."""
-        return invert_information(self.information)
+        # Scaled by the diagonal, so that the rule does not depend on units.
+        diagonal = np.sqrt(np.maximum(np.diag(self.information), 1e-200))
+        values, vectors = np.linalg.eigh(self.information / np.outer(diagonal, diagonal))
+        return np.asarray((vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal))
 
     def of_anchors(self, covariance: Array) -> Array:
         """Return the (m, 3, 3) parts of the anchors in a (p, p) covariance; 0 for anchors that are not estimated."""
@@ -363,20 +360,16 @@ class _System:
 
     def fit(self, state: RangeState, cost: float, weights: Array | None = None) -> RangeFit:
         """Return the fit at a state; ``weights``: (n,), or None to take them from the loss."""
-        (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
-        weights, share = self.loss.weights(scaled) if weights is None else weights, self.share
-        pulls, prior_information = share * weights, of_priors.T @ of_priors
-        gradients = jacobian * pulls[:, None]
+        (scaled, _), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
+        weights = self.loss.weights(scaled) if weights is None else weights
+        gradients = jacobian * (self.share * weights)[:, None]
         return RangeFit(
             state=state,
             residuals_m=scaled * np.concatenate([part.stddev_m for part in self.parts]),
             weights=weights,
-            pulls=pulls,
             cost=cost,
-            information=gradients.T @ jacobian + prior_information,
+            information=gradients.T @ jacobian + of_priors.T @ of_priors,
             gradients=gradients,
-            gradient=gradients.T @ scaled + of_priors.T @ off_priors,
-            prior_information=prior_information,
             columns=self.columns,
         )
 
@@ -475,10 +468,3 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
         block[:, columns.of_map] = problem.placement.jacobian(similarity, _left_of_step(start, state))
         blocks.append(block)
     return np.concatenate(blocks)
-
-
-def invert_information(information: Array) -> Array:
-    """Invert an information matrix with unit-free conditioning; an undetermined direction gets a huge variance."""
-    diagonal = np.sqrt(np.maximum(np.diag(information), 1e-200))
-    values, vectors = np.linalg.eigh(information / np.outer(diagonal, diagonal))
-    return np.asarray((vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal))

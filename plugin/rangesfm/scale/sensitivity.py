@@ -9,7 +9,6 @@ from rangesfm.scale.range_equation import predicted_ranges, range_gradient
 from rangesfm.scale.scale_estimate import ScaleSensitivity
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
-from rangesfm.scale.uncertainty import scale_influence
 
 _CM = 0.01
 # Ranges must be shorter than the median by this factor to count as the shorter half: rounding spreads equal ranges.
@@ -18,9 +17,9 @@ _SHORTER = 1 - 1e-9
 
 def scale_sensitivity(solution: Solution, posed: ScaleProblem) -> ScaleSensitivity:
     """Return the changes of the scale in percent, to first order."""
-    problem, state = solution.problem, solution.fit.state
-
-    influence = scale_influence(solution.fit, problem)
+    problem, fit, state = solution.problem, solution.fit, solution.fit.state
+    # Relative change of the scale per metre by which each range is longer.
+    influence = fit.gradients @ fit.covariance[0] / problem.stddev_m
 
     def percent(range_error_m: Array) -> float:
         return 100 * float(influence @ range_error_m)

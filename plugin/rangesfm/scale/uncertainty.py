@@ -15,11 +15,9 @@ from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisines
 from rangesfm.scale.linear_map import LinearMap
 from rangesfm.scale.range_equation import (
     Columns,
-    RangeFit,
     RangeProblem,
     RangeState,
     columns_of,
-    invert_information,
     predicted_ranges,
     prior_jacobian,
     prior_residuals,
@@ -184,39 +182,25 @@ class KnownMap:
 
 
 def known_map(
-    posed: ScaleProblem, solution: Solution, learned: LearnedErrors, bending_of_lengths: float = 0.0
-) -> KnownMap:
-    """Return the uncertainty of a map that was scaled as one piece, with robust weights.
-
-    Args:
-        posed: its measured lengths must have the uncertainty that the map's bending gives them.
-        bending_of_lengths: relative standard deviation of the scale by measured lengths, due to the map's bending.
-    """
-    linear = linear_map(posed, solution, learned.bins)
-    variances = np.diag(parameter_covariance(solution, learned))[: linear.columns.num].copy()
-    variances[linear.columns.scale] += (_say_of_lengths(solution) * bending_of_lengths) ** 2
-    return KnownMap.between(linear, learned, solution.fit.log_scale_stddev, variances)
-
-
-def known_refined_map(
     posed: ScaleProblem,
     solution: Solution,
     learned: LearnedErrors,
-    bending: BendingOfBins | None,
-    shared_m: Array,
+    bending: BendingOfBins | None = None,
+    shared_m: Array | None = None,
 ) -> KnownMap:
-    """Return the uncertainty of a refined map.
+    """Return the uncertainty of a map at the solution of its ranges with robust weights.
 
     Args:
-        solution: at the refined map, weighted as in the refinement. bending: of the map, in its bins.
-        shared_m: (n, k) errors of the ranges that the refinement took for shared ones, as ``shared_errors_m``.
+        posed: its measured lengths must have the uncertainty that the map's bending gives them.
+        bending: of a refined map, in its bins; None: the map was scaled as one piece.
+        shared_m: (n, k) errors of the ranges that a refinement took for shared ones, as ``shared_errors_m``.
     """
     errors, bins, given = solution.errors, learned.bins, posed.ranges
     linear, robust = linear_map(posed, solution, bins), solution.fit.weights / errors.stddev_m**2
     bent_m2 = np.zeros_like(learned.covariance_m2) if bending is None else bending.formal_m2
     alone, weighed = (np.diag(1 / np.maximum(bins.total(each), 1e-12)) for each in (robust, errors.worth * robust))
     formal = float(np.sqrt(linear.solved(alone + bent_m2).covariance[0, 0]))
-    shared = bins.mean(shared_m)
+    shared = np.zeros((len(bins), 0)) if shared_m is None else bins.mean(shared_m)
     assumed_m2 = weighed + bent_m2 + bias_covariance(bins, given) + shared @ shared.T
     variances, _ = linear.with_weights(assumed_m2, learned.covariance_m2)
     at_optimum = linear if bending is None else replace(linear, residual_m=linear.residual_m + bending.shift_m)
@@ -237,36 +221,6 @@ def bias_covariance(bins: RangeBins, given: RangeProblem) -> Array:
     )
 
 
-def _say_of_lengths(solution: Solution) -> float:
-    """Return the relative change of the scale per relative change of all lengths between points."""
-    distances, fit = solution.problem.distances, solution.fit
-    if distances is None:
-        return 0.0
-    of_points = distances.subset(distances.is_between_points)
-    slopes = fit.state.metric_from_model.scale * of_points.model_length / of_points.stddev_m
-    return float(invert_information(fit.information)[0, 0] * (slopes @ slopes))
-
-
-def _by_what_was_given(solution: Solution) -> Array:
-    """Return the (p, p) covariance due to errors of measured distances, anchor positions and the upward direction.
-
-    Biases are not in it, as they count as errors of the ranges. The standard deviations of all priors were divided by
-    the inflation, so the result is multiplied by its square.
-    """
-    fit = solution.fit
-    given = fit.prior_information.copy()
-    biases = fit.columns[0].bias[fit.columns[0].bias >= 0]
-    given[biases] = given[:, biases] = 0.0
-    inverse = _inverse(fit)
-    return solution.errors.inflation**2 * inverse @ given @ inverse.T
-
-
-def parameter_covariance(solution: Solution, learned: LearnedErrors) -> Array:
-    """Return the (p, p) covariance of all parameters of a fit, from the errors of ranges and of given values."""
-    of_bins = parameter_influence(solution.fit, solution.problem, learned)
-    return of_bins @ learned.covariance_m2 @ of_bins.T + _by_what_was_given(solution)
-
-
 def shared_errors_m(solution: Solution, learned: LearnedErrors, of_range: Indices) -> Array:
     """Return the errors (n, k) that ranges share, for k independent standard deviations.
 
@@ -285,19 +239,3 @@ def shared_errors_m(solution: Solution, learned: LearnedErrors, of_range: Indice
     matters = variances > 1
     of_bins = scatter_m[:, None] * axes[:, matters] * np.sqrt(variances[matters])
     return np.where(of_range[:, None] >= 0, of_bins[of_range], 0.0)
-
-
-def parameter_influence(fit: RangeFit, problem: RangeProblem, learned: LearnedErrors) -> Array:
-    """Return the (p, c) change of all parameters of a fit per metre by which the ranges of a bin are longer."""
-    of_bins = [learned.bins.total(column / problem.stddev_m) for column in fit.gradients.T]
-    return _inverse(fit) @ np.stack(of_bins)
-
-
-def scale_influence(fit: RangeFit, problem: RangeProblem) -> Array:
-    """Return the (n,) relative change of the scale per metre by which each range is longer."""
-    return np.asarray(fit.gradients @ _inverse(fit)[0] / problem.stddev_m)
-
-
-def _inverse(fit: RangeFit) -> Array:
-    """Return the pseudo-inverse of a fit's information: undetermined directions get no variance."""
-    return np.asarray(np.linalg.pinv(fit.information, rcond=1e-12, hermitian=True), dtype=np.float64)
