@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -418,3 +418,31 @@ def test_priors_may_err_otherwise_than_the_residuals_of_photos() -> None:
     plain = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
     np.testing.assert_allclose(usual.centers, plain.centers, rtol=1e-9)
     assert (np.trace(better.centers, axis1=1, axis2=2) < np.trace(usual.centers, axis1=1, axis2=2)).all()
+
+
+def test_an_anchor_whose_ranges_weigh_far_more_than_they_err_keeps_a_positive_variance() -> None:
+    """Its variance towards the frames is a millionth of the ranges' own, less than a difference of two can resolve."""
+    survey = joint(model(), hold_first=True, num_anchors=0)
+    anchor, bias, frames = np.array([500.0, 3.0, 1.0]), np.zeros(1), np.arange(NUM_FRAMES)
+    ranges = PlacedRanges(
+        range_m=np.linalg.norm(orbit_path(1.4 * NUM_FRAMES).centers(np.arange(8.0)) - anchor, axis=1),
+        stddev_m=np.full(NUM_FRAMES, 1e-5),
+        before=frames,
+        after=frames,
+        weight=np.zeros(NUM_FRAMES),
+        offset_in_world_m=np.zeros((NUM_FRAMES, 3)),
+        anchor_index=np.zeros(NUM_FRAMES, dtype=np.int64),
+        tag_index=np.zeros(NUM_FRAMES, dtype=np.int64),
+    )
+    rows = add_ranges(survey.adjuster, ranges, RangeBlocks(survey.poses, [anchor], [bias], [TAG_IN_CAM_M]))
+    survey.problem.set_parameter_block_constant(bias)
+    errors = ResidualErrors(rows, csr_array(np.ones((NUM_FRAMES, 1))), np.full((1, 1), 1e-8), np.zeros(0, dtype=int))
+    (found,) = joint_covariance(
+        survey.problem, survey.reconstruction, anchors=[anchor], others=[bias], errors=errors
+    ).anchors
+    blocks = variable(replace(survey, anchors=[anchor], biases=[bias]))
+    gain = np.linalg.pinv(tangent_jacobian(survey.problem, blocks).toarray())
+    of_residuals = np.eye(survey.problem.num_residuals())
+    of_residuals[np.ix_(rows, rows)] = 1e-8
+    expected = (gain @ of_residuals @ gain.T)[42:45, 42:45]
+    np.testing.assert_allclose(np.linalg.eigvalsh(found), np.linalg.eigvalsh(expected), rtol=0.05)

@@ -118,9 +118,9 @@ def joint_covariance(
     """
     columns = _Columns.of(problem, reconstruction, anchors, others)
     jacobian = tangent_jacobian(problem, columns.variable)
-    normal, kept, _ = _schur_complement(jacobian, columns, np.zeros(jacobian.shape[0]))
-    free = _free_motions(jacobian, _world_motions(columns))[kept]
-    inverse = _Inverse(normal, free, columns, _Excess.of(jacobian, kept, columns, errors))
+    reduced = _Reduced.of(jacobian, columns, errors)
+    kept = reduced.kept
+    inverse = _Inverse(reduced, _free_motions(jacobian, _world_motions(columns))[kept], columns)
     blocks = inverse.diagonal_blocks()
     variance = residual_stddev**2
     frames = columns.frames
@@ -138,7 +138,7 @@ def joint_covariance(
         anchors=np.array([variance * columns.covariance(anchor, blocks) for anchor in anchors]).reshape(-1, 3, 3),
         others=tuple(variance * columns.covariance(block, blocks) for block in others),
         similarity=similarity,
-        num_free_directions=free.shape[1],
+        num_free_directions=inverse.free.shape[1],
         errors=map_errors(
             parts,
             len(kept),
@@ -164,10 +164,11 @@ class PhotosAlone:
         """
         self._columns = _Columns.of(problem, reconstruction, (), ())
         jacobian, residuals = tangent_jacobian(problem, self._columns.variable), problem.evaluate_residuals()
-        normal, kept, self._gradient = _schur_complement(jacobian, self._columns, np.asarray(residuals))
-        free = _free_motions(jacobian, _world_motions(self._columns))[kept]
-        self._inverse = _Inverse(normal, free, self._columns, _Excess.of(jacobian, kept, self._columns, None))
-        self._size, self._stddev = len(kept), residual_stddev
+        reduced = _Reduced.of(jacobian, self._columns, None)
+        free = _free_motions(jacobian, _world_motions(self._columns))[reduced.kept]
+        self._gradient = reduced.gradient(np.asarray(residuals))
+        self._inverse = _Inverse(reduced, free, self._columns)
+        self._size, self._stddev = len(reduced.kept), residual_stddev
 
     def of_functions(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
         """Return the errors of functions that do not depend on the place and the size of the map.
@@ -271,50 +272,61 @@ class _Columns:
         return f"{kind} number {self.kinds[:index].count(kind)}"
 
 
-@dataclass(frozen=True)
-class _Excess:
-    """J^T (S - 1) J in the columns that are kept: by_error @ covariance @ by_error.T - independent."""
-
-    by_error: csr_array
-    covariance: Array
-    independent: csr_array
-
-    @classmethod
-    def of(cls, jacobian: csc_array, kept: Indices, columns: _Columns, errors: ResidualErrors | None) -> _Excess:
-        if errors is None:
-            return cls(csr_array((len(kept), 0)), np.zeros((0, 0)), csr_array((len(kept), len(kept))))
-        has_point = np.diff(csr_array(jacobian[:, columns.num_kept_columns :]).indptr) > 0
-        has_point[errors.rows] = has_point[errors.exact] = True
-        of_all = csr_array(jacobian[:, kept])
-        rows, without = of_all[errors.rows], of_all[np.flatnonzero(~has_point)]
-        replaced = of_all[np.concatenate([errors.rows, errors.exact])]
-        independent = csr_array(replaced.T @ replaced) + (1 - errors.variance_without_points) * csr_array(
-            without.T @ without
-        )
-        return cls(csr_array(rows.T @ errors.by_error), errors.covariance, independent)
-
-    def times(self, right: Array) -> Array:
-        """Return the product with a matrix (size, k)."""
-        return np.asarray(self.by_error @ (self.covariance @ (self.by_error.T @ right)) - self.independent @ right)
-
-
 def _address(block: Array) -> int:
     return int(block.__array_interface__["data"][0])
 
 
-def _schur_complement(
-    jacobian: csc_array, columns: _Columns, residuals: Array
-) -> tuple[Array | csr_array, Indices, Array]:
-    """Eliminate the points; return the normal equations of the other columns, these columns, and the gradient."""
-    first = columns.num_kept_columns
-    stays = np.repeat(_tied_points(jacobian[:, first:]), 3)
-    kept_columns = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
-    kept, points = jacobian[:, kept_columns], jacobian[:, first + np.flatnonzero(~stays)]
-    rows, whitener = kept.tocsr(), _whitener(points)
-    own, explained = both(lambda: kept.T @ rows, lambda: _explained_by(points, rows, whitener))
-    off_points = points.T @ residuals
-    gradient = kept.T @ residuals - rows.T @ (points @ (whitener @ (whitener.T @ off_points)))
-    return own - explained, kept_columns, np.asarray(gradient)
+@dataclass(frozen=True)
+class _Reduced:
+    """Normal equations after the elimination of the points, J^T J, and J^T S J for the residuals' covariance S.
+
+    The second one is ``independent + by_error @ covariance @ by_error.T``. Both are sums, since a difference of the two
+    would leave negative variances where residuals that err together determine nearly everything.
+
+    Attributes:
+        kept: columns of the Jacobian that are not eliminated.
+        rows: all rows of these columns. points: the eliminated columns. whitener: as ``_whitener`` returns it.
+    """
+
+    normal: Array | csr_array
+    independent: Array | csr_array
+    by_error: csr_array
+    covariance: Array
+    kept: Indices
+    rows: csr_array
+    points: csc_array
+    whitener: bsr_array
+
+    @classmethod
+    def of(cls, jacobian: csc_array, columns: _Columns, errors: ResidualErrors | None) -> _Reduced:
+        first = columns.num_kept_columns
+        of_points = jacobian[:, first:]
+        stays = np.repeat(_tied_points(of_points), 3)
+        kept = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
+        rows, points = csr_array(jacobian[:, kept]), of_points[:, np.flatnonzero(~stays)]
+        whitener = _whitener(points)
+        has_point = np.diff(csr_array(of_points).indptr) > 0
+        seen, others = csr_array(rows[has_point]), csr_array(rows[~has_point])
+        own, explained = both(lambda: csr_array(seen.T) @ seen, lambda: _explained_by(points, rows, whitener))
+        of_photos = own - explained
+        normal = of_photos + others.T @ others
+        if errors is None:
+            nothing = csr_array((len(kept), 0))
+            return cls(normal, normal, nothing, np.zeros((0, 0)), kept, rows, points, whitener)
+        has_point[errors.rows] = has_point[errors.exact] = True
+        alone = csr_array(rows[~has_point])
+        independent = of_photos + errors.variance_without_points * (alone.T @ alone)
+        by_error = csr_array(rows[errors.rows].T @ errors.by_error)
+        return cls(normal, independent, by_error, errors.covariance, kept, rows, points, whitener)
+
+    def gradient(self, residuals: Array) -> Array:
+        """Return the gradient in the kept columns, given all residuals, where the points follow."""
+        off_points = self.whitener @ (self.whitener.T @ (self.points.T @ residuals))
+        return np.asarray(self.rows.T @ (residuals - self.points @ off_points))
+
+    def spread(self, right: Array) -> Array:
+        """Return J^T S J times a matrix (size, k)."""
+        return np.asarray(self.independent @ right + self.by_error @ (self.covariance @ (self.by_error.T @ right)))
 
 
 def _whitener(points: csc_array) -> bsr_array:
@@ -381,52 +393,55 @@ def _free_motions(jacobian: csc_array, motions: Array) -> Array:
 class _Inverse:
     """Pseudo-inverse of the normal equations, orthogonal to the free motions, and the covariance by it."""
 
-    def __init__(self, normal: Array | csr_array, free: Array, columns: _Columns, excess: _Excess) -> None:
-        self._excess, self._free = excess, linalg.orth(free) if free.shape[1] else free
-        scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    def __init__(self, reduced: _Reduced, free: Array, columns: _Columns) -> None:
+        self._reduced, self.free = reduced, linalg.orth(free) if free.shape[1] else free
+        normal = reduced.normal
+        self._scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))[:, None]
         # Fixing as many coordinates as there are free motions makes the matrix regular; any suitable choice will do.
-        held = np.zeros(len(scale))
-        held[linalg.qr(self._free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
-        scaled = diags_array(scale) @ normal @ diags_array(scale) + diags_array(held)
-        self._scale = scale[:, None]
+        held = np.zeros(len(self._scale))
+        held[linalg.qr(self.free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
         self._starts = np.concatenate(
-            [columns.starts[: columns.num_kept_blocks + 1], np.arange(columns.num_kept_columns, len(scale), 3) + 3]
+            [columns.starts[: columns.num_kept_blocks + 1], np.arange(columns.num_kept_columns, len(held), 3) + 3]
         )
-        self._factor = _factored(scaled, self._starts, columns)
+        self._factor = _factored(self._scaled(normal) + diags_array(held), self._starts, columns)
+
+    def _scaled(self, matrix: Array | csr_array) -> Array | csr_array:
+        return diags_array(self._scale[:, 0]) @ matrix @ diags_array(self._scale[:, 0])
 
     def solve(self, right: Array) -> Array:
         """Solve for a right side (size, k)."""
-        right = right - self._free @ (self._free.T @ right)
-        solution = self._scale * self._factor.solve(self._scale * right)
-        return np.asarray(solution - self._free @ (self._free.T @ solution))
+        return self._off_free(self._solve_regular(self._off_free(right)))
+
+    def _solve_regular(self, right: Array) -> Array:
+        return np.asarray(self._scale * self._factor.solve(self._scale * right))
+
+    def _off_free(self, right: Array) -> Array:
+        return np.asarray(right - self.free @ (self.free.T @ right))
 
     def diagonal_blocks(self) -> list[Array]:
         """Return the blocks of the covariance on its diagonal."""
-        scale, free, excess = self._scale[:, 0], self._free, self._excess
-        between = diags_array(scale) @ -excess.independent @ diags_array(scale)
-        blocks = self._factor.blocks_of_sandwich(csr_array(between))
+        free, reduced = self.free, self._reduced
+        blocks = self._factor.blocks_of_sandwich(self._scaled(reduced.independent))
         # The same without the free motions, from the product of this matrix with them.
-        of_free = self._scale * self._factor.solve(self._scale * free)
-        of_free -= self._scale * self._factor.solve(self._scale * (excess.independent @ of_free))
+        of_free = self._solve_regular(np.asarray(reduced.independent @ self._solve_regular(free)))
         of_free -= 0.5 * free @ (free.T @ of_free)
-        by_error = self.solve(excess.by_error.toarray())
+        by_error = self.solve(reduced.by_error.toarray())
         return [
             self._scale[rows] * block * self._scale[rows].T
             - of_free[rows] @ free[rows].T
             - free[rows] @ of_free[rows].T
-            + by_error[rows] @ excess.covariance @ by_error[rows].T
+            + by_error[rows] @ reduced.covariance @ by_error[rows].T
             for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
         ]
 
     def covariance_times(self, right: Array) -> Array:
         """Return the covariance of all columns times (size, k)."""
-        solution = self.solve(right)
-        return solution + self.solve(self._excess.times(solution))
+        return self.solve(self._reduced.spread(self.solve(right)))
 
     def of_functions(self, gradients: Array) -> Array:
         """Return the (k, k) covariance of linear functions with (size, k) gradients."""
         solution = self.solve(gradients)
-        return np.asarray(gradients.T @ solution + solution.T @ self._excess.times(solution))
+        return np.asarray(solution.T @ self._reduced.spread(solution))
 
 
 def _factored(normal: Array | csr_array, starts: Indices, columns: _Columns) -> NestedFactor:

@@ -218,8 +218,8 @@ class NestedFactor:
             found[shape.own] = front.solved(found[shape.own] - front.tie @ found[shape.rest], transposed=True)
         return found[self._place].reshape(right.shape)
 
-    def blocks_of_sandwich(self, between: csr_array) -> list[Array]:
-        """Return the diagonal blocks of inverse + inverse @ between @ inverse.
+    def blocks_of_sandwich(self, between: Array | csr_array) -> list[Array]:
+        """Return the diagonal blocks of inverse @ between @ inverse.
 
         Args:
             between: (size, size), symmetric, with no entries where the factored matrix has none.
@@ -236,15 +236,14 @@ class NestedFactor:
                 if number == self._shapes[parent].children[0]:  # the last one that needs it
                     del of_fronts[parent]
             inverse, product = _upwards(self._eliminated[number], *changes.pop(), *of_rest)
-            own = inverse[: shape.num_own, : shape.num_own] + product[: shape.num_own, : shape.num_own]
             for block in np.unique(np.searchsorted(self._starts, self._order[shape.own], side="right") - 1).tolist():
                 rows = self._place[self._starts[block] : self._starts[block + 1]] - shape.own.start
-                blocks[block] = own[np.ix_(rows, rows)]
+                blocks[block] = product[np.ix_(rows, rows)]
             if shape.children:
                 of_fronts[number] = inverse, product
         return blocks
 
-    def _changes(self, matrix: csr_array) -> list[tuple[Array, Array]]:
+    def _changes(self, matrix: Array | csr_array) -> list[tuple[Array, Array]]:
         """Return the parts (m, m), (m, rest) by which each front changes if a multiple of a matrix is added."""
         changes: list[tuple[Array, Array]] = []
 
