@@ -145,9 +145,7 @@ def bending_part(name: str, covariance: Array, factor: float, spread: float) -> 
 
 def averaged(bins: RangeBins, by_range: csr_array, num_poses: int) -> Array:
     """Average (n, 6 k') derivatives over bins and return (c, 6 k); the last of the k poses may have no ranges."""
-    of_range, shape = bins.of_range, (len(bins), len(bins.of_range))
-    share = bins.robust_weight / np.maximum(bins.worth, 1e-12)[of_range]
-    sums = csr_array((share, (of_range, np.arange(len(of_range)))), shape=shape) @ by_range
+    sums = bins.averages @ by_range
     return np.pad(sums.toarray(), ((0, 0), (0, 6 * num_poses - sums.shape[1])))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -48,13 +49,16 @@ class RangeBins:
     def __len__(self) -> int:
         return len(self.worth)
 
+    @cached_property
+    def averages(self) -> csr_array:
+        """(c, n) weights of the ranges in the bins, with a sum of 1 in each bin."""
+        share = self.robust_weight / np.maximum(self.worth, 1e-12)[self.of_range]
+        return csr_array((share, (self.of_range, np.arange(len(share)))), shape=(len(self), len(share)))
+
     def mean(self, values: Array) -> Array:
         """Return the (c, ...) weighted means of (n, ...) values of the ranges."""
-        means = np.zeros((len(self), *values.shape[1:]))
-        for at in np.ndindex(values.shape[1:]):
-            column = (slice(None), *at)
-            means[column] = self.total(self.robust_weight * values[column]) / np.maximum(self.worth, 1e-12)
-        return means
+        means = self.averages @ values.reshape(len(values), -1)
+        return np.asarray(means.reshape(len(self), *values.shape[1:]))
 
     def shared_by_places(self, towards: Array, placing_m: Array, gap: Indices) -> Array:
         """Return the covariance (c, c), square metres, of the bins due to uncertain positions of the antenna.
@@ -66,12 +70,9 @@ class RangeBins:
             towards: (n, 3) unit vectors from anchor to tag. placing_m: (n,) standard deviation of each coordinate.
             gap: (n,) index of each range's gap.
         """
-        share = self.robust_weight * placing_m / np.maximum(self.worth[self.of_range], 1e-12)
-        covariance = np.zeros((len(self), len(self)))
-        for along in towards.T:
-            of_gaps = csr_array((share * along, (self.of_range, gap)), shape=(len(self), int(gap.max()) + 1))
-            covariance += (of_gaps @ of_gaps.T).toarray()
-        return covariance
+        in_gap = csr_array((placing_m, (np.arange(len(gap)), gap)), shape=(len(gap), int(gap.max()) + 1))
+        of_gaps = [self.averages @ (in_gap * along[:, None]) for along in towards.T]
+        return np.asarray(sum(along @ along.T for along in of_gaps).toarray())
 
     def total(self, values: Array) -> Array:
         """Return the (c,) sums of (n,) values of the ranges."""
