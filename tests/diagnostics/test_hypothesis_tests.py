@@ -12,11 +12,11 @@ from tests.studies.erring_surveys import SITES, run, surveyed
 from rangesfm.diagnostics import hypothesis_tests
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.hypothesis import Hypothesis
-from rangesfm.diagnostics.hypothesis_tests import FALSE_ALARM_RATE, Factorization, row_of
+from rangesfm.diagnostics.hypothesis_tests import Factorization, row_of
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.diagnostics.mistakes import find_mistakes
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
-from rangesfm.scale.linear_map import noncentrality
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE, noncentrality
 
 
 @pytest.fixture(scope="module")

@@ -13,16 +13,17 @@ from rangesfm.diagnostics.hypothesis import MEASURE_AGAIN, Correction, corrected
 from rangesfm.diagnostics.linearized import RangesOnMap
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points
 from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.ranging.range_observations import OUTLIER_BELOW
+from rangesfm.ranging.readers.units import FOOT_M
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 from rangesfm.scale.starts import multilaterate_all, spread_rows
 
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
-# Robust weight of a range that fits, and share of an anchor's ranges that fit if it is about where it is said to be.
-_FITS, _MOST_FIT = 0.1, 0.5
-_FOOT_M = 0.3048
+# Share of an anchor's ranges that fit if it is about where it is said to be.
+_MOST_FIT = 0.5
 _UNITS_M = {
-    "the anchors' coordinates are in feet": _FOOT_M,
-    "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / _FOOT_M,
+    "the anchors' coordinates are in feet": FOOT_M,
+    "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / FOOT_M,
     "the ranges are of both ways, there and back": 2.0,
 }
 _SCALE_FACTORS = np.geomspace(1 / 4, 4, 7)
@@ -124,7 +125,7 @@ def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Alte
     """
     for name, at in given.items():
         k = on_map.anchor_ids.index(name)
-        if np.mean(on_map.weights[on_map.problem.anchor_index == k] > _FITS) < _MOST_FIT:
+        if np.mean(on_map.weights[on_map.problem.anchor_index == k] >= OUTLIER_BELOW) < _MOST_FIT:
             off_m = where_ranges_meet(on_map, k) - at
             words = (
                 f"anchor {name} is about {np.linalg.norm(off_m):.2f} m from where its coordinates say "

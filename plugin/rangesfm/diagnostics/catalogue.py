@@ -23,7 +23,8 @@ from rangesfm.diagnostics.hypothesis import (
 )
 from rangesfm.diagnostics.linearized import Linearized
 
-_SAME_HEIGHT_M = 1e-3
+SAME_HEIGHT_M = 1e-3
+"""Nobody measures heights of anchors that agree to within this, metres."""
 # Growth of an anchor's ranges per metre of distance below which they hardly change with the distance.
 _STUCK = 0.3
 # Largest mistakes, in metres, that nobody notices: along a camera, and of an anchor on a sketch of the site.
@@ -188,7 +189,7 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
     """Yield: the anchors were all given the same height, which is not true."""
     given_m, ids = problem.on_map.problem.anchor_mean_m, problem.on_map.anchor_ids
     known = [k for k in problem.heard if np.isfinite(given_m[k]).all()]
-    if len(known) < 3 or np.ptp(given_m[known, 2]) > _SAME_HEIGHT_M or not all(is_given(problem, k) for k in known):
+    if len(known) < 3 or np.ptp(given_m[known, 2]) > SAME_HEIGHT_M or not all(is_given(problem, k) for k in known):
         return
     up = np.array([0.0, 0.0, 1.0])
     yield Hypothesis(

@@ -13,6 +13,7 @@ from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized,
 from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
 from rangesfm.diagnostics.scale_bound import HiddenMistake
 from rangesfm.processes.threads import with_one_blas_thread
+from rangesfm.ranging.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
 from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
 # Largest standard deviations, metres, of noise and of lasting errors. Real radios show 0.03 to 0.15 m beside outliers,
@@ -144,12 +145,12 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
     index = on_map.problem.anchor_index
     for k in np.unique(index).tolist():
         is_of, name = index == k, on_map.anchor_ids[k]
-        unused = float(np.mean(on_map.weights[is_of] < 0.1))
+        unused = float(np.mean(on_map.weights[is_of] < OUTLIER_BELOW))
         num = int(np.count_nonzero(is_of))
         words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
         remedy = "look whether it is the anchor that it is taken for, and where it stands"
         yield _seen("anchor hardly used", name, unused, 1 - _LEAST_USED, words, remedy)
-        rows = np.flatnonzero(is_of & (bins.robust_weight < 0.5))
+        rows = np.flatnonzero(is_of & (bins.robust_weight < DOWN_WEIGHTED_BELOW))
         if len(rows) >= _MIN_NUM_OUTLYING and len(on_map.anchor_ids) > 1:
             yield _mixed_up(problem, k, rows)
         outlying = len(rows) / num

@@ -12,9 +12,8 @@ from scipy.linalg import solve_triangular
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.scale.linear_map import NOTHING_LEFT, EstimatedMistake, Solved, noncentrality
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NOTHING_LEFT, EstimatedMistake, Solved, noncentrality
 
-FALSE_ALARM_RATE = 0.02
 _NUM_DRAWS = 1000
 
 

@@ -12,8 +12,8 @@ from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite
 from rangesfm.diagnostics.scale_bound import hidden_lengths
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.errors import number_text
-from rangesfm.scale.linear_map import noncentrality
-from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 _MEASURE_AGAIN = "look whether it was mistyped, or measure it again"
@@ -92,7 +92,7 @@ def against_other(estimate: ScaleEstimate, kind: str, other: str, remedy: str) -
         f"{kind} against {other}",
         "",
         (apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
-        float(special.chdtri(1, LENGTH_FALSE_ALARM_RATE)),
+        float(special.chdtri(1, FALSE_ALARM_RATE)),
         words=f"by the {_NAMES[kind]} the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the "
         f"{_NAMES[other]}; their errors together explain {100 * stddev:.1f} % (1 stddev)",
         remedy=remedy,

@@ -21,8 +21,7 @@ from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.positions.control_points import ControlPoint, ControlPoints, marks_seen
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.linear_map import EstimatedMistake, Solved
-from rangesfm.scale.scale_by_positions import POINT_FALSE_ALARM_RATE
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
 
 _ONE_FRAME = "look whether points and anchors are in one frame, and measured to the same height of the antennas"
 _ALL = "frame of the points"
@@ -105,7 +104,7 @@ def _tested(off_m: Array, covariance_m2: Array, points: Sequence[ControlPoint]) 
     columns = [*np.eye(3 * num).reshape(3 * num, num, 3).transpose(1, 0, 2)]
     if num > 1:
         columns.append(np.tile(np.eye(3), (num, 1)))
-    threshold = float(special.chdtri(3, POINT_FALSE_ALARM_RATE / len(columns)))
+    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / len(columns)))
     found: dict[int, EstimatedMistake] = {}
     while True:
         beside = np.hstack([np.zeros((3 * num, 0)), *(columns[k] for k in found)])

@@ -13,8 +13,9 @@ from rangesfm.diagnostics.hypothesis import in_axes
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, row_of_mistake
 from rangesfm.diagnostics.length_tests import against_other
 from rangesfm.processes.threads import with_one_blas_thread
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE
 from rangesfm.scale.position_equations import at_point
-from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, POINT_FALSE_ALARM_RATE, PositionScale
+from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, PositionScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
@@ -88,7 +89,7 @@ def _of_check_points(positions: PositionScale, left_out: Collection[str]) -> Ite
     """Yield the test of each check point against the control points, which it does not move."""
     known = positions.known
     rows = [row for row in np.flatnonzero(known.is_mark & known.is_check).tolist() if known.names[row] not in left_out]
-    threshold = float(special.chdtri(3, POINT_FALSE_ALARM_RATE / max(len(rows), 1)))
+    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(len(rows), 1)))
     for row in rows:
         yield replace(_of_point(positions, _CHECK_POINT, row, threshold), effect_on_scale=0.0)
 
@@ -121,7 +122,7 @@ def _of_antenna(positions: PositionScale) -> Iterator[MistakeTest]:
     for name, of_all in columns.items():
         by = of_all.reshape(3 * len(known), -1)
         found = positions.equations.with_mistake_learnt(by).of_mistake(by)
-        threshold = float(special.chdtri(max(found.num, 1), POINT_FALSE_ALARM_RATE / len(columns)))
+        threshold = float(special.chdtri(max(found.num, 1), FALSE_ALARM_RATE / len(columns)))
         words, remedy, most, unit = _OF_ANTENNA[name]
         if np.linalg.norm(found.sizes) > most:
             found = replace(found, statistic=0.0)

@@ -12,16 +12,18 @@ from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
+from rangesfm.diagnostics.catalogue import SAME_HEIGHT_M
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import number_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import RangeKind, RangeLog
-from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE
+from rangesfm.ranging.readers.units import FOOT_M
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 
 # No survey finds the same height for three anchors to within a millimetre, and no two anchors are in one place.
-_SAME_HEIGHT_M, SAME_PLACE_M = 1e-3, 0.01
+SAME_PLACE_M = 0.01
 _MIN_ANCHORS_ALIKE = 3
 # UWB radios reach some 200 m. The unit is doubted if this share of the ranges is longer than the limit.
 FAR_M, _FAR_SHARE = 300.0, 0.95
@@ -48,10 +50,10 @@ _MAX_NUM_NAMED = 2
 _UNITS = {
     "anchors are in millimetres": 1e-3,
     "anchors are in centimetres": 1e-2,
-    "anchors are in feet": 0.3048,
+    "anchors are in feet": FOOT_M,
     "ranges are in millimetres": 1e3,
     "ranges are in centimetres": 1e2,
-    "ranges are in feet": 1 / 0.3048,
+    "ranges are in feet": 1 / FOOT_M,
 }
 
 
@@ -82,7 +84,7 @@ def _on_taped_anchors(tape: Tape, anchors: Sequence[Anchor]) -> Iterator[str]:
     """Yield a note for each taped distance that coordinates of its two anchors contradict, by their stated errors."""
     surveyed = {anchor.anchor_id: anchor for anchor in anchors if anchor.position_m is not None}
     between = [taped for taped in tape.distances if surveyed.keys() >= {*taped.ends}]
-    threshold = np.sqrt(special.chdtri(1, LENGTH_FALSE_ALARM_RATE / max(len(between), 1)))
+    threshold = np.sqrt(special.chdtri(1, FALSE_ALARM_RATE / max(len(between), 1)))
     for taped in between:
         first, second = (surveyed[end] for end in taped.ends)
         assert first.position_m is not None
@@ -100,7 +102,7 @@ def _on_taped_anchors(tape: Tape, anchors: Sequence[Anchor]) -> Iterator[str]:
 
 def _on_positions(positions_m: Mapping[str, Array], *, is_site: bool) -> Iterator[str]:
     heights_m = np.array([at[2] for at in positions_m.values()])
-    if is_site and len(heights_m) >= _MIN_ANCHORS_ALIKE and np.ptp(heights_m) < _SAME_HEIGHT_M:
+    if is_site and len(heights_m) >= _MIN_ANCHORS_ALIKE and np.ptp(heights_m) < SAME_HEIGHT_M:
         yield (
             f"all {len(heights_m)} anchors have one height, {heights_m[0]:g} m: if nobody measured it, the map's "
             "height and tilt rest on a guess, and the ranges cannot show it; measure the heights of the antennas"

@@ -19,8 +19,8 @@ from scipy.optimize import brentq
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Test
-from rangesfm.scale.linear_map import noncentrality
-from rangesfm.scale.scale_by_lengths import LENGTH_FALSE_ALARM_RATE, LengthScale
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 
 RISK = 1e-4
@@ -95,7 +95,7 @@ def hidden_lengths(lengths: LengthScale, against_stddev: float | None) -> tuple[
     found = zip(slopes.tolist(), lengths.threshold[is_checked].tolist(), strict=True)
     hidden = [HiddenMistake("length", slope, threshold, 1, np.inf) for slope, threshold in found]
     if against_stddev is not None:
-        threshold = float(special.chdtri(1, LENGTH_FALSE_ALARM_RATE))
+        threshold = float(special.chdtri(1, FALSE_ALARM_RATE))
         hidden.append(HiddenMistake("lengths", against_stddev, threshold, 1, np.inf))
     elif not is_checked.all():
         hidden.append(HiddenMistake("length", np.inf, np.inf, 1, np.inf))

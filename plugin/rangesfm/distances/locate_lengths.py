@@ -18,6 +18,7 @@ from rangesfm.distances.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import shared_stddev
+from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 
 # Largest distance of a mark from its reprojected marker, as a fraction of the photo's longer side. A mark farther off
@@ -105,6 +106,28 @@ class LocatedDistances:
         first, second = anchors_m[self.anchor_pair[between_anchors].T]
         lengths[between_anchors] = np.linalg.norm(first - second, axis=1)
         return lengths
+
+    def residuals(self, scale: float, anchors_m: Array) -> Array:
+        """Return the (k,) residuals in such a map, predicted minus measured, in standard deviations."""
+        return (self.lengths_m(scale, anchors_m) - self.distance_m) / self.stddev_m
+
+    def jacobian(self, scale: float, anchors_m: Array, anchor_column: Indices, num_columns: int) -> Array:
+        """Return the (k, p) Jacobian of the residuals.
+
+        Args:
+            anchor_column: (m,) first of the three columns of each anchor; -1 for an anchor that is held fixed.
+            num_columns: p; the first column is the logarithm of the scale.
+        """
+        jacobian, between_points = np.zeros((len(self), num_columns)), self.is_between_points
+        jacobian[between_points, 0] = (scale * self.model_length / self.stddev_m)[between_points]
+        rows = np.flatnonzero(~between_points)
+        first, second = self.anchor_pair[rows].T
+        by = RangeGradient.of(anchors_m[first] - anchors_m[second])
+        for anchor, slopes in ((first, by.by_tag), (second, by.by_anchor)):
+            free = anchor_column[anchor] >= 0
+            columns = anchor_column[anchor[free], None] + np.arange(3)
+            jacobian[rows[free, None], columns] = slopes[free] / self.stddev_m[rows[free], None]
+        return jacobian
 
 
 def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> LocatedDistances:

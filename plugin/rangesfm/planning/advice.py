@@ -14,8 +14,9 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.expected import Expected, expect_roughly
-from rangesfm.planning.paths import way_along
+from rangesfm.planning.paths import NUM_WAVES, way_along
 from rangesfm.planning.placement import spread_places
+from rangesfm.planning.plan_checks import told
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.walls import lead_through
@@ -27,8 +28,8 @@ from rangesfm.scale.scale_verdict import CALIBRATE
 
 # Changes of an anchor's height that are tried, metres.
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)
-# Amplitude in metres and number of the waves of a path that goes up and down.
-_UP_AND_DOWN_M, _NUM_WAVES = 0.5, 3
+# Amplitude, metres, of a path that goes up and down.
+_UP_AND_DOWN_M = 0.5
 # Factor by which a path or the anchors are spread out.
 _WIDER = 1.5
 # Standard deviation of the radio's error curve after a calibration, metres.
@@ -157,7 +158,7 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
         survey = f"survey the anchors, to {_SURVEYED_M:g} m"
         yield "anchor survey", "", survey, replace(planned, anchors=known, anchor_frame="site")
     if not planned.path_is_level:
-        up = f"go up and down on the way, by {_UP_AND_DOWN_M:g} m, {_NUM_WAVES} times"
+        up = f"go up and down on the way, by {_UP_AND_DOWN_M:g} m, {NUM_WAVES} times"
         yield "up and down", "", up, replace(planned, trajectory=_up_and_down(path))
     if path_shape(path.centers).stddevs[1] < NEARLY_STRAIGHT * path_shape(path.centers).stddevs[0]:
         bent, off_m = _bent(path)
@@ -229,7 +230,7 @@ def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
     """Yield the plan with each anchor moved to each of some allowed places."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
         for place in _free_places(planned):
-            words = f"move anchor {anchor.anchor_id} to {_told(place)}"
+            words = f"move anchor {anchor.anchor_id} to {told(place)}"
             yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
@@ -241,7 +242,7 @@ def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
     name = next(name for name in (f"new{number or ''}" for number in range(len(taken) + 1)) if name not in taken)
     for place in _free_places(planned):
         more = (*planned.anchors, Anchor(name, place, stddev_m))
-        words = f"add an anchor at {_told(place)}"
+        words = f"add an anchor at {told(place)}"
         yield "one more anchor", "", words, replace(planned, anchors=more)
 
 
@@ -263,7 +264,7 @@ def _with_control_points(planned: PlannedSurvey) -> Iterator[_Change]:
     outermost_first = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1), kind="stable")
     spread = spread_places(MIN_NUM_POSITIONS, places[outermost_first])
     more = tuple(ControlPoint(name, at, _POINT_STDDEV_M, CONTROL, 0) for name, at in zip(names, spread, strict=False))
-    where = "; ".join(map(_told, spread))
+    where = "; ".join(map(told, spread))
     words = f"survey three control points that the photos show, such as {where}, to {_POINT_STDDEV_M:g} m"
     anchor_frame = "site" if planned.anchor_frame == "site" else "unknown"
     with_points = replace(planned, points=(*planned.points, *more), anchor_frame=anchor_frame)
@@ -286,13 +287,9 @@ def _free_places(planned: PlannedSurvey) -> list[Array]:
     return [place for place in spread if np.linalg.norm(planned.anchors_m - place, axis=1).min() > _NEAR_M]
 
 
-def _told(place: Array) -> str:
-    return ", ".join(f"{x:.3g}" for x in place)
-
-
 def _up_and_down(path: Trajectory) -> Trajectory:
     way = way_along(path.centers)
-    wave = _UP_AND_DOWN_M * np.sin(2 * np.pi * _NUM_WAVES * way / max(float(way[-1]), 1e-9))
+    wave = _UP_AND_DOWN_M * np.sin(2 * np.pi * NUM_WAVES * way / max(float(way[-1]), 1e-9))
     return replace(path, centers=path.centers + wave[:, None] * [0.0, 0.0, 1.0])
 
 

@@ -15,8 +15,10 @@ from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruct
 _MAX_NUM_KEYFRAMES = 20_000
 # Size of a loop relative to its floor.
 _LOOP_SHARE = 2 / 3
-# Distance between waypoints of a loop, and number of its waves up and down.
-_LOOP_STEP_M, _NUM_WAVES = 0.25, 3
+# Distance between waypoints of a loop.
+_LOOP_STEP_M = 0.25
+NUM_WAVES = 3
+"""Number of the waves of a path that goes up and down."""
 # Below this ratio of its horizontal part to its length a direction counts as vertical.
 _STEEP = 1e-6
 # Times at which a turn is sampled, relative to its middle and its duration.
@@ -84,11 +86,11 @@ def loop_inside(corners_m: Sequence[Sequence[float]], heights_m: tuple[float, fl
     closed = np.vstack([corners, corners[:1]])
     sides = np.linalg.norm(np.diff(closed, axis=0), axis=1)
     way = way_along(closed)
-    at = np.linspace(0.0, way[-1], max(int(_LOOP_SHARE * way[-1] / _LOOP_STEP_M), 4 * _NUM_WAVES) + 1)
+    at = np.linspace(0.0, way[-1], max(int(_LOOP_SHARE * way[-1] / _LOOP_STEP_M), 4 * NUM_WAVES) + 1)
     outline = places_on_way(at, way, closed)
     middle = sides @ (closed[:-1] + closed[1:]) / (2 * max(float(way[-1]), 1e-9))
     low, high = heights_m
-    heights = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * _NUM_WAVES * at / max(float(way[-1]), 1e-9))
+    heights = (low + high) / 2 + (high - low) / 2 * np.sin(2 * np.pi * NUM_WAVES * at / max(float(way[-1]), 1e-9))
     return [tuple(place) for place in np.insert(middle + _LOOP_SHARE * (outline - middle), 2, heights, axis=1).tolist()]
 
 

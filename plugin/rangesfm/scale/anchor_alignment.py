@@ -23,8 +23,8 @@ _NUM_ROUNDS = 30
 _NUM_BEST = 6
 # A motion whose robust cost exceeds the best one's by more than this is discarded.
 _MAX_COST_GAP = 50.0
-# Two motions count as one if they carry the path to places no further apart than this, in extents of the path.
-_SAME_SHARE = 0.1
+SAME_SHARE = 0.1
+"""Two placements of a path are one if its places are no further apart than this, in extents of the path."""
 # An anchor this many standard deviations from its place in the other frame is reported as standing elsewhere.
 _ELSEWHERE_STDDEVS = 5.0
 
@@ -153,7 +153,7 @@ def _refuse_too_few(pairs: Mapping[str, _Pair]) -> None:
 
 def _distinct(pairs: Mapping[str, _Pair], path_m: Array) -> list[AnchorAlignment]:
     """Return the refined fits that start from triples of anchors, best first, each different motion once."""
-    tolerance = _SAME_SHARE * float(np.linalg.norm(path_shape(path_m).stddevs))
+    tolerance = SAME_SHARE * float(np.linalg.norm(path_shape(path_m).stddevs))
 
     def best(fits: Iterable[AnchorAlignment]) -> list[AnchorAlignment]:
         return each_once(sorted(fits, key=lambda fit: fit.cost), are_same, 2 * _NUM_BEST)

@@ -11,10 +11,10 @@ from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
+from rangesfm.scale.scale_problem import MIN_RANGES
 from rangesfm.scale.solution import MIN_COST_GAP, Solution
 from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
 
-_MIN_RANGES_ALONE = 8
 _MAX_RANGES_ALONE = 3000
 # An anchor gives no scale of its own if the standard deviation of the scale's logarithm is larger than this.
 _MAX_LOG_SCALE_STDDEV = 0.5
@@ -32,7 +32,7 @@ def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[st
     for k, anchor_id in enumerate(anchor_ids):
         part = problem.of_anchor(k)
         alone = spread_subset(replace(part, centers=part.centers - middle), _MAX_RANGES_ALONE)
-        if len(alone.range_m) < _MIN_RANGES_ALONE:
+        if len(alone.range_m) < MIN_RANGES:
             continue
         start = RangeState(placed, state.anchors_m[k : k + 1], state.bias_m[k : k + 1])
         fit = solve(alone, start, loss=GEMAN_MCCLURE)

@@ -24,10 +24,6 @@ from rangesfm.scale.scale_verdict import judge, judge_positions
 from rangesfm.scale.solution import Solution, weighted
 from rangesfm.scale.uncertainty import KnownMap, bending_of_bins, known_map, learned_errors
 
-# With twice as many bins the learnt errors change by less than a twentieth (hall and laps of
-# ``tests.studies.drifting_maps``), and each bin costs one solution of the photos' normal equations.
-MAX_NUM_BINS = 450
-
 
 @dataclass(frozen=True)
 class MapWithRanges:
@@ -94,7 +90,7 @@ class MapWithRanges:
 
     def learned(self) -> LearnedErrors:
         """Estimate the errors of the ranges and of the map from the residuals at this map."""
-        return learned_errors(self.posed, self.solution, self.bending, MAX_NUM_BINS)
+        return learned_errors(self.posed, self.solution, self.bending)
 
     def bending_factor(self, learned: LearnedErrors) -> float:
         """Return the learnt bending over the bending expected from the photos' residuals; 1 if that is unknown."""

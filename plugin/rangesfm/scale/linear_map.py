@@ -19,6 +19,10 @@ from rangesfm.arrays import Array
 from rangesfm.ranging.errors.learned import ROUNDING
 from rangesfm.scale.range_equation import Columns
 
+FALSE_ALARM_RATE = 0.02
+"""Share of surveys without any mistake in which one is named, or a correct length or point is set aside."""
+NUM_SUSPECTS = 3
+"""Number of measurements for which it is tried what the others say without them, the most deviating first."""
 # Baarda's significance level of a single test, and the probability that it misses a mistake of the smallest size.
 _ALPHA, _BETA = 0.001, 0.2
 NOTHING_LEFT = 1e-7

@@ -14,17 +14,14 @@ from rangesfm.geometry.similarity import Similarity, path_shape, rmse
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import wider
-from rangesfm.scale.anchor_alignment import PlacedAnchor, align_by_anchors
+from rangesfm.scale.anchor_alignment import SAME_SHARE, PlacedAnchor, align_by_anchors
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
 from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.scale.solution import MIN_COST_GAP
+from rangesfm.scale.solution import MIN_COST_GAP, SUBSET_PER_ANCHOR
 from rangesfm.scale.starts import spread_subset
 
 # Smallest standard deviation of an anchor's position: antennas err by as much, whatever the ranges say.
 _MIN_STDDEV_M = 0.02
-_MAX_RANGES_PER_ANCHOR = 300
-# Two placements count as the same if the path's places are no further apart than this, in extents of the path.
-_SAME_SHARE = 0.1
 # A model counts as not placed if its path's places have a larger standard deviation than this, in extents of the path.
 _MAX_OPEN = 0.25
 
@@ -136,7 +133,7 @@ class _World:
     def _best(self, k: int, starts: Sequence[tuple[Similarity, Mapping[str, Array]]]) -> RangeFit:
         """Choose among possible places of a model by the ranges of all; raise GeometryError if they cannot decide."""
         members = [*self.metric_from_sfm, k]
-        group = _Group([self._models[j] for j in members], _MAX_RANGES_PER_ANCHOR)
+        group = _Group([self._models[j] for j in members], SUBSET_PER_ANCHOR)
         fits = sorted(
             (group.solve([*self.metric_from_sfm.values(), metric], at) for metric, at in starts),
             key=lambda fit: fit.cost,
@@ -146,7 +143,7 @@ class _World:
         extent = float(np.linalg.norm(placed.scale * path_shape(path).stddevs))
         for rival in fits[1:]:
             apart = placed.apply(path) - rival.state.similarities[-1].apply(path)
-            if rmse(apart) > _SAME_SHARE * extent and rival.cost - best.cost < MIN_COST_GAP:
+            if rmse(apart) > SAME_SHARE * extent and rival.cost - best.cost < MIN_COST_GAP:
                 raise GeometryError(f"it can be laid in two ways, {rmse(apart):.2g} m apart, that fit all ranges alike")
         stddev = _path_stddev_m(best, path)
         if stddev > _MAX_OPEN * extent:

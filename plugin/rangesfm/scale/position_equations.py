@@ -11,10 +11,9 @@ from scipy.sparse import block_diag, csr_array, kron
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.ranging.errors.learned import ComponentLikelihood, ErrorParts
+from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.linear_map import EstimatedMistake, LinearMap
 
-OUTLYING = 0.1
-"""Robust weight below which a position is an outlier."""
 NUM_TIMES = 8
 """Number of times of a group, over which its correlation with others is averaged."""
 # An antenna's positions are averaged to at most this many groups for the estimate of their errors.
@@ -87,7 +86,7 @@ def at_point(known: KnownPositions, row: int) -> Array:
 def grouped_by_time(known: KnownPositions, weights: Array) -> csr_array:
     """Return the (3 g, 3 k) weights of positions in groups: marks alone, an antenna's averaged in the order of time."""
     marks = np.flatnonzero(known.is_mark)
-    others = np.flatnonzero(~known.is_mark & (weights >= OUTLYING))
+    others = np.flatnonzero(~known.is_mark & (weights >= OUTLIER_BELOW))
     order = (
         others[np.argsort(known.time_s[others], kind="stable")] if np.isfinite(known.time_s[others]).all() else others
     )

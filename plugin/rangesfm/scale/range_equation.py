@@ -28,7 +28,6 @@ from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.placement_prior import PlacementPrior
-from rangesfm.scale.scale_by_lengths import distance_jacobian, distance_residuals
 
 
 @dataclass(frozen=True)
@@ -431,7 +430,7 @@ def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) 
     off_bias = problem.bias_whitening @ (state.bias_m - problem.bias_mean_m)[biases]
     priors = [off_anchor.ravel(), off_bias]
     if problem.distances is not None:
-        priors.append(distance_residuals(problem.distances, state.metric_from_model.scale, state.anchors_m))
+        priors.append(problem.distances.residuals(state.metric_from_model.scale, state.anchors_m))
     if problem.gravity is not None and columns.frame >= 0:
         priors.append(problem.gravity.residuals(state.metric_from_model.rotation))
     if problem.placement is not None and columns.frame >= 0:
@@ -455,9 +454,7 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
     jacobian[3 * len(anchors) :, columns.bias[biases]] = problem.bias_whitening
     blocks, similarity = [jacobian], state.metric_from_model
     if problem.distances is not None:
-        blocks.append(
-            distance_jacobian(problem.distances, similarity.scale, state.anchors_m, columns.anchor, columns.num)
-        )
+        blocks.append(problem.distances.jacobian(similarity.scale, state.anchors_m, columns.anchor, columns.num))
     if problem.gravity is not None and columns.frame >= 0:
         block = np.zeros((3, columns.num))
         turn = problem.gravity.jacobian(similarity.rotation, _left_of_step(start, state))

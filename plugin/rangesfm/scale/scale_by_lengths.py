@@ -1,4 +1,4 @@
-"""The scale from measured lengths alone, outliers among them, and residuals of lengths beside ranges.
+"""The scale from measured lengths alone, and outliers among them.
 
 A measured length d between two points of a model has three errors: of its measurement, of the marks of its ends, and
 of the map's bending. Bending means that the scale of a map varies smoothly from place to place; a length sees the mean
@@ -20,7 +20,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import path_shape
-from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS
 
 # BENDING: relative variation of the scale within a map (stddev). _BENDING_SPREAD: stddev of its logarithm from map to
 # map. _ALIKE_WITHIN: correlation length of the variation, as a share of the path's extent. Source: lengths of 0.5 to
@@ -28,9 +28,6 @@ from rangesfm.ranging.range_gradient import RangeGradient
 BENDING = 0.008
 _BENDING_SPREAD, _ALIKE_WITHIN = 0.6, 0.25
 _NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 21, 8, 2
-# Share of surveys without any mistake in which a correct length is set aside.
-LENGTH_FALSE_ALARM_RATE = 0.02
-_NUM_SUSPECTS = 3
 
 
 @dataclass(frozen=True)
@@ -232,7 +229,7 @@ class _Lengths:
         ratios = np.log(self.metric / self.model)
         while kept.sum() > 2 and (~kept).sum() + 1 < num / 2:
             among = np.flatnonzero(kept)
-            far = np.argsort(-np.abs(ratios[among] - np.median(ratios[among])), kind="stable")[:_NUM_SUSPECTS]
+            far = np.argsort(-np.abs(ratios[among] - np.median(ratios[among])), kind="stable")[:NUM_SUSPECTS]
             excess = {k: self.test(kept & (np.arange(num) != k), k).excess for k in among[far].tolist()}
             worst = max(excess, key=excess.__getitem__)
             if excess[worst] <= 1:
@@ -278,7 +275,7 @@ class _Lengths:
             fit: whose size of the bending is used, as that of a fit for each of many lengths takes long; None: fit
                 the other kept ones.
         """
-        others, risk = kept & (np.arange(len(kept)) != k), LENGTH_FALSE_ALARM_RATE / len(kept)
+        others, risk = kept & (np.arange(len(kept)) != k), FALSE_ALARM_RATE / len(kept)
         if not others.any():
             return _Test(0.0, np.inf, 0.0, float(special.chdtri(1, risk)))
         fit, chosen, at = fit or self.fit(others), others | (np.arange(len(kept)) == k), int(others[:k].sum())
@@ -315,34 +312,3 @@ def _unlikeliness(covariance: Array, model: Array, metric: Array) -> float:
     (information, right), (_, square) = whitened.T @ whitened
     determinant = np.linalg.slogdet(covariance)[1]
     return float(0.5 * (determinant + np.log(information) + square - right**2 / information))
-
-
-def distance_residuals(distances: LocatedDistances, scale: float, anchors_m: Array) -> Array:
-    """Return the (k,) residuals, predicted minus measured, in standard deviations."""
-    return (distances.lengths_m(scale, anchors_m) - distances.distance_m) / distances.stddev_m
-
-
-def distance_jacobian(
-    distances: LocatedDistances,
-    scale: float,
-    anchors_m: Array,
-    anchor_column: Indices,
-    num_columns: int,
-) -> Array:
-    """Return the (k, p) Jacobian of the residuals.
-
-    Args:
-        anchor_column: (m,) first of the three columns of each anchor; -1 for an anchor that is held fixed.
-        num_columns: p; the first column is the logarithm of the scale.
-    """
-    jacobian = np.zeros((len(distances), num_columns))
-    between_points = distances.anchor_pair[:, 0] < 0
-    jacobian[between_points, 0] = (scale * distances.model_length / distances.stddev_m)[between_points]
-    rows = np.flatnonzero(~between_points)
-    first, second = distances.anchor_pair[rows].T
-    by = RangeGradient.of(anchors_m[first] - anchors_m[second])
-    for anchor, slopes in ((first, by.by_tag), (second, by.by_anchor)):
-        free = anchor_column[anchor] >= 0
-        columns = anchor_column[anchor[free], None] + np.arange(3)
-        jacobian[rows[free, None], columns] = slopes[free] / distances.stddev_m[rows[free], None]
-    return jacobian

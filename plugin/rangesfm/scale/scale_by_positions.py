@@ -27,12 +27,12 @@ from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.learned import ErrorParts
 from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import is_line
-from rangesfm.scale.linear_map import LinearMap
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, LinearMap
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.position_equations import (
     NUM_TIMES,
-    OUTLYING,
     ErrorPart,
     PositionEquations,
     at_point,
@@ -49,9 +49,6 @@ from rangesfm.scale.uncertainty import KnownMap
 
 MIN_NUM_POSITIONS = 3
 """Fewest positions, not on one line, that determine a similarity."""
-# Share of surveys without any mistake in which a correct control point is set aside.
-POINT_FALSE_ALARM_RATE = 0.02
-_NUM_SUSPECTS = 3
 # Median length of a vector of three normally distributed numbers, in their standard deviation.
 _MEDIAN_LENGTH = 1.538
 _MAX_NUM_TRIPLES, _NUM_ROUNDS = 300, 30
@@ -127,7 +124,7 @@ class PositionScale:
     @property
     def is_used(self) -> Mask:
         """(k,) positions that take part."""
-        return np.asarray(~self.known.is_check & ~self.is_left_out & (self.weights >= OUTLYING))
+        return np.asarray(~self.known.is_check & ~self.is_left_out & (self.weights >= OUTLIER_BELOW))
 
     @property
     def num_used(self) -> int:
@@ -171,7 +168,7 @@ def scale_by_positions(
     problem.require_enough()
     used = ~known.is_check
     num_control = int(np.count_nonzero(known.is_mark & used))
-    threshold = float(special.chdtri(3, POINT_FALSE_ALARM_RATE / max(num_control, 1)))
+    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(num_control, 1)))
     fit = problem.fit(used)
     while (worst := problem.worst(fit, threshold)) is not None:
         fit = worst
@@ -238,7 +235,7 @@ class _Problem:
         bending = self.bending.of_functions(by_pose, frame_is_free=True)
         linear = self._linear(similarity, grouping, bending)
         parts = tuple(self._parts(similarity, grouping, stddev_m, bending))
-        takes_part = (abs(grouping) @ np.repeat(used & (weights >= OUTLYING) | used & self.known.is_mark, 3)) > 0
+        takes_part = (abs(grouping) @ np.repeat(used & (weights >= OUTLIER_BELOW) | used & self.known.is_mark, 3)) > 0
         errors = errors_of_sizes(parts, {part.name: part.median * float(np.exp(part.spread**2)) for part in parts})
         return PositionEquations(linear, parts, errors, takes_part, grouping), bending
 
@@ -342,7 +339,7 @@ class _Problem:
         rows = np.flatnonzero(fit.used & self.known.is_mark)
         statistics = np.array([fit.equations.of_mistake(at_point(self.known, row)).statistic for row in rows.tolist()])
         found, largest = None, threshold
-        for row in rows[np.argsort(-statistics, kind="stable")[:_NUM_SUSPECTS]].tolist():
+        for row in rows[np.argsort(-statistics, kind="stable")[:NUM_SUSPECTS]].tolist():
             others = fit.used & (np.arange(len(fit.used)) != row)
             if int(others.sum()) <= MIN_NUM_POSITIONS - 1 or not _determine(self.known, others):
                 continue
@@ -356,7 +353,7 @@ class _Problem:
         """Return the scale with its uncertainty, by the rule of ``KnownMap.between``."""
         rows = fit.equations.is_used
         linear, errors = fit.equations.of(rows)
-        variances = fit.stddev_m**2 / np.maximum(fit.weights, OUTLYING)
+        variances = fit.stddev_m**2 / np.maximum(fit.weights, OUTLIER_BELOW)
         weighed = (fit.equations.grouping @ diags_array(np.repeat(variances, 3)) @ fit.equations.grouping.T).toarray()
         if self.refined is not None:
             weighed = weighed + fit.bending.formal_m2

@@ -23,7 +23,8 @@ from rangesfm.scale.anchor_plane import is_line, is_steep
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeProblem
 
-_MIN_RANGES = 8
+MIN_RANGES = 8
+"""Fewest ranges that determine a scale: there are seven unknowns, and one more checks the fit."""
 _MIN_KEYFRAMES = 4
 # A position has three unknowns; two more ranges check the fit.
 _MIN_RANGES_OF_UNKNOWN = 5
@@ -215,10 +216,10 @@ def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indice
     heard = counts >= np.where(given, 1, _MIN_RANGES_OF_UNKNOWN)
     rows = rows[heard[index[rows]]]
     keyframes = np.union1d(observations.before[rows], observations.after[rows])
-    if len(rows) < _MIN_RANGES or len(keyframes) < _MIN_KEYFRAMES:
+    if len(rows) < MIN_RANGES or len(keyframes) < _MIN_KEYFRAMES:
         raise GeometryError(
             f"the scale is not determined: {len(rows)} of {len(observations.log)} ranges lie on the path, near "
-            f"{len(keyframes)} keyframes; {_MIN_RANGES} near {_MIN_KEYFRAMES} are needed (do the clocks agree?)"
+            f"{len(keyframes)} keyframes; {MIN_RANGES} near {_MIN_KEYFRAMES} are needed (do the clocks agree?)"
         )
     return rows, heard
 

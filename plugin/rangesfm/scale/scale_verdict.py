@@ -14,19 +14,19 @@ from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
-from rangesfm.scale.solution import WHY_SCALE_IS_OPEN, Solution
+from rangesfm.scale.solution import MANY_OUTLIERS, WHY_SCALE_IS_OPEN, Solution
 
 # A scale is doubtful if half of its relative 95 % interval is wider than this.
 DOUBTFUL_ABOVE = 0.04
-_MANY_OUTLIERS = 0.3
 _FEW_RANGES = 50
-# Relative standard deviation of the scale from which nothing is known about it.
-_NOTHING_KNOWN = 1.0
+NOTHING_KNOWN = 1.0
+"""Relative standard deviation of the scale from which nothing is known about it: it may as well be zero."""
 # Scatter of the scales from single anchors above which they disagree. Antennas and short paths alone cause less.
 _MAX_ANCHOR_SPREAD = 0.05
 CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
@@ -135,7 +135,7 @@ def _doubts_of_survey(posed: ScaleProblem, solution: Solution, half_width: float
     # On these paths the scale is uncertain because of their shape: a longer walk of the same shape would not help.
     if half_width > DOUBTFUL_ABOVE and is_round:
         yield _Doubt(*WHY_SCALE_IS_OPEN[kind])
-    elif half_width > NORMAL_95 * _NOTHING_KNOWN:
+    elif half_width > NORMAL_95 * NOTHING_KNOWN:
         yield _Doubt("the ranges do not show that the camera moved", "walk a loop of several metres")
     for note in posed.notes:
         yield _Doubt(note, "survey three anchors or more that are not on one line")
@@ -155,8 +155,8 @@ def _doubts_of_ranges(fit: RangeFit, per_anchor: dict[str, float]) -> Iterator[_
     if len(fit.weights) < _FEW_RANGES:
         reason = f"only {len(fit.weights)} ranges lie on the path"
         yield _Doubt(reason, "range more often, and all along the path")
-    outliers = float(np.mean(fit.weights < 0.1))
-    if outliers > _MANY_OUTLIERS:
+    outliers = float(np.mean(fit.weights < OUTLIER_BELOW))
+    if outliers > MANY_OUTLIERS:
         reason = f"{100 * outliers:.0f} % of the ranges do not fit the map: blocked, reflected, or of another anchor"
         yield _Doubt(reason, "place the anchors where nothing stands between them and the path")
     if len(per_anchor) > 1:

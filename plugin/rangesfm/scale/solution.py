@@ -12,6 +12,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
+from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
 from rangesfm.scale.range_equation import (
     RangeFit,
@@ -34,7 +35,8 @@ from rangesfm.scale.starts import (
     unknown_anchor_starts,
 )
 
-_SUBSET_PER_ANCHOR = 300
+SUBSET_PER_ANCHOR = 300
+"""Ranges per anchor, spread over all of them, with which candidates for a map are searched."""
 # This many ranges per anchor, spread over all of them, tell maps apart and show the errors as well as more would.
 _ENOUGH_OF_ANCHOR, _NUM_ROUNDS = 1000, 2
 _NUM_ALTERNATIVES = 4
@@ -44,8 +46,8 @@ _SAME_ROTATION_DEG = 5.0
 _SAME_SHIFT = 0.05
 # Half of 3 standard deviations squared: a rival whose cost is closer than this is not ruled out.
 MIN_COST_GAP = 4.5
-# Share of the ranges that the best map must explain before rivals are compared; below it, the map is doubted anyway.
-_MIN_EXPLAINED = 0.7
+MANY_OUTLIERS = 0.3
+"""Share of outliers above which a map is doubted, so that rivals are not compared any more."""
 
 WHY_SCALE_IS_OPEN = {
     "straight": ("the path is straight", "walk a bend"),
@@ -141,7 +143,7 @@ def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) ->
 
     They are searched with few ranges per anchor and ranked with more.
     """
-    small = spread_subset(problem, _SUBSET_PER_ANCHOR)
+    small = spread_subset(problem, SUBSET_PER_ANCHOR)
     if not anchors_are_known:
         starts = unknown_anchor_starts(problem)
     else:
@@ -247,7 +249,7 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
     Does nothing where even the best map explains too few ranges: then that is the reason to doubt it.
     """
     problem = solution.problem
-    if np.mean(solution.fit.weights > 0.1) < _MIN_EXPLAINED:
+    if np.mean(solution.fit.weights < OUTLIER_BELOW) > MANY_OUTLIERS:
         return
     for rival in rivals:
         other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)

@@ -29,16 +29,14 @@ from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 
 
-def learned_errors(
-    posed: ScaleProblem, solution: Solution, bending: MapBending | None = None, max_num_bins: int = MAX_NUM_BINS
-) -> LearnedErrors:
+def learned_errors(posed: ScaleProblem, solution: Solution, bending: MapBending | None = None) -> LearnedErrors:
     """Estimate the errors of the ranges from the residuals of a solution.
 
     Args:
         bending: of the map; None: the map is not bent.
     """
     linear, observations, velocity = _linear(posed, solution), posed.observations, posed.velocity
-    of_ranges = _bins(posed, solution, max_num_bins)
+    of_ranges = _bins(posed, solution, MAX_NUM_BINS)
     others_m2 = _by_places(posed, solution, of_ranges)
     if velocity is not None and observations.time_offset_stddev_s:
         placed, by = solution.fit.state.metric_from_model, range_gradient(solution.problem, solution.fit.state)

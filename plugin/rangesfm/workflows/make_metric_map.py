@@ -47,7 +47,7 @@ from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import first_camera_from
-from rangesfm.scale.scale_verdict import refuse_unknown
+from rangesfm.scale.scale_verdict import NOTHING_KNOWN, refuse_unknown
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.workflows.close_loops import closed, find_loops
@@ -57,8 +57,6 @@ _MAX_SPREAD = 0.03
 # ... unless all offsets with such different scales together have a probability of at most this.
 _HARDLY_LIKELY = 0.05
 _ANY_STDDEV = 1e3  # a relative stddev of the scale that never leads to a refusal
-# Largest relative stddev of a scale from which a refinement can start. At this value the scale may as well be zero.
-_NOTHING_KNOWN = 1.0
 
 
 def join_by_survey(
@@ -137,7 +135,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     if offset is not None and offset.offset_matters:
         path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
     bending = None if is_a_start else bending_by_survey(survey, path)
-    limit = max(survey.scale.max_relative_stddev, _NOTHING_KNOWN)
+    limit = max(survey.scale.max_relative_stddev, NOTHING_KNOWN)  # a refinement can start from less certain scales
     try:
         estimate = run.changed({"scale.max_relative_stddev": limit}).estimate_scale(path, bending)
     except GeometryError as error:

@@ -11,7 +11,8 @@ from rangesfm.errors import InputError
 from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
-UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048}
+FOOT_M = 0.3048
+UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / FOOT_M}
 
 _MIN_NUM = 20  # number of values below which the values do not show their unit
 _SECONDS_SINCE_1970 = (1e9, 4e9)  # the years 2001 to 2096
