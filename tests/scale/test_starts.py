@@ -37,7 +37,7 @@ def test_on_which_side_of_a_flat_path_an_anchor_is_put_does_not_hang_on_rounding
     shape = path_shape(problem.centers)
     for turned in (1.0, -1.0):
         thought = np.array(list(survey.anchors_m.values())) * [1.0, 1.0, turned]
-        state, rise = choose_sides(problem, RangeState(IDENTITY, to_model.apply(thought), np.zeros(5)))
+        state, _, rise = choose_sides(problem, RangeState(IDENTITY, to_model.apply(thought), np.zeros(5)))
         heights = (state.anchors_m - shape.centroid) @ shape.axes[:, 2]
         assert heights.min() > -1e-3  # one anchor is in the plane
         assert heights.max() > 2.0

@@ -18,6 +18,7 @@ from rangesfm.ranging.readers.units import FOOT_M
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
 from rangesfm.scale.starts import multilaterate_all, spread_rows
 
+# Ranges of each anchor in a refit, and most evaluations of it: alternatives are only compared.
 _NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
 # Share of an anchor's ranges that fit if it is about where it is said to be.
 _MOST_FIT = 0.5
@@ -26,6 +27,7 @@ _UNITS_M = {
     "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / FOOT_M,
     "the ranges are of both ways, there and back": 2.0,
 }
+# Factors on the scale of the map that are tried, as with ranges in feet or of both ways.
 _SCALE_FACTORS = np.geomspace(1 / 4, 4, 7)
 _AXES_OF_ANCHORS = {
     "x and y are swapped": np.eye(3)[[1, 0, 2]],

@@ -20,6 +20,7 @@ from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import judge
 from rangesfm.scale.uncertainty import KnownMap, bias_covariance
 
+# Most Gauss-Newton steps.
 _MAX_NUM_ROUNDS = 8
 # Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
 _STILL = 0.1

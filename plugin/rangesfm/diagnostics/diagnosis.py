@@ -22,6 +22,7 @@ _MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
 # Addition to both limits per metre of distance: a radio over 70 m is noisier than in a room.
 _NOISE_BY_DISTANCE = 0.005
 _LASTING = ("time", "place", "view")
+# Least share of an anchor's ranges that fit the map, and largest share that is far from those right before and after.
 _LEAST_USED, _MOST_OUTLYING = 0.4, 0.35
 # Share of an anchor's outliers that must fit one other anchor to be taken for its ranges, and the fewest outliers.
 _MOST_OF_OTHER, _MIN_NUM_OUTLYING = 0.5, 10

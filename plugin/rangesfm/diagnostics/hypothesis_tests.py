@@ -14,6 +14,7 @@ from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NOTHING_LEFT, EstimatedMistake, Solved, noncentrality
 
+# Random surveys from which the thresholds come: 20 of them exceed one.
 _NUM_DRAWS = 1000
 
 

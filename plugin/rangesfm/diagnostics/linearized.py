@@ -32,12 +32,14 @@ from rangesfm.scale.uncertainty import ruled_out
 
 # Fewer bins than for an interval, because the tests learn the errors many times.
 _MAX_NUM_BINS = 160
+# Number of consecutive ranges of an anchor whose median they are compared with.
 _NUM_NEIGHBOURS = 8
 # A range farther than this many standard deviations from the median of its neighbours is an outlier among them. For
 # this the noise counts as _LEAST_SCATTER_M or more: a radio may repeat itself to a centimetre and still err by ten from
 # one place to the next.
 _OUTLYING = 3.0
 _LEAST_SCATTER_M = 0.08
+# Weight of such an outlier in its bin.
 _NO_WEIGHT = 1e-6
 # Standard deviation and correlation time of a slow wandering of the ranges, for each anchor and for all, as hands and
 # bodies move. It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where

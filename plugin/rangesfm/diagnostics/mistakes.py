@@ -27,8 +27,9 @@ _AS_LIKELY = 6.0
 # The same for alternatives where no test exceeds its threshold. By Markov's inequality a likelihood ratio is as large
 # by chance in one of 100 surveys at most: the mean of each ratio is 1, and the penalty counts the alternatives.
 _BEYOND_CHANCE = 2 * float(np.log(100))
-_SAME = 0.95
-_MAX_NUM_RIVALS = 2
+# Overlap of two hypotheses from which on nothing tells them apart, and most causes that are named beside the likeliest.
+_SAME, _MAX_NUM_RIVALS = 0.95, 2
+# Most steps to the likeliest state with a mistake, and relative change of its size at which they stop.
 _NUM_SETTLING, _SETTLED = 6, 0.05
 # Consecutive growing steps that count as divergence. One may be too short at first, with a large mistake.
 _NUM_LONGER = 2

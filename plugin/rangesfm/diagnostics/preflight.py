@@ -36,17 +36,18 @@ LONG_ARM_M = 2.5
 _PAUSE = 30.0
 # Clocks that count seconds since 1970 show more than this.
 _SINCE_1970_S = 1e9
+# Time between two logs, seconds, from which on they are of different walks or time zones.
 _LONG_GAP_S = 60.0
-_MIN_SHARE_OF_TIME = 0.5
-_MAX_SHARE_BETWEEN_FAR_PHOTOS = 0.3
+# Least duration of the ranges, of that of the photos; largest share of the time between keyframes that are far apart.
+_MIN_SHARE_OF_TIME, _MAX_SHARE_BETWEEN_FAR_PHOTOS = 0.5, 0.3
 # Ranges this close in time are taken from one place, up to the way that a tag moves meanwhile.
 _SAME_MOMENT_S, _MAX_SPEED_M_PER_S = 0.2, 5.0
 # Largest error of a radio without calibration: a constant delay, and a share of the distance.
 _MAX_ERROR_M, _MAX_ERROR_SHARE = 0.5, 0.1
 # Share of the triangles of two anchors that may be wrong, as blocked paths spoil some, and the fewest triangles.
 _MAX_SPOILT, _MIN_TRIANGLES = 0.3, 10
-_MAX_NUM_TRIANGLES = 20_000
-_MAX_NUM_NAMED = 2
+# Most triangles that are checked, and most pairs or swaps that are named.
+_MAX_NUM_TRIANGLES, _MAX_NUM_NAMED = 20_000, 2
 _UNITS = {
     "anchors are in millimetres": 1e-3,
     "anchors are in centimetres": 1e-2,

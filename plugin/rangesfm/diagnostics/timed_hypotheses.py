@@ -24,8 +24,7 @@ from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.scale.range_equation import antenna_positions
 
 # Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.
-_NUM_TIMES = 32
-_NUM_FINER = 17
+_NUM_TIMES, _NUM_FINER = 32, 17
 # Share of the survey that must be before and after a change; otherwise it is as good as a lasting mistake.
 _LEAST_SHARE = 1 / 12
 # Shares of the survey that a stretch may last.

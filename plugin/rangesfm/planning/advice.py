@@ -24,7 +24,7 @@ from rangesfm.positions.control_points import ControlPoint
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
-from rangesfm.scale.scale_verdict import CALIBRATE
+from rangesfm.scale.scale_verdict import CALIBRATE, FEW_RANGES
 
 # Changes of an anchor's height that are tried, metres.
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)
@@ -45,8 +45,8 @@ _NEAR_M = 1.0
 # Standard deviation of each coordinate of a control point, metres; fewest photos that show one, so that marks in some
 # may fail; number of places that are tried.
 _POINT_STDDEV_M, _MIN_NUM_SHOWING, _NUM_TRIED_POINTS = 0.01, 3, 24
-# With fewer ranges, ranging so many times as often is worth trying, and so is walking the path so many times.
-_FEW_RANGES, _MORE_OFTEN, _NUM_AGAIN = 50, (10, 50), 5
+# With few ranges, ranging so many times as often is worth trying, and so is walking the path so many times.
+_MORE_OFTEN, _NUM_AGAIN = (10, 50), 5
 # Number of changes that a result recommends.
 _NUM_BEST = 3
 # Number of places, of all allowed ones, that are tried for an anchor.
@@ -171,7 +171,7 @@ def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
         yield "wider anchors", "", f"put the anchors {_WIDER:g} times as far out", _with_wider_anchors(planned)
     if planned.curve_stddev_m is None and planned.anchors:
         yield "calibration", "", f"{CALIBRATE}, to {_LEARNT_CURVE_M:g} m", _calibrated(planned)
-    if planned.num_ranges < _FEW_RANGES and planned.anchors:
+    if planned.num_ranges < FEW_RANGES and planned.anchors:
         again = f"walk the path {_NUM_AGAIN} times, there and back"
         if len(path) > 1:
             yield "again", "", again, replace(planned, trajectory=_there_and_back(path, _NUM_AGAIN))

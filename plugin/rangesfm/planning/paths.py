@@ -12,6 +12,7 @@ from rangesfm.errors import InputError, OptionError
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
+# A plan of more would take minutes.
 _MAX_NUM_KEYFRAMES = 20_000
 # Size of a loop relative to its floor.
 _LOOP_SHARE = 2 / 3

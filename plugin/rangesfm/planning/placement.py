@@ -19,6 +19,7 @@ from rangesfm.ranging.anchors.anchor import Anchor
 _GRID = (4, 4, 2)
 # Number of places along all walls together, at each of two heights.
 _NUM_ALONG_WALLS = 16
+# Most rounds in which every anchor is tried at every place.
 _MAX_NUM_ROUNDS = 4
 # Smallest decrease of the sum of two logarithms for which an anchor is moved.
 _LEAST_GAIN = 0.01

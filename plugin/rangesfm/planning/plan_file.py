@@ -30,10 +30,10 @@ from rangesfm.survey.survey_reader import absolute_value, parse_toml, refuse_unk
 _Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 _Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
 _Spot = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False)]
-_MAX_NUM_ANCHORS = 64
+# A plan with more anchors, or of a longer survey (seconds), would take minutes.
+_MAX_NUM_ANCHORS, _MAX_DURATION_S = 64, 1e5
 # Keys in [path] that give a path, each instead of the others.
 _PATHS = ("waypoints", "loop_inside_m", "file", "model")
-_MAX_DURATION_S = 1e5
 
 
 def _going_somewhere(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:

@@ -19,8 +19,8 @@ from rangesfm.scale.starts import each_once
 
 # Triples are tried among this many anchors, the best placed ones. More make it slower without a better result.
 _MAX_NUM_TRIED = 8
-_NUM_ROUNDS = 30
-_NUM_BEST = 6
+# Most Gauss-Newton steps of a motion, and the number of motions by triples that are refined.
+_NUM_ROUNDS, _NUM_BEST = 30, 6
 # A motion whose robust cost exceeds the best one's by more than this is discarded.
 _MAX_COST_GAP = 50.0
 SAME_SHARE = 0.1

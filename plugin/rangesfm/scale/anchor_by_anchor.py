@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 from rangesfm.scale.scale_problem import MIN_RANGES
 from rangesfm.scale.solution import MIN_COST_GAP, Solution
-from rangesfm.scale.starts import anchor_alone, choose_sides, mirrored, spread_subset
+from rangesfm.scale.starts import choose_sides, spread_subset
 
+# Most ranges with which an anchor is solved alone.
 _MAX_RANGES_ALONE = 3000
 # An anchor gives no scale of its own if the standard deviation of the scale's logarithm is larger than this.
 _MAX_LOG_SCALE_STDDEV = 0.5
@@ -85,11 +85,9 @@ def _common_bias(problem: RangeProblem, state: RangeState) -> float:
 
 def _mirror_places(solution: Solution) -> dict[int, Array]:
     """Return the mirror places, by index, of unknown anchors that may stand on either side of the path's plane."""
-    problem, state = solution.problem, solution.fit.state
-    _, rise = choose_sides(spread_subset(problem, _MAX_RANGES_ALONE), state)
-    places: dict[int, Array] = {}
-    for k in np.flatnonzero(rise / solution.errors.inflation**2 < MIN_COST_GAP):
-        alone = anchor_alone(problem, int(k), state.metric_from_model)
-        start = RangeState(IDENTITY, mirrored(problem, state, int(k))[None], state.bias_m[k : k + 1])
-        places[int(k)] = solve(alone, start).state.anchors_m[0]
-    return places
+    found_m = solution.fit.state.anchors_m
+    chosen, others_m, rise = choose_sides(spread_subset(solution.problem, _MAX_RANGES_ALONE), solution.fit.state)
+    sides_m = np.stack([chosen.anchors_m, others_m])
+    is_open = rise / solution.errors.inflation**2 < MIN_COST_GAP
+    farther = np.argmax(np.linalg.norm(sides_m - found_m, axis=2), axis=0)
+    return {int(k): sides_m[farther[k], k] for k in np.flatnonzero(is_open)}

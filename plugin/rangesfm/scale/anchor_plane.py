@@ -14,6 +14,7 @@ from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState
 _COPLANAR = 0.1
 # Anchors are on a line if their second largest extent is at most this share of the largest.
 _COLLINEAR = 0.02
+# Angle of a line from the vertical, degrees, below which gravity does not fix the turn about it.
 _MIN_OFF_VERTICAL_DEG = 20.0
 # Angle from the vertical, degrees. With a steeper normal, "above" and "below" have no meaning.
 _MAX_TILT_DEG = 60.0

@@ -251,6 +251,7 @@ _TIGHT = 1e-12
 # Expected decrease of the cost by a step (squared standard deviations of the parameters): below _NO_GAIN the step is
 # only rounding; above _NEAR_BOTTOM the solver has not converged, and its result is left as it is.
 _NO_GAIN, _NEAR_BOTTOM = 1e-24, 1e-6
+# Most Newton steps; they converge in two or three.
 _MAX_NUM_SETTLING = 20
 
 

@@ -27,6 +27,7 @@ from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS
 # 5 m against the truth in a room mapped with a hand-held camera.
 BENDING = 0.008
 _BENDING_SPREAD, _ALIKE_WITHIN = 0.6, 0.25
+# Numbers of sizes of the bending that are tried, of places along a length, and of fits, as the scale changes errors.
 _NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 21, 8, 2
 
 

@@ -51,6 +51,7 @@ MIN_NUM_POSITIONS = 3
 """Fewest positions, not on one line, that determine a similarity."""
 # Median length of a vector of three normally distributed numbers, in their standard deviation.
 _MEDIAN_LENGTH = 1.538
+# Most triples for a start, and most reweighted steps from there.
 _MAX_NUM_TRIPLES, _NUM_ROUNDS = 300, 30
 # Standard deviation of the logarithm of what a system says of its own errors, and of what is guessed of them; and the
 # share of the noise that lasts, before anything is known.
@@ -422,6 +423,7 @@ def expected_positions(
 
 # Steps of the similarity (relative, radians, metres) below this are rounding.
 _SMALL_STEP = 1e-10
+# Standard deviation of positions without errors, metres.
 _LEAST_STDDEV_M = 1e-9
 
 

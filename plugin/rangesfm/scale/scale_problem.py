@@ -25,6 +25,7 @@ from rangesfm.scale.range_equation import RangeProblem
 
 MIN_RANGES = 8
 """Fewest ranges that determine a scale: there are seven unknowns, and one more checks the fit."""
+# Fewest keyframes with ranges: three lie in one plane with any anchor.
 _MIN_KEYFRAMES = 4
 # A position has three unknowns; two more ranges check the fit.
 _MIN_RANGES_OF_UNKNOWN = 5

@@ -24,7 +24,8 @@ from rangesfm.scale.solution import MANY_OUTLIERS, WHY_SCALE_IS_OPEN, Solution
 
 # A scale is doubtful if half of its relative 95 % interval is wider than this.
 DOUBTFUL_ABOVE = 0.04
-_FEW_RANGES = 50
+FEW_RANGES = 50
+"""Number of ranges below which outliers and noise can hardly be told apart."""
 NOTHING_KNOWN = 1.0
 """Relative standard deviation of the scale from which nothing is known about it: it may as well be zero."""
 # Scatter of the scales from single anchors above which they disagree. Antennas and short paths alone cause less.
@@ -152,7 +153,7 @@ def _doubts_of_survey(posed: ScaleProblem, solution: Solution, half_width: float
 
 
 def _doubts_of_ranges(fit: RangeFit, per_anchor: dict[str, float]) -> Iterator[_Doubt]:
-    if len(fit.weights) < _FEW_RANGES:
+    if len(fit.weights) < FEW_RANGES:
         reason = f"only {len(fit.weights)} ranges lie on the path"
         yield _Doubt(reason, "range more often, and all along the path")
     outliers = float(np.mean(fit.weights < OUTLIER_BELOW))

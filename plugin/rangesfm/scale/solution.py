@@ -39,11 +39,10 @@ SUBSET_PER_ANCHOR = 300
 """Ranges per anchor, spread over all of them, with which candidates for a map are searched."""
 # This many ranges per anchor, spread over all of them, tell maps apart and show the errors as well as more would.
 _ENOUGH_OF_ANCHOR, _NUM_ROUNDS = 1000, 2
+# Number of different maps that are compared. Two maps are the same if the logarithms of their scales, their rotations
+# (degrees) and the places of the path's middle (extents of the path) are no further apart than this.
 _NUM_ALTERNATIVES = 4
-_SAME_LOG_SCALE = 0.03
-_SAME_ROTATION_DEG = 5.0
-# Largest shift of the path's middle between two equal maps, in extents of the path.
-_SAME_SHIFT = 0.05
+_SAME_LOG_SCALE, _SAME_ROTATION_DEG, _SAME_SHIFT = 0.03, 5.0, 0.05
 # Half of 3 standard deviations squared: a rival whose cost is closer than this is not ruled out.
 MIN_COST_GAP = 4.5
 MANY_OUTLIERS = 0.3

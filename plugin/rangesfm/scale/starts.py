@@ -25,26 +25,23 @@ from rangesfm.scale.range_equation import RangeProblem, RangeState, antenna_posi
 
 _T = TypeVar("_T")
 
-_NUM_SCALES = 80
-_SCALE_SPAN = 200.0
-_NUM_ROTATIONS = 400
-_NUM_HEADINGS = 60
-_MAX_RANGES_PER_ANCHOR = 200
-_MAX_RANGES_FOR_ROTATIONS = 240
-_NUM_STARTS = 12
-_NUM_MINIMA = 4
-# Trials closer to each other than this converge to the same minimum.
-_BASIN_LOG_SCALE = 0.3
-_BASIN_ROTATION_RAD = 0.6
+# Number of scales of a sweep, and the largest over the smallest.
+_NUM_SCALES, _SCALE_SPAN = 80, 200.0
+# Numbers of rotations of a sweep, without and with a known vertical: the latter are 6 degrees apart.
+_NUM_ROTATIONS, _NUM_HEADINGS = 400, 60
+# Most ranges of each anchor in a sweep over scales, and of all anchors in one over rotations.
+_MAX_RANGES_PER_ANCHOR, _MAX_RANGES_FOR_ROTATIONS = 200, 240
+# Numbers of starts from a sweep over rotations, and of minima from each kind of residuals in one over scales.
+_NUM_STARTS, _NUM_MINIMA = 12, 4
+# Trials closer to each other than this, in the logarithm of the scale and in radians, converge to the same minimum.
+_BASIN_LOG_SCALE, _BASIN_ROTATION_RAD = 0.3, 0.6
 # In radii: an anchor this near to the centre of a sphere cannot exchange its distance from it with the radius.
 _IN_MIDDLE = 1e-6
 # A range agrees with a scale if it fits within this many standard deviations of noise and bias together.
 TOLERANCE_STDDEVS = 2.5
 # Maxima of the number of agreeing ranges are told apart on a logarithmic grid of the scale with this step. Maxima below
-# the given share of the highest one are dropped.
-_LOG_CELL = 0.02
-_MIN_SHARE_OF_BEST = 0.5
-_MAX_CANDIDATES = 12
+# the given share of the highest one are dropped, and all but the highest few.
+_LOG_CELL, _MIN_SHARE_OF_BEST, _MAX_CANDIDATES = 0.02, 0.5, 12
 
 
 def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProblem:
@@ -172,15 +169,17 @@ def sphere_swaps(problem: RangeProblem, state: RangeState) -> list[RangeState]:
     return swaps
 
 
-def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, Array]:
+def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, Array, Array]:
     """Put each unknown anchor on the side of the path's plane that fits better, with the scale held fixed.
 
     If both sides fit equally well, the side of the plane's normal is taken.
 
     Returns:
-        the state, and (m,) by how much the robust cost is higher on the other side; inf for known anchors.
+        the state, the (m, 3) places on the other side, and (m,) by how much the robust cost is higher there; inf for
+        known anchors.
     """
     anchors, rise = state.anchors_m.copy(), np.full(problem.num_anchors, np.inf)
+    others = anchors.copy()
     shape = path_shape(state.metric_from_model.apply(problem.centers))
     normal = shape.axes[:, 2]
     for k in np.flatnonzero(np.isinf(problem.anchor_stddev_m)):
@@ -197,16 +196,9 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
             fits.append(solve(alone, at, tolerance=1e-8))
         if fits[0].cost - fits[1].cost > SAME_COST * (1 + fits[0].cost):
             fits.reverse()
-        anchors[k] = fits[0].state.anchors_m[0]
+        anchors[k], others[k] = (fit.state.anchors_m[0] for fit in fits)
         rise[k] = fits[1].cost - fits[0].cost
-    return replace(state, anchors_m=anchors), rise
-
-
-def mirrored(problem: RangeProblem, state: RangeState, k: int) -> Array:
-    """Return the (3,) position of anchor k mirrored in the path's plane."""
-    shape = path_shape(state.metric_from_model.apply(problem.centers))
-    normal = shape.axes[:, 2]
-    return np.asarray(state.anchors_m[k] - 2 * ((state.anchors_m[k] - shape.centroid) @ normal) * normal)
+    return replace(state, anchors_m=anchors), others, rise
 
 
 def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeState:
