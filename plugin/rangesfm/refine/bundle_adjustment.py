@@ -14,7 +14,7 @@ import pycolmap
 
 from rangesfm import ceres
 from rangesfm.arrays import Array
-from rangesfm.ceres.linear_solver import dense_is_faster, max_num_images_direct
+from rangesfm.ceres.linear_solver import dense_is_faster, inverse_is_affordable, max_num_images_direct
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.errors import SolverError
@@ -45,6 +45,8 @@ _MAX_PROMISE_LEFT = 0.5
 _MAX_LAST_GAIN = 1e-4
 # Smallest and largest sum of the steps to come, in units of the last one.
 _NUM_STEPS_LEFT = (0.1, 10.0)
+# Largest number of photos, all overlapping, with a covariance: it takes a minute, that of twice as many ten minutes.
+_MAX_NUM_IMAGES_FOR_COVARIANCE = 1500
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,12 @@ class BundleAdjustment:
         """Root mean square of the current lengths of reprojection errors, in pixels."""
         residuals = np.asarray(self.adjuster.problem.evaluate_residuals())[: self.num_reprojections]
         return float(np.sqrt(2 * np.mean(residuals**2)))
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the photos are few enough, or overlap little enough, for a covariance of all."""
+        limit = _MAX_NUM_IMAGES_FOR_COVARIANCE
+        return self.metric.num_reg_images() <= limit or inverse_is_affordable(overlaps_in(self.metric), limit)
 
     @property
     def refined_params(self) -> dict[int, list[int]]:

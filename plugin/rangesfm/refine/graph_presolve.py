@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
-from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
@@ -31,11 +30,13 @@ from rangesfm.refine.vision_information import (
     Observations,
     Poses,
     VisionInformation,
+    costs_of_points,
     model_poses,
     photo_gradient,
     project,
     ray_residuals,
     robust_root_weights,
+    steps_of_points,
     vision_information,
 )
 
@@ -250,28 +251,16 @@ def _carried(observations: Observations, before: Poses, after: Poses, local_scal
 
 
 def _triangulated(observations: Observations, poses: Poses, start: Array) -> Array:
-    """Return the (p, 3) points that fit the rays best, by damped Gauss-Newton steps that are kept where they help."""
-    n, num_points = len(observations.frame), len(start)
-    adder = sparse.csr_array((np.ones(n), (observations.point, np.arange(n))), shape=(num_points, n))
-    points, cost = start, _costs(observations, poses, start, adder)
+    """Return the (p, 3) points that fit the rays best, by Gauss-Newton steps that are kept where they help."""
+    points, cost = start, costs_of_points(observations, poses, start)
     for _ in range(_NUM_TRIANGULATIONS):
         _, in_cam, derivative = project(observations, poses, points)
         residuals = np.nan_to_num(ray_residuals(observations, in_cam), posinf=0.0)
-        root = robust_root_weights(residuals)
+        root = robust_root_weights(residuals)[:, None]
         to_rig = np.nan_to_num(derivative) @ observations.cam_from_rig_rotation
-        to_point = root[:, None, None] * to_rig @ np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
-        normal = (adder @ np.einsum("nai,naj->nij", to_point, to_point).reshape(n, 9)).reshape(-1, 3, 3)
-        gradient = adder @ np.einsum("nai,na->ni", to_point, root[:, None] * residuals)
-        ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-200
-        trial = points - np.linalg.solve(normal + ridge * np.eye(3), gradient[:, :, None])[:, :, 0]
-        trial_cost = _costs(observations, poses, trial, adder)
-        better = trial_cost < cost
-        points = np.where(better[:, None], trial, points)
-        cost = np.where(better, trial_cost, cost)
+        to_point = to_rig @ np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
+        trial = points + steps_of_points(observations, root[:, :, None] * to_point, root * residuals)
+        trial_cost = costs_of_points(observations, poses, trial)
+        points = np.where((trial_cost < cost)[:, None], trial, points)
+        cost = np.minimum(trial_cost, cost)
     return points
-
-
-def _costs(observations: Observations, poses: Poses, points: Array, adder: sparse.csr_array) -> Array:
-    """Return the (p,) robust cost of each point; infinite for a point behind a camera that sees it."""
-    residuals = ray_residuals(observations, project(observations, poses, points)[1])
-    return np.asarray(adder @ np.log1p(np.sum(residuals**2, axis=1)))

@@ -10,8 +10,6 @@ import pycolmap
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import PhotosAlone
-from rangesfm.ceres.linear_solver import inverse_is_affordable
-from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import CameraOptions, RefineOptions
@@ -25,8 +23,6 @@ from rangesfm.ranging.errors.bending import (
 from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
-MAX_NUM_IMAGES = 1500
-"""Largest map whose photos all overlap: its inverse takes a minute, that of twice as many photos ten minutes."""
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
 # independent errors of features, as in simulations; 8 to 12 in three scenes of real photos (Strecha et al. 2008).
 _FACTOR, _SPREAD = 2.0, 0.8
@@ -114,11 +110,10 @@ def by_photos(
     Raises:
         GeometryError: the photos do not determine the map up to a similarity, or are too many.
     """
-    metric = bundle.metric
-    if metric.num_reg_images() > MAX_NUM_IMAGES and not inverse_is_affordable(overlaps_in(metric), MAX_NUM_IMAGES):
+    if not bundle.has_covariance:
         raise GeometryError("too many photos")
     return PhotoBending(
-        PhotosAlone(bundle.adjuster.problem, metric, bundle.pixel_stddev),
+        PhotosAlone(bundle.adjuster.problem, bundle.metric, bundle.pixel_stddev),
         trajectory.frame_ids,
         in_first_camera(trajectory, metres_per_unit),
         trajectory.world_from_cam[0],

@@ -22,6 +22,7 @@ from rangesfm.errors import SolverError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import side_by_side
+from rangesfm.ranging.errors.robust_loss import RobustLoss
 
 # A long track is cut into overlapping pieces of this length; distant keyframes are linked through those in between.
 _MAX_PIECE = 8
@@ -31,8 +32,8 @@ _PIECE_STEP = 4
 _NUM_PIECES_OF_KEYFRAME = 40
 _ENOUGH_PIECES, _MAX_NUM_PIECES = 8000, 20000
 _BATCH = 500
-# Residual, in standard deviations, at which an observation has half its weight.
-_ROBUST_WIDTH = 3.0
+# Loss of an observation, whose residual is in standard deviations; at this width it has half its weight.
+_LOSS = RobustLoss(3.0, is_bounded=False)
 # Smallest plausible depth, as a share of the median depth: lenses are not sharp at less.
 _MIN_DEPTH = 0.01
 # Residual, in standard deviations, beyond which a feature says nothing of the photos' gradient: that of a camera out of
@@ -245,8 +246,34 @@ def ray_residuals(observations: Observations, in_cam: Array) -> Array:
 
 
 def robust_root_weights(residuals: Array) -> Array:
-    """Return the (n,) square roots of the Cauchy weights of (n, 2) residuals in standard deviations."""
-    return np.asarray(1 / np.sqrt(1 + np.sum(residuals**2, axis=1) / _ROBUST_WIDTH**2))
+    """Return the (n,) square roots of the robust weights of (n, 2) residuals in standard deviations."""
+    return np.sqrt(_LOSS.weights(np.linalg.norm(residuals, axis=1)))
+
+
+def costs_of_points(observations: Observations, poses: Poses, points: Array) -> Array:
+    """Return the (p,) robust cost of each point; infinite for a point behind a camera that sees it."""
+    residuals = ray_residuals(observations, project(observations, poses, points)[1])
+    rho = _LOSS.rho(np.sum(residuals**2, axis=1))[0]
+    return np.bincount(observations.point, rho, len(points)).astype(np.float64)
+
+
+def steps_of_points(observations: Observations, to_point: Array, residuals: Array) -> Array:
+    """Return the (p, 3) Gauss-Newton steps of all points.
+
+    Args:
+        to_point: (n, 2, 3) derivatives of the (n, 2) residuals by the points.
+    """
+    n, num_points = len(residuals), len(observations.points)
+    adder = sparse.csr_array((np.ones(n), (observations.point, np.arange(n))), shape=(num_points, n))
+    information = (adder @ np.einsum("nai,naj->nij", to_point, to_point).reshape(n, 9)).reshape(-1, 3, 3)
+    slope = adder @ np.einsum("nai,na->ni", to_point, residuals)
+    return -np.linalg.solve(_regular(information), slope[:, :, None])[:, :, 0]
+
+
+def _regular(information: Array) -> Array:
+    """Return (n, 3, 3) information on points with what rounding needs to invert it where a depth is open."""
+    ridge = 1e-12 * np.trace(information, axis1=1, axis2=2) + 1e-200
+    return information + ridge[:, None, None] * np.eye(3)
 
 
 def vision_information(observations: Observations, poses: Poses) -> VisionInformation:
@@ -282,12 +309,8 @@ def photo_gradient(observations: Observations, poses: Poses) -> Array:
     to_rig = np.where(fits[:, None, None], derivative, 0.0) @ observations.cam_from_rig_rotation
     rig_from_world = np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
     to_point = to_rig @ rig_from_world
-    information, slope = np.zeros((len(observations.points), 3, 3)), np.zeros((len(observations.points), 3))
-    np.add.at(information, observations.point, np.swapaxes(to_point, 1, 2) @ to_point)
-    np.add.at(slope, observations.point, np.einsum("nai,na->ni", to_point, residuals))
-    ridge = 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-200
-    step = np.linalg.solve(information + ridge * np.eye(3), slope[:, :, None])
-    residuals = residuals - (to_point @ step[observations.point])[:, :, 0]
+    step = steps_of_points(observations, to_point, residuals)
+    residuals = residuals + (to_point @ step[observations.point, :, None])[:, :, 0]
     to_pose = np.concatenate([to_rig @ cross_matrices(in_rig), -to_point], axis=2)
     gradient = np.zeros((len(poses), 6))
     np.add.at(gradient, observations.frame, np.einsum("nai,na->ni", to_pose, residuals))
@@ -345,9 +368,8 @@ def _eliminate(rows: Indices, frame: Indices, in_rig: Array, to_rig: Array, pose
     to_pose[frames == reference[:, None]] = 0.0
     to_point = to_rig[rows] @ turn
     information = np.einsum("kmai,kmaj->kij", to_point, to_point)
-    ridge = 1e-12 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-200
     coupling = np.einsum("kmai,kmaj->kmij", to_point, to_pose)
-    inverse = np.linalg.inv(information + ridge * np.eye(3))
+    inverse = np.linalg.inv(_regular(information))
     blocks = -np.einsum("kmia,kij,knjb->kmnab", coupling, inverse, coupling, optimize=True)
     own = np.arange(rows.shape[1])
     blocks[:, own, own] += np.einsum("kmai,kmaj->kmij", to_pose, to_pose)

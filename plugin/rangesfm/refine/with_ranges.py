@@ -12,8 +12,6 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
-from rangesfm.ceres.linear_solver import inverse_is_affordable
-from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_radio
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
@@ -45,8 +43,6 @@ from rangesfm.refine.vision_information import (
 _MAX_NUM_ROUNDS = 3
 # Largest movement of a keyframe left at the end, as a share of the smallest standard deviation of a range.
 _MAX_LAST_MOVEMENT = 0.01
-# With this many photos that all overlap the covariance takes a minute, with twice as many ten minutes.
-_MAX_NUM_IMAGES_FOR_COVARIANCE = 1500
 
 
 @dataclass(frozen=True)
@@ -372,15 +368,12 @@ def _covariance(
     errors: RangeErrors,
     bending_factor: float,
 ) -> JointCovariance | None:
-    metric, limit = problem.metric, _MAX_NUM_IMAGES_FOR_COVARIANCE
-    if not problem.options.covariance:
-        return None
-    if metric.num_reg_images() > limit and not inverse_is_affordable(overlaps_in(metric), limit):
+    if not (problem.options.covariance and bundle.has_covariance):
         return None
     try:
         return joint_covariance(
             bundle.adjuster.problem,
-            metric,
+            problem.metric,
             anchors=added.blocks.anchors,
             others=added.all_but_anchors,
             residual_stddev=bending_factor * bundle.pixel_stddev,

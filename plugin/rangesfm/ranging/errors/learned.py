@@ -99,10 +99,6 @@ class LearnedErrors(ErrorParts):
         of_range[rows] = self.of_range
         return replace(self, of_range=of_range)
 
-    def stddev_of(self, influence: Array) -> dict[str, float]:
-        """Return the effect of each component on a number that changes by (n,) ``influence`` per metre of a range."""
-        return self.stddev_of_bins(self.bins.total(influence))
-
 
 def learn_errors(
     bins: RangeBins,
