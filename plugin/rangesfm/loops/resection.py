@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
@@ -54,7 +54,7 @@ class Loop:
         covariance = self.noise + errors.covariance(frames, np.concatenate([self.by_frame, -np.eye(6)[None]]))
         difference = np.concatenate([self.turn, self.shift])
         squared = float(difference @ np.linalg.solve(covariance, difference))
-        return float(chi2.sf(squared, len(difference)))
+        return float(chdtrc(len(difference), squared))
 
     def covariance(self, errors: RelativeErrors) -> Array:
         """Return the (6, 6) covariance of the pose by the points where the pose of ``held`` is exact."""
