@@ -23,7 +23,7 @@ from rangesfm.files.text_tables import (
     repeated,
     write_table,
 )
-from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
+from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
 from rangesfm.options import COORDINATE_M, TIME_S
 
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
@@ -92,16 +92,13 @@ class Reference:
         assert times_s is not None
         assert self.timestamps_s is not None
         known = self.timestamps_s
-        after = np.clip(np.searchsorted(known, times_s, side="right"), 1, max(len(known) - 1, 1))
-        after = np.minimum(after, len(known) - 1)
-        before = np.maximum(after - 1, 0)
-        nearest = np.where(times_s - known[before] <= known[after] - times_s, before, after)
+        before, after, fraction, nearest = keyframes_around(times_s, known)
         nearest[np.abs(times_s - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
         positions, rotations = self._at_index(nearest)
 
         gap = known[after] - known[before]
         between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times_s >= known[before]) & (times_s <= known[after])
-        fraction = ((times_s - known[before])[between] / gap[between])[:, None]
+        fraction = fraction[between, None]
         start_m, end_m = self.positions_m[before[between]], self.positions_m[after[between]]
         positions[between] = (1 - fraction) * start_m + fraction * end_m
         if rotations is not None and between.any():

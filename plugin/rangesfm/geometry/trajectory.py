@@ -71,6 +71,19 @@ class Trajectory:
         return self.transformed(factor, np.eye(3), (1.0 - factor) * fixed_point)
 
 
+def keyframes_around(times: Array, keyframe_times: Array) -> tuple[Indices, Indices, Array, Indices]:
+    """Return the keyframes before and after each time (n,), the fraction of the later one, and the nearer one.
+
+    Times outside the path belong to its first or last two keyframes, with a fraction of 0 or 1.
+    """
+    last = len(keyframe_times) - 1
+    after = np.clip(np.searchsorted(keyframe_times, times), min(1, last), last)
+    before = np.maximum(after - 1, 0)
+    gap = keyframe_times[after] - keyframe_times[before]
+    fraction = np.clip((times - keyframe_times[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+    return before, after, fraction, np.where(fraction < 0.5, before, after)
+
+
 def in_first_camera(trajectory: Trajectory, unit: float = 1.0) -> Trajectory:
     """Return a path in the frame of its first pose, in a new unit that is ``unit`` times its own."""
     turn = trajectory.world_from_cam[0].T

@@ -11,11 +11,11 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import align_points, are_apart
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, keyframes_around
 from rangesfm.options import AssociationOptions
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.positions.position_log import PositionLog
-from rangesfm.ranging.association import is_too_long, keyframes_around, places_on_path
+from rangesfm.ranging.association import is_too_long, places_on_path
 from rangesfm.ranging.errors.noise import STRETCH_S
 
 # An offset that puts fewer positions on the path than this share of the largest possible number is not tried.

@@ -13,7 +13,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.geometry.motion_prior import learn_motion
 from rangesfm.geometry.reference import Reference
-from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory
+from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
 from rangesfm.options import AssociationOptions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.noise import robust_stddev
@@ -206,19 +206,6 @@ def places_on_path(
         stddev = np.hypot(stddev, _timing_stddev(time_resolution_s, trajectory, before, after, fraction, options))
     on_line = (1 - fraction)[:, None] * trajectory.centers[before] + fraction[:, None] * trajectory.centers[after]
     return PlacesOnPath(on_line + offsets, offsets, stddev, arms_m, arm_stddev_m)
-
-
-def keyframes_around(times: Array, keyframe_times: Array) -> tuple[Indices, Indices, Array, Indices]:
-    """Return the keyframes before and after each time (n,), the fraction of the later one, and the nearer one.
-
-    Times outside the path belong to its first or last two keyframes, with a fraction of 0 or 1.
-    """
-    last = len(keyframe_times) - 1
-    after = np.clip(np.searchsorted(keyframe_times, times), min(1, last), last)
-    before = np.maximum(after - 1, 0)
-    gap = keyframe_times[after] - keyframe_times[before]
-    fraction = np.clip((times - keyframe_times[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
-    return before, after, fraction, np.where(fraction < 0.5, before, after)
 
 
 def _places_by_time(

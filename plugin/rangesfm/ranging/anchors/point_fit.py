@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.errors.learned import learn_errors
-from rangesfm.ranging.errors.noise import inlier_noise, robust_stddevs
+from rangesfm.ranging.errors.noise import MIN_ORDINARY, START_STDDEV_M, inlier_noise, robust_stddevs
 from rangesfm.ranging.errors.range_bins import noisiness, range_bins
 from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
@@ -40,11 +40,8 @@ _DISTINCT_M = 0.01
 _NUM_UNKNOWNS = 4
 # Rounds in which the noise and the fit are made consistent.
 _NUM_NOISE_ROUNDS = 4
-# Prior of the noise, and the number of ranges that it counts as.
-_USUAL_NOISE_M = 0.1
+# Number of ranges that the usual noise counts as.
 _USUAL_NOISE_COUNTS = 2.0
-# Smallest share of ranges without a large shared error for which the noise is estimated from these alone.
-_MIN_ORDINARY = 0.3
 # Error components that are not learnt here, because each anchor's bias is estimated with a prior of its own.
 _NOT_HERE = ("bias", "common_bias")
 
@@ -179,7 +176,7 @@ def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
         given_m: (n,) noise of each range, NaN where it is unknown.
     """
     is_given = np.isfinite(given_m)
-    unit = np.where(is_given, given_m, np.median(given_m[is_given]) if is_given.any() else _USUAL_NOISE_M)
+    unit = np.where(is_given, given_m, np.median(given_m[is_given]) if is_given.any() else START_STDDEV_M)
     x, noise = _best_start(problem, unit)
     for _ in range(_NUM_NOISE_ROUNDS):
         noise = max(noise, 1.0) if is_given.all() else noise
@@ -187,7 +184,7 @@ def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
         fit = PointFit(now, improve(now, x), noise * unit)
         x = fit.x
         ordinary = problem.shared_stddev_m < noise * unit
-        rows = ordinary if np.mean(ordinary) > _MIN_ORDINARY else np.ones(len(unit), dtype=np.bool_)
+        rows = ordinary if np.mean(ordinary) > MIN_ORDINARY else np.ones(len(unit), dtype=np.bool_)
         noise = _noise_of(fit.residuals_m[rows] / unit[rows])
     return fit
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.ranging.clock.search import PathSamples, TimedRanges
-from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev, rows_by_anchor
+from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev
 from rangesfm.ranging.errors.noise import NORMAL_95
 
 # Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
@@ -187,7 +187,7 @@ def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale
     points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
     squares = fit_squares(points, ranges.range_m, ranges.anchor)
     deviations = ranges.range_m.copy()
-    for rows in rows_by_anchor(ranges.anchor):
+    for rows in rows_by_key(ranges.anchor):
         deviations[rows] -= np.median(deviations[rows])
     cells = np.floor(ranges.times_s / _CELL_S).astype(np.int64) * (ranges.anchor.max(initial=0) + 1) + ranges.anchor
     num_cells = len(np.unique(cells))

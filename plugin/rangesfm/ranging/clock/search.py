@@ -15,12 +15,12 @@ import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import maximum_filter1d
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.clock.squares import MIN_RANGE_M, rows_by_anchor
+from rangesfm.ranging.clock.squares import MIN_RANGE_M
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 
@@ -224,7 +224,7 @@ def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> tuple[Array
     products = {(i, j): correlate.transform(columns[:, i] * columns[:, j]) for i, j in _PAIRS}
 
     sums = np.zeros((5, correlate.num_offsets))
-    for rows in rows_by_anchor(ranges.anchor):
+    for rows in rows_by_key(ranges.anchor):
         sums += _sums_of_anchor(ranges.range_m[rows], weights[rows], cell[rows], products, correlate)
     num, variation, without, column, cross = sums
     scale_squared = np.maximum(cross, 0.0) / np.maximum(column, 1e-12)

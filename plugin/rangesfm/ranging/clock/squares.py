@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 
@@ -78,7 +78,7 @@ def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: floa
     middle = points.mean(axis=0)
     unit = max(float(np.sqrt(np.mean((points - middle) ** 2))), 1e-300)
     points = (points - middle) / unit
-    design, groups = np.column_stack([points, np.ones(len(points))]), rows_by_anchor(anchor)
+    design, groups = np.column_stack([points, np.ones(len(points))]), rows_by_key(anchor)
     # Division by the derivative of rho^2 converts residuals back to metres.
     metres = 1 / (2 * np.maximum(range_m, MIN_RANGE_M))
     residuals_m = np.zeros(len(points))
@@ -147,7 +147,3 @@ class _LinearColumns:
 def residual_stddev(residuals_m: Array) -> float:
     """Return a robust standard deviation of residuals, at least MIN_RESIDUAL_M."""
     return max(robust_stddev(residuals_m), MIN_RESIDUAL_M)
-
-
-def rows_by_anchor(anchor: Indices) -> list[Indices]:
-    return [np.flatnonzero(anchor == number) for number in np.unique(anchor)]

@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M
 from rangesfm.ranging.errors.range_bins import RangeBins
 
-# Decay length of the short-range error, metres, and correlation time of errors that last for seconds.
-_SHORT_M = 1.0
+# Correlation time of errors that last for seconds.
 _TIME_S = 3.0
 # Correlation time of the slow drift, seconds, as of a warming radio.
 _DRIFT_S = 60.0
@@ -109,7 +109,7 @@ def _in_place(bins: RangeBins) -> Array:
 
 
 def _short(bins: RangeBins) -> Array:
-    shortness = np.exp(-bins.distance_m / _SHORT_M)
+    shortness = np.exp(-bins.distance_m / SHORT_RANGE_LENGTH_M)
     return np.outer(shortness, shortness)
 
 

@@ -13,12 +13,12 @@ from scipy.optimize import minimize
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.bending import BendingOfBins
 from rangesfm.ranging.errors.components import BENDS, COMPONENTS, LEARNT_CURVE, Component
+from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.range_bins import RangeBins
 
-# Noise of single ranges up to which a radio belongs to the population. With more noise all other components may be
-# larger too, by more than in proportion: an old radio with five times the noise reads 7 % too long, while the others
-# are right to a percent.
-_USUAL_NOISE_M, _WIDENING_POWER = 0.1, 1.5
+# With more noise than usual all other components may be larger too, to this power: an old radio with five times the
+# noise reads 7 % too long, while the others are right to a percent.
+_WIDENING_POWER = 1.5
 _MAX_NUM_ITERATIONS = 100
 _TOLERANCE = 1e-9
 # Bounds of the logarithms of standard deviations, relative to the median; farther away the likelihood is flat.
@@ -195,7 +195,7 @@ class ExpectedErrors:
             most_unusual: largest standard deviation above its median, in spreads over radios.
         """
         # Bending does not depend on the radio, and the noise is measured itself.
-        widening = max(1.0, noise_m / _USUAL_NOISE_M) ** _WIDENING_POWER
+        widening = max(1.0, noise_m / START_STDDEV_M) ** _WIDENING_POWER
         widened = [1.0 if c.name in (*BENDS, "white") else widening**2 for c in self.components]
         likelihood = ComponentLikelihood(
             np.array(widened)[:, None, None] * self.of_components if widening > 1 else self.of_components,

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.range_log import RangeLog
 
 # Standard deviation, metres, at distance 0, and its decay length: radios read up to 0.15 m short below about 2 m, all
@@ -20,11 +21,16 @@ from rangesfm.ranging.range_log import RangeLog
 # short ranges does not average out, so they are trusted far less than their scatter suggests.
 _SHORT_RANGE_STDDEV_M = 2.0
 SHORT_RANGE_LENGTH_M = 1.0
-# Assumed noise before an estimate. Ranges with a larger common error are not used to estimate the noise.
 NORMAL_95 = 1.96
 """Half the width of a 95 % interval, in standard deviations of a normal distribution."""
 START_STDDEV_M = 0.1
+"""Noise of a usual radio, metres, assumed before an estimate: in ``examples/radios.md`` 0.03 to 0.1, one has more."""
+MIN_NUM_OF_SCATTER = 20
+"""Smallest number of residuals that show a scatter, or a share of outliers."""
+MIN_ORDINARY = 0.3
+"""Smallest share of ranges without a large common error for which the noise is estimated from these alone."""
 MIN_STDDEV_M = 1e-9
+"""Smallest standard deviation, metres; what is divided by is at least as large."""
 # Ratio of standard deviation to median absolute value of a normal distribution.
 _STDDEV_PER_MAD = 1.4826
 # Root mean square of residuals, in standard deviations, below which they are only rounding and the solver's tolerance.
@@ -41,18 +47,13 @@ _NUM_MIXTURE_ROUNDS = 60
 _FIRST_SHARE, _FIRST_QUANTILE = 0.1, 0.1257
 # Mean error of outliers, in standard deviations of the noise, at least; smaller errors would be noise.
 _MIN_OUTLIER_STDDEVS = 3.0
-# With fewer residuals a mixture is not determined.
-_MIN_MIXED = 20
 _MIN_DENSITY = 1e-300
 # For the estimate from the log alone.
 _WINDOW = 11
 _MAX_NUM_WINDOWS = 20_000
 _MAX_STRETCH = 3.0  # a window longer than this many typical ones has a gap in it
-_CAUCHY_SCALE = 2.4
 _NUM_PARABOLA_ROUNDS = 8
-_TINY = 1e-9
 _STEPS_M = (0.1, 0.01)
-_MIN_NUM_ROUNDED = 20
 _ROUNDED_TO_M = 1e-5  # rounding of 32-bit numbers, for ranges of some hundred metres
 
 
@@ -138,7 +139,7 @@ def inlier_noise(residuals: Array) -> InlierNoise:
     is fitted by expectation maximisation (Dempster, Laird and Rubin, 1977). The median absolute deviation would take
     outliers for noise well before they are half of all residuals.
     """
-    if len(residuals) < _MIN_MIXED:
+    if len(residuals) < MIN_NUM_OF_SCATTER:
         return _gaussian(residuals)
     # Sorted, so that thinning keeps the distribution and the result does not depend on the order.
     sizes = np.abs(residuals)
@@ -210,24 +211,24 @@ def _misses_of_parabola(times: Array, ranges: Array) -> Array:
     """Return (m,) distances of the middle of each row of (m, 11) ranges from a robust parabola through the others."""
     middle = _WINDOW // 2
     centred = times - times[:, middle : middle + 1]
-    scaled = centred / np.maximum(np.abs(centred).max(axis=1, keepdims=True), _TINY)
+    scaled = centred / np.maximum(np.abs(centred).max(axis=1, keepdims=True), MIN_STDDEV_M)
     powers = np.stack([np.ones_like(scaled), scaled, scaled**2], axis=2)
     weights = np.ones_like(ranges)
     offset = np.median(ranges, axis=1, keepdims=True)
     for _ in range(_NUM_PARABOLA_ROUNDS):
-        normal = np.einsum("mi,mij,mik->mjk", weights, powers, powers) + _TINY * np.eye(3)
+        normal = np.einsum("mi,mij,mik->mjk", weights, powers, powers) + MIN_STDDEV_M * np.eye(3)
         right = np.einsum("mi,mij,mi->mj", weights, powers, ranges - offset)
         coefficients = np.linalg.solve(normal, right[..., np.newaxis])
         residuals = ranges - offset - (powers @ coefficients)[..., 0]
-        weights = 1 / (1 + (residuals / (_CAUCHY_SCALE * robust_stddevs(residuals))) ** 2)
-    plain = np.einsum("mij,mik->mjk", powers, powers) + _TINY * np.eye(3)
+        weights = CAUCHY.weights(residuals / robust_stddevs(residuals))
+    plain = np.einsum("mij,mik->mjk", powers, powers) + MIN_STDDEV_M * np.eye(3)
     pull = np.linalg.inv(plain)[:, 0, 0]  # effect of the middle range on its fit; its powers are 1, 0, 0
-    return np.asarray(residuals[:, middle] / np.sqrt(np.maximum(1 - pull, _TINY)), np.float64)
+    return np.asarray(residuals[:, middle] / np.sqrt(np.maximum(1 - pull, MIN_STDDEV_M)), np.float64)
 
 
 def find_quantization_m(range_m: Array) -> float | None:
     """Return the step (0.1 or 0.01 m) of which all ranges are multiples; None if there is none or too few ranges."""
-    if len(range_m) < _MIN_NUM_ROUNDED:
+    if len(range_m) < MIN_NUM_OF_SCATTER:
         return None
     for step in _STEPS_M:
         if np.all(np.abs(range_m - np.round(range_m / step) * step) < _ROUNDED_TO_M):

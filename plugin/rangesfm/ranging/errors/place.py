@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.errors.noise import NO_ERROR
+from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER, NO_ERROR
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 
 # Edge of a place, metres: some wavelengths, the scale at which echoes that overlap the direct path change. On real logs
@@ -14,8 +14,6 @@ _PLACE_SIZE_M = 0.2
 # Offset of the grid, in cells: a path at a height of 1.6 m, or at the first camera's 0, lies on grid planes, where
 # rounding would choose the cell.
 _OFF_GRID = 1e-9
-# With fewer ranges a correlation cannot be estimated.
-_MIN_NUM = 20
 
 
 def place_labels(tags_m: Array, anchor_index: Indices) -> Indices:
@@ -55,7 +53,7 @@ def correlation_in_place(errors: Array, labels: Indices) -> float:
     counts = np.bincount(labels)
     num_places = len(counts)
     within_degrees = len(errors) - num_places
-    if len(errors) < _MIN_NUM or within_degrees < _MIN_NUM:
+    if len(errors) < MIN_NUM_OF_SCATTER or within_degrees < MIN_NUM_OF_SCATTER:
         return 0.0
     means = np.bincount(labels, errors) / counts
     within = float(np.sum((errors - means[labels]) ** 2)) / within_degrees

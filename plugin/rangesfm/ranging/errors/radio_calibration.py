@@ -14,7 +14,7 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.error_curve import ErrorCurve
 from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors
-from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER, robust_stddev
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.range_log import RangeLog
@@ -27,9 +27,8 @@ _LOG_SPACING = 1 / 6
 _AT_ANCHOR_M = 1e-3
 # Share of the ranges beyond each end of the curve.
 _EDGE_SHARE = 0.001
-# Fewer ranges are not enough for a curve, or for the noise at a knot.
+# With fewer ranges there is no curve.
 _MIN_RANGES = 100
-_MIN_RANGES_OF_KNOT = 20
 # Rounds of robust weights, and bins of ranges in each; with more, neither changes the curve by a millimetre.
 _NUM_ROUNDS, _NUM_BINS = 4, 200
 
@@ -162,4 +161,4 @@ def _noise_by_knot(knots: Array, distance: Array, residuals: Array, noise_m: flo
     """Return the (k,) scatter of the ranges nearest to each knot; the scatter of all where they are few."""
     nearest = np.searchsorted((knots[1:] + knots[:-1]) / 2, distance)
     parts = [residuals[nearest == k] for k in range(len(knots))]
-    return np.array([robust_stddev(part) if len(part) >= _MIN_RANGES_OF_KNOT else noise_m for part in parts])
+    return np.array([robust_stddev(part) if len(part) >= MIN_NUM_OF_SCATTER else noise_m for part in parts])

@@ -9,15 +9,13 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER, robust_stddev
 
 # The covariance of the bins is a full matrix, and learning it takes some twenty inversions.
 MAX_NUM_BINS = 450
 _SHORTEST_S = 0.5
 _LONGER = 1.25
 _MIN_NOISINESS, _MAX_NOISINESS = 0.5, 3.0
-# With fewer ranges of an anchor its noise cannot be estimated.
-_MIN_NUM_OF_ANCHOR = 20
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,7 @@ def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Ar
     scatter = np.full(num_anchors, np.nan)
     for k in range(num_anchors):
         own = residuals_m[anchor_index == k]
-        if len(own) >= _MIN_NUM_OF_ANCHOR:
+        if len(own) >= MIN_NUM_OF_SCATTER:
             scatter[k] = robust_stddev(own - np.median(own))
     if np.isnan(scatter).all():
         return np.ones(num_anchors)

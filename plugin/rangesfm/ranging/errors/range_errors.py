@@ -13,6 +13,8 @@ from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import (
+    MIN_NUM_OF_SCATTER,
+    MIN_ORDINARY,
     START_STDDEV_M,
     STRETCH_S,
     InlierNoise,
@@ -32,10 +34,7 @@ _Fit = TypeVar("_Fit")
 _MIN_STDDEV_M = 1e-3
 # An anchor gets its own noise only if it differs from that of all by this many standard deviations.
 _SIGNIFICANT = 3.0
-# With fewer ranges of an anchor its noise cannot be told from outliers.
-_MIN_NUM_OF_ANCHOR = 20
 _NUM_MEAN_ROUNDS = 10
-_MIN_ORDINARY = 0.3
 # A median residual of a stretch above this many standard deviations is not noise.
 _MAX_BLOCK_STDDEVS = 3.0
 _MIN_BLOCK = 5
@@ -43,7 +42,6 @@ _MIN_BLOCK = 5
 # times.
 _MAX_STDDEV_OVER_SCATTER = 5.0
 _MIN_SCATTER_M = 0.01
-_MIN_DIFFERENCES = 20
 # If the residuals of this share of the ranges, those nearest to the photos, are smaller than all by this factor, the
 # path between the photos is the reason.
 _NEAREST, _AT_PHOTOS = 0.2, 0.5
@@ -187,7 +185,7 @@ class RangeErrors:
         among = among if among.any() else np.ones(len(among), dtype=bool)
         usual = np.where(self.is_estimated, START_STDDEV_M, self.given_m)
         ordinary = among & (together_m < usual)
-        is_enough = np.count_nonzero(ordinary) > _MIN_ORDINARY * np.count_nonzero(among)
+        is_enough = np.count_nonzero(ordinary) > MIN_ORDINARY * np.count_nonzero(among)
         return np.flatnonzero(ordinary if is_enough else among)
 
     def seen_by_rigid_map(self, residuals_m: Array, prior_cost: float) -> RangeErrors:
@@ -258,7 +256,7 @@ class RangeErrors:
             own[index == k] -= self._bulk_mean(own[index == k], noise_m)
         together = inlier_noise(own)
         for k in range(len(ratios)):
-            if np.count_nonzero(index == k) < _MIN_NUM_OF_ANCHOR:
+            if np.count_nonzero(index == k) < MIN_NUM_OF_SCATTER:
                 continue
             alone = inlier_noise(own[index == k])
             # The variance of the mixture's noise estimate is some 2.7 times that of an ordinary standard deviation.
@@ -327,7 +325,7 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
     reasons = []
     stated = residuals_m / errors.stddev_m
     typical = robust_stddev(stated)
-    if len(stated) >= _MIN_DIFFERENCES and typical > _MAX_BLOCK_STDDEVS:
+    if len(stated) >= MIN_NUM_OF_SCATTER and typical > _MAX_BLOCK_STDDEVS:
         reasons.append(Misfit(f"range residuals are typically {typical:.1f} times their stddev"))
     off = [np.median(stated[rows]) for rows in rows_by_key(errors.group) if len(rows) >= _MIN_BLOCK]
     num_off = int(np.sum(np.abs(off) > _MAX_BLOCK_STDDEVS))
@@ -336,7 +334,7 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
         reasons.append(Misfit(told))
     order = np.lexsort((time_order, errors.anchor_index))
     steps = np.diff(residuals_m[order])[np.diff(errors.anchor_index[order]) == 0]
-    if len(steps) >= _MIN_DIFFERENCES:
+    if len(steps) >= MIN_NUM_OF_SCATTER:
         scatter = max(robust_stddev(steps) / np.sqrt(2), _MIN_SCATTER_M)
         size = robust_stddev(residuals_m)
         if size > _MAX_STDDEV_OVER_SCATTER * scatter:
