@@ -8,10 +8,10 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
+from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, MIN_COST_GAP
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 from rangesfm.scale.scale_problem import MIN_RANGES
-from rangesfm.scale.solution import MIN_COST_GAP, Solution
+from rangesfm.scale.solution import Solution
 from rangesfm.scale.starts import choose_sides, spread_subset
 
 # Most ranges with which an anchor is solved alone.

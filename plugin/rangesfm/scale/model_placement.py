@@ -13,11 +13,11 @@ from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, path_shape, rmse
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.robust_loss import wider
+from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP, wider
 from rangesfm.scale.anchor_alignment import SAME_SHARE, PlacedAnchor, align_by_anchors
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
 from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.scale.solution import MIN_COST_GAP, SUBSET_PER_ANCHOR
+from rangesfm.scale.solution import SUBSET_PER_ANCHOR
 from rangesfm.scale.starts import spread_subset
 
 # Smallest standard deviation of an anchor's position: antennas err by as much, whatever the ranges say.

@@ -12,6 +12,7 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
+from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
 from rangesfm.scale.range_equation import (
@@ -43,8 +44,6 @@ _ENOUGH_OF_ANCHOR, _NUM_ROUNDS = 1000, 2
 # (degrees) and the places of the path's middle (extents of the path) are no further apart than this.
 _NUM_ALTERNATIVES = 4
 _SAME_LOG_SCALE, _SAME_ROTATION_DEG, _SAME_SHIFT = 0.03, 5.0, 0.05
-# Half of 3 standard deviations squared: a rival whose cost is closer than this is not ruled out.
-MIN_COST_GAP = 4.5
 MANY_OUTLIERS = 0.3
 """Share of outliers above which a map is doubted, so that rivals are not compared any more."""
 

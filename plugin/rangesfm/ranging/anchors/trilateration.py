@@ -27,13 +27,11 @@ from rangesfm.ranging.anchors.point_fit import (
     improve,
 )
 from rangesfm.ranging.errors.noise import short_range_stddev
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, SAME_COST
+from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, MIN_COST_GAP, SAME_COST
 from rangesfm.ranging.range_log import RangeLog
 
 # Three ranges determine a position, and a fourth one checks it.
 MIN_NUM_RANGES = 4
-# A mirror image is ruled out if its cost is larger by at least this, half the square of 3 standard deviations.
-_MIN_COST_GAP = 4.5
 # Standard deviations above this fraction of the distance are computed from the cost itself, not from its curvature.
 _NONLINEAR = 0.05
 # Distances at which the cost is then evaluated, metres.
@@ -432,7 +430,7 @@ def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) ->
     apart = (other - found.fit.x)[:3]
     distance = float(np.linalg.norm(apart))
     stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
-    return other if distance > 2 * stddev and _gap(found, other) < _MIN_COST_GAP else None
+    return other if distance > 2 * stddev and _gap(found, other) < MIN_COST_GAP else None
 
 
 def _gap(found: _Found, mirror: Array) -> float:

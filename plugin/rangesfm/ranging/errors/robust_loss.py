@@ -10,6 +10,8 @@ from rangesfm.arrays import Array
 
 # Relative difference of costs below which two fits are equal: rounding and the solver's tolerance.
 SAME_COST = 1e-6
+# Difference of costs from which the worse of two fits is ruled out: half the square of 3 standard deviations.
+MIN_COST_GAP = 4.5
 
 
 @dataclass(frozen=True)
