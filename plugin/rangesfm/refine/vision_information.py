@@ -273,7 +273,7 @@ def steps_of_points(observations: Observations, to_point: Array, residuals: Arra
 def _regular(information: Array) -> Array:
     """Return (n, 3, 3) information on points with what rounding needs to invert it where a depth is open."""
     ridge = 1e-12 * np.trace(information, axis1=1, axis2=2) + 1e-200
-    return information + ridge[:, None, None] * np.eye(3)
+    return np.asarray(information + ridge[:, None, None] * np.eye(3))
 
 
 def vision_information(observations: Observations, poses: Poses) -> VisionInformation:
