@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.known import known
 from tests.scale.conftest import MakeSurvey
 
 from rangesfm.demo.simulated_radio import Radio
@@ -38,7 +37,7 @@ def test_a_model_weighs_the_same_alone_and_in_a_join(make_survey: MakeSurvey) ->
     joined = model_placement._Group([model], None).solve([estimate.metric_from_sfm], places)
     assert joined.state.metric_from_model.scale == pytest.approx(estimate.value, rel=1e-6)
     np.testing.assert_allclose(joined.state.metric_from_model.rotation, estimate.metric_from_sfm.rotation, atol=1e-6)
-    alone_stddev = errors.inflation * known(estimate.solution).fit.log_scale_stddev
+    alone_stddev = errors.inflation * estimate.uncertainty.formal
     assert joined.log_scale_stddev == pytest.approx(alone_stddev, rel=0.02)
     # This would not hold if all its ranges counted alike.
     part = replace(model_placement._problem(model, estimate.anchors), share=None)

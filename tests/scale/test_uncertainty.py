@@ -17,7 +17,7 @@ from rangesfm.ranging.errors.bending import BendingOfBins
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
-from rangesfm.scale.uncertainty import bias_covariance, known_map, linear_map
+from rangesfm.scale.uncertainty import known_map
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -152,11 +152,8 @@ def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(
     learned = found.errors.learned
     for share in (1.0, 1e-6):
         told = replace(learned, covariances_m2=share * learned.covariances_m2)
-        errors, linear = found.solution.errors, linear_map(found.problem, found.solution, told.bins)
-        worth = told.bins.total(errors.worth * found.solution.fit.weights / errors.stddev_m**2)
-        assumed_m2 = np.diag(1 / worth) + bias_covariance(told.bins, found.problem.ranges)
-        by_robust = linear.with_weights(assumed_m2, told.covariance_m2)[0][0]
-        uncertainty = known_map(found.problem, found.solution, told).uncertainty
+        known = known_map(found.problem, found.solution, told)
+        uncertainty, by_robust = known.uncertainty, known.by_own_weights[0, 0]
         stated = uncertainty.components
         best = np.array([stated[name] for name in stated if name != "reweighting"])
         chance = np.sqrt(by_robust - np.sum(best**2))

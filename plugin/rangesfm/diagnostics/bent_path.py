@@ -90,8 +90,8 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
 def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
     """Return the uncertainty of a path at the estimate with the best weights, compared with simple weights."""
     simple_m2 = problem.errors.only("white", *BENDS).covariance_m2 + bias_covariance(problem.bins, posed.ranges)
-    variances, _ = problem.with_weights(simple_m2, problem.errors.covariance_m2)
-    return KnownMap.between(problem, problem.errors, formal, variances, problem.solved(simple_m2).step)
+    by_others, _ = problem.with_weights(simple_m2, problem.errors.covariance_m2)
+    return KnownMap.between(problem, problem.errors, formal, by_others, problem.solved(simple_m2).step)
 
 
 def learnt_at(on_map: RangesOnMap) -> Linearized:

@@ -16,7 +16,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.expected import Expected, expect_roughly
 from rangesfm.planning.paths import NUM_WAVES, way_along
 from rangesfm.planning.placement import spread_places
-from rangesfm.planning.plan_checks import told
+from rangesfm.planning.plan_checks import coordinates_text
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.walls import lead_through
@@ -230,7 +230,7 @@ def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
     """Yield the plan with each anchor moved to each of some allowed places."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
         for place in _free_places(planned):
-            words = f"move anchor {anchor.anchor_id} to {told(place)}"
+            words = f"move anchor {anchor.anchor_id} to {coordinates_text(place)}"
             yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
@@ -242,7 +242,7 @@ def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
     name = next(name for name in (f"new{number or ''}" for number in range(len(taken) + 1)) if name not in taken)
     for place in _free_places(planned):
         more = (*planned.anchors, Anchor(name, place, stddev_m))
-        words = f"add an anchor at {told(place)}"
+        words = f"add an anchor at {coordinates_text(place)}"
         yield "one more anchor", "", words, replace(planned, anchors=more)
 
 
@@ -264,7 +264,7 @@ def _with_control_points(planned: PlannedSurvey) -> Iterator[_Change]:
     outermost_first = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1), kind="stable")
     spread = spread_places(MIN_NUM_POSITIONS, places[outermost_first])
     more = tuple(ControlPoint(name, at, _POINT_STDDEV_M, CONTROL, 0) for name, at in zip(names, spread, strict=False))
-    where = "; ".join(map(told, spread))
+    where = "; ".join(map(coordinates_text, spread))
     words = f"survey three control points that the photos show, such as {where}, to {_POINT_STDDEV_M:g} m"
     anchor_frame = "site" if planned.anchor_frame == "site" else "unknown"
     with_points = replace(planned, points=(*planned.points, *more), anchor_frame=anchor_frame)

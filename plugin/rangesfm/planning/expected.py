@@ -22,7 +22,7 @@ from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import in_first_camera
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.ranging.errors.bending import BendingPart, MapBending, WalkBending, averaged
+from rangesfm.ranging.errors.bending import ErrorPart, MapBending, WalkBending, averaged
 from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.learned import ErrorParts, LearnedErrors, usual_stddevs
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
@@ -99,9 +99,8 @@ class Expected:
     def nothing(cls, planned: PlannedSurvey, refusal: str) -> Expected:
         """Return that a run will refuse the survey, and know nothing of its map."""
         none, is_placed = np.zeros(0, dtype=np.int64), planned.anchor_frame == "site"
-        known = KnownMap(
-            ScaleUncertainty(np.inf, {}), OPEN**4 * np.eye(7), Columns(0, 1 if is_placed else -1, none, none, 7)
-        )
+        columns, open_ = Columns(0, 1 if is_placed else -1, none, none, 7), OPEN**4 * np.eye(7)
+        known = KnownMap(ScaleUncertainty(np.inf, {}), open_, columns, open_)
         errors = ErrorParts((), np.zeros(0), np.zeros((0, 0, 0)))
         open_m = np.full(len(planned.trajectory), np.inf)
         return cls(replace(planned, photos=None), None, None, known, errors, open_m, 0, (), refusal)
@@ -332,9 +331,9 @@ class _BendingMap:
         formal = float(np.sqrt(linear.solved(errors.only(*_NOISE).covariance_m2).covariance[0, 0]))
         bent_m2 = np.sum([np.zeros((num + 3 * len(self._some),) * 2), *bent.values()], axis=0)
         simple_m2 = block_diag(*(each.simple_m2 for each in observed)) + bent_m2[:num, :num]
-        variances, _ = linear.with_weights(simple_m2, errors.covariance_m2)
+        by_others, _ = linear.with_weights(simple_m2, errors.covariance_m2)
         # The estimates with different weights will differ by about one standard deviation.
-        known = KnownMap.between(linear, errors, formal, variances, np.full(columns.num, np.inf))
+        known = KnownMap.between(linear, errors, formal, by_others, np.full(columns.num, np.inf))
         known = replace(known, uncertainty=replace(known.uncertainty, lean=0.0))
         whitened = cho_solve(cho_factor(regular(errors.covariance_m2)), np.hstack([bent_m2[:num, num:], design]))
         of_places, of_design = whitened[:, : bent_m2.shape[0] - num], whitened[:, bent_m2.shape[0] - num :]
@@ -359,7 +358,7 @@ class _BendingMap:
         parts = self.bending.of_functions(by_pose, frame_is_free=is_free).parts
         return {part.name: self._variance(part, num_first) * part.alike for part in parts}
 
-    def _variance(self, part: BendingPart, num_first: int) -> float:
+    def _variance(self, part: ErrorPart, num_first: int) -> float:
         """Return the variance of a part's size; what is given of it refers to the first observations."""
         given_m = self.planned.component_stddevs.get(part.name)
         if given_m is None:

@@ -45,7 +45,7 @@ def require_possible(
     is_out = are_outside(path[:-1, :2], floors_m)
     through = np.flatnonzero(is_out | lead_through(path[:-1, :2], path[1:, :2], planned.walls_m))
     if len(through):
-        at = told(path[through[0], :2])
+        at = coordinates_text(path[through[0], :2])
         raise OptionError(
             f"[path] {path_key} leads the camera through a wall at {at}, expected a path inside the walls; "
             "a door is a gap between walls",
@@ -63,7 +63,7 @@ def require_possible(
 def _require_apart(places: dict[str, Array], table: str, key_of: KeyOf) -> None:
     for one, other in combinations(places, 2):
         if np.linalg.norm(places[one] - places[other]) < SAME_PLACE_M:
-            found = f"[{table}] {key_of(other)}: {other} is at {told(places[other])}, where {one} is"
+            found = f"[{table}] {key_of(other)}: {other} is at {coordinates_text(places[other])}, where {one} is"
             raise OptionError(f"{found}, expected another place", table, key_of(other))
 
 
@@ -106,6 +106,6 @@ def oddities(
         yield OptionError(f"{found}, {in_site}", "anchors", "heights_m")
 
 
-def told(place: Array) -> str:
+def coordinates_text(place: Array) -> str:
     """Return the coordinates of a place for people, metres."""
     return ", ".join(f"{x:.3g}" for x in place)

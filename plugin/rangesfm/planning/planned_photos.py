@@ -156,10 +156,13 @@ class PlannedPhotos(Options, table="photos"):
 
     def _shows(self, in_cam: Array) -> Mask:
         """Return whether photos show points (n, 3) in the axes of their cameras."""
-        depth = np.where(in_cam[:, 2] > 0, in_cam[:, 2], np.nan)
-        at, distance = np.abs(in_cam[:, :2] / depth[:, None]), np.linalg.norm(in_cam, axis=1)
-        is_within = (at[:, 0] < self._half_width) & (at[:, 1] < _HEIGHT * self._half_width)
-        return np.asarray(is_within & (distance >= self.seen_m[0]) & (distance <= self.seen_m[1]))
+        distance = np.linalg.norm(in_cam, axis=1)
+        return np.asarray(self._is_in_view(in_cam) & (distance >= self.seen_m[0]) & (distance <= self.seen_m[1]))
+
+    def _is_in_view(self, in_cam: Array) -> Mask:
+        """Return whether points (..., 3) in the axes of a camera are before it and within its field of view."""
+        x, y, depth = np.moveaxis(in_cam, -1, 0)
+        return (np.abs(x) < self._half_width * depth) & (np.abs(y) < _HEIGHT * self._half_width * depth)
 
     def _scattered(self, path: Trajectory, frame: int, num: int, rng: np.random.Generator) -> Array:
         near, far = self.seen_m
@@ -173,10 +176,7 @@ class PlannedPhotos(Options, table="photos"):
         photos = np.arange(frame, len(path) if self.closes_loops else min(frame + self.num_photos_of_point, len(path)))
         off = points[:, None] - path.centers[photos]
         in_cam = np.einsum("nji,knj->kni", path.world_from_cam[photos], off)
-        depth, distance = in_cam[:, :, 2], np.linalg.norm(off, axis=2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at = np.abs(in_cam[:, :, :2] / depth[:, :, None])
-        found = (depth > 0) & (at[:, :, 0] < self._half_width) & (at[:, :, 1] < _HEIGHT * self._half_width)
+        distance, found = np.linalg.norm(off, axis=2), self._is_in_view(in_cam)
         looks_alike = np.einsum("kni,ki->kn", off, off[:, 0]) > _SAME_LOOK * distance * distance[:, :1]
         looks_alike &= np.abs(np.log(distance / distance[:, :1])) < np.log(_SAME_SIZE)
         is_first_run = np.logical_and.accumulate(found, axis=1)

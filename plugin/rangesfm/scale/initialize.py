@@ -182,7 +182,7 @@ class _Given:
         posed = problem if lengths is None else _bent(problem, lengths)
         known = known_map(posed, solution, learned)
         uncertainty = known.uncertainty
-        found = anchor_estimates(solution, observations.log.anchor_ids, known.covariance)
+        found = anchor_estimates(solution, observations.log.anchor_ids, known.by_own_weights)
         judged = judge(problem, solution, uncertainty, per_anchor, found, options)
         verdict, remarks = judged.verdict, (*open_place, *self.remarks)
         if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
@@ -213,7 +213,7 @@ class _Given:
             noise_stddev_m=solution.noise_stddev_m,
             problem=posed,
             solution=solution,
-            placement=known.columns.placement(known.covariance),
+            placement=known.columns.placement(known.by_own_weights),
             remarks=remarks,
             lengths=lengths,
             positions=by_positions,

@@ -10,6 +10,7 @@ from scipy.sparse import block_diag, csr_array, kron
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.positions.known_positions import KnownPositions
+from rangesfm.ranging.errors.bending import ErrorPart
 from rangesfm.ranging.errors.learned import ComponentLikelihood, ErrorParts
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.linear_map import EstimatedMistake, LinearMap
@@ -18,16 +19,6 @@ NUM_TIMES = 8
 """Number of times of a group, over which its correlation with others is averaged."""
 # An antenna's positions are averaged to at most this many groups for the estimate of their errors.
 _MAX_NUM_GROUPS = 150
-
-
-@dataclass(frozen=True)
-class ErrorPart:
-    """One component of the errors: its covariance, and the lognormal prior of its size; a spread of 0: it is known."""
-
-    name: str
-    covariance_m2: Array
-    median: float = 1.0
-    spread: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -125,10 +116,10 @@ def learnt_sizes(parts: Sequence[ErrorPart], linear: LinearMap, rows: Mask) -> d
     if not learnt:
         return sizes
     at = np.ix_(rows, rows)
-    known_m2 = [part.covariance_m2[at] for part in parts if part.spread == 0]
+    known_m2 = [part.alike[at] for part in parts if part.spread == 0]
     likelihood = ComponentLikelihood(
-        np.array([part.covariance_m2[at] for part in learnt]),
-        np.log([part.median for part in learnt]),
+        np.array([part.alike[at] for part in learnt]),
+        np.log([part.median_m for part in learnt]),
         np.array([part.spread for part in learnt]),
         np.sum([np.zeros((rows.sum(),) * 2), *known_m2], axis=0),
         -linear.residual_m[rows],
@@ -141,6 +132,6 @@ def learnt_sizes(parts: Sequence[ErrorPart], linear: LinearMap, rows: Mask) -> d
 
 def errors_of_sizes(parts: Sequence[ErrorPart], sizes: Mapping[str, float]) -> ErrorParts:
     """Return the errors with components of these sizes."""
-    of_all = np.array([sizes[part.name] ** 2 * part.covariance_m2 for part in parts])
+    of_all = np.array([sizes[part.name] ** 2 * part.alike for part in parts])
     stddevs = np.sqrt(np.trace(of_all, axis1=1, axis2=2) / of_all.shape[1])
     return ErrorParts(tuple(part.name for part in parts), stddevs, of_all)

@@ -23,7 +23,7 @@ from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, pat
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.ranging.errors.bending import BendingOfBins, MapBending
+from rangesfm.ranging.errors.bending import BendingOfBins, ErrorPart, MapBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.learned import ErrorParts
 from rangesfm.ranging.errors.robust_loss import CAUCHY
@@ -33,7 +33,6 @@ from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, LinearMap
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.position_equations import (
     NUM_TIMES,
-    ErrorPart,
     PositionEquations,
     at_point,
     covariance_of_groups,
@@ -237,7 +236,7 @@ class _Problem:
         linear = self._linear(similarity, grouping, bending)
         parts = tuple(self._parts(similarity, grouping, stddev_m, bending))
         takes_part = (abs(grouping) @ np.repeat(used & (weights >= OUTLIER_BELOW) | used & self.known.is_mark, 3)) > 0
-        errors = errors_of_sizes(parts, {part.name: part.median * float(np.exp(part.spread**2)) for part in parts})
+        errors = errors_of_sizes(parts, {part.name: part.median_m * float(np.exp(part.spread**2)) for part in parts})
         return PositionEquations(linear, parts, errors, takes_part, grouping), bending
 
     def robust(self, used: Mask, start: Similarity | None) -> tuple[Similarity, Array, Array]:
@@ -301,8 +300,7 @@ class _Problem:
         self, similarity: Similarity, grouping: csr_array, stddev_m: Array, bending: BendingOfBins
     ) -> Iterator[ErrorPart]:
         """Yield the components of the errors."""
-        for part in bending.parts:
-            yield ErrorPart(part.name, part.alike, part.median_m, part.spread)
+        yield from bending.parts
         known, rotation = self.known, similarity.rotation
         places = similarity.scale**2 * rotation @ known.own_covariance @ rotation.T
         places += known.arm_stddev_m[:, None, None] ** 2 * np.eye(3)

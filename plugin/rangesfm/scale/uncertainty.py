@@ -137,11 +137,13 @@ class KnownMap:
     Attributes:
         uncertainty: of the scale.
         covariance: (p, p) of the scale's logarithm, the map's turn and shift, and the anchors, as in ``columns``.
+        by_own_weights: (p, p) the same for the estimate as it is weighted, without the best weights.
     """
 
     uncertainty: ScaleUncertainty
     covariance: Array
     columns: Columns
+    by_own_weights: Array
 
     @classmethod
     def between(
@@ -149,7 +151,7 @@ class KnownMap:
         linear: LinearMap,
         learned: ErrorParts,
         formal: float,
-        variance_by_others: Array,
+        by_others: Array,
         change_by_others: Array | None = None,
     ) -> KnownMap:
         """Combine the estimate with the best weights for the errors and the estimate with other weights.
@@ -162,21 +164,21 @@ class KnownMap:
 
         Args:
             formal: relative standard deviation of the scale, as if all ranges erred independently.
-            variance_by_others: (p,) variances of the unknowns with the other weights.
+            by_others: (p, p) covariance of the unknowns with the other weights.
             change_by_others: (p,) change from the estimate with the best weights, at which the map is, to the estimate
                 with the other weights; None: the map is at the estimate with the other weights.
         """
         best = linear.solved(learned.covariance_m2)
         of_bins, of_priors = best.gains
         change = best.step if change_by_others is None else change_by_others
-        chance = np.sqrt(np.maximum(variance_by_others - np.diag(best.covariance), 0.0))
+        chance = np.sqrt(np.maximum(np.diag(by_others - best.covariance), 0.0))
         half = np.clip(change, -chance, chance) / 2
         components = learned.stddev_of_bins(of_bins[0])
         if (given := float(np.linalg.norm(of_priors[0]))) > 0:
             components[GIVEN] = given
         components[REWEIGHTING] = abs(float(half[0]))
         uncertainty = ScaleUncertainty(formal, components, float(half[0]))
-        return cls(uncertainty, best.covariance + np.outer(half, half), linear.columns)
+        return cls(uncertainty, best.covariance + np.outer(half, half), linear.columns, by_others)
 
 
 def known_map(
@@ -197,12 +199,14 @@ def known_map(
     linear, robust = linear_map(posed, solution, bins), solution.fit.weights / errors.stddev_m**2
     bent_m2 = np.zeros_like(learned.covariance_m2) if bending is None else bending.formal_m2
     alone, weighed = (np.diag(1 / np.maximum(bins.total(each), 1e-12)) for each in (robust, errors.worth * robust))
-    formal = float(np.sqrt(linear.solved(alone + bent_m2).covariance[0, 0]))
+    formal = solution.fit.log_scale_stddev
+    if bending is not None:
+        formal = float(np.sqrt(linear.solved(alone + bent_m2).covariance[0, 0]))
     shared = np.zeros((len(bins), 0)) if shared_m is None else bins.mean(shared_m)
     assumed_m2 = weighed + bent_m2 + bias_covariance(bins, given) + shared @ shared.T
-    variances, _ = linear.with_weights(assumed_m2, learned.covariance_m2)
+    by_own_weights, _ = linear.with_weights(assumed_m2, learned.covariance_m2)
     at_optimum = linear if bending is None else replace(linear, residual_m=linear.residual_m + bending.shift_m)
-    return KnownMap.between(at_optimum, learned, formal, variances)
+    return KnownMap.between(at_optimum, learned, formal, by_own_weights)
 
 
 def linear_map(posed: ScaleProblem, solution: Solution, bins: RangeBins) -> LinearMap:

@@ -64,18 +64,19 @@ def by_poses(
 
 
 @dataclass(frozen=True)
-class BendingPart:
-    """One component of a map's bending.
+class ErrorPart:
+    """One component of errors, such as of a map's bending.
 
     Attributes:
-        name: in BENDS. alike: (c, c) covariance for a size of 1.
-        median_m: of its size, before anything is measured. spread: standard deviation of the logarithm of that.
+        name: in BENDS, for a part of the bending. alike: (c, c) covariance for a size of 1.
+        median_m: of its size, before anything is measured. spread: standard deviation of the logarithm of that; 0: the
+            size is known.
     """
 
     name: str
     alike: Array
-    median_m: float
-    spread: float
+    median_m: float = 1.0
+    spread: float = 0.0
 
     @property
     def component(self) -> Component:
@@ -93,7 +94,7 @@ class BendingOfBins:
         shift_m: (c,) change of the predicted ranges if the map moves to the minimum of the photos alone.
     """
 
-    parts: tuple[BendingPart, ...]
+    parts: tuple[ErrorPart, ...]
     formal_m2: Array
     shift_m: Array
 
@@ -131,7 +132,7 @@ def bending_in_bins(bending: MapBending, bins: RangeBins, by_pose: csr_array, *,
     return bending.of_functions(averaged(bins, by_pose, len(bending.path)), frame_is_free=frame_is_free)
 
 
-def bending_part(name: str, covariance: Array, factor: float, spread: float) -> BendingPart | None:
+def bending_part(name: str, covariance: Array, factor: float, spread: float) -> ErrorPart | None:
     """Return a part in metres with ``factor`` as the median of its size; None if the bins are not affected.
 
     Args:
@@ -140,7 +141,7 @@ def bending_part(name: str, covariance: Array, factor: float, spread: float) -> 
     size_m = float(np.sqrt(np.trace(covariance) / max(len(covariance), 1)))
     if not size_m > 0:
         return None
-    return BendingPart(name, covariance / size_m**2, factor * size_m, spread)
+    return ErrorPart(name, covariance / size_m**2, factor * size_m, spread)
 
 
 def averaged(bins: RangeBins, by_range: csr_array, num_poses: int) -> Array:
