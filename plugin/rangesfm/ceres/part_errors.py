@@ -19,7 +19,6 @@ MAX_NUM_MODES = 300
 # Further columns, and products, with which the subspace of the largest modes is found; see Halko, Martinsson and Tropp,
 # "Finding structure with randomness", SIAM Review 2011.
 _NUM_FURTHER, _NUM_PRODUCTS = 20, 3
-_SEED = 0
 
 
 class PartSteps(NamedTuple):
@@ -107,7 +106,7 @@ def _largest_modes(product: Callable[[Array], Array], size: int) -> Array:
     num = min(size, MAX_NUM_MODES + _NUM_FURTHER)
     basis = np.eye(size)
     if num < size:
-        basis = np.random.default_rng(_SEED).standard_normal((size, num))
+        basis = np.random.default_rng(0).standard_normal((size, num))
         for _ in range(_NUM_PRODUCTS):
             basis = linalg.qr(product(basis), mode="economic", overwrite_a=True)[0]
     small = basis.T @ product(basis)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
+from scipy.optimize import approx_fprime
 from scipy.sparse import csr_array
 
 from rangesfm import ceres
@@ -28,8 +29,6 @@ from rangesfm.refine.radio import (
     add_range_residuals,
     radio_blocks,
 )
-
-_PARAMETER_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -160,20 +159,17 @@ def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) ->
     One standard deviation of any parameter moves a feature at the photo's edge equally far, because an error of the
     calibration seen there does not tell which parameter is wrong.
     """
-    edge = np.array([[0.5 * camera.width / camera.mean_focal_length(), 0.0, 1.0]])
-    edge[0, 1] = 0.5 * camera.height / camera.mean_focal_length()
-    shifts_px = np.array([_shift_px(camera, edge, index) for index in range(len(camera.params))])
+    focal_length = camera.mean_focal_length()
+    edge = np.array([[0.5 * camera.width / focal_length, 0.5 * camera.height / focal_length, 1.0]])
+
+    def image_of_edge(params: Array) -> Array:
+        other = pycolmap.Camera(camera.todict())
+        other.params = params
+        return np.ravel(other.img_from_cam(edge))
+
+    shifts_px = np.linalg.norm(approx_fprime(camera.params, image_of_edge, 1e-6), axis=0)
     of_focal_lengths = np.linalg.norm(shifts_px[list(camera.focal_length_idxs())])
     smallest = 1e-12 * of_focal_lengths  # a parameter without any effect gets a very large stddev
     stddevs: Array = focal_length_stddev_px * of_focal_lengths / np.maximum(shifts_px, smallest)
     stddevs[list(camera.focal_length_idxs())] = focal_length_stddev_px
     return stddevs
-
-
-def _shift_px(camera: pycolmap.Camera, points_in_cam: Array, index: int) -> float:
-    """Return how far a parameter moves the image of a point, pixels per unit."""
-    other = pycolmap.Camera(camera.todict())
-    other.params[index] += _PARAMETER_STEP * max(1.0, abs(camera.params[index]))
-    step = other.params[index] - camera.params[index]
-    found = [np.asarray(one.img_from_cam(points_in_cam)) for one in (camera, other)]
-    return float(np.linalg.norm(found[1] - found[0]) / abs(step))

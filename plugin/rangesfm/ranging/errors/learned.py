@@ -19,8 +19,6 @@ from rangesfm.ranging.errors.range_bins import RangeBins
 # With more noise than usual all other components may be larger too, to this power: an old radio with five times the
 # noise reads 7 % too long, while the others are right to a percent.
 _WIDENING_POWER = 1.5
-_MAX_NUM_ITERATIONS = 100
-_TOLERANCE = 1e-9
 # Bounds of the logarithms of standard deviations, relative to the median; farther away the likelihood is flat.
 _FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 4.0
 # Relative singular value below which a combination of unknowns has no effect.
@@ -255,10 +253,7 @@ class ComponentLikelihood:
         """Return the (k,) most likely logarithms, at most ``most_unusual`` spreads above their medians."""
         above = np.minimum(most_unusual * self.spreads, _FARTHEST_ABOVE)
         bounds = np.column_stack([self.log_medians - _FARTHEST_BELOW, self.log_medians + above])
-        options = {"maxiter": _MAX_NUM_ITERATIONS, "ftol": _TOLERANCE}
-        found = minimize(
-            self._negative_with_gradient, self.log_medians, jac=True, method="L-BFGS-B", bounds=bounds, options=options
-        )
+        found = minimize(self._negative_with_gradient, self.log_medians, jac=True, method="L-BFGS-B", bounds=bounds)
         return np.asarray(found.x)
 
     def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:

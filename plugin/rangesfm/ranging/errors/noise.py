@@ -47,7 +47,6 @@ _NUM_MIXTURE_ROUNDS = 60
 _FIRST_SHARE, _FIRST_QUANTILE = 0.1, 0.1257
 # Mean error of outliers, in standard deviations of the noise, at least; smaller errors would be noise.
 _MIN_OUTLIER_STDDEVS = 3.0
-_MIN_DENSITY = 1e-300
 # For the estimate from the log alone.
 _WINDOW = 11
 _MAX_NUM_WINDOWS = 20_000
@@ -150,13 +149,13 @@ def inlier_noise(residuals: Array) -> InlierNoise:
     for _ in range(_NUM_MIXTURE_ROUNDS):
         means = np.maximum(means, _MIN_OUTLIER_STDDEVS * stddev)
         densities = _densities(thinned, stddev, means, shares)
-        belongs = densities / np.maximum(densities.sum(axis=0), _MIN_DENSITY)
+        belongs = densities / np.maximum(densities.sum(axis=0), 1e-300)
         counts = np.maximum(belongs.sum(axis=1), 1e-9)
         shares = counts / counts.sum()
         stddev = max(float(np.sqrt(belongs[0] @ thinned**2 / counts[0])), MIN_STDDEV_M)
         means = (belongs[1:] @ np.abs(thinned)) / counts[1:]
     means = np.maximum(means, _MIN_OUTLIER_STDDEVS * stddev)
-    densities = np.maximum(_densities(thinned, stddev, means, shares).sum(axis=0), _MIN_DENSITY)
+    densities = np.maximum(_densities(thinned, stddev, means, shares).sum(axis=0), 1e-300)
     return InlierNoise(stddev, float(shares[0]) * len(residuals), float(np.mean(np.log(densities))) * len(residuals))
 
 
