@@ -341,7 +341,8 @@ def _adjust(
     last = replace(last, radio=added.estimate(last.radio), solutions=(*last.solutions, *more))
     learnt = Learnt(errors.learned, 1.0) if learn is None else learn(_at_rest(problem, last.radio, errors))
     errors = replace(errors, learned=learnt.errors)
-    covariance = _covariance(problem, bundle, added, errors, learnt.bending_factor)
+    # Ranges that are too coarse to see any bending do not make it smaller than the noise of the features does.
+    covariance = _covariance(problem, bundle, added, errors, max(learnt.bending_factor, 1.0))
     problem.metric.update_point_3d_errors()
     return _summary(problem, start, bundle, last, errors, covariance, learnt.bending_factor, is_still=is_still)
 
