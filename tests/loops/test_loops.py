@@ -31,19 +31,19 @@ def closed(laps: LoopedSurvey, tmp_path_factory: pytest.TempPathFactory) -> Clos
 
 
 def test_the_map_proposes_pairs_of_both_laps_that_see_the_same(closed: Closed, laps: LoopedSurvey) -> None:
-    far = [pair for pair in closed.proposed if pair[1] - pair[0] > laps.max_track_length]
+    far = [pair for pair in closed.tried.proposed if pair[1] - pair[0] > laps.max_track_length]
     assert len(far) >= len(laps.truth.images) // 2
     assert np.mean([pair in laps.matches for pair in far]) > 0.5
 
 
 def test_closed_loops_tie_the_laps_together(closed: Closed, laps: LoopedSurvey) -> None:
-    assert len(closed.loops) > 10
-    assert not closed.contradicted
-    assert error_m(laps, closed.after) < 0.5 * error_m(laps, closed.before)
+    assert len(closed.tried.closed) > 10
+    assert not closed.tried.contradicted
+    assert error_m(laps, closed.after.model) < 0.5 * error_m(laps, closed.before.model)
     longest = max(
         max(element.image_id for element in point.track.elements)
         - min(element.image_id for element in point.track.elements)
-        for point in closed.after.points3D.values()
+        for point in closed.after.model.points3D.values()
     )
     assert longest > 20
 

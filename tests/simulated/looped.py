@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +22,7 @@ from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruct
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.resection import Loop
+from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
 from rangesfm.options import CameraOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
@@ -30,7 +31,6 @@ from rangesfm.refine.with_ranges import Learnt, LoopClosing, RefineSummary, refi
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.vision.database import create_database
-from rangesfm.workflows.close_loops import MAX_NUM_PAIRS
 
 Pair = tuple[int, int]
 Matches = npt.NDArray[np.int64]
@@ -198,22 +198,55 @@ class ScaledMap:
 
 
 @dataclass(frozen=True)
+class SimulatedMap:
+    """A refined map of a simulated survey, whose loops can be closed.
+
+    Attributes:
+        looped: the survey. scaled: its map before.
+        model: the map. summary: of its refinement.
+        matches: of all pairs that look alike. database_path: for the matches of those that are used.
+    """
+
+    looped: LoopedSurvey
+    scaled: ScaledMap
+    model: pycolmap.Reconstruction
+    summary: RefineSummary
+    matches: dict[Pair, Matches]
+    database_path: Path
+
+    @cached_property
+    def finder(self) -> LoopFinder:
+        covariance = self.summary.covariance
+        assert covariance is not None
+        return LoopFinder.of(self.model, self.scaled.trajectory, covariance.errors, self.summary.pixel_stddev, seed=0)
+
+    def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
+        return find_in(self.finder, self.matches_of, self.looped.known, tried)
+
+    def matches_of(self, pairs: Iterable[Pair]) -> dict[Pair, Matches]:
+        return {pair: self.matches[pair] for pair in pairs if pair in self.matches}
+
+    def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> SimulatedMap:
+        path = self.database_path
+        path.unlink(missing_ok=True)
+        write_matches(path, self.model, self.looped.neighbours | self.matches_of(sorted(tried.closed)))
+        closing = LoopClosing(self.finder.relative_poses(loops), lambda model: merge_tracks(model, path, seed=0))
+        model, summary = self.scaled.refined(self.model, closing)
+        return replace(self, model=model, summary=summary)
+
+
+@dataclass(frozen=True)
 class Closed:
     """A refined survey before and after its loops are closed.
 
     Attributes:
-        scaled, before, after: the maps. finder: of the loops in the map before.
-        proposed: pairs that the map proposes. loops: those that match and fit the ranges.
-        contradicted: those that match and do not fit.
+        before, after: the maps.
+        tried: pairs that the maps proposed, and what became of them.
     """
 
-    scaled: ScaledMap
-    before: pycolmap.Reconstruction
-    after: pycolmap.Reconstruction
-    finder: LoopFinder
-    proposed: list[Pair]
-    loops: list[Loop]
-    contradicted: list[Pair]
+    before: SimulatedMap
+    after: SimulatedMap
+    tried: TriedPairs
 
 
 def close(
@@ -231,18 +264,10 @@ def close(
         alike: matches of further pairs, which do not show the same place.
     """
     scaled = ScaledMap.of(looped.survey, chain, log)
-    before, summary = scaled.refined()
-    assert summary.covariance is not None
-    finder = LoopFinder.of(before, scaled.trajectory, summary.covariance.errors, summary.pixel_stddev, seed=0)
-    proposed = finder.propose(looped.known, max_num=MAX_NUM_PAIRS)
     matches = looped.matches | (alike or {})
-    loops, contradicted = finder.tested({pair: matches[pair] for pair in proposed if pair in matches})
-    path, after = folder / "database.db", before
-    write_matches(path, before, looped.neighbours | {loop.image_ids: matches[loop.image_ids] for loop in loops})
-    if loops:
-        closing = LoopClosing(finder.relative_poses(loops), lambda model: merge_tracks(model, path, seed=0))
-        after, _ = scaled.refined(before, closing)
-    return Closed(scaled, before, after, finder, proposed, loops, contradicted)
+    before = SimulatedMap(looped, scaled, *scaled.refined(), matches, folder / "database.db")
+    after, tried = close_in_rounds(before)
+    return Closed(before, after, tried)
 
 
 def two_laps(

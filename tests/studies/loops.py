@@ -35,7 +35,7 @@ from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.loops.candidates import MIN_OVERLAP, Views
 from rangesfm.loops.loop_finder import LoopFinder
-from rangesfm.workflows.close_loops import MAX_NUM_PAIRS
+from rangesfm.loops.rounds import MAX_NUM_PAIRS
 
 
 def study_laps(
@@ -55,9 +55,10 @@ def study_laps(
         with TemporaryDirectory() as folder:
             found = close(looped, looped.chain(), log, Path(folder))
         best = ScaledMap.of(looped.survey, adjusted(pycolmap.Reconstruction(looped.truth)), log)
-        maps = (found.scaled.scaled, found.before, found.after, best.refined()[0])
+        maps = (found.before.scaled.scaled, found.before.model, found.after.model, best.refined()[0])
         errors_m = [best.error_m(model) for model in maps]
-        counts = len(found.proposed), len(found.loops), len(found.contradicted), _num_without_ranges(found)
+        tried = found.tried
+        counts = len(tried.proposed), len(tried.closed), len(tried.contradicted), _num_without_ranges(found)
         print(seed, *(f"{error:.3f}" for error in errors_m), f"{errors_m[2] / errors_m[3]:.2f}", *counts, flush=True)
         is_good &= errors_m[2] < 2 * errors_m[3]
     return is_good
@@ -65,11 +66,12 @@ def study_laps(
 
 def _num_without_ranges(found: Closed) -> int:
     """Return how many of the loops overlap in the map of photos alone, which has the true scale."""
-    path = found.scaled.trajectory.as_in(found.scaled.scaled)
-    scale = align_points(path.centers, found.scaled.survey.model.centers_m).scale
-    model = rescale(found.scaled.scaled, Similarity(scale, np.eye(3), np.zeros(3)))
+    scaled = found.before.scaled
+    path = scaled.trajectory.as_in(scaled.scaled)
+    scale = align_points(path.centers, scaled.survey.model.centers_m).scale
+    model = rescale(scaled.scaled, Similarity(scale, np.eye(3), np.zeros(3)))
     views = Views.of(model, path.frame_ids)
-    rows = [[views.row_of[image_id] for image_id in loop.image_ids] for loop in found.loops]
+    rows = [[views.row_of[image_id] for image_id in pair] for pair in found.tried.closed]
     return sum(views.overlaps(one, np.array([other]), np.zeros(1))[0] >= MIN_OVERLAP for one, other in rows)
 
 
@@ -81,10 +83,10 @@ def study_aisles(num_seeds: int) -> None:
         log = range_log(survey.looped.survey, seed)
         with TemporaryDirectory() as folder:
             found = close(survey.looped, survey.looped.chain(), log, Path(folder), alike=survey.alike)
-        loops, contradicted = found.finder.tested(survey.alike)
-        num_wrong = len(loops) + len({loop.image_ids for loop in found.loops} & survey.alike.keys())
+        loops, contradicted = found.before.finder.tested(survey.alike)
+        num_wrong = len(loops) + len(found.tried.closed & survey.alike.keys())
         num_without += num_wrong == 0
-        errors_m = [found.scaled.error_m(model) for model in (found.before, found.after)]
+        errors_m = [found.before.scaled.error_m(of.model) for of in (found.before, found.after)]
         print(seed, len(survey.alike), len(loops), len(contradicted), *(f"{e:.3f}" for e in errors_m), flush=True)
     print(f"no wrong loop in {num_without} of {num_seeds}")
 

@@ -9,7 +9,7 @@ from typing import cast
 import pycolmap
 import pytest
 from tests.outputs import names_in
-from tests.simulated.looped import two_laps, write_matches
+from tests.simulated.looped import LoopedSurvey, two_laps, write_matches
 from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
 
 from rangesfm.errors import InputError
@@ -25,7 +25,7 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.loop_database import LoopDatabase
-from rangesfm.workflows.close_loops import find_loops
+from rangesfm.workflows.close_loops import close_loops
 from rangesfm.workflows.run import refine_model
 
 
@@ -55,9 +55,14 @@ class Laps:
     database: Path
 
 
+def bent_laps() -> LoopedSurvey:
+    """Return laps that bend by some decimetres, which their ranges hardly see."""
+    return two_laps(80, size_m=(32.0, 20.0), num_observations=100, pixel_stddev=1.0)
+
+
 @pytest.fixture(scope="module")
 def laps(tmp_path_factory: pytest.TempPathFactory) -> Laps:
-    folder, looped = tmp_path_factory.mktemp("laps"), two_laps(60, size_m=(24.0, 16.0), num_observations=100)
+    folder, looped = tmp_path_factory.mktemp("laps"), bent_laps()
     truth, chain = looped.survey.model, looped.chain()
     (folder / "sparse").mkdir()
     chain.write_binary(folder / "sparse")
@@ -124,8 +129,9 @@ def test_a_model_with_its_database_has_its_loops_closed(closed: ClosedLaps, laps
     before_m, after_m = error_m["refined, loops open"], error_m["refined"]
     assert before_m is not None
     assert after_m is not None
-    # With the kernels of three processors the error falls to 0.49 to 0.58 of what it was.
-    assert after_m < 0.7 * before_m
+    assert after_m < 0.5 * before_m
+    # The ranges learn next to no bending of this map, which the noise of its features bends nevertheless.
+    assert loops.num_contradicted == 0
     out = laps.survey.output.path
     table = LoopPairs.read(out)
     assert table is not None
@@ -136,9 +142,9 @@ def test_a_model_with_its_database_has_its_loops_closed(closed: ClosedLaps, laps
 
 
 def test_an_interrupted_run_goes_on_with_the_matches_that_it_has(closed: ClosedLaps) -> None:
-    assert closed.summary.loops is not None
-    num = closed.summary.loops.num_proposed
-    assert closed.counts == [(num, num)]
+    num_done, num_all = closed.counts[0]
+    assert num_done == num_all
+    assert num_done > 100
 
 
 def test_where_no_loops_are_found_the_map_is_refined_once(laps: Laps, tmp_path: Path) -> None:
@@ -155,7 +161,8 @@ def test_where_no_loops_are_found_the_map_is_refined_once(laps: Laps, tmp_path: 
 def test_loops_stay_open_where_that_is_asked_for(laps: Laps) -> None:
     survey = laps.survey.changed({"mapper.close_loops": False})
     run = SurveyRun(survey, cast(RangingInputs, None), Journal(SilentProgress()))
-    assert find_loops(run, cast(MetricResult, None)) is None
+    metric = cast(MetricResult, None)
+    assert close_loops(run, metric, lambda *_: pytest.fail("it is refined again")) is metric
 
 
 def test_a_database_of_another_model_is_refused(laps: Laps, tmp_path: Path) -> None:

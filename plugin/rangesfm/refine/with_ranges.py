@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -235,11 +236,18 @@ def refine_with_ranges(
         to_begin_with = _errors_to_begin_with(problem, errors, metric_from_sfm.scale)
         if closing is not None:
             problem = _with_closed_loops(problem, to_begin_with, closing)
-        marker_ids = add_marker_points(metric, tape, positions.markers)
-        problem = replace(problem, distances=replace(problem.distances, marker_ids=marker_ids))
-        summary = _refine(problem, to_begin_with, learn)
-    remove_marker_points(metric, marker_ids)
+        with _markers_in_map(problem) as with_markers:
+            summary = _refine(with_markers, to_begin_with, learn)
     return metric, summary
+
+
+@contextmanager
+def _markers_in_map(problem: RefinementProblem) -> Iterator[RefinementProblem]:
+    """Add the markers to the map as points inside the block."""
+    metric, distances = problem.metric, problem.distances
+    marker_ids = add_marker_points(metric, distances.tape, problem.positions.markers)
+    yield replace(problem, distances=replace(distances, marker_ids=marker_ids))
+    remove_marker_points(metric, marker_ids)
 
 
 def _errors_to_begin_with(problem: RefinementProblem, errors: RangeErrors, metres_per_unit: float) -> RangeErrors:
@@ -292,8 +300,22 @@ def _with_closed_loops(problem: RefinementProblem, errors: RangeErrors, closing:
     )
     seen, _, rays = _without_misplaced(problem)
     moved = presolve(seen, rays, errors, replace(closing.loops, reference=reference, frame=frame))
+    problem = replace(problem, radio=replace(problem.radio, anchors=moved.anchors))
     closing.merge_tracks(problem.metric)
-    return replace(problem, radio=replace(problem.radio, anchors=moved.anchors))
+    # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do
+    # so only when those that have merged have straightened it.
+    problem = _settled(problem, errors)
+    closing.merge_tracks(problem.metric)
+    return problem
+
+
+def _settled(problem: RefinementProblem, errors: RangeErrors) -> RefinementProblem:
+    """Solve the full problem once, with known errors."""
+    with _markers_in_map(problem) as with_markers:
+        with_markers, bundle, _ = _without_misplaced(with_markers)
+        added = with_markers.add_to(bundle, errors, problem.radio)
+        solve_bundle_adjustment(bundle, _tolerance_m(problem, errors))
+        return replace(problem, radio=added.estimate(problem.radio))
 
 
 @dataclass(frozen=True)

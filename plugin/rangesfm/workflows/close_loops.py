@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import pycolmap
 
@@ -13,104 +14,98 @@ from rangesfm.files.output_folder import sole_writer
 from rangesfm.loops.loop_closure import LoopClosure
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
-from rangesfm.progress import Journal
+from rangesfm.loops.resection import Loop
+from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
 from rangesfm.refine.with_ranges import LoopClosing
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.survey_run import SurveyRun
-from rangesfm.vision.loop_database import LoopDatabase, Pair
-from rangesfm.vision.matching import MatchingOptions, matching_options
-from rangesfm.vision.steps import DATABASE_NAME
+from rangesfm.workflows.loop_matching import LoopMatching
 
-MAX_NUM_PAIRS = 5
-"""Pairs that one photo proposes at most. Sequential matching pairs a photo with 10 neighbours by default."""
+Refine = Callable[[MetricResult, LoopClosing], MetricResult]
+"""Refines a map with loops that are to be closed."""
 
 
-@dataclass(frozen=True)
-class FoundLoops:
-    """Loops of a map, with the database that has their matches.
+def close_loops(run: SurveyRun, metric: MetricResult, refine: Refine) -> MetricResult:
+    """Return a refined map with its loops closed; the same map where they are not to be closed.
 
-    Attributes:
-        closing: for the refinement; None if there are no loops.
-        outcome: for the result, with the map as it is before they are closed.
-    """
-
-    closing: LoopClosing | None
-    outcome: LoopClosure
-
-
-def find_loops(run: SurveyRun, metric: MetricResult) -> FoundLoops | None:
-    """Match the pairs that a refined map proposes, and test those that match; None where loops are not to be closed.
+    Args:
+        run: the survey. metric: the map. refine: refines it again.
 
     Raises:
         InputError: the given database does not belong to the given model.
     """
-    survey, is_given = run.survey, run.survey.images.model is not None
-    is_wanted = survey.mapper.close_loops and not (is_given and survey.mapper.database_path is None)
-    if not is_wanted or not len(metric.observations.log) or metric.kept_refinement is None:
-        return None
-    with sole_writer(survey.output.path) as output:
-        source = survey.mapper.database_path if is_given else output.newest(output.path / DATABASE_NAME)
-        if source is None or not source.is_file():
-            return None
-        options = matching_options(survey.mapper, metric.final.num_images(), survey.output.seed)
-        if not (is_given or options.is_in_time_only):
-            return None
+    if not run.survey.mapper.close_loops or not len(metric.observations.log) or metric.kept_refinement is None:
+        return metric
+    with sole_writer(run.survey.output.path) as output:
+        if (matching := LoopMatching.of(run, output)) is None:
+            return metric
         if metric.map_errors is None:
             run.journal.warn("loops are not closed, because the covariance of the poses is not known")
+            return metric
+        if why_not := matching.database.why_unfit(metric.final):
+            matching.database.discard()
+            if run.survey.images.model is not None:
+                raise InputError(why_not, run.survey.mapper.database_path)
+            return metric
+        last, tried = close_in_rounds(_RefinedMap(run, metric, matching, refine))
+        last.keep(tried)
+        matching.database.publish(output)
+        return _told(run, metric, last.metric, tried)
+
+
+@dataclass(frozen=True)
+class _RefinedMap:
+    """A refined map with the matching of its photos."""
+
+    run: SurveyRun
+    metric: MetricResult
+    matching: LoopMatching
+    refine: Refine
+
+    def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
+        if (finder := self._finder) is None:
+            return [], tried
+        with self.run.journal.stage("loops"):
+            return find_in(finder, self.matching.match, self.matching.database.known(), tried)
+
+    def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> _RefinedMap | None:
+        self.keep(tried)
+        finder, database = self._finder, self.matching.database
+        assert finder is not None, "it has found the loops"
+
+        def merge(model: pycolmap.Reconstruction) -> None:
+            with colmap_log(database.log):
+                merge_tracks(model, database.path, seed=finder.seed)
+
+        with self.run.journal.stage("refinement"):
+            refined = self.refine(self.metric, LoopClosing(finder.relative_poses(loops), merge))
+        if refined.why_broken:
+            self.run.journal.warn(f"loops are left open, because the map broke: {'; '.join(refined.why_broken)}")
             return None
-        with run.journal.stage("loops"):
-            database = LoopDatabase.of(source, output)
-            if why_not := database.why_unfit(metric.final):
-                database.discard()
-                if is_given:
-                    raise InputError(why_not, source)
-                return None
-            finder = LoopFinder.of(
-                metric.final,
-                metric.trajectory,
-                metric.map_errors,
-                metric.kept_refinement.pixel_stddev,
-                survey.output.seed,
-            )
-            found = _found(finder, database, options, run.journal)
-            database.publish(output)
-            return found
+        return replace(self, metric=refined)
+
+    def keep(self, tried: TriedPairs) -> None:
+        self.matching.database.keep(tried.proposed, tried.verified, tried.closed)
+
+    @cached_property
+    def _finder(self) -> LoopFinder | None:
+        metric = self.metric
+        if metric.map_errors is None or metric.kept_refinement is None:
+            return None
+        pixel_stddev, seed = metric.kept_refinement.pixel_stddev, self.run.survey.output.seed
+        return LoopFinder.of(metric.final, metric.trajectory, metric.map_errors, pixel_stddev, seed)
 
 
-def _found(finder: LoopFinder, database: LoopDatabase, options: MatchingOptions, journal: Journal) -> FoundLoops:
-    proposed = finder.propose(database.known(), max_num=MAX_NUM_PAIRS)
-    verified = database.match(proposed, options, journal.progress)
-    loops, contradicted = finder.tested(verified)
-    accepted = [loop.image_ids for loop in loops]
-    database.keep(proposed, verified, accepted)
-    closed_pairs, others = (_named(finder.model, pairs) for pairs in (accepted, contradicted))
-    outcome = LoopClosure(len(proposed), len(verified), closed_pairs, others, finder.path, finder.path)
-    journal.warn(*filter(None, [outcome.warning]))
-
-    def merge(model: pycolmap.Reconstruction) -> None:
-        with colmap_log(database.log):
-            merge_tracks(model, database.path, seed=finder.seed)
-
-    return FoundLoops(LoopClosing(finder.relative_poses(loops), merge) if loops else None, outcome)
-
-
-def _named(model: pycolmap.Reconstruction, pairs: Sequence[Pair]) -> tuple[tuple[str, str], ...]:
-    return tuple((model.image(first).name, model.image(second).name) for first, second in pairs)
-
-
-def closed(run: SurveyRun, found: FoundLoops, metric: MetricResult, refined: MetricResult) -> MetricResult:
-    """Return the map refined with its loops, with what was found; the map without them if it broke.
-
-    Args:
-        run: the survey. found: its loops.
-        metric: the map before. refined: the map after.
-    """
-    outcome = found.outcome
-    if refined.why_broken:
-        run.journal.warn(f"loops are left open, because the map broke: {'; '.join(refined.why_broken)}")
-        refined, outcome = metric, replace(outcome, closed=())
-    loops = replace(outcome, after=refined.trajectory.as_in(refined.final))
-    if metric.refinement is None or refined.refinement is None:
-        return replace(refined, loops=loops)
-    # The bend that the ranges took out of the map is that of the first refinement; the second began with its map.
-    return replace(refined, loops=loops, refinement=replace(refined.refinement, bend_m=metric.refinement.bend_m))
+def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: TriedPairs) -> MetricResult:
+    """Return the last map with what became of its loops, of which the journal is told."""
+    closed, contradicted = (
+        tuple((after.final.image(first).name, after.final.image(second).name) for first, second in sorted(pairs))
+        for pairs in (tried.closed, tried.contradicted)
+    )
+    paths = (metric.trajectory.as_in(metric.final) for metric in (before, after))
+    loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, *paths)
+    run.journal.warn(*filter(None, [loops.warning]))
+    if before.refinement is None or after.refinement is None:
+        return replace(after, loops=loops)
+    # The bend that the ranges took out of the map is that of the first refinement; the others began with its map.
+    return replace(after, loops=loops, refinement=replace(after.refinement, bend_m=before.refinement.bend_m))

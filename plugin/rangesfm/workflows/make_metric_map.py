@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pycolmap
@@ -50,7 +51,7 @@ from rangesfm.scale.scale_problem import first_camera_from
 from rangesfm.scale.scale_verdict import NOTHING_KNOWN, refuse_unknown
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
-from rangesfm.workflows.close_loops import closed, find_loops
+from rangesfm.workflows.close_loops import close_loops
 
 # Two likely time offsets whose scales differ by more than this fraction leave the scale undetermined, ...
 _MAX_SPREAD = 0.03
@@ -101,12 +102,7 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
     if refine:
         with run.journal.stage("refinement"):
             metric = refine_map(run, metric)
-        if (found := find_loops(run, metric)) is not None:
-            again = metric
-            if found.closing is not None:
-                with run.journal.stage("refinement"):
-                    again = refine_map(run, metric, found.closing)
-            metric = closed(run, found, metric, again)
+        metric = close_loops(run, metric, partial(refine_map, run))
     with run.journal.stage("judgement"):
         return judge_map(run, metric, of_pieces)
 
