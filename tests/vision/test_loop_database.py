@@ -36,7 +36,7 @@ def test_the_record_notes_loops_until_they_are_forgotten(looped: LoopedSurvey, t
     (tmp_path / RECORD_NAME).write_text(json.dumps({"steps": {"mapping": {"done": True}}, "notes": {}}))
     with sole_writer(tmp_path) as output:
         first = copied(output)
-        first._note(others)  # as ``match`` does before it matches
+        first._note(others, ())  # as ``match`` does before it matches
         write_matches(first.path, looped.truth, looped.matches)
         assert first.known() == {
             id_: {other for pair in looped.matches if pair not in others and id_ in pair for other in pair} - {id_}

@@ -20,6 +20,7 @@ from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.pairs import pairing_options, pairs_to_match
 from rangesfm.vision.photo_files import usable_photos
+from rangesfm.vision.photos_alike import pairs_alike
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Room
@@ -73,6 +74,15 @@ def test_those_that_look_alike_are_matched(room: Room, database: Path, tree: Pat
     pairs = pairs_to_match(database, usable_photos(room.folder, room.names), pairing)
     ids = range(1, len(room.names) + 1)
     assert pairs == [(first, second) for first in ids for second in ids[first:] if (second - first) % 2 == 0]
+
+
+def test_photos_of_different_groups_that_look_alike_are_found_by_their_own_words(database: Path) -> None:
+    groups, log = [{1, 2}, {3, 4, 5, 6}], database.with_name("words.log")
+    pairs = pairs_alike(database, groups, log, max_num=1, seed=0)
+    assert all(first in groups[0] and second in groups[1] for first, second in pairs)
+    assert all((second - first) % 2 == 0 for first, second in pairs)
+    assert {photo for pair in pairs for photo in pair} == {1, 2, 3, 4, 5, 6}
+    assert pairs_alike(database, groups, log, max_num=1, seed=0) == pairs
 
 
 def test_a_file_that_is_no_tree_is_one_line(room: Room, database: Path, tmp_path: Path) -> None:

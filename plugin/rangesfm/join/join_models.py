@@ -84,7 +84,7 @@ def join_models(run: SurveyRun, parts: Sequence[PathOfModel]) -> JoinedModels:
         )
         for k, part in enumerate(parts)
     )
-    path = _assembled([parts[k] for k in placed], list(placed.values()))
+    path = assembled([parts[k] for k in placed], list(placed.values()))
     return JoinedModels(path, tuple(verdicts), placements.notes)
 
 
@@ -109,7 +109,7 @@ def _scaled_alone(
     reasons: dict[int, str] = {}
     for k, part in enumerate(parts):
         try:
-            scaled[k] = _alone(run, part, has_first_camera=k == first)
+            scaled[k] = scaled_alone(run, part, has_first_camera=k == first)
         except GeometryError as error:
             if k == 0:
                 raise
@@ -117,7 +117,7 @@ def _scaled_alone(
     return scaled, reasons
 
 
-def _alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -> ScaledModel:
+def scaled_alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -> ScaledModel:
     """Scale a model by its own ranges.
 
     For a model without the first photo, anchors in that photo's frame are like anchors in a site frame.
@@ -136,7 +136,7 @@ def _alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -> Scal
     )
 
 
-def _assembled(parts: Sequence[PathOfModel], first_from_sfm: Sequence[Similarity]) -> PathOfModel:
+def assembled(parts: Sequence[PathOfModel], first_from_sfm: Sequence[Similarity]) -> PathOfModel:
     """Return all models and paths as one, in the world of the first."""
     if len(parts) == 1:
         return parts[0]

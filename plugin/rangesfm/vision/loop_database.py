@@ -26,6 +26,7 @@ from rangesfm.vision.steps import DATABASE_NAME, LOG_NAME, RECORD_NAME, Steps
 Pair = tuple[int, int]
 """Ids of two photos, the smaller one first."""
 _FOLDER_NAME, _SOURCE_NAME, _NOTE = "loops", "source.txt", "loops"
+_LOOPS, _TIES = "pairs", "ties"  # pairs that were tried as loops, and pairs that tie models
 
 
 def forget_loops(steps: Steps, path: Path | None = None) -> None:
@@ -34,14 +35,14 @@ def forget_loops(steps: Steps, path: Path | None = None) -> None:
     Args:
         path: of the database; None: it has just been made without loops.
     """
-    if pairs := _noted(steps):
+    if pairs := {*_noted(steps, _LOOPS), *_noted(steps, _TIES)}:
         if path is not None:
             _forget(path, pairs)
         steps.note(_NOTE, {})
 
 
-def _noted(steps: Steps) -> list[Pair]:
-    return [(first, second) for first, second in steps.notes.get(_NOTE, {}).get("pairs", [])]
+def _noted(steps: Steps, kind: str) -> set[Pair]:
+    return {(first, second) for first, second in steps.notes.get(_NOTE, {}).get(kind, [])}
 
 
 def _forget(path: Path, pairs: Collection[Pair]) -> None:
@@ -107,18 +108,18 @@ class LoopDatabase:
         return None
 
     def known(self) -> dict[int, set[int]]:
-        """Return the photos that each photo was matched with by the mapping, by its id."""
+        """Return the photos that each photo was matched with by the mapping or tied with, by its id."""
         known: dict[int, set[int]] = defaultdict(set)
         with pycolmap.Database.open(self.path) as database:
             pairs = {*map(pycolmap.pair_id_to_image_pair, database.read_num_matches()[0])}
-        for first, second in pairs - set(self._tried()):
+        for first, second in pairs - self._tried():
             known[first].add(second)
             known[second].add(first)
         return known
 
     def match(self, pairs: list[Pair], options: MatchingOptions, progress: Progress) -> dict[Pair, Indices]:
         """Match pairs, and return the matches (m, 2) of those that are verified by a two-view geometry."""
-        self._note({*self._tried(), *pairs})
+        self._note({*self._tried(), *pairs} - self._ties(), self._ties())
         with colmap_log(self.log):
             match_pairs(self.path, pairs, options, self.log, progress)
         verified: dict[Pair, Indices] = {}
@@ -131,9 +132,14 @@ class LoopDatabase:
 
     def keep(self, proposed: Collection[Pair], verified: Collection[Pair], accepted: Collection[Pair]) -> None:
         """Forget the matches of all pairs that were tried as loops, except those that are accepted or do not match."""
-        tried, right = set(self._tried()), {*accepted, *(set(proposed) - set(verified))}
-        _forget(self.path, tried - right)
-        self._note(right)
+        right = {*accepted, *(set(proposed) - set(verified))}
+        _forget(self.path, self._tried() - right)
+        self._note(right, self._ties())
+
+    def keep_ties(self, proposed: Collection[Pair], accepted: Collection[Pair]) -> None:
+        """Forget the matches of all pairs that were proposed as ties, now or before, except those that are accepted."""
+        _forget(self.path, self._ties().union(proposed).difference(accepted))
+        self._note(self._tried().difference(proposed), accepted)
 
     def publish(self, output: OutputFolder) -> None:
         """Let the database, and the record that notes its loops, take their places with the next whole result."""
@@ -147,8 +153,11 @@ class LoopDatabase:
     def _record(self) -> Steps:
         return Steps(self.folder / RECORD_NAME, SilentProgress())
 
-    def _tried(self) -> list[Pair]:
-        return _noted(self._record())
+    def _tried(self) -> set[Pair]:
+        return _noted(self._record(), _LOOPS)
 
-    def _note(self, pairs: Collection[Pair]) -> None:
-        self._record().note(_NOTE, {"pairs": sorted(pairs)})
+    def _ties(self) -> set[Pair]:
+        return _noted(self._record(), _TIES)
+
+    def _note(self, tried: Collection[Pair], ties: Collection[Pair]) -> None:
+        self._record().note(_NOTE, {_LOOPS: sorted(tried), _TIES: sorted(ties)})

@@ -39,6 +39,7 @@ from rangesfm.workflows.map_photos import (
 from rangesfm.workflows.place_ranges import place_ranges
 from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.run_results import RunResult, write_results
+from rangesfm.workflows.tie_models import tie_by_photos
 
 
 @with_one_blas_thread
@@ -74,7 +75,8 @@ def _from_photos(survey: Survey, progress: Progress | None, *, restart: bool) ->
         # An earlier result keeps its reconstruction until the new result is complete.
         deferred = (output.path / ResultSummary.NAME).exists()
         models = map_keyframes(run.survey, keyframes, run.journal, restart, deferred=deferred)
-        return with_results(*map_in_metres(run, place_ranges(run, models, times), refine=survey.refine.enabled))
+        paths = tie_by_photos(run, place_ranges(run, models, times), times)
+        return with_results(*map_in_metres(run, paths, refine=survey.refine.enabled))
 
 
 def reconstruct_survey(survey: Survey, *, progress: Progress | None = None, restart: bool = False) -> list[str]:
