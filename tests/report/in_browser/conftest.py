@@ -52,9 +52,7 @@ class Browser:
         """
         features = [{"name": "prefers-color-scheme", "value": theme}]
         self.command("Emulation.setEmulatedMedia", features=features)
-        is_phone = width < 600
-        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": is_phone}
-        self.command("Emulation.setDeviceMetricsOverride", **metrics)
+        self._set_size(width, height)
         for kind in ("browser", "performance"):
             self._driver.get_log(kind)
         self._driver.get(page.as_uri())
@@ -62,6 +60,15 @@ class Browser:
         self.wait_for("!document.querySelector('#view') || window.rangesfmView")
         if is_unfolded:
             self.run("document.querySelectorAll('details').forEach(section => { section.open = true; })")
+
+    def resize(self, width: int, height: int = 900) -> None:
+        """Give the window another size, without opening the page again."""
+        self._set_size(width, height)
+
+    def _set_size(self, width: int, height: int) -> None:
+        is_phone = width < 600
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": is_phone}
+        self.command("Emulation.setDeviceMetricsOverride", **metrics)
 
     def draw_figures(self) -> None:
         """Draw all figures, not only those near the visible part."""

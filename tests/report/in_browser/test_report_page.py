@@ -22,6 +22,18 @@ MakeResult = Callable[..., Path]
 # histogram, and errors.
 NUM_CHARTS = 21
 WIDTHS_PX = (320, 390, 768, 1280)
+# Figures whose data can be downloaded: the columns of the file, and how many rows it has at least.
+DOWNLOADS = {
+    "scale_candidates": ("panel,series,time_s,candidate_m_per_unit", 100),
+    "scale_consensus": ("panel,series,scale_m_per_unit,ranges", 100),
+    "trajectory": ("panel,series,x_m,y_m", 100),
+    "range_residuals": ("time_s,anchor_id,range_m,residual_scaled_m,residual_refined_m,status", 1000),
+    "absolute_range_errors": (
+        "time_s,anchor_id,range_m,range_by_reference_m,error_scaled_m,error_refined_m",
+        1000,
+    ),
+    "map_points": ("x_m,y_m,z_m,red,green,blue", 1000),
+}
 EVIL = "</script><script>document.title = 'broken out'</script>"
 HOSTILE = (
     EVIL,
@@ -90,57 +102,147 @@ def test_an_error_on_the_console_and_a_request_are_noticed(browser: Browser, tmp
     assert "file:///nowhere.png" in browser.requests()
 
 
-def test_it_opens_with_all_figures_a_silent_console_and_no_request(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    browser.draw_figures()
-    assert browser.console() == []
-    assert {url for url in browser.requests() if not url.startswith("data:")} == {page.as_uri()}
-    assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
-    assert browser.run("return document.title").startswith("a survey & more")
-
-
-def test_whatever_is_pointed_at_or_clicked_the_console_stays_silent(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    browser.draw_figures()
-    browser.run("for (const details of document.querySelectorAll('details')) details.open = true")
-    assert browser.run(POINT_AT_FIGURES) == NUM_CHARTS
-    num_clicked = browser.run(
-        "window.files = []; HTMLAnchorElement.prototype.click = function () { files.push(this.download); };"
-        "const controls = document.querySelectorAll('button, input, summary, a[href^=\"#\"]');"
-        "for (const control of controls) control.dispatchEvent(new MouseEvent('click', {bubbles: true}));"
-        "return controls.length"
+def place_in(browser: Browser, chart: str, x: float, y: float) -> tuple[float, float]:
+    """Return the window position of a point in a chart's data."""
+    browser.run(f"{chart}.node.scrollIntoView({{block: 'center'}})")
+    browser.wait_for(f"{chart}.view")
+    left, top = browser.run(
+        f"const {{node, view, spec}} = {chart}, box = node.getBoundingClientRect(), {{left, top}} = spec.padding;"
+        "return [box.x + left + view.scale('x')(arguments[0]), box.y + top + view.scale('y')(arguments[1])]",
+        x,
+        y,
     )
-    browser.draw_frame()
-    buttons = browser.run("return [...document.querySelectorAll('button.csv')].map(x => `${x.dataset.figure}.csv`)")
-    assert num_clicked > len(buttons) > 10
-    assert browser.run("return files") == buttons
-    assert browser.console() == []
+    return float(left), float(top)
 
 
-def test_it_draws_in_the_readers_theme(browser: Browser, page: Path) -> None:
+class TestOpened:
+    """The page opened once, all unfolded and drawn; the last test clicks on everything."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def opened(cls, browser: Browser, page: Path) -> Browser:
+        browser.open(page)
+        browser.draw_figures()
+        return browser
+
+    def test_it_opens_with_all_figures_a_silent_console_and_no_request(self, opened: Browser, page: Path) -> None:
+        assert opened.console() == []
+        assert {url for url in opened.requests() if not url.startswith("data:")} == {page.as_uri()}
+        assert opened.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
+        assert opened.run("return document.title").startswith("a survey & more")
+
+    def test_every_control_has_a_name(self, opened: Browser) -> None:
+        nameless = """
+        return [...document.querySelectorAll("button, a, input, img, canvas, .chart")].filter(node =>
+          !(node.ariaLabel || node.alt || node.textContent.trim() || (node.labels && node.labels[0].textContent.trim()))
+        ).filter(node => node.checkVisibility()).map(node => node.outerHTML)
+        """
+        assert opened.run(nameless) == []
+
+    def test_the_data_of_figures_are_downloads(self, opened: Browser) -> None:
+        for figure, (header, min_num_rows) in DOWNLOADS.items():
+            rows = downloaded(opened, figure)
+            assert rows[0] == header.split(",")
+            assert len(rows) > min_num_rows
+            assert opened.run("return window.fileName") == f"{figure}.csv"
+        assert opened.console() == []
+
+    def test_a_figures_data_are_those_of_the_result(self, opened: Browser, page: Path) -> None:
+        rows = opened.run("return [...rangesfmFigures.scale_consensus[0].rows()].map(Object.values)")
+        lines = (page.parent / "scale_consensus.csv").read_text().splitlines()[1:]
+        expected = [[float(cell) for cell in line.split(",")] for line in lines]
+        np.testing.assert_allclose([row[1:] for row in rows], expected, rtol=1e-6)
+
+    def test_the_pointer_tells_the_values_of_what_is_nearest(self, opened: Browser) -> None:
+        chart = "rangesfmFigures.scale_consensus[0]"
+        _, scale, num_agreeing = opened.run(f"return Object.values([...{chart}.rows()][50])")
+        x, y = place_in(opened, chart, scale, num_agreeing)
+        opened.command("Input.dispatchMouseEvent", type="mouseMoved", x=x + 2, y=y - 2)
+        said = opened.run(f"return {chart}.tip.checkVisibility() && {chart}.tip.textContent")
+        assert said == f"ranges that agree · scale m per unit {scale:.5g} · ranges {num_agreeing:.0f}"
+        opened.command("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
+        assert not opened.run(f"return {chart}.tip.checkVisibility()")
+
+    def test_the_pointer_names_the_mark_that_is_drawn_under_it(self, opened: Browser) -> None:
+        opened.run("document.querySelector('#trajectory').scrollIntoView({block: 'center'})")
+        opened.wait_for("rangesfmFigures.trajectory[1].view")
+        for i in (0, 3, 7):
+            x, y = opened.run(
+                "const mark = document.querySelectorAll('#trajectory .chart')[1].querySelectorAll('.mark-symbol path');"
+                "const box = mark[arguments[0]].getBoundingClientRect();"
+                "return [box.x + box.width / 2, box.y + box.height / 2]",
+                i,
+            )
+            opened.command("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+            tip, shown_x, shown_y = opened.run(
+                "const {tip, node} = rangesfmFigures.trajectory[1], box = node.getBoundingClientRect();"
+                "return [tip.textContent, box.x + parseFloat(tip.style.left), box.y + parseFloat(tip.style.top)]"
+            )
+            assert tip.startswith("anchor ")
+            assert (shown_x, shown_y) == pytest.approx((x, y), abs=2.0)
+
+    def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(self, opened: Browser) -> None:
+        chart = "rangesfmFigures.scale_candidates[0]"
+
+        def domain() -> list[float]:
+            opened.draw_frame()
+            low, high = opened.run(f"return {chart}.view.scale('x').domain()")
+            return [low, high]
+
+        whole = domain()
+        x, y = place_in(opened, chart, 95.0, 1.0)
+        wheel = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -240}
+        opened.command("Input.dispatchMouseEvent", **wheel, modifiers=2)  # the Ctrl key
+        near = domain()
+        assert near[1] - near[0] < 0.8 * (whole[1] - whole[0])
+        opened.drag((x, y), (x + 80, y))
+        moved = domain()
+        assert moved[0] < near[0]
+        assert moved[1] - moved[0] == pytest.approx(near[1] - near[0])
+        for clicks in (1, 2):
+            for kind in ("mousePressed", "mouseReleased"):
+                opened.command("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=clicks)
+        assert domain() == pytest.approx(whole)
+        top = opened.run("return scrollY")
+        opened.command("Input.dispatchMouseEvent", **(wheel | {"deltaY": 240}))
+        opened.wait_for(f"scrollY > {top}")
+        assert domain() == pytest.approx(whole)
+
+    def test_whatever_is_pointed_at_or_clicked_the_console_stays_silent(self, opened: Browser) -> None:
+        assert opened.run(POINT_AT_FIGURES) == NUM_CHARTS
+        num_clicked = opened.run(
+            "window.files = []; HTMLAnchorElement.prototype.click = function () { files.push(this.download); };"
+            "const controls = document.querySelectorAll('button, input, summary, a[href^=\"#\"]');"
+            "for (const control of controls) control.dispatchEvent(new MouseEvent('click', {bubbles: true}));"
+            "return controls.length"
+        )
+        opened.draw_frame()
+        buttons = opened.run("return [...document.querySelectorAll('button.csv')].map(x => `${x.dataset.figure}.csv`)")
+        assert num_clicked > len(buttons) > 10
+        assert opened.run("return files") == buttons
+        assert opened.console() == []
+
+
+@pytest.mark.parametrize(("theme", "other"), [("light", "dark"), ("dark", "light")])
+def test_it_draws_in_the_readers_theme_and_every_text_is_readable(
+    browser: Browser, page: Path, theme: str, other: str
+) -> None:
     colors = {
         "light": ((194, 87, 12), (29, 95, 209), (162, 28, 175)),  # the scaled path, the refined path, the anchors
         "dark": ((251, 154, 80), (121, 169, 255), (229, 138, 242)),
     }
-    for theme, other in (("light", "dark"), ("dark", "light")):
-        browser.open(page, theme=theme)
-        browser.draw_figures()
-        picture = browser.picture("#trajectory")
-        assert all(num_pixels(picture, color) > 50 for color in colors[theme])
-        assert not any(num_pixels(picture, color) > 10 for color in colors[other])
-        assert (np.median(picture) > 200) == (theme == "light")
+    browser.open(page, theme=theme)
+    browser.draw_figures()
+    picture = browser.picture("#trajectory")
+    assert all(num_pixels(picture, color) > 50 for color in colors[theme])
+    assert not any(num_pixels(picture, color) > 10 for color in colors[other])
+    assert (np.median(picture) > 200) == (theme == "light")
+    assert browser.run(CONTRASTS) == []
 
 
 def num_pixels(picture: Pixels, color: tuple[int, int, int]) -> int:
     """Count the pixels that have nearly this colour."""
     return int((np.abs(picture - color).max(axis=2) < 8).sum())
-
-
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_every_text_is_readable(browser: Browser, page: Path, theme: str) -> None:
-    browser.open(page, theme=theme)
-    browser.draw_figures()
-    assert browser.run(CONTRASTS) == []
 
 
 def test_unreadable_text_is_noticed(browser: Browser, tmp_path: Path) -> None:
@@ -150,21 +252,64 @@ def test_unreadable_text_is_noticed(browser: Browser, tmp_path: Path) -> None:
     assert [text for text, _ in browser.run(CONTRASTS)] == ["pale"]
 
 
-@pytest.mark.parametrize("width", WIDTHS_PX)
-def test_it_never_scrolls_sideways(browser: Browser, page: Path, width: int) -> None:
-    browser.open(page, width=width)
+def test_it_never_scrolls_sideways(browser: Browser, page: Path) -> None:
+    """The window is made narrower and narrower, as when a reader changes its size."""
+    browser.open(page, width=max(WIDTHS_PX))
     browser.draw_figures()
-    assert browser.run("return [innerWidth, document.documentElement.scrollWidth]") == [width, width]
+    for width in sorted(WIDTHS_PX, reverse=True):
+        browser.resize(width)
+        browser.wait_for(f"innerWidth === {width} && document.documentElement.scrollWidth === {width}")
 
 
-def test_every_control_has_a_name(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    nameless = """
-    return [...document.querySelectorAll("button, a, input, img, canvas, .chart")].filter(node =>
-      !(node.ariaLabel || node.alt || node.textContent.trim() || (node.labels && node.labels[0].textContent.trim()))
-    ).filter(node => node.checkVisibility()).map(node => node.outerHTML)
-    """
-    assert browser.run(nameless) == []
+class TestFolded:
+    """The page opened once, folded as it is when it is opened; each test leaves it so."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def opened(cls, browser: Browser, page: Path) -> Browser:
+        browser.open(page, is_unfolded=False)
+        return browser
+
+    def test_one_screen_answers_what_a_client_asks(self, opened: Browser) -> None:
+        for shown in ("h1", "#verdict .figure", ".stage canvas", "[name=measure]", ".facts > :last-child"):
+            bottom = opened.run("return document.querySelector(arguments[0]).getBoundingClientRect().bottom", shown)
+            assert 0 < bottom <= 900, shown
+        folded = opened.run("return [...document.querySelectorAll('details:not([open])')].map(section => section.id)")
+        assert folded == [
+            "view-section",
+            "checks",
+            "path",
+            "scale",
+            "ranges",
+            "anchors",
+            "mistakes",
+            "candidates",
+            "run",
+        ]
+        assert not opened.run("return document.querySelector('#ranges .chart').checkVisibility()")
+        assert opened.run("return document.querySelector('#found table').checkVisibility()")
+
+    def test_a_folded_section_shows_its_figures_as_wide_as_it_is(self, opened: Browser) -> None:
+        opened.wait_for("Object.values(rangesfmFigures).flat().every(chart => chart.view)")  # drawn while folded
+        opened.run("document.querySelector('#ranges summary').click()")
+        opened.draw_frame()
+        widths = opened.run(
+            "return rangesfmFigures.range_residuals.map("
+            "({node}) => [node, node.querySelector('svg')].map(element => element.clientWidth))"
+        )
+        assert all(room > 200 and drawn == pytest.approx(room, abs=1) for room, drawn in widths)
+        opened.run("document.querySelector('#ranges summary').click()")
+
+    def test_paper_has_all_but_the_appendix_unfolded(self, opened: Browser) -> None:
+        unfolded = "return [...document.querySelectorAll('details[open]')].map(section => section.id)"
+        opened.run("dispatchEvent(new Event('beforeprint'))")
+        assert opened.run(unfolded) == ["view-section", "checks", "path", "scale", "ranges", "anchors"]
+        opened.run("dispatchEvent(new Event('afterprint'))")
+        assert opened.run(unfolded) == []
+        a4 = {"paperWidth": 8.27, "paperHeight": 11.69, "printBackground": True}
+        pdf = base64.b64decode(opened.command("Page.printToPDF", **a4)["data"])
+        assert len(re.findall(rb"/Type */Page\b", pdf)) <= 9
+        assert opened.console() == []
 
 
 def test_names_from_files_cannot_break_out(
@@ -172,7 +317,7 @@ def test_names_from_files_cannot_break_out(
 ) -> None:
     photos = (*HOSTILE, "constructor", "1.jpg", "2.jpg")
     monkeypatch.setattr("tests.report.conftest._names", lambda num: photos[:num])
-    folder = make_result(anchor_ids=HOSTILE, num_keyframes=len(photos), num_ranges_per_anchor=30)
+    folder = make_result(anchor_ids=HOSTILE, num_keyframes=len(photos), num_ranges_per_anchor=30, num_points=500)
     for table in ("ranges.csv", "scale_candidates.csv", "images.csv"):
         assert EVIL in (folder / table).read_text()
     path = write_report(folder)
@@ -192,147 +337,6 @@ def test_names_from_files_cannot_break_out(
     assert {url for url in browser.requests() if not url.startswith("data:")} == {path.as_uri()}
     rows = downloaded(browser, "range_residuals")[1:]
     assert {row[1] for row in rows} == {*HOSTILE[:-1], f"'{HOSTILE[-1]}"}
-
-
-@pytest.mark.parametrize(
-    ("figure", "header", "min_num_rows"),
-    [
-        ("scale_candidates", "panel,series,time_s,candidate_m_per_unit", 100),
-        ("scale_consensus", "panel,series,scale_m_per_unit,ranges", 100),
-        ("trajectory", "panel,series,x_m,y_m", 100),
-        ("range_residuals", "time_s,anchor_id,range_m,residual_scaled_m,residual_refined_m,status", 1000),
-        ("absolute_range_errors", "time_s,anchor_id,range_m,range_by_reference_m,error_scaled_m,error_refined_m", 1000),
-        ("map_points", "x_m,y_m,z_m,red,green,blue", 1000),
-    ],
-)
-def test_the_data_of_figures_are_downloads(
-    browser: Browser, page: Path, figure: str, header: str, min_num_rows: int
-) -> None:
-    browser.open(page)
-    rows = downloaded(browser, figure)
-    assert rows[0] == header.split(",")
-    assert len(rows) > min_num_rows
-    assert browser.run("return window.fileName") == f"{figure}.csv"
-    assert browser.console() == []
-
-
-def test_a_figures_data_are_those_of_the_result(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    rows = browser.run("return [...rangesfmFigures.scale_consensus[0].rows()].map(Object.values)")
-    lines = (page.parent / "scale_consensus.csv").read_text().splitlines()[1:]
-    expected = [[float(cell) for cell in line.split(",")] for line in lines]
-    np.testing.assert_allclose([row[1:] for row in rows], expected, rtol=1e-6)
-
-
-def place_in(browser: Browser, chart: str, x: float, y: float) -> tuple[float, float]:
-    """Return the window position of a point in a chart's data."""
-    browser.run(f"{chart}.node.scrollIntoView({{block: 'center'}})")
-    browser.wait_for(f"{chart}.view")
-    left, top = browser.run(
-        f"const {{node, view, spec}} = {chart}, box = node.getBoundingClientRect(), {{left, top}} = spec.padding;"
-        "return [box.x + left + view.scale('x')(arguments[0]), box.y + top + view.scale('y')(arguments[1])]",
-        x,
-        y,
-    )
-    return float(left), float(top)
-
-
-def test_the_pointer_tells_the_values_of_what_is_nearest(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    chart = "rangesfmFigures.scale_consensus[0]"
-    _, scale, num_agreeing = browser.run(f"return Object.values([...{chart}.rows()][50])")
-    x, y = place_in(browser, chart, scale, num_agreeing)
-    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x + 2, y=y - 2)
-    said = browser.run(f"return {chart}.tip.checkVisibility() && {chart}.tip.textContent")
-    assert said == f"ranges that agree · scale m per unit {scale:.5g} · ranges {num_agreeing:.0f}"
-    browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
-    assert not browser.run(f"return {chart}.tip.checkVisibility()")
-
-
-def test_the_pointer_names_the_mark_that_is_drawn_under_it(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    browser.run("document.querySelector('#trajectory').scrollIntoView({block: 'center'})")
-    browser.wait_for("rangesfmFigures.trajectory[1].view")
-    for i in (0, 3, 7):
-        x, y = browser.run(
-            "const mark = document.querySelectorAll('#trajectory .chart')[1].querySelectorAll('.mark-symbol path');"
-            "const box = mark[arguments[0]].getBoundingClientRect();"
-            "return [box.x + box.width / 2, box.y + box.height / 2]",
-            i,
-        )
-        browser.command("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        tip, shown_x, shown_y = browser.run(
-            "const {tip, node} = rangesfmFigures.trajectory[1], box = node.getBoundingClientRect();"
-            "return [tip.textContent, box.x + parseFloat(tip.style.left), box.y + parseFloat(tip.style.top)]"
-        )
-        assert tip.startswith("anchor ")
-        assert (shown_x, shown_y) == pytest.approx((x, y), abs=2.0)
-
-
-def test_a_wheel_with_a_key_zooms_a_drag_moves_and_a_double_click_goes_back(browser: Browser, page: Path) -> None:
-    browser.open(page)
-    chart = "rangesfmFigures.scale_candidates[0]"
-
-    def domain() -> list[float]:
-        browser.draw_frame()
-        low, high = browser.run(f"return {chart}.view.scale('x').domain()")
-        return [low, high]
-
-    browser.draw_figures()
-    whole = domain()
-    x, y = place_in(browser, chart, 95.0, 1.0)
-    wheel = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -240}
-    browser.command("Input.dispatchMouseEvent", **wheel, modifiers=2)  # the Ctrl key
-    near = domain()
-    assert near[1] - near[0] < 0.8 * (whole[1] - whole[0])
-    browser.drag((x, y), (x + 80, y))
-    moved = domain()
-    assert moved[0] < near[0]
-    assert moved[1] - moved[0] == pytest.approx(near[1] - near[0])
-    for clicks in (1, 2):
-        for kind in ("mousePressed", "mouseReleased"):
-            browser.command("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=clicks)
-    assert domain() == pytest.approx(whole)
-    top = browser.run("return scrollY")
-    browser.command("Input.dispatchMouseEvent", **(wheel | {"deltaY": 240}))
-    browser.wait_for(f"scrollY > {top}")
-    assert domain() == pytest.approx(whole)
-
-
-def test_one_screen_answers_what_a_client_asks(browser: Browser, page: Path) -> None:
-    browser.open(page, is_unfolded=False)
-    for shown in ("h1", "#verdict .figure", ".stage canvas", "[name=measure]", ".facts > :last-child"):
-        bottom = browser.run("return document.querySelector(arguments[0]).getBoundingClientRect().bottom", shown)
-        assert 0 < bottom <= 900, shown
-    folded = browser.run("return [...document.querySelectorAll('details:not([open])')].map(section => section.id)")
-    assert folded == ["view-section", "checks", "path", "scale", "ranges", "anchors", "mistakes", "candidates", "run"]
-    assert not browser.run("return document.querySelector('#ranges .chart').checkVisibility()")
-    assert browser.run("return document.querySelector('#found table').checkVisibility()")
-
-
-def test_a_folded_section_shows_its_figures_as_wide_as_it_is(browser: Browser, page: Path) -> None:
-    browser.open(page, is_unfolded=False)
-    browser.wait_for("Object.values(rangesfmFigures).flat().every(chart => chart.view)")  # drawn while folded
-    browser.run("document.querySelector('#ranges summary').click()")
-    browser.draw_frame()
-    widths = browser.run(
-        "return rangesfmFigures.range_residuals.map("
-        "({node}) => [node, node.querySelector('svg')].map(element => element.clientWidth))"
-    )
-    assert all(room > 200 and drawn == pytest.approx(room, abs=1) for room, drawn in widths)
-
-
-def test_paper_has_all_but_the_appendix_unfolded(browser: Browser, page: Path) -> None:
-    browser.open(page, is_unfolded=False)
-    unfolded = "return [...document.querySelectorAll('details[open]')].map(section => section.id)"
-    browser.run("dispatchEvent(new Event('beforeprint'))")
-    assert browser.run(unfolded) == ["view-section", "checks", "path", "scale", "ranges", "anchors"]
-    browser.run("dispatchEvent(new Event('afterprint'))")
-    assert browser.run(unfolded) == []
-    a4 = {"paperWidth": 8.27, "paperHeight": 11.69, "printBackground": True}
-    pdf = base64.b64decode(browser.command("Page.printToPDF", **a4)["data"])
-    assert len(re.findall(rb"/Type */Page\b", pdf)) <= 9
-    assert browser.console() == []
 
 
 def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser, Pixels
 
 MakeResult = Callable[..., Path]
-WIDTHS_PX = (390, 1280)
+PHONE_PX, DESKTOP_PX = 390, 1280
 REFINED, SCALED = (29, 95, 209), (194, 87, 12)
 NUM_KEYFRAMES = 40
 CENTER = "Array.from(rangesfmView.path.centers.subarray(3 * ({0}), 3 * ({0}) + 3))"
@@ -37,10 +37,14 @@ def page(tmp_path_factory: pytest.TempPathFactory, make_shared_result: MakeResul
     )
 
 
-@pytest.fixture(params=WIDTHS_PX)
-def opened(request: pytest.FixtureRequest, browser: Browser, page: Path) -> Browser:
-    """The page on a phone and on a desktop, scrolled to the view."""
-    browser.open(page, width=request.param)
+@pytest.fixture
+def opened(browser: Browser, page: Path) -> Browser:
+    """The page on a desktop, scrolled to the view."""
+    return open_view(browser, page, DESKTOP_PX)
+
+
+def open_view(browser: Browser, page: Path, width: int) -> Browser:
+    browser.open(page, width=width)
     browser.run("document.querySelector('.stage').scrollIntoView({block: 'center'})")
     browser.wait_for("window.rangesfmView && rangesfmView.stage")
     return browser
@@ -67,29 +71,60 @@ def text_of(browser: Browser, selector: str) -> str:
     return str(browser.run("return document.querySelector(arguments[0]).textContent", selector))
 
 
-def test_points_cameras_and_anchors_are_drawn_and_layers_take_them_away(opened: Browser) -> None:
-    full = opened.picture(".stage canvas")
+def test_layers_take_away_what_is_drawn(opened: Browser) -> None:
+    before = full = opened.picture(".stage canvas")
     assert np.std(full) > 5
-    assert num_pixels(full, REFINED) > 30
-    assert num_pixels(full, SCALED) > 30
+    for color in (REFINED, SCALED):
+        assert num_pixels(full, color) > 30
     for layer in ("points", "refined", "scaled"):
-        before = opened.picture(".stage canvas")
         toggle(opened, "layer", layer)
-        assert np.any(opened.picture(".stage canvas") != before)
-    assert num_pixels(opened.picture(".stage canvas"), SCALED) < 5
+        after = opened.picture(".stage canvas")
+        assert np.any(after != before)
+        before = after
+    assert num_pixels(before, SCALED) < 5
     toggle(opened, "layer", "anchors")
-    opened.picture(".stage canvas")
+    opened.draw_frame()
     assert opened.run("return [...document.querySelectorAll('.label.anchor')].every(label => !label.checkVisibility())")
     assert opened.console() == []
 
 
-def test_the_grid_and_the_scale_bar_are_round_lengths(opened: Browser) -> None:
-    assert re.fullmatch(r"grid [125]0* c?m", text_of(opened, ".grid-cell"))
-    bar = text_of(opened, ".scale-bar")
-    assert re.fullmatch(r"[125]0* c?m", bar)
-    length = float(bar.split()[0]) / (100 if bar.endswith("cm") else 1)
-    drawn = opened.run("return parseFloat(document.querySelector('.scale-bar').style.width)")
-    assert drawn * opened.run("return rangesfmView.stage.metresPerPixel()") == pytest.approx(length, rel=0.01)
+class TestOnAPhone:
+    """The page opened once; no test changes what the next one looks at."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def phone(cls, browser: Browser, page: Path) -> Browser:
+        return open_view(browser, page, PHONE_PX)
+
+    def test_both_paths_are_drawn_without_a_word_on_the_console(self, phone: Browser) -> None:
+        picture = phone.picture(".stage canvas")
+        assert num_pixels(picture, REFINED) > 30
+        assert num_pixels(picture, SCALED) > 30
+        assert phone.console() == []
+
+    def test_the_grid_and_the_scale_bar_are_round_lengths(self, phone: Browser) -> None:
+        assert re.fullmatch(r"grid [125]0* c?m", text_of(phone, ".grid-cell"))
+        bar = text_of(phone, ".scale-bar")
+        assert re.fullmatch(r"[125]0* c?m", bar)
+        length = float(bar.split()[0]) / (100 if bar.endswith("cm") else 1)
+        drawn = phone.run("return parseFloat(document.querySelector('.scale-bar').style.width)")
+        assert drawn * phone.run("return rangesfmView.stage.metresPerPixel()") == pytest.approx(length, rel=0.01)
+
+    def test_points_stand_where_the_map_has_them(self, phone: Browser) -> None:
+        """The tolerance covers the resolution in which points are packed, a fraction of a millimetre."""
+        low, high = phone.run(
+            "const num = rangesfmView.scene.points.num;"
+            "const all = Array.from({length: num}, (_, i) => rangesfmView.pointAt(i));"
+            "return [Math.min, Math.max].map("
+            "f => [0, 1, 2].map(axis => all.reduce((m, p) => f(m, p[axis]), all[0][axis])))"
+        )
+        # The made-up result is a room with walls at these places, with noise.
+        origin = phone.run("return rangesfmView.scene.origin")
+        assert np.add(low, origin) == pytest.approx(np.array((-2.4, -2.9, 0.0)), abs=0.1)
+        assert np.add(high, origin) == pytest.approx(np.array((2.4, 2.9, 2.3)), abs=0.1)
+
+    def test_a_click_on_a_camera_shows_its_photo_and_its_ranges(self, phone: Browser) -> None:
+        assert_a_click_shows_the_photo(phone)
 
 
 def test_ranges_are_filtered_by_status_and_photo(opened: Browser) -> None:
@@ -113,6 +148,10 @@ def test_ranges_are_filtered_by_status_and_photo(opened: Browser) -> None:
 
 
 def test_a_click_on_a_camera_shows_its_photo_and_its_ranges(opened: Browser) -> None:
+    assert_a_click_shows_the_photo(opened)
+
+
+def assert_a_click_shows_the_photo(opened: Browser) -> None:
     wanted = 11
     opened.run("rangesfmView.look('plan')")
     opened.picture(".stage canvas")
@@ -218,19 +257,6 @@ def test_a_drag_turns_the_view_and_chooses_nothing(opened: Browser) -> None:
     opened.drag((x, y), (x + 60, y + 20))
     assert np.any(opened.picture(".stage canvas") != before)
     assert opened.run("return rangesfmView.chosen") == chosen
-
-
-def test_points_stand_where_the_map_has_them(opened: Browser) -> None:
-    """The tolerance covers the resolution in which points are packed, a fraction of a millimetre."""
-    low, high = opened.run(
-        "const num = rangesfmView.scene.points.num;"
-        "const all = Array.from({length: num}, (_, i) => rangesfmView.pointAt(i));"
-        "return [Math.min, Math.max].map(f => [0, 1, 2].map(axis => all.reduce((m, p) => f(m, p[axis]), all[0][axis])))"
-    )
-    # The made-up result is a room with walls at these places, with noise.
-    origin = opened.run("return rangesfmView.scene.origin")
-    assert np.add(low, origin) == pytest.approx(np.array((-2.4, -2.9, 0.0)), abs=0.1)
-    assert np.add(high, origin) == pytest.approx(np.array((2.4, 2.9, 2.3)), abs=0.1)
 
 
 def test_in_the_coordinates_of_a_national_grid_all_stands_where_it_is_to_a_millimetre(
