@@ -162,9 +162,8 @@ def test_interrupted_it_stops_its_workers_and_says_how_far_it_came(surveys: Path
     assert left_over(surveys) == []
 
 
-@pytest.mark.parametrize("is_refined", [True, False])
-def test_a_survey_may_begin_with_a_model(is_refined: bool, own_survey: WalkedSurvey, rangesfm_process: Command) -> None:
-    text = f"""
+def test_surveys_may_begin_with_a_model(own_survey: WalkedSurvey, rangesfm_process: Command) -> None:
+    text = """
         [images]
         model = "sparse/0"
         times = "images.csv"
@@ -172,18 +171,19 @@ def test_a_survey_may_begin_with_a_model(is_refined: bool, own_survey: WalkedSur
         path = "uwb.csv"
         time_offset = 2.0
         [anchors]
-        path = "anchors.csv"
-        [scale]
-        max_relative_stddev = 0.1
-        [refine]
-        enabled = {str(is_refined).lower()}
+        path = "anchors_first_camera.csv"
+        frame = "first_camera"
         [report]
         enabled = false
     """
-    (own_survey.folder / "survey.toml").write_text(text)
-    done = rangesfm_process("batch", "survey.toml", cwd=own_survey.folder)
-    assert rows_of(own_survey.folder)["survey.toml"]["status"] == "done", done.stderr
-    assert (own_survey.folder / "out" / "sparse_metric" / "0").is_dir() == is_refined
+    for name, is_refined in (("refined", "true"), ("scaled", "false")):
+        own = f'[refine]\nenabled = {is_refined}\n[output]\npath = "{name}"\n'
+        (own_survey.folder / f"{name}.toml").write_text(text + own)
+    done = rangesfm_process("batch", "refined.toml", "scaled.toml", "--num_workers", "1", cwd=own_survey.folder)
+    assert [row["status"] for row in rows_of(own_survey.folder).values()] == ["done", "done"], done.stderr
+    assert (own_survey.folder / "refined" / "sparse_metric" / "0").is_dir()
+    assert (own_survey.folder / "scaled" / "sparse_scaled" / "0").is_dir()
+    assert not (own_survey.folder / "scaled" / "sparse_metric").exists()
 
 
 def test_two_surveys_with_one_folder_are_refused_before_anything_starts(
