@@ -95,7 +95,7 @@ def test_a_photo_of_two_tables_or_a_table_of_no_photo_is_one_line(photos: Photos
 def test_mapping_keeps_the_camera_of_one_table_and_refines_that_of_another(room: Room, tmp_path: Path) -> None:
     known = room.camera.changed(images="photo00[0-2]*", focal_length_stddev_px=0.0)
     tables = CameraOptions(model="SIMPLE_PINHOLE", others=(known,))
-    mapper = MapperOptions(features={"sift": {"max_num_features": 250}})
+    mapper = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}})
     (model,) = reconstruct(room.folder, room.names, tmp_path, camera=tables, mapper=mapper).models
     of_photo = {image.name: model.camera(image.camera_id) for image in model.images.values()}
     assert tuple(of_photo[room.names[0]].params) == room.camera.params
@@ -120,7 +120,7 @@ def test_photos_of_other_sizes_and_turned_ones_take_their_place_on_the_path(
             size = (200, 150) if index == 2 else photo.size
             resized = photo.resize(size, Image.Resampling.LANCZOS)
             (resized.transpose(Image.Transpose.ROTATE_90) if index == 4 else resized).save(tmp_path / name)
-    mapper = MapperOptions(features={"sift": {"max_num_features": 400}})
+    mapper = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 400}})
     summary = reconstruct(tmp_path, room.names, tmp_path / "out", camera=room.camera, mapper=mapper, progress=listener)
     assert summary.num_registered == len(room.names)
     (model,) = summary.models

@@ -24,7 +24,7 @@ from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
-MAPPER = MapperOptions(features={"sift": {"max_num_features": 250}}, num_threads=2)
+MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}, num_threads=2)
 PROGRAM = """
 import os, pathlib, sys, pycolmap
 assert pathlib.Path(sys.argv[1]).is_dir() and "OPENBLAS_NUM_THREADS" not in os.environ

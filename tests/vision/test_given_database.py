@@ -22,7 +22,7 @@ from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
-FEATURES = {"sift": {"max_num_features": 250}}
+FEATURES = {"sift": {"first_octave": 0, "max_num_features": 250}}
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from rangesfm.vision.reconstruct import reconstruct
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
-MAPPER = MapperOptions(features={"sift": {"max_num_features": 400}})
+MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 400}})
 NUM_PHOTOS = 12
 ALL = {"features": NUM_PHOTOS, "matching": NUM_PHOTOS * (NUM_PHOTOS - 1) // 2}
 PROGRAM = """
@@ -37,7 +37,7 @@ class Printer:
     def message(self, text): pass
 
 images, output, *params = sys.argv[1:]
-mapper = MapperOptions(features={"sift": {"max_num_features": 400}})
+mapper = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 400}})
 camera = CameraOptions(model="SIMPLE_PINHOLE", params=tuple(map(float, params)))
 try:
     reconstruct(images, list_images(images), output, camera=camera, mapper=mapper, progress=Printer())

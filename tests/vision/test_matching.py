@@ -36,7 +36,7 @@ def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFa
     photos = usable_photos(room.folder, room.names)
     cameras = cameras_of_photos(room.camera, photos)
     create_database(room.folder / "database.db", room.names, cameras.cameras, cameras.of_photo)
-    options = feature_options(MapperOptions(features={"sift": {"max_num_features": 250}}))
+    options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}))
     extract_features(room.folder / "database.db", photos, options, room.folder / "features.log", SilentProgress())
     return photos
 

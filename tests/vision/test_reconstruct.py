@@ -26,7 +26,7 @@ from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
-FEATURES = {"sift": {"max_num_features": 250}}  # enough for these photos, and quick
+FEATURES = {"sift": {"first_octave": 0, "max_num_features": 250}}  # enough for these photos, and quick
 MAPPER = MapperOptions(features=FEATURES)
 
 
@@ -349,7 +349,7 @@ class TestOtherPhotos:
     def test_with_other_options_start_from_nothing(
         self, room: Room, output: Path, tmp_path: Path, listener: Listener
     ) -> None:
-        mapper = MapperOptions(features={"sift": {"max_num_features": 200}})
+        mapper = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 200}})
         reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=mapper, progress=listener)
         assert not listener.messages
         assert listener.stages == ["features", "matching", "mapping"]

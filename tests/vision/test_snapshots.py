@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
 # One thread: with more, COLMAP starts from whichever pair is ready first.
-MAPPER = MapperOptions(features={"sift": {"max_num_features": 250}}, num_threads=1)
+MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}, num_threads=1)
 NUM_PHOTOS = 13
 
 

@@ -44,7 +44,7 @@ def database(room: Room) -> Path:
     cameras = cameras_of_photos(room.camera, photos)
     path = room.folder / "alike.db"
     create_database(path, room.names, cameras.cameras, cameras.of_photo)
-    options = feature_options(MapperOptions(features={"sift": {"max_num_features": 400}}))
+    options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 400}}))
     extract_features(path, photos, options, path.with_name("mapper.log"), SilentProgress())
     return path
 

@@ -21,7 +21,7 @@ from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
-MAPPER = MapperOptions(features={"sift": {"max_num_features": 250}}, num_threads=2)
+MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}, num_threads=2)
 
 
 @pytest.fixture(scope="module")
