@@ -409,7 +409,8 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     try:
         if (of_ranges := _diagnose(survey, on_map)) is not None:
             diagnosis = of_ranges.with_more(diagnosis)
-            of_place = (*(of_ranges.reasons if any(test.rejected for test in of_ranges.tests) else ()), *of_place)
+            if any(cause.correction.anchors_m for cause in of_ranges.causes):  # the anchors are elsewhere
+                of_place = (causes_in_words(of_ranges.causes), *of_place)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not tested, because the ranges determine too little: {error}")
     journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *diagnosis.reasons)
