@@ -134,7 +134,8 @@ def _expected_curve(
     bins: RangeBins, error_m: Array, knots: Array, noise_m: float, num_anchors: int
 ) -> tuple[Array, Array, Array]:
     """Return the (k,) expected curve at knots, given the errors (c,) of bins, its stddev, and the (m,) biases."""
-    expected, nothing = ExpectedErrors.of(bins), np.zeros((len(bins), 1))
+    # Errors off the anchors' axes are alike at all anchors: the curve has them, and each survey expects its own anew.
+    expected, nothing = ExpectedErrors.of(bins, ruled_out=("off_axis",)), np.zeros((len(bins), 1))
     learned = expected.learnt(error_m, nothing, np.ones((1, 1)), noise_m)
     total = learned.covariance_m2
     factor = cho_factor(total + ROUNDING * np.trace(total) * np.eye(len(total)))
