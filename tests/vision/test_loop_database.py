@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from tests.simulated.looped import LoopedSurvey, two_laps, write_matches
 
+from rangesfm.colmap.transform import joined_model, without_photos
 from rangesfm.files.output_folder import OutputFolder, sole_writer
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.loop_database import LoopDatabase, forget_loops
@@ -51,3 +52,17 @@ def test_the_record_notes_loops_until_they_are_forgotten(looped: LoopedSurvey, t
         forget_loops(steps, again.path)
         assert pairs_in(again.path) == looped.matches.keys() - set(others)
         assert not steps.notes["loops"]
+
+
+def test_photos_whose_models_found_different_cameras_cannot_be_matched_together(
+    looped: LoopedSurvey, tmp_path: Path
+) -> None:
+    write_matches(tmp_path / DATABASE_NAME, looped.truth, looped.matches, with_descriptors=True)
+    names = list(looped.survey.model.timestamps_s)
+    halves = [without_photos(looped.truth, others) for others in (names[6:], names[:6])]
+    lens = halves[1].camera(1)
+    lens.params = 1.01 * lens.params
+    with sole_writer(tmp_path) as output:
+        database = copied(output)
+        assert database.why_unfit(joined_model(halves, is_of_one_database=True)) is None
+        assert "frame_00007.jpg has another camera in the model" in str(database.why_unfit(joined_model(halves)))

@@ -29,7 +29,9 @@ def transform(reconstruction: pycolmap.Reconstruction, new_from_old: Similarity)
     reconstruction.transform(pycolmap.Sim3d(new_from_old.scale, rotation, new_from_old.translation))
 
 
-def joined_model(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
+def joined_model(
+    models: Sequence[pycolmap.Reconstruction], *, is_of_one_database: bool = False
+) -> pycolmap.Reconstruction:
     """Return one model with the registered photos and the points of several models.
 
     Ids of photos, frames, rigs and cameras are kept where they are free, so that models from one database keep that
@@ -37,10 +39,12 @@ def joined_model(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstr
 
     Args:
         models: models in one world and unit. Each photo is in one of them only.
+        is_of_one_database: whether rigs and cameras of one id are the same, even if their models differ in what they
+            found of them. Then those of the first model are taken.
     """
     joined = pycolmap.Reconstruction()
     for model in models:
-        _Addition(joined, model).make()
+        _Addition(joined, model, is_of_one_database).make()
     joined.update_point_3d_errors()
     return joined
 
@@ -62,6 +66,7 @@ class _Addition:
 
     joined: pycolmap.Reconstruction
     model: pycolmap.Reconstruction
+    is_of_one_database: bool
 
     def make(self) -> None:
         rig_ids, camera_ids = self._add_rigs()
@@ -80,7 +85,8 @@ class _Addition:
         same = {
             rig_id
             for rig_id in self.model.rigs
-            if self.joined.exists_rig(rig_id) and _description(self.joined, rig_id) == _description(self.model, rig_id)
+            if self.joined.exists_rig(rig_id)
+            and (self.is_of_one_database or _description(self.joined, rig_id) == _description(self.model, rig_id))
         }
         cameras_of = {rig_id: _camera_ids(rig) for rig_id, rig in self.model.rigs.items()}
         shared = {camera_id for rig_id in same for camera_id in cameras_of[rig_id]}

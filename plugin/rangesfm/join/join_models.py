@@ -136,8 +136,10 @@ def scaled_alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -
     )
 
 
-def assembled(parts: Sequence[PathOfModel], first_from_sfm: Sequence[Similarity]) -> PathOfModel:
-    """Return all models and paths as one, in the world of the first."""
+def assembled(
+    parts: Sequence[PathOfModel], first_from_sfm: Sequence[Similarity], *, is_of_one_database: bool = False
+) -> PathOfModel:
+    """Return all models and paths as one, in the world of the first; ``is_of_one_database`` as for ``joined_model``."""
     if len(parts) == 1:
         return parts[0]
     moved = [
@@ -146,7 +148,8 @@ def assembled(parts: Sequence[PathOfModel], first_from_sfm: Sequence[Similarity]
     ]
     trajectory, keyframes = joined_trajectory(moved)
     observations = joined_observations([part.observations for part in parts], first_from_sfm, keyframes)
-    model = joined_model([rescale(part.sfm, motion) for part, motion in zip(parts, first_from_sfm, strict=True)])
+    moved_models = [rescale(part.sfm, motion) for part, motion in zip(parts, first_from_sfm, strict=True)]
+    model = joined_model(moved_models, is_of_one_database=is_of_one_database)
     frame_of = {image.name: image.frame_id for image in model.images.values()}
     frame_ids = np.array([frame_of[name] for name in trajectory.image_names], dtype=np.int64)
     path = replace(trajectory, frame_ids=frame_ids)

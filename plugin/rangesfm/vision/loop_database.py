@@ -98,11 +98,14 @@ class LoopDatabase:
         """Return why the photos of a model cannot be matched by this database; None if they can."""
         with pycolmap.Database.open(self.path) as database:
             name_of = {image.image_id: image.name for image in database.read_all_images()}
+            rig_of = {frame.frame_id: frame.rig_id for frame in database.read_all_frames()}
             for image_id in model.reg_image_ids():
                 image = model.image(image_id)
                 same_features = database.num_keypoints_for_image(image_id) == image.num_points2D()
                 if name_of.get(image_id) != image.name or not same_features:
                     return f"{image.name} has other features in the model, expected the database it was made from"
+                if rig_of.get(image.frame_id) != model.frame(image.frame_id).rig_id:
+                    return f"{image.name} has another camera in the model, expected the database it was made from"
                 if not database.exists_descriptors(image_id):
                     return f"{image.name} has no descriptors in the database"
         return None

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
+import pycolmap
 from scipy.stats import norm
 
 from rangesfm.arrays import Array, Indices
@@ -15,14 +17,16 @@ from rangesfm.errors import GeometryError
 from rangesfm.files.output_folder import sole_writer
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.join.join_models import assembled, scaled_alone
-from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.model_ties import Tie, find_tie
 from rangesfm.loops.resection import MAX_CHANCE
 from rangesfm.loops.rounds import MAX_NUM_PAIRS
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.vision.image_times import ImageTimes
+from rangesfm.vision.incremental_mapping import adjust_whole
 from rangesfm.vision.loop_database import Pair
+from rangesfm.vision.mapping import mapping_options
 from rangesfm.vision.photos_alike import pairs_alike
+from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.loop_matching import LoopMatching
 from rangesfm.workflows.place_ranges import place_ranges
 
@@ -54,12 +58,23 @@ def tie_by_photos(run: SurveyRun, paths: Sequence[PathOfModel], times: ImageTime
             database.keep_ties(proposed, pairs)
             with colmap_log(database.log):
                 for path in (path for path in tied if not any(path is one for one in paths)):
-                    merge_tracks(path.sfm, database.path, seed=seed)
+                    adjust_whole(database.path, path.sfm, options=_options(run, database.path))
             database.publish(output)
     if not pairs:
         return list(paths)
     models = sorted((path.sfm for path in tied), key=lambda model: -model.num_reg_images())
     return place_ranges(run, models, times)
+
+
+def _options(run: SurveyRun, database_path: Path) -> pycolmap.IncrementalPipelineOptions:
+    """Return the options by which the mapping adjusts a whole model."""
+    survey = run.survey
+    rigs, seed = read_rigs(survey.images.rig_config), survey.output.seed
+    of_mapping = mapping_options(survey.camera, survey.mapper, rigs, seed, database_path)
+    options = of_mapping.whole or of_mapping.growing
+    if isinstance(options, pycolmap.IncrementalPipelineOptions):
+        return options
+    return pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed)
 
 
 def _tied(
@@ -74,7 +89,7 @@ def _tied(
             f"{other.name} ({other.sfm.num_reg_images()} photos) becomes a part of {one.name}:"
             f" {len(tie.pairs)} pairs of photos tie them"
         )
-        parts[first] = assembled([one, other], [IDENTITY, tie.first_from_second])
+        parts[first] = assembled([one, other], [IDENTITY, tie.first_from_second], is_of_one_database=True)
         del parts[second]
         pairs.update((min(pair), max(pair)) for pair in tie.pairs)
     run.journal.warn(*contradicted)
