@@ -36,7 +36,6 @@ sys.exit(main(argv))
 """
 IN_MATCHING = ("rangesfm.vision.matching", "append_log", 0)
 IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
-AMONG_TABLES = ("rangesfm.result.result_tables", "write_table", 2)
 BEFORE_THE_RESULT = ("rangesfm.workflows.run_results", "input_hashes", 0)
 BEFORE_THE_REPORT = ("rangesfm.workflows.run_results", "write_report_of", 0)
 AMONG_RENAMES = ("rangesfm.files.output_folder", "_rename", 9)
@@ -77,9 +76,8 @@ def test_killed_while_it_replaces_a_result_it_leaves_the_old_one_or_what_complet
 ) -> None:
     output, folder = shutil.copytree(photo_run.output_path, tmp_path / "out"), photo_run.survey.folder
     flags = (*photo_run.flags, "--output_path", str(output))
-    for moment in (AMONG_TABLES, BEFORE_THE_REPORT):
-        killed(moment, *flags, "--check_share", "0.2", cwd=folder)
-        assert_whole(output, photo_run.output_path)
+    killed(BEFORE_THE_REPORT, *flags, "--check_share", "0.2", cwd=folder)
+    assert_whole(output, photo_run.output_path)
     killed(AMONG_RENAMES, *flags, "--check_share", "0.2", cwd=folder)
     assert not (output / "result.json").exists()
     rangesfm_command("report", str(output), cwd=folder)
