@@ -211,10 +211,10 @@ class TestCovariance:
 
     @pytest.mark.parametrize("timed", [True, False])
     def test_covers_errors_that_last(self, timed: bool) -> None:
-        """Twenty ranges in a row have the same error, for 15 s, and count for hardly more than one."""
-        positions, times, squares = flight(400), np.linspace(0.0, 300.0, 400), []
+        """Ten ranges in a row have the same error, for 15 s, and count for hardly more than one."""
+        positions, times, squares = flight(200), np.linspace(0.0, 300.0, 200), []
         for seed in range(8):
-            ranges = distances(positions) + np.repeat(noise(20, 0.1, seed), 20) + noise(400, 0.03, 99 + seed)
+            ranges = distances(positions) + np.repeat(noise(20, 0.1, seed), 10) + noise(200, 0.03, 99 + seed)
             found = trilaterate(positions, ranges, timestamp_s=times if timed else None, options=KNOWN_BIAS)
             squares.append(squared_error(found))
         assert np.mean(squares) < chi2.ppf(1 - 5e-4, 24) / 8
