@@ -466,7 +466,7 @@ class RefineOptions(Options, table="refine"):
     refined unless this is 0; with 0, short ranges get less weight instead."""
     covariance: bool = True
     """Compute the covariance of poses, anchors and scale. It is not computed for more than 1500 photos that nearly all
-    see the same, or for more than some 7000 over a field with loops everywhere; along a path it can be computed for
+    see the same, or for more than some 18 000 over a field with loops everywhere; along a path it can be computed for
     more."""
     bundle_adjustment: dict[str, Any] = Field(default_factory=dict)
     """Passed through to pycolmap's BundleAdjustmentOptions."""

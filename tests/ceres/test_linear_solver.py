@@ -81,6 +81,11 @@ def test_the_inverse_is_affordable_along_a_path_but_not_of_photos_that_all_see_t
     assert not inverse_is_affordable(csr_array(np.ones((101, 101))), 100)
 
 
+def test_the_inverse_of_many_photos_is_affordable_if_each_takes_no_longer_than_one_of_the_limit() -> None:
+    assert inverse_is_affordable(each_with_the_next(3000, 15), 100)
+    assert not inverse_is_affordable(each_with_the_next(3000, 60), 100)
+
+
 @pytest.mark.parametrize("num_rows", [0, 1, 3, 50])
 @pytest.mark.parametrize("has_information", [False, True])
 def test_normal_equations_are_the_product(num_rows: int, *, has_information: bool) -> None:

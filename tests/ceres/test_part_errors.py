@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.ceres.test_covariance import Joint, covariance_of_all, joint, model, variable
 
+from rangesfm.ceres import part_errors
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
+from rangesfm.ceres.part_errors import PartSteps, map_errors
 from rangesfm.geometry.map_errors import MapErrors, MapPointErrors
 
 Array = npt.NDArray[np.float64]
@@ -115,3 +119,15 @@ def test_the_same_problem_has_the_same_modes_each_time() -> None:
     first, second = (found_in(joint(model(), hold_first=True)).errors for _ in range(2))
     for kind, errors in first.parts.items():
         assert np.array_equal(errors.modes, second.parts[kind].modes)
+
+
+def test_the_modes_of_many_keyframes_take_memory_in_proportion_to_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(part_errors, "MAX_NUM_MODES", 20)
+    num = 200
+    parts = [PartSteps("frame", k, 6 * k, np.eye(6), np.ones(6)) for k in range(num)]
+    variances = np.linspace(1.0, 2.0, 6 * num)[:, None]
+    tracemalloc.start()
+    map_errors(parts, 6 * num, lambda right: variances * right, lambda _: np.eye(6), np.zeros(6 * num), 0.0)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 0.5 * 8 * (6 * num) ** 2  # half of a matrix with an entry for each two numbers

@@ -352,4 +352,7 @@ def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csc_array:
     place = np.empty(len(is_padding), dtype=columns.dtype)
     place[np.argsort(is_padding, kind="stable")] = np.arange(len(place))  # padding goes to the end, where it is cut off
     shape = jacobian.num_rows, jacobian.num_cols
-    return csr_array((values, place[columns], jacobian.rows), shape=shape).tocsc()[:, : wanted.sum()]
+    by_column = csr_array((values, place[columns], jacobian.rows), shape=shape).tocsc()
+    starts = by_column.indptr[: wanted.sum() + 1]
+    entries = slice(starts[-1])  # a view of the entries, which take most of the memory of a large map
+    return csc_array((by_column.data[entries], by_column.indices[entries], starts), shape=(shape[0], wanted.sum()))

@@ -117,10 +117,8 @@ def joint_covariance(
         GeometryError: a block is not determined by the residuals.
     """
     columns = _Columns.of(problem, reconstruction, anchors, others)
-    jacobian = tangent_jacobian(problem, columns.variable)
-    reduced = _Reduced.of(jacobian, columns, errors)
-    kept = reduced.kept
-    inverse = _Inverse(reduced, _free_motions(jacobian, _world_motions(columns))[kept], columns)
+    inverse = _Inverse(_Reduced.of(problem, columns, errors), columns)
+    size, num_free_directions = inverse.free.shape
     blocks = inverse.diagonal_blocks()
     variance = residual_stddev**2
     frames = columns.frames
@@ -129,7 +127,7 @@ def joint_covariance(
     to_center = np.array([_center_from_step(pose) for pose in columns.poses]).reshape(-1, 3, 6)
     names = list(map(str, range(len(anchors)))) if anchor_ids is None else anchor_ids
     parts = [*_parts(columns, reconstruction, dict(zip(names, anchors, strict=True)), refined_params or {})]
-    by_similarity = _similarity_gradients(columns, len(kept))
+    by_similarity = _similarity_gradients(columns, size)
     similarity = variance * inverse.of_functions(by_similarity) if len(frames) > 1 else np.full((7, 7), np.nan)
     return JointCovariance(
         frame_ids=frames,
@@ -138,10 +136,10 @@ def joint_covariance(
         anchors=np.array([variance * columns.covariance(anchor, blocks) for anchor in anchors]).reshape(-1, 3, 3),
         others=tuple(variance * columns.covariance(block, blocks) for block in others),
         similarity=similarity,
-        num_free_directions=inverse.free.shape[1],
+        num_free_directions=num_free_directions,
         errors=map_errors(
             parts,
-            len(kept),
+            size,
             lambda right: variance * inverse.covariance_times(right),
             lambda start: variance * blocks[columns.index_at(start)],
             by_similarity[:, 0],
@@ -163,12 +161,9 @@ class PhotosAlone:
             GeometryError: the residuals do not determine the map up to a similarity.
         """
         self._columns = _Columns.of(problem, reconstruction, (), ())
-        jacobian, residuals = tangent_jacobian(problem, self._columns.variable), problem.evaluate_residuals()
-        reduced = _Reduced.of(jacobian, self._columns, None)
-        free = _free_motions(jacobian, _world_motions(self._columns))[reduced.kept]
-        self._gradient = reduced.gradient(np.asarray(residuals))
-        self._inverse = _Inverse(reduced, free, self._columns)
-        self._size, self._stddev = len(reduced.kept), residual_stddev
+        reduced = _Reduced.of(problem, self._columns, None)
+        self._gradient, self._stddev = reduced.gradient, residual_stddev
+        self._inverse = _Inverse(reduced, self._columns)
 
     def of_functions(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
         """Return the errors of functions that do not depend on the place and the size of the map.
@@ -180,7 +175,7 @@ class PhotosAlone:
         Returns:
             (c, c) covariance, and (c,) change of the functions if the map moves to the minimum of the photos alone.
         """
-        columns, gradients = self._columns, np.zeros((self._size, len(by_turn)))
+        columns, gradients = self._columns, np.zeros((len(self._gradient), len(by_turn)))
         pose_of_frame = dict(zip(columns.frames.tolist(), columns.poses, strict=True))
         for k, frame_id in enumerate(frame_ids.tolist()):
             pose = pose_of_frame[frame_id]
@@ -277,32 +272,43 @@ def _address(block: Array) -> int:
 
 
 @dataclass(frozen=True)
-class _Reduced:
-    """Normal equations after the elimination of the points, J^T J, and J^T S J for the residuals' covariance S.
+class _Spread:
+    """J^T S J for the residuals' covariance S: ``independent + by_error @ covariance @ by_error.T``."""
 
-    The second one is ``independent + by_error @ covariance @ by_error.T``. Both are sums, since a difference of the two
-    would leave negative variances where residuals that err together determine nearly everything.
-
-    Attributes:
-        kept: columns of the Jacobian that are not eliminated.
-        rows: all rows of these columns. points: the eliminated columns. whitener: as ``_whitener`` returns it.
-    """
-
-    normal: Array | csr_array
     independent: Array | csr_array
     by_error: csr_array
     covariance: Array
-    kept: Indices
-    rows: csr_array
-    points: csc_array
-    whitener: bsr_array
+
+    def times(self, right: Array) -> Array:
+        """Return the product with a matrix (size, k)."""
+        return np.asarray(self.independent @ right + self.by_error @ (self.covariance @ (self.by_error.T @ right)))
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """Normal equations after the elimination of the points; the Jacobian, which is larger, is not kept.
+
+    ``normal``, J^T J, and ``spread`` are sums, since a difference of the two would leave negative variances where
+    residuals that err together determine nearly everything.
+
+    Attributes:
+        gradient: (size,) of half the sum of squares, where the points follow.
+        free: (size, k) basis of the motions of the world that change no residual.
+    """
+
+    normal: Array | csr_array
+    spread: _Spread
+    gradient: Array
+    free: Array
 
     @classmethod
-    def of(cls, jacobian: csc_array, columns: _Columns, errors: ResidualErrors | None) -> _Reduced:
+    def of(cls, problem: Any, columns: _Columns, errors: ResidualErrors | None) -> _Reduced:
+        jacobian, residuals = tangent_jacobian(problem, columns.variable), np.asarray(problem.evaluate_residuals())
         first = columns.num_kept_columns
         of_points = jacobian[:, first:]
         stays = np.repeat(_tied_points(of_points), 3)
         kept = np.concatenate([np.arange(first), first + np.flatnonzero(stays)])
+        free = _free_motions(jacobian, _world_motions(columns))[kept]
         rows, points = csr_array(jacobian[:, kept]), of_points[:, np.flatnonzero(~stays)]
         whitener = _whitener(points)
         has_point = np.diff(csr_array(of_points).indptr) > 0
@@ -310,23 +316,14 @@ class _Reduced:
         own, explained = both(lambda: csr_array(seen.T) @ seen, lambda: _explained_by(points, rows, whitener))
         of_photos = own - explained
         normal = of_photos + others.T @ others
+        gradient = rows.T @ (residuals - points @ (whitener @ (whitener.T @ (points.T @ residuals))))
         if errors is None:
-            nothing = csr_array((len(kept), 0))
-            return cls(normal, normal, nothing, np.zeros((0, 0)), kept, rows, points, whitener)
+            return cls(normal, _Spread(normal, csr_array((len(kept), 0)), np.zeros((0, 0))), gradient, free)
         has_point[errors.rows] = has_point[errors.exact] = True
         alone = csr_array(rows[~has_point])
         independent = of_photos + errors.variance_without_points * (alone.T @ alone)
         by_error = csr_array(rows[errors.rows].T @ errors.by_error)
-        return cls(normal, independent, by_error, errors.covariance, kept, rows, points, whitener)
-
-    def gradient(self, residuals: Array) -> Array:
-        """Return the gradient in the kept columns, given all residuals, where the points follow."""
-        off_points = self.whitener @ (self.whitener.T @ (self.points.T @ residuals))
-        return np.asarray(self.rows.T @ (residuals - self.points @ off_points))
-
-    def spread(self, right: Array) -> Array:
-        """Return J^T S J times a matrix (size, k)."""
-        return np.asarray(self.independent @ right + self.by_error @ (self.covariance @ (self.by_error.T @ right)))
+        return cls(normal, _Spread(independent, by_error, errors.covariance), gradient, free)
 
 
 def _whitener(points: csc_array) -> bsr_array:
@@ -391,11 +388,17 @@ def _free_motions(jacobian: csc_array, motions: Array) -> Array:
 
 
 class _Inverse:
-    """Pseudo-inverse of the normal equations, orthogonal to the free motions, and the covariance by it."""
+    """Pseudo-inverse of the normal equations, orthogonal to the free motions, and the covariance by it.
 
-    def __init__(self, reduced: _Reduced, free: Array, columns: _Columns) -> None:
-        self._reduced, self.free = reduced, linalg.orth(free) if free.shape[1] else free
-        normal = reduced.normal
+    Attributes:
+        free: (size, k) orthonormal basis of the free motions.
+    """
+
+    free: Array
+
+    def __init__(self, reduced: _Reduced, columns: _Columns) -> None:
+        normal, free = reduced.normal, reduced.free
+        self._spread, self.free = reduced.spread, linalg.orth(free) if free.shape[1] else free
         self._scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))[:, None]
         # Fixing as many coordinates as there are free motions makes the matrix regular; any suitable choice will do.
         held = np.zeros(len(self._scale))
@@ -420,28 +423,28 @@ class _Inverse:
 
     def diagonal_blocks(self) -> list[Array]:
         """Return the blocks of the covariance on its diagonal."""
-        free, reduced = self.free, self._reduced
-        blocks = self._factor.blocks_of_sandwich(self._scaled(reduced.independent))
+        free, spread = self.free, self._spread
+        blocks = self._factor.blocks_of_sandwich(self._scaled(spread.independent))
         # The same without the free motions, from the product of this matrix with them.
-        of_free = self._solve_regular(np.asarray(reduced.independent @ self._solve_regular(free)))
+        of_free = self._solve_regular(np.asarray(spread.independent @ self._solve_regular(free)))
         of_free -= 0.5 * free @ (free.T @ of_free)
-        by_error = self.solve(reduced.by_error.toarray())
+        by_error = self.solve(spread.by_error.toarray())
         return [
             self._scale[rows] * block * self._scale[rows].T
             - of_free[rows] @ free[rows].T
             - free[rows] @ of_free[rows].T
-            + by_error[rows] @ reduced.covariance @ by_error[rows].T
+            + by_error[rows] @ spread.covariance @ by_error[rows].T
             for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
         ]
 
     def covariance_times(self, right: Array) -> Array:
         """Return the covariance of all columns times (size, k)."""
-        return self.solve(self._reduced.spread(self.solve(right)))
+        return self.solve(self._spread.times(self.solve(right)))
 
     def of_functions(self, gradients: Array) -> Array:
         """Return the (k, k) covariance of linear functions with (size, k) gradients."""
         solution = self.solve(gradients)
-        return np.asarray(solution.T @ self._reduced.spread(solution))
+        return np.asarray(solution.T @ self._spread.times(solution))
 
 
 def _factored(normal: Array | csr_array, starts: Indices, columns: _Columns) -> NestedFactor:

@@ -50,12 +50,13 @@ def dense_is_faster(overlaps: csr_array) -> bool:
 
 
 def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:
-    """Return True if factor and inverse take no longer than those of ``limit`` photos that all overlap.
+    """Return True if factor and inverse take no longer for each photo than those of ``limit`` photos that all overlap.
 
     Args:
         overlaps: as for ``max_num_images_direct``.
     """
-    return bool(overlaps.shape[0] <= limit) or cost_of_factor(overlaps) <= float(limit) ** 3
+    num = overlaps.shape[0]
+    return bool(num <= limit) or cost_of_factor(overlaps) <= _cost_of_all(limit) * num / limit
 
 
 def _cost(overlaps: csr_array) -> float:

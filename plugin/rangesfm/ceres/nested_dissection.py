@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -102,7 +103,9 @@ def cost_of_factor(tied: csr_array) -> float:
         tied: (n, n) as for ``fronts_of``.
     """
     fronts = fronts_of(tied, np.zeros(tied.shape[0], dtype=bool))
-    return float(sum(len(front.own) * float(len(front.own) + len(front.boundary)) ** 2 for front in fronts))
+    own = np.array([len(front.own) for front in fronts], dtype=np.float64)
+    rest = np.array([len(front.boundary) for front in fronts], dtype=np.float64)
+    return float(np.sum(own**3 / 3 + own**2 * rest + own * rest**2))
 
 
 class _Shape(NamedTuple):
@@ -186,14 +189,22 @@ class NestedFactor:
 
     def _from_below(self, matrix: Array | csr_array, rest_of: Callable[[int, Array], Array]) -> None:
         """Assemble a matrix front by front; ``rest_of`` returns what a front adds to the next one, on its rest."""
-        is_dense, rests = isinstance(matrix, np.ndarray), dict[int, Array]()
-        ordered = matrix if is_dense else csr_array(matrix[self._order][:, self._order])
+        rests = dict[int, Array]()
         for number, shape in enumerate(self._shapes):
-            full = ordered if is_dense else _rows_of_front(ordered, shape)
+            full = matrix if isinstance(matrix, np.ndarray) else self._rows_of_front(matrix, shape)
             for child in shape.children:
                 at = np.searchsorted(shape.columns, self._shapes[child].rest)
                 full[np.ix_(at, at)] += rests.pop(child)
             rests[number] = rest_of(number, full)
+
+    def _rows_of_front(self, matrix: csr_array, shape: _Shape) -> Array:
+        """Return a front with the rows of a matrix that are eliminated in it, (size, size), of which the rest is 0."""
+        full = np.zeros((len(shape.columns),) * 2)
+        rows = matrix[self._order[shape.own]].tocoo()
+        column = self._place[rows.col]
+        is_later = column >= shape.own.start
+        full[rows.row[is_later], np.searchsorted(shape.columns, column[is_later])] = rows.data[is_later]
+        return full
 
     def _eliminate(self, number: int, full: Array) -> Array:
         shape = self._shapes[number]
@@ -284,10 +295,12 @@ def _upwards(
 
 def _tied_blocks(matrix: csr_array, starts: Indices) -> csr_array:
     """Return the (n, n) matrix of blocks, nonzero where a block of a matrix has entries."""
-    entries = matrix.tocoo()
-    row, column = (np.searchsorted(starts, of, side="right") - 1 for of in (entries.row, entries.col))
     num = len(starts) - 1
-    return csr_array((np.ones(len(row)), (row, column)), shape=(num, num))
+    block_of = np.repeat(np.arange(num), np.diff(starts))
+    # Row by row of blocks, because copies of the entries of all columns would take several times the matrix's memory.
+    tied = [np.unique(block_of[matrix.indices[first:last]]) for first, last in pairwise(matrix.indptr[starts].tolist())]
+    ends = np.cumsum([0, *map(len, tied)])
+    return csr_array((np.ones(ends[-1]), np.concatenate(tied), ends), shape=(num, num))
 
 
 def _columns_of(blocks: Sequence[Indices], starts: Indices) -> Indices:
@@ -296,12 +309,3 @@ def _columns_of(blocks: Sequence[Indices], starts: Indices) -> Indices:
     sizes = starts[first + 1] - starts[first]
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     return np.asarray(np.repeat(starts[first], sizes) + within)
-
-
-def _rows_of_front(ordered: csr_array, shape: _Shape) -> Array:
-    """Return a front with the rows of a matrix that are eliminated in it, (size, size), of which the rest is 0."""
-    full = np.zeros((len(shape.columns),) * 2)
-    rows = ordered[shape.own].tocoo()
-    is_later = rows.col >= shape.own.start
-    full[rows.row[is_later], np.searchsorted(shape.columns, rows.col[is_later])] = rows.data[is_later]
-    return full

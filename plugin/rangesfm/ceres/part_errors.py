@@ -104,8 +104,9 @@ def _all_steps(parts: Sequence[PartSteps], num_columns: int) -> csc_array:
 def _largest_modes(product: Callable[[Array], Array], size: int) -> Array:
     """Return (size, r) modes whose product with their transpose is nearest to a symmetric (size, size) covariance."""
     num = min(size, MAX_NUM_MODES + _NUM_FURTHER)
-    basis = np.eye(size)
-    if num < size:
+    if num == size:
+        basis = np.eye(size)
+    else:
         basis = np.random.default_rng(0).standard_normal((size, num))
         for _ in range(_NUM_PRODUCTS):
             basis = linalg.qr(product(basis), mode="economic", overwrite_a=True)[0]
