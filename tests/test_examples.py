@@ -23,6 +23,7 @@ from rangesfm.geometry.reference import read_reference
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.survey.survey_reader import parse_toml, read_survey
+from rangesfm.vision.image_times import read_image_times_csv
 
 if TYPE_CHECKING:
     from tests.conftest import PhotoRun, WalkedSurvey
@@ -59,6 +60,7 @@ def test_every_program_is_tested_here() -> None:
         "own_problem.py",
         "public_data.py",
         "scale_existing_model.py",
+        "split_survey.py",
     }
 
 
@@ -112,6 +114,23 @@ def test_a_survey_compared_with_itself_has_not_changed(photo_run: PhotoRun, tmp_
     printed = run_example("compare_two_surveys.py", folder, folder, "changes.ply", cwd=tmp_path)
     assert "explain: 0 (0.0 %)" in printed
     assert (tmp_path / "changes.ply").is_file()
+
+
+def test_the_parts_of_a_split_survey_have_its_photos_in_order_and_its_settings(
+    photo_run: PhotoRun, tmp_path: Path
+) -> None:
+    whole = photo_run.survey.folder / "survey.toml"
+    printed = run_example("split_survey.py", str(whole), "2", "parts", cwd=tmp_path)
+    assert printed.splitlines() == ["part_1: 7 photos", "part_2: 7 photos"]
+    expected = read_survey(whole)
+    parts = [read_survey(tmp_path / "parts" / f"part_{k}" / "survey.toml") for k in (1, 2)]
+    photos = [path for part in parts for path in sorted(part.photos_path.iterdir())]
+    assert [path.resolve() for path in photos] == sorted(expected.photos_path.resolve().iterdir())
+    for part in parts:
+        assert part.changed({"output.path": expected.output.path}).model_copy(update={"images": expected.images}) == (
+            expected
+        )
+        assert read_image_times_csv(part.images.times, [path.name for path in part.photos_path.iterdir()])
 
 
 # Raw text in the form of the public repositories, with invented numbers, by the file's path in a clone.
