@@ -150,12 +150,12 @@ def _checked(done: subprocess.CompletedProcess[str], status: int | None) -> subp
 
 @pytest.fixture(scope="session")
 def walked_survey(tmp_path_factory: pytest.TempPathFactory) -> WalkedSurvey:
-    """A walk of 40 photos, one a second, and 20 ranges a second to four anchors. Tests must not write to it."""
+    """A walk of 40 photos and of 42 ranges to each of four anchors, one a second. Tests must not write to it."""
     return make_walked_survey(tmp_path_factory.mktemp("walked_survey"))
 
 
-def make_walked_survey(folder: Path) -> WalkedSurvey:
-    """Write the files of a ``WalkedSurvey`` into a folder."""
+def make_walked_survey(folder: Path, *, rate_hz: float = 1.0) -> WalkedSurvey:
+    """Write the files of a ``WalkedSurvey`` into a folder, with so many ranges a second to each anchor."""
     path = loop_path(42.0, start_s=99.0, seed=3)
     times: Array = np.arange(100, 140, dtype=np.float64)
     made = synthetic_model(
@@ -167,7 +167,7 @@ def make_walked_survey(folder: Path) -> WalkedSurvey:
         pixel_stddev=0.5,
         seed=1,
     )
-    radio = Radio(rate_hz=5.0, range_stddev_m=0.05, time_offset_s=TIME_OFFSET_S)
+    radio = Radio(rate_hz=rate_hz, range_stddev_m=0.05, time_offset_s=TIME_OFFSET_S)
     (folder / "sparse" / "0").mkdir(parents=True)
     made.reconstruction.write(folder / "sparse" / "0")
     write_ranges_csv(simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, radio, seed=5).log, folder / "uwb.csv")
@@ -179,6 +179,12 @@ def make_walked_survey(folder: Path) -> WalkedSurvey:
     names = tuple(made.timestamps_s)
     write_reference(Reference(made.centers_m, image_names=names), folder / "reference.csv")
     return WalkedSurvey(folder, made.metric_from_sfm, made.centers_m, names)
+
+
+@pytest.fixture(scope="session")
+def dense_survey(tmp_path_factory: pytest.TempPathFactory) -> WalkedSurvey:
+    """The same walk with five times as many ranges, for tests of how right results are. Tests must not write to it."""
+    return make_walked_survey(tmp_path_factory.mktemp("dense_survey"), rate_hz=5.0)
 
 
 @pytest.fixture

@@ -75,17 +75,17 @@ def test_own_problem_converges_on_a_model_that_fits_its_ranges(walked_survey: Wa
     assert 0 < final <= initial
 
 
-def test_scale_existing_model_takes_it_to_metres(walked_survey: WalkedSurvey, tmp_path: Path) -> None:
+def test_scale_existing_model_takes_it_to_metres(dense_survey: WalkedSurvey, tmp_path: Path) -> None:
     files = ("sparse/0", "images.csv", "uwb.csv", str(tmp_path / "metric" / "0"))
     arm = map(str, TAG_IN_CAM_M)
-    printed = run_process("scale_existing_model.py", *files, "--tag_in_cam", *arm, cwd=walked_survey.folder)
+    printed = run_process("scale_existing_model.py", *files, "--tag_in_cam", *arm, cwd=dense_survey.folder)
     offset, scale, _ = printed.splitlines()
     assert float(offset.split()[2]) == pytest.approx(TIME_OFFSET_S, abs=0.05)
-    assert float(scale.split()[0]) == pytest.approx(walked_survey.site_from_sfm.scale, rel=0.02)
+    assert float(scale.split()[0]) == pytest.approx(dense_survey.site_from_sfm.scale, rel=0.02)
     images = sorted(pycolmap.Reconstruction(tmp_path / "metric" / "0").images.values(), key=lambda image: image.name)
     centers = np.array([image.projection_center() for image in images])
     length_m, true_m = (
-        np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in (centers, walked_survey.centers_m)
+        np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in (centers, dense_survey.centers_m)
     )
     assert length_m == pytest.approx(true_m, rel=0.02)
 

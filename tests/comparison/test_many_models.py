@@ -120,9 +120,9 @@ def test_a_results_ranges_fit_its_own_model_as_its_file_says(result: Path, model
 
 
 def test_a_log_is_held_against_models_that_no_run_has_made(
-    walked_survey: WalkedSurvey, models: tuple[Path, Path, Path]
+    dense_survey: WalkedSurvey, models: tuple[Path, Path, Path]
 ) -> None:
-    files = walked_survey.folder
+    files = dense_survey.folder
     survey = survey_of(files)
     named = read_named_models(models)
     assert named[0].model is not None

@@ -60,6 +60,11 @@ def leave_as_it_is(model: pycolmap.Reconstruction) -> None:
     assert model.num_reg_images()
 
 
+@pytest.fixture(scope="module")
+def walked_survey(dense_survey: WalkedSurvey) -> WalkedSurvey:
+    return dense_survey
+
+
 @pytest.fixture
 def survey(own_survey: WalkedSurvey) -> Survey:
     folder = own_survey.folder
@@ -148,8 +153,10 @@ def test_where_the_model_was_none_before_nothing_is_left(survey: Survey, spoil: 
         refined(spoilt(survey, spoil))
     assert caught.value.exit_status == 4
     assert not (survey.output.path / "result.json").exists()
-    # The path alone can be scaled, with a warning about the points.
-    scaled = scale_model(survey, progress=SilentProgress()).summary
+
+
+def test_the_path_of_such_a_model_is_scaled_with_a_warning_about_its_points(survey: Survey) -> None:
+    scaled = scale_model(spoilt(survey, mirror_points), progress=SilentProgress()).summary
     assert scaled.scale.verdict == "doubtful"
     assert any(warning.startswith("the model's points lie") for warning in scaled.warnings)
 

@@ -20,6 +20,11 @@ FIRST, LAST = "frame_00001.jpg", "frame_00025.jpg"
 
 
 @pytest.fixture(scope="module")
+def walked_survey(dense_survey: WalkedSurvey) -> WalkedSurvey:
+    return dense_survey
+
+
+@pytest.fixture(scope="module")
 def results(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with results of the walk: refined in the site, refined in the first camera's frame, and only scaled."""
     folder = shutil.copytree(walked_survey.folder, tmp_path_factory.mktemp("measured") / "survey")
