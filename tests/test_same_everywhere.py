@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from tests.outputs import paths_below
-from tests.test_kernels import NEEDED_FLAGS
+from tests.test_kernels import NEEDED_FLAGS, why_not
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
@@ -86,16 +86,11 @@ def alone(walked_survey: WalkedSurvey, tmp_path_factory: pytest.TempPathFactory)
     return run((*COMMAND, "--num_threads", "1"), folder, OPENBLAS_NUM_THREADS="1")
 
 
-def test_threads_change_no_byte(alone: Left, own_survey: WalkedSurvey) -> None:
-    threads = {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
-    assert run((*COMMAND, "--num_threads", "2"), own_survey.folder, **threads).contents == alone.contents
-
-
-def test_the_order_of_rows_changes_no_byte(alone: Left, own_survey: WalkedSurvey) -> None:
-    rng = np.random.default_rng(0)
+def test_threads_and_the_order_of_rows_change_no_byte(alone: Left, own_survey: WalkedSurvey) -> None:
+    rng, threads = np.random.default_rng(0), {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
     for name in TABLES:
         shuffle(own_survey.folder / name, rng)
-    assert run((*COMMAND, "--num_threads", "1"), own_survey.folder).contents == alone.contents
+    assert run((*COMMAND, "--num_threads", "2"), own_survey.folder, **threads).contents == alone.contents
 
 
 def test_photos_copied_in_another_order_and_two_threads_change_no_byte(photo_run: PhotoRun, tmp_path: Path) -> None:
@@ -135,8 +130,8 @@ def differences(found: Any, expected: Any, stddevs: dict[str, float], name: str 
 def test_another_processor_changes_numbers_by_less_than_a_billionth(
     kernel: str, alone: Left, own_survey: WalkedSurvey
 ) -> None:
-    if NEEDED_FLAGS[kernel] not in Path("/proc/cpuinfo").read_text().split():
-        pytest.skip(f"this processor cannot execute it: it lacks {NEEDED_FLAGS[kernel]}")
+    if reason := why_not(kernel):
+        pytest.skip(reason)
     again, result = run((*COMMAND, "--num_threads", "1"), own_survey.folder, OPENBLAS_CORETYPE=kernel), alone.result
     of_scale, of_place_m = (
         result["scale"]["stddev_empirical"] / result["scale"]["value"],
