@@ -1,4 +1,7 @@
-"""The renderer makes the photos that ship with the demo, and their camera is where its file says."""
+"""The camera of the photos that ship with the demo is where its file says.
+
+``tests/studies/demo_photos.py`` compares the photos themselves with what the renderer makes.
+"""
 
 from __future__ import annotations
 
@@ -6,37 +9,11 @@ from datetime import timezone
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
-import pytest
-from PIL import Image
 from PIL.ExifTags import IFD, Base
-from tests.rendering.courtyard import courtyard
-from tests.rendering.make_demo_photos import CAMERA, photo_exif, take_photo, walk, write_path
+from tests.rendering.make_demo_photos import photo_exif, walk, write_path
 from tests.rendering.photos import PhotoCamera
-from tests.rendering.scene import Scene
 
-from rangesfm.demo.survey import PATH_FILE, PHOTOS
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return courtyard()
-
-
-@pytest.mark.parametrize("number", [0, 23])
-def test_a_shipped_photo_is_what_the_renderer_makes(scene: Scene, number: int) -> None:
-    path, times_s = walk()
-    rendered = take_photo(scene, CAMERA, path, times_s, number)
-    with Image.open(PHOTOS / f"IMG_{number + 1:04d}.jpg") as photo:
-        assert photo.size == rendered.size
-        error = _averaged(rendered) - _averaged(photo)
-    # On a scale of 255. The loss of JPEG is 1.4; a camera two centimetres away would give 3.5.
-    assert np.abs(error).mean() < 2
-
-
-def _averaged(photo: Image.Image) -> npt.NDArray[np.float64]:
-    """Average the photo over blocks of 4 x 4 pixels."""
-    return np.asarray(photo.resize((photo.width // 4, photo.height // 4), Image.Resampling.BOX), dtype=np.float64)
+from rangesfm.demo.survey import PATH_FILE
 
 
 def test_shipped_path_is_the_way_of_that_camera(tmp_path: Path) -> None:
