@@ -66,26 +66,20 @@ def blas_kernels() -> list[str]:
     return [str(library.get("architecture")) for library in threadpool_info() if library["user_api"] == "blas"]
 
 
-# Test files that take a quarter of a minute or more.
-LONG_FILES = (
-    *(
-        "test_cpp_part.py",
-        "test_kernels.py",
-        "test_same_everywhere.py",
-        "test_commands.py",
-        "test_batch.py",
-        "test_initialize.py",
-    ),
-    *("test_trilateration.py", "test_run.py", "test_kills.py", "test_bad_input.py"),
-    *("test_mistakes.py", "test_with_ranges.py", "test_reconstruct.py", "test_estimate.py", "test_report.py"),
-    *("test_site_anchors.py", "test_broken_refinement.py", "test_interrupt.py", "test_lengths_alone.py"),
-)
+# Test files that take eight seconds or more, the longest first, by the sums of ``pytest --durations=0``.
+LONG_FILES = """
+    test_mistakes test_commands test_same_results test_kernels test_initialize test_pages test_batch
+    test_reconstruct test_surroundings test_run test_same_everywhere test_broken_refinement test_kills
+    test_trilateration test_report_page test_drifting_maps test_bad_input test_view test_with_ranges
+    test_uncertainty test_cpp_part test_numbers test_own_files test_report test_positions_alone test_lengths_alone
+    test_join_models test_workflows test_matching test_interrupt test_scale_crb test_odd_names
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Start the longest files first; otherwise one of two processes would work alone on the last of them."""
-    place = {name: number for number, name in enumerate(LONG_FILES)}
-    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+    place = {name: number for number, name in enumerate(LONG_FILES.split())}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 @dataclass(frozen=True)
