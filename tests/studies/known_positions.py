@@ -218,7 +218,7 @@ class Known:
         )
         bending = PhotoBending(photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, True)
         found = scale_by_positions(known, path, bending)
-        parts = {part.name: part.covariance_m2 for part in found.equations.parts}
+        parts = {part.name: part.alike for part in found.equations.parts}
         covariance = found.bending_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))
         grouping, at = found.equations.grouping, np.flatnonzero(~known.is_mark)
         own = np.zeros((len(known), len(known)))

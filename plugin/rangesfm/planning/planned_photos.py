@@ -162,7 +162,7 @@ class PlannedPhotos(Options, table="photos"):
     def _is_in_view(self, in_cam: Array) -> Mask:
         """Return whether points (..., 3) in the axes of a camera are before it and within its field of view."""
         x, y, depth = np.moveaxis(in_cam, -1, 0)
-        return (np.abs(x) < self._half_width * depth) & (np.abs(y) < _HEIGHT * self._half_width * depth)
+        return np.asarray((np.abs(x) < self._half_width * depth) & (np.abs(y) < _HEIGHT * self._half_width * depth))
 
     def _scattered(self, path: Trajectory, frame: int, num: int, rng: np.random.Generator) -> Array:
         near, far = self.seen_m
