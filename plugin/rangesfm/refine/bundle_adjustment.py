@@ -98,7 +98,7 @@ class BundleAdjustment:
 
     @property
     def has_covariance(self) -> bool:
-        """Whether the photos are few enough, or overlap little enough, for a covariance of all."""
+        """Return whether the photos are few enough, or overlap little enough, for a covariance of all."""
         limit = _MAX_NUM_IMAGES_FOR_COVARIANCE
         return self.metric.num_reg_images() <= limit or inverse_is_affordable(overlaps_in(self.metric), limit)
 
