@@ -164,7 +164,7 @@ def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) ->
 
     def image_of_edge(params: Array) -> Array:
         other = pycolmap.Camera(camera.todict())
-        other.params = params
+        other.params[:] = params
         return np.ravel(other.img_from_cam(edge))
 
     shifts_px = np.linalg.norm(approx_fprime(camera.params, image_of_edge, 1e-6), axis=0)
