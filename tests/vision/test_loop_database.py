@@ -61,7 +61,7 @@ def test_photos_whose_models_found_different_cameras_cannot_be_matched_together(
     names = list(looped.survey.model.timestamps_s)
     halves = [without_photos(looped.truth, others) for others in (names[6:], names[:6])]
     lens = halves[1].camera(1)
-    lens.params = 1.01 * lens.params
+    lens.params = (1.01 * lens.params).tolist()
     with sole_writer(tmp_path) as output:
         database = copied(output)
         assert database.why_unfit(joined_model(halves, is_of_one_database=True)) is None

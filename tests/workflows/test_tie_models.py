@@ -59,7 +59,7 @@ def test_two_laps_that_were_mapped_apart_become_one_model(tmp_path: Path) -> Non
     names = list(looped.survey.model.timestamps_s)
     run, models = run_of(looped, tmp_path), models_of(looped, [names[:24], names[24:]])
     lens = models[1].camera(1)  # each model has found parameters of its own for the same camera
-    lens.params = 1.002 * lens.params
+    lens.params = (1.002 * lens.params).tolist()
     (path,) = tied(run, looped, models)
     assert path.trajectory.image_names == tuple(names)
     truth_m = looped.survey.model.centers_m
