@@ -130,6 +130,7 @@ def test_the_parts_of_a_split_survey_have_its_photos_in_order_and_its_settings(
         assert part.changed({"output.path": expected.output.path}).model_copy(update={"images": expected.images}) == (
             expected
         )
+        assert part.images.times is not None
         assert read_image_times_csv(part.images.times, [path.name for path in part.photos_path.iterdir()])
 
 
