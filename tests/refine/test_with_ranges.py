@@ -106,6 +106,7 @@ class Survey:
             "tag_in_cam_m": TAG_IN_CAM_M,
             "first_pose_is_fixed": self.frame != "site",
             "camera": CameraOptions(refine_intrinsics=False),
+            "is_refined": refined is not None,
             "num_threads": 1,
         }
         model = rescale(self.sfm, start) if refined is None else refined

@@ -188,6 +188,7 @@ class ScaledMap:
             camera=CameraOptions(refine_intrinsics=False),
             learn=lambda rest: Learnt(None, 1.0),  # the simulated ranges have no errors but noise
             closing=closing,
+            is_refined=start is not None,
             num_threads=1,
         )
 

@@ -88,7 +88,7 @@ def presolve(
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Presolved(errors, 0.0, problem.radio.anchors, 0.0, 0)
-    graph = _graph(problem, rays, errors, problem.radio.anchors)
+    graph = _graph(problem, rays, errors, problem.radio.anchors, is_refined=problem.is_refined)
     if loops is not None:
         graph = replace(graph, vision=graph.vision.with_loops(loops))
     fit, errors = _solve_with_own_errors(graph)
@@ -110,21 +110,32 @@ def presolve_again(
     New errors turn the whole map slightly. That is one step here, but tens of rejected steps in the full problem, whose
     points follow a turn along straight lines.
     """
-    graph = _graph(problem, rays, errors, anchors)
+    graph = _graph(problem, rays, errors, anchors, is_refined=True)
     state = solve_graph(graph, graph.start(), tolerance_m=_tolerance_m(errors)).state
     _move(problem, rays, graph.vision, state.poses, errors)
     return moved_anchors(anchors, state.anchors_m, state.biases_m)
 
 
 def _graph(
-    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
+    problem: RefinementProblem,
+    rays: Observations,
+    errors: RangeErrors,
+    anchors: tuple[AnchorEstimate, ...],
+    *,
+    is_refined: bool,
 ) -> KeyframeGraph:
-    """Set up the keyframe graph of the current model."""
+    """Set up the keyframe graph of the current model.
+
+    In a refined model the ranges balance the gradient of the photos' cost. In a model of photos alone it is only what
+    the mapper left. That goes along weak modes, of which information from pieces of tracks sees less than the photos
+    do, so that steps by it would be many times too long.
+    """
     ranges = problem.ranges
     takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))[rays.point]
     seen, poses = rays.subset(np.flatnonzero(takes_part)), model_poses(problem.metric, problem.frame_ids)
+    vision = vision_information(seen, poses)
     return KeyframeGraph(
-        vision=with_gradient(vision_information(seen, poses), photo_gradient(seen, poses)),
+        vision=with_gradient(vision, photo_gradient(seen, poses)) if is_refined else vision,
         antennas=ranges.antennas.subset(ranges.rows),
         range_m=ranges.observations.log.range_m[ranges.rows],
         errors=errors,

@@ -41,6 +41,7 @@ class RefinementProblem:
         distances: measured ones, which are fitted too. positions: known ones, too.
         first_pose_is_fixed: the gauge.
         gravity: the upward direction in the first camera; None if unknown, or if that camera's pose is fixed.
+        is_refined: whether the model was refined with its ranges before, which pull it from the photos' optimum.
         left_out_ids: 3-D points that do not take part.
     """
 
@@ -54,6 +55,7 @@ class RefinementProblem:
     first_pose_is_fixed: bool
     gravity: Gravity | None
     num_threads: int
+    is_refined: bool
     left_out_ids: frozenset[int] = frozenset()
 
     @property

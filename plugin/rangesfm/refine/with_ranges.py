@@ -178,6 +178,7 @@ def refine_with_ranges(
     shared_errors_m: Array | None = None,
     learn: Learn | None = None,
     closing: LoopClosing | None = None,
+    is_refined: bool = False,
     num_threads: int = -1,
 ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
     """Refine a scaled model by bundle adjustment with range residuals.
@@ -202,6 +203,7 @@ def refine_with_ranges(
             other measurements may correct; None without any.
         learn: estimates the ranges' errors at the refined map, for its covariance; None: those in ``errors`` are used.
         closing: loops to be closed before; None without any.
+        is_refined: whether the model was refined with these ranges before. It stays where it is if nothing is new.
 
     Returns:
         the refined model and the summary.
@@ -231,6 +233,7 @@ def refine_with_ranges(
         first_pose_is_fixed,
         None if first_pose_is_fixed else gravity,
         num_threads,
+        is_refined,
     )
     with at_most(num_threads):
         to_begin_with = _errors_to_begin_with(problem, errors, metric_from_sfm.scale)

@@ -231,6 +231,15 @@ class ResultFolder:
         return self.read_model("sparse_metric") or self.read_model("sparse_scaled")
 
 
+def is_refined_model(path: Path | None) -> bool:
+    """Return whether a model's folder is that of a result whose map was refined with ranges."""
+    stage = None if path is None else path.resolve().parent
+    if stage is None or stage.name != MODEL_NAMES[1] or not (stage.parent / ResultSummary.NAME).is_file():
+        return False
+    refine = read_result_folder(stage.parent).summary.refine
+    return refine is not None and refine.kept
+
+
 def read_result_folder(path: Path) -> ResultFolder:
     """Read the summary and the photo times of a result folder; models and other tables are read on demand.
 

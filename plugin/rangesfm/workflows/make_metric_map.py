@@ -43,6 +43,7 @@ from rangesfm.refine.positions import HeldPositions
 from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, LoopClosing, RefineSummary, refine_with_ranges
 from rangesfm.result.metric_result import MetricResult, Rivals
+from rangesfm.result.result_folder import is_refined_model
 from rangesfm.scale.at_map import MapWithRanges, estimate_at, estimate_by_positions_at
 from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
@@ -339,6 +340,7 @@ def _refined(
         shared_errors_m=estimate.shared_errors_m,
         learn=learn,
         closing=closing,
+        is_refined=closing is not None or is_refined_model(survey.images.model),
         num_threads=survey.mapper.num_threads,
     )
 
