@@ -15,7 +15,7 @@ from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import SolverError
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import SilentProgress
-from rangesfm.result.result_folder import read_result_folder
+from rangesfm.result.result_folder import is_refined_model, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.settings import Survey
 from rangesfm.workflows.run import refine_model, scale_model
@@ -120,6 +120,7 @@ def test_where_it_breaks_the_scaled_map_is_the_result_and_says_so(survey: Survey
     summary, refine, place = done.summary, known(done.summary.refine), known(done.summary.place)
     assert not refine.kept
     assert refine.why_not_kept
+    assert not is_refined_model(survey.output.path / "sparse_metric" / "0")
     (reason,) = (reason for reason in summary.scale.reasons if reason.startswith("the refinement broke the map"))
     assert reason in summary.warnings
     assert reason in place.reasons

@@ -628,6 +628,21 @@ class TestWithNoise:
         )
         assert rmse(survey.centers(refined) - survey.centers_m) < max_error_m
 
+    def test_a_map_of_photos_alone_is_not_pulled_by_what_its_mapper_left_of_a_gradient(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        survey = make_survey("first_camera", pixel_stddev=0.3, radio=Radio(range_stddev_m=0.1), seed=1)
+        told: dict[str, Any] = {"scale_error": 1.1, "errors": 0.1}
+        refined, _ = survey.refine(survey.anchors(0.0), **told)
+        rng = np.random.default_rng(0)
+        monkeypatch.setattr(
+            "rangesfm.refine.graph_presolve.photo_gradient", lambda _, poses: 1e5 * rng.standard_normal(6 * len(poses))
+        )
+        again, _ = survey.refine(survey.anchors(0.0), **told)
+        np.testing.assert_allclose(survey.centers(again), survey.centers(refined), atol=1e-4)
+        pulled, _ = survey.refine(survey.anchors(0.0), refined=refined, errors=0.1)
+        assert rmse(survey.centers(pulled) - survey.centers(refined)) > 1e-3, "so large a gradient is seen"
+
     def test_a_refined_map_stays_where_it_is_and_its_errors_are_learnt_alike(self) -> None:
         """The ranges of one anchor are noisier, which only residuals show."""
         survey = make_survey("first_camera", pixel_stddev=0.3, radio=Radio(range_stddev_m=0.1), num_epochs=8, seed=1)

@@ -26,6 +26,7 @@ from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.result.places import path_in, recorded_path
+from rangesfm.result.result_folder import is_refined_model
 from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import KEYS, Survey
@@ -130,6 +131,9 @@ def test_result_and_summary_are_returned_as_written(refined: Done) -> None:
 def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Survey, refined: Done) -> None:
     shutil.copytree(refined.survey.output.path, survey.output.path)
     assert {"sparse_metric", "reference.csv", "report.html"} <= files_of(survey.output.path)
+    assert is_refined_model(survey.output.path / "sparse_metric" / "0")
+    assert not is_refined_model(survey.output.path / "sparse_scaled" / "0")
+    assert not is_refined_model(known(survey.images.model))
     second = survey.changed({"export.formats": (), "report.enabled": False})
     scaled = scale_model(second, progress=SilentProgress()).summary
     assert "comparison" not in scaled.to_json()
