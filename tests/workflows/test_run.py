@@ -134,6 +134,10 @@ def test_a_run_in_the_same_folder_leaves_nothing_of_the_one_before(survey: Surve
     assert is_refined_model(survey.output.path / "sparse_metric" / "0")
     assert not is_refined_model(survey.output.path / "sparse_scaled" / "0")
     assert not is_refined_model(known(survey.images.model))
+    written = (survey.output.path / "result.json").read_text()
+    (survey.output.path / "result.json").write_text("{}")
+    assert not is_refined_model(survey.output.path / "sparse_metric" / "0"), "of another program"
+    (survey.output.path / "result.json").write_text(written)
     second = survey.changed({"export.formats": (), "report.enabled": False})
     scaled = scale_model(second, progress=SilentProgress()).summary
     assert "comparison" not in scaled.to_json()

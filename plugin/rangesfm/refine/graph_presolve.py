@@ -88,7 +88,7 @@ def presolve(
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Presolved(errors, 0.0, problem.radio.anchors, 0.0, 0)
-    graph = _graph(problem, rays, errors, problem.radio.anchors, is_refined=problem.is_refined)
+    graph = _graph(problem, rays, errors, problem.radio.anchors)
     if loops is not None:
         graph = replace(graph, vision=graph.vision.with_loops(loops))
     fit, errors = _solve_with_own_errors(graph)
@@ -110,19 +110,14 @@ def presolve_again(
     New errors turn the whole map slightly. That is one step here, but tens of rejected steps in the full problem, whose
     points follow a turn along straight lines.
     """
-    graph = _graph(problem, rays, errors, anchors, is_refined=True)
+    graph = _graph(replace(problem, is_refined=True), rays, errors, anchors)
     state = solve_graph(graph, graph.start(), tolerance_m=_tolerance_m(errors)).state
     _move(problem, rays, graph.vision, state.poses, errors)
     return moved_anchors(anchors, state.anchors_m, state.biases_m)
 
 
 def _graph(
-    problem: RefinementProblem,
-    rays: Observations,
-    errors: RangeErrors,
-    anchors: tuple[AnchorEstimate, ...],
-    *,
-    is_refined: bool,
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
 ) -> KeyframeGraph:
     """Set up the keyframe graph of the current model.
 
@@ -135,7 +130,7 @@ def _graph(
     seen, poses = rays.subset(np.flatnonzero(takes_part)), model_poses(problem.metric, problem.frame_ids)
     vision = vision_information(seen, poses)
     return KeyframeGraph(
-        vision=with_gradient(vision, photo_gradient(seen, poses)) if is_refined else vision,
+        vision=with_gradient(vision, photo_gradient(seen, poses)) if problem.is_refined else vision,
         antennas=ranges.antennas.subset(ranges.rows),
         range_m=ranges.observations.log.range_m[ranges.rows],
         errors=errors,
@@ -273,5 +268,5 @@ def _triangulated(observations: Observations, poses: Poses, start: Array) -> Arr
         trial = points + steps_of_points(observations, root[:, :, None] * to_point, root * residuals)
         trial_cost = costs_of_points(observations, poses, trial)
         points = np.where((trial_cost < cost)[:, None], trial, points)
-        cost = np.minimum(trial_cost, cost)
+        cost = np.fmin(trial_cost, cost)  # a point without any cost keeps its place
     return points

@@ -203,7 +203,8 @@ def refine_with_ranges(
             other measurements may correct; None without any.
         learn: estimates the ranges' errors at the refined map, for its covariance; None: those in ``errors`` are used.
         closing: loops to be closed before; None without any.
-        is_refined: whether the model was refined with these ranges before. It stays where it is if nothing is new.
+        is_refined: whether the model was refined with these ranges before, as one whose loops
+            are closed was. It stays where it is if nothing is new.
 
     Returns:
         the refined model and the summary.
@@ -233,7 +234,7 @@ def refine_with_ranges(
         first_pose_is_fixed,
         None if first_pose_is_fixed else gravity,
         num_threads,
-        is_refined,
+        is_refined or closing is not None,
     )
     with at_most(num_threads):
         to_begin_with = _errors_to_begin_with(problem, errors, metric_from_sfm.scale)

@@ -234,9 +234,12 @@ class ResultFolder:
 def is_refined_model(path: Path | None) -> bool:
     """Return whether a model's folder is that of a result whose map was refined with ranges."""
     stage = None if path is None else path.resolve().parent
-    if stage is None or stage.name != MODEL_NAMES[1] or not (stage.parent / ResultSummary.NAME).is_file():
+    if stage is None or stage.name != "sparse_metric":
         return False
-    refine = read_result_folder(stage.parent).summary.refine
+    try:
+        refine = read_result_folder(stage.parent).summary.refine
+    except InputError:  # a folder of another program, or a result of another version
+        return False
     return refine is not None and refine.kept
 
 

@@ -340,7 +340,7 @@ def _refined(
         shared_errors_m=estimate.shared_errors_m,
         learn=learn,
         closing=closing,
-        is_refined=closing is not None or is_refined_model(survey.images.model),
+        is_refined=is_refined_model(survey.images.model),
         num_threads=survey.mapper.num_threads,
     )
 

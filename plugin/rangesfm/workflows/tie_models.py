@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.colmap_log import colmap_log
@@ -31,7 +31,7 @@ from rangesfm.workflows.loop_matching import LoopMatching
 from rangesfm.workflows.place_ranges import place_ranges
 
 # Largest difference of two ranges beyond the distance of their places, in standard deviations of a range.
-_MAX_IN_STDDEVS = float(np.sqrt(2) * norm.isf(MAX_CHANCE))
+_MAX_IN_STDDEVS = -float(np.sqrt(2) * ndtri(MAX_CHANCE))
 
 
 def tie_by_photos(run: SurveyRun, paths: Sequence[PathOfModel], times: ImageTimes | None) -> list[PathOfModel]:
