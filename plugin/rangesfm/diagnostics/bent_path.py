@@ -33,7 +33,7 @@ def bent_to_ranges(on_map: RangesOnMap) -> RangesOnMap:
     path that has drifted far.
     """
     for _ in range(_MAX_NUM_ROUNDS if isinstance(on_map.bending, WalkBending) else 0):
-        problem = learnt_at(on_map)
+        problem = linearized(on_map).with_learnt_errors()
         before, on_map = on_map, _bent_once(problem)
         moved_m = on_map.from_anchor_m - before.from_anchor_m
         if float(np.sqrt(np.mean(moved_m**2))) < _STILL * problem.scatter_m:
@@ -64,7 +64,7 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     posed, solution, bent_by_m = estimate.problem, estimate.solution, bends_m(on_map)
     if posed is None or solution is None or not len(bent_by_m):
         return estimate
-    problem, drift_m = learnt_at(on_map), rmse(bent_by_m[:, None])
+    problem, drift_m = linearized(on_map).with_learnt_errors(), rmse(bent_by_m[:, None])
     if drift_m < problem.scatter_m:
         return estimate
     known = _known(problem, posed, estimate.uncertainty.formal)
@@ -92,13 +92,6 @@ def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
     simple_m2 = problem.errors.only("white", *BENDS).covariance_m2 + bias_covariance(problem.bins, posed.ranges)
     by_others, _ = problem.with_weights(simple_m2, problem.errors.covariance_m2)
     return KnownMap.between(problem, problem.errors, formal, by_others, problem.solved(simple_m2).step)
-
-
-def learnt_at(on_map: RangesOnMap) -> Linearized:
-    """Return the linearised map, with the errors learnt under the assumption that no mistake was made."""
-    problem = linearized(on_map)
-    nothing = np.zeros((len(problem.residual_m), 0)), np.zeros((problem.num_priors, 0))
-    return problem.with_learnt_errors(*nothing)
 
 
 def _bent_once(problem: Linearized) -> RangesOnMap:

@@ -162,12 +162,14 @@ class Linearized(LinearMap):
         anchors: list[int] = np.unique(self.bins.anchor_index).tolist()
         return anchors
 
-    def with_learnt_errors(self, columns: Array, priors: Array) -> Linearized:
+    def with_learnt_errors(self, columns: Array | None = None, priors: Array | None = None) -> Linearized:
         """Return the problem with the errors learnt while given mistakes explain what they can.
 
         Args:
-            columns, priors: (c, k) and (r, k) effects of the mistakes.
+            columns, priors: (c, k) and (r, k) effects of the mistakes; None: no mistake was made.
         """
+        columns = self.design[:, :0] if columns is None else columns
+        priors = self.prior_design[:, :0] if priors is None else priors
         # Residuals are taken where the priors' residuals are smallest, with the map as it is.
         back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
         learnt = self.expected.learnt(

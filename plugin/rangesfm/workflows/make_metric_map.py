@@ -13,6 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece, loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale
+from rangesfm.diagnostics.anchor_sides import likelier_sides
 from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
 from rangesfm.diagnostics.finished_map import (
@@ -102,7 +103,7 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         metric = scale_by_survey(run, path, is_a_start=refine)
     if refine:
         with run.journal.stage("refinement"):
-            metric = refine_map(run, metric)
+            metric = _with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))
         metric = close_loops(run, metric, partial(refine_map, run))
     with run.journal.stage("judgement"):
         return judge_map(run, metric, of_pieces)
@@ -141,7 +142,9 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
         raise _refused_with_cause(error, run, path) from None
     on_map, rivals = None, None
     if not is_a_start and (on_map := _ranges_on_scaled(estimate, bending)) is not None:
-        estimate = estimate_by_bent(estimate, on_map, survey.scale)
+        sides = likelier_sides(on_map)
+        on_map, estimate = sides.on_map, estimate_by_bent(estimate, sides.on_map, survey.scale)
+        estimate = replace(estimate, anchors=sides.of(estimate.anchors))
     if offset is not None and offset.rivals:
         rivals = scale_by_rivals(run, path, offset, estimate.value)
     scaled = rescale(path.sfm, estimate.metric_from_sfm)
@@ -311,6 +314,23 @@ def refine_map(run: SurveyRun, metric: MetricResult, closing: LoopClosing | None
         refined_with_ranges=at_rest[0] if at_rest else None,
         positions_at_refined=placed[0] if placed else None,
     )
+
+
+def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: MetricResult) -> MetricResult:
+    """Return the refined map, refined again if the ranges say that an unknown anchor is on the other side of the path.
+
+    Args:
+        start: the scaled map. metric: the refined map.
+    """
+    at = metric.refined_with_ranges
+    if at is None or metric.kept_refinement is None:
+        return metric
+    sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
+    estimate = replace(start.estimate, anchors=sides.of(start.estimate.anchors))
+    if sides.has_crossed:
+        return refine_map(run, replace(start, estimate=estimate))
+    refinement = replace(metric.kept_refinement, anchors=sides.of(metric.kept_refinement.anchors))
+    return replace(metric, estimate=estimate, refinement=refinement)
 
 
 def _refined(

@@ -1,0 +1,94 @@
+"""Choice of the side of a path on which an unknown anchor stands, where the bending of the map decides it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.diagnostics.hypothesis_tests import Factorization
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized
+from rangesfm.geometry.similarity import path_shape
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
+from rangesfm.scale.range_equation import antenna_positions, state_after
+
+# Smallest gain in twice the log-likelihood that tells the sides apart.
+_MIN_GAIN = 2 * MIN_COST_GAP
+# Gauss-Newton steps from an anchor's mirror image, which is near the minimum on that side.
+_NUM_STEPS = 5
+
+
+@dataclass(frozen=True)
+class AnchorSides:
+    """Sides of the path's plane on which unknown anchors stand.
+
+    Attributes:
+        on_map: with each anchor on its likelier side.
+        has_crossed: whether an anchor is much likelier on the other side than it was before.
+        mirrors_m: by id of each unknown anchor, its (3,) place on the other side if that is about as likely, or None.
+    """
+
+    on_map: RangesOnMap
+    has_crossed: bool
+    mirrors_m: Mapping[str, Array | None]
+
+    def of(self, anchors: Iterable[AnchorEstimate]) -> tuple[AnchorEstimate, ...]:
+        """Return estimates of anchors with the unknown ones on these sides."""
+        at_m = dict(zip(self.on_map.anchor_ids, self.on_map.state.anchors_m, strict=True))
+        return tuple(
+            replace(
+                anchor,
+                position_m=at_m[anchor.anchor_id] if self.has_crossed else anchor.position_m,
+                mirror_position_m=self.mirrors_m[anchor.anchor_id],
+            )
+            if anchor.anchor_id in self.mirrors_m
+            else anchor
+            for anchor in anchors
+        )
+
+
+def likelier_sides(on_map: RangesOnMap) -> AnchorSides:
+    """Find for each unknown anchor the side of its path where the ranges are likelier.
+
+    On a nearly flat path, an anchor and its mirror image fit alike, and which of them fits a map of one piece better
+    may depend on how the map drifts. Here the map may bend as its photos allow.
+    """
+    heard = np.unique(on_map.problem.anchor_index)
+    unknown = heard[np.isinf(on_map.problem.anchor_stddev_m[heard])]
+    mirrors_m: dict[str, Array | None] = {}
+    has_crossed = False
+    if not len(unknown):
+        return AnchorSides(on_map, has_crossed, mirrors_m)
+    problem = linearized(on_map).with_learnt_errors()
+    for k in unknown.tolist():
+        other = _on_other_side(problem, k)
+        gain = _misfit(problem) - _misfit(other)
+        if gain > 0:  # learning the errors takes time, and it hardly changes which side fits better
+            other = other.with_learnt_errors()
+            gain = Factorization(problem).deviance() - Factorization(other).deviance()
+        is_open, crosses = abs(gain) < _MIN_GAIN, gain >= _MIN_GAIN
+        mirrors_m[on_map.anchor_ids[k]] = other.on_map.state.anchors_m[k] if is_open else None
+        problem, has_crossed = (other, True) if crosses else (problem, has_crossed)
+    return AnchorSides(problem.on_map if has_crossed else on_map, has_crossed, mirrors_m)
+
+
+def _on_other_side(problem: Linearized, k: int) -> Linearized:
+    """Return the problem at the likeliest state with an anchor on the other side of the plane of its path."""
+    on_map = problem.on_map
+    anchors_m, tags_m = on_map.state.anchors_m.copy(), antenna_positions(on_map.problem, on_map.state.metric_from_model)
+    path = path_shape(tags_m[on_map.problem.anchor_index == k])
+    normal = path.axes[:, 2]
+    anchors_m[k] -= 2 * ((anchors_m[k] - path.centroid) @ normal) * normal
+    state = replace(on_map.state, anchors_m=anchors_m)
+    for _ in range(_NUM_STEPS):
+        problem = at_state(problem, replace(on_map, state=state))
+        state = state_after((problem.columns,), state, Factorization(problem).step)
+    return at_state(problem, replace(on_map, state=state))
+
+
+def _misfit(problem: Linearized) -> float:
+    left = Factorization(problem).residual
+    return float(left @ left)

@@ -1,0 +1,71 @@
+"""The side of a nearly flat path on which an unknown anchor stands, with a map that may have drifted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.known import known
+from tests.studies.drifting_maps import Made, lap_of_drift, run
+
+from rangesfm.diagnostics.anchor_sides import likelier_sides
+from rangesfm.diagnostics.linearized import ranges_on_map
+from rangesfm.result.metric_result import MetricResult
+from rangesfm.workflows import make_metric_map
+
+DRIFT_M, NUM_KEYFRAMES = 0.5, 100
+# As one piece, this map fits better with the anchor below the path. The anchor is above it, which is -y here.
+FITS_BELOW = 1
+# This one tells the sides apart neither before nor after it is refined.
+TELLS_NOTHING = 2
+
+
+def surveyed(seed: int) -> Made:
+    return lap_of_drift(DRIFT_M, seed, "unknown", num_keyframes=NUM_KEYFRAMES)
+
+
+@pytest.fixture(scope="module")
+def crossed() -> MetricResult:
+    return run(surveyed(FITS_BELOW), 0)
+
+
+def test_an_anchor_that_drift_puts_on_the_wrong_side_is_brought_to_the_right_one(crossed: MetricResult) -> None:
+    [anchor] = crossed.anchors
+    truth_m = surveyed(FITS_BELOW).anchors_m["A1"]
+    assert np.linalg.norm(anchor.position_m - truth_m) < 3 * np.sqrt(3) * anchor.position_stddev_m
+    assert anchor.mirror_position_m is None
+    assert crossed.estimate.verdict == "good", crossed.estimate.reasons
+
+
+def test_without_the_second_look_the_anchor_would_be_on_the_wrong_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The survey above is one whose map of one piece misleads; a mistake was named there that nobody made."""
+    monkeypatch.setattr(make_metric_map, "_with_anchors_on_likelier_sides", lambda run, start, refined: refined)
+    found = run(surveyed(FITS_BELOW), 0)
+    assert found.anchors[0].position_m[1] > 0
+
+
+def test_an_anchor_on_the_right_side_stays_there(crossed: MetricResult) -> None:
+    at = known(crossed.refined_with_ranges)
+    sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
+    assert not sides.has_crossed
+    assert sides.mirrors_m == {"A1": None}
+    assert sides.of(crossed.anchors) == crossed.anchors
+
+
+def test_sides_that_the_ranges_do_not_tell_apart_are_both_given() -> None:
+    survey = surveyed(TELLS_NOTHING)
+    found = run(survey, 0)
+    [anchor] = found.anchors
+    places_m = np.array([anchor.position_m, known(anchor.mirror_position_m)])
+    off_m = np.linalg.norm(places_m - survey.anchors_m["A1"], axis=1)
+    assert off_m.min() < 1.0
+    assert off_m.max() > 10.0
+    assert any("on which side of it the unknown anchors stand" in reason for reason in found.estimate.reasons)
+
+
+def test_surveyed_anchors_are_left_alone(crossed: MetricResult) -> None:
+    at = known(crossed.refined_with_ranges)
+    on_map = ranges_on_map(at.posed, at.solution, at.bending)
+    surveyed_m = replace(on_map.problem, anchor_mean_m=on_map.state.anchors_m, anchor_stddev_m=np.array([0.02]))
+    assert likelier_sides(replace(on_map, problem=surveyed_m)).mirrors_m == {}
