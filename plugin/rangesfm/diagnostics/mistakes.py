@@ -9,6 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives, lever_arms_in_other_axes
+from rangesfm.diagnostics.bursts import likeliest_burst, without
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis, corrected, of_bins
 from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
@@ -33,6 +34,8 @@ _SAME, _MAX_NUM_RIVALS = 0.95, 2
 _NUM_SETTLING, _SETTLED = 6, 0.05
 # Consecutive growing steps that count as divergence. One may be too short at first, with a large mistake.
 _NUM_LONGER = 2
+# Most bursts that are left out. More of them are no exception, and are seen as noise.
+_MAX_NUM_BURSTS = 8
 # Largest number of steps for a nonlinear hypothesis.
 _NUM_STEPS = 10
 
@@ -90,8 +93,7 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     problem = linearized(on_map)
     standing = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
-    problem = _learnt(problem, standing)
-    all_tests = Factorization(problem).test(hypotheses, seed)
+    problem, all_tests = _tested(problem, standing, hypotheses, seed)
     tests = _best_of_each(all_tests, problem)
     possible = [test for test in tests if test.is_possible]
     rejected = [test for test in possible if test.is_rejected]
@@ -100,6 +102,26 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
         problem = _learnt(problem, [*standing, causes[0].test.hypothesis])
         tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
     return Findings(problem, tuple(tests), tuple(causes), hidden_among(all_tests))
+
+
+def _tested(
+    problem: Linearized, standing: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis], seed: int
+) -> tuple[Linearized, list[Test]]:
+    """Test all hypotheses, without the bursts of obstructed ranges that explain the residuals better than any.
+
+    Returns:
+        the problem with the errors learnt while the standing mistakes explain what they can, and the tests.
+    """
+    for _ in range(_MAX_NUM_BURSTS):
+        problem = _learnt(problem, standing)
+        factorized = Factorization(problem)
+        tests = factorized.test(hypotheses, seed)
+        burst, num = likeliest_burst(factorized), len(problem.residual_m)
+        likeliest = max((test.statistic - _penalty(test, num) for test in tests if test.is_possible), default=0.0)
+        if burst.statistic < burst.threshold or burst.statistic - float(np.log(num)) < likeliest:
+            break
+        problem = without(problem, burst)
+    return problem, tests
 
 
 def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized:

@@ -1,0 +1,73 @@
+"""Bursts of obstructed ranges: for seconds all ranges to an anchor read too long, as where somebody stands between.
+
+Single obstructed ranges differ from those right before and after. Those of a burst agree with each other, so that they
+would count like all others, and a mistake of the same size at that time would explain them. They are no mistake.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import special
+
+from rangesfm.arrays import Indices
+from rangesfm.diagnostics.hypothesis_tests import Factorization
+from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE
+
+# Longest burst, seconds: the correlation time of errors that last for seconds. What lasts longer is a mistake.
+_LONGEST_S = 3.0
+# Standard deviation, metres, of the bins of a burst: they say nothing any more.
+_NOTHING_SAID_M = 10.0
+# Name of the errors of left out bins.
+_OBSTRUCTED = "obstructed"
+
+
+@dataclass(frozen=True)
+class Burst:
+    """A burst, as the residuals show it.
+
+    Attributes:
+        bins: of its ranges. statistic: chi-square distributed with one degree of freedom where there is no burst.
+        threshold: of the statistic, for all possible bursts together.
+    """
+
+    bins: Indices
+    statistic: float
+    threshold: float
+
+
+def likeliest_burst(solved: Factorization) -> Burst:
+    """Return the burst that explains the residuals best; its statistic is 0 if none makes ranges too long."""
+    windows = _windows(solved.problem)
+    columns = np.zeros((len(solved.problem.bins), len(windows)))
+    for column, window in enumerate(windows):
+        columns[window, column] = -1.0  # a longer range is a smaller residual
+    left = solved.left(solved.whitened(columns, np.zeros((solved.num_priors, len(windows)))))
+    pulls = left.T @ solved.residual / np.maximum(np.linalg.norm(left, axis=0), 1e-12)
+    best = int(np.argmax(pulls))
+    threshold = float(special.chdtri(1, FALSE_ALARM_RATE / len(windows)))
+    return Burst(windows[best], max(float(pulls[best]), 0.0) ** 2, threshold)
+
+
+def without(problem: Linearized, burst: Burst) -> Linearized:
+    """Return the problem with the ranges of a burst left out."""
+    known = dict(problem.expected.known)
+    variances_m2 = np.zeros(len(problem.bins))
+    variances_m2[burst.bins] = _NOTHING_SAID_M**2
+    known[_OBSTRUCTED] = known.get(_OBSTRUCTED, np.zeros((len(problem.bins),) * 2)) + np.diag(variances_m2)
+    return replace(problem, expected=replace(problem.expected, known=known))
+
+
+def _windows(problem: Linearized) -> list[Indices]:
+    """Return the bins of all possible bursts: consecutive ones of one anchor and tag that are over in seconds."""
+    bins, found = problem.bins, []
+    order = np.lexsort((bins.time_s, bins.tag_index, bins.anchor_index))
+    link, time_s = np.stack([bins.anchor_index, bins.tag_index])[:, order], bins.time_s[order]
+    for first in range(len(order)):
+        for end in range(first + 1, len(order) + 1):
+            if np.any(link[:, end - 1] != link[:, first]) or time_s[end - 1] - time_s[first] > _LONGEST_S:
+                break
+            found.append(order[first:end])
+    return found
