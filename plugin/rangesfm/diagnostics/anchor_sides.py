@@ -15,7 +15,7 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.scale.range_equation import antenna_positions, state_after
 
-# Smallest gain in twice the log-likelihood that tells the sides apart.
+# Smallest gain in twice the log-likelihood that rules out the other side.
 _MIN_GAIN = 2 * MIN_COST_GAP
 # Gauss-Newton steps from an anchor's mirror image, which is near the minimum on that side.
 _NUM_STEPS = 5
@@ -27,7 +27,7 @@ class AnchorSides:
 
     Attributes:
         on_map: with each anchor on its likelier side.
-        has_crossed: whether an anchor is much likelier on the other side than it was before.
+        has_crossed: whether an anchor is likelier on the other side than where it was before.
         mirrors_m: by id of each unknown anchor, its (3,) place on the other side if that is about as likely, or None.
     """
 
@@ -69,9 +69,9 @@ def likelier_sides(on_map: RangesOnMap) -> AnchorSides:
         if gain > 0:  # learning the errors takes time, and it hardly changes which side fits better
             other = other.with_learnt_errors()
             gain = Factorization(problem).deviance() - Factorization(other).deviance()
-        is_open, crosses = abs(gain) < _MIN_GAIN, gain >= _MIN_GAIN
-        mirrors_m[on_map.anchor_ids[k]] = other.on_map.state.anchors_m[k] if is_open else None
-        problem, has_crossed = (other, True) if crosses else (problem, has_crossed)
+        likelier, less_likely = (other, problem) if gain > 0 else (problem, other)
+        mirrors_m[on_map.anchor_ids[k]] = less_likely.on_map.state.anchors_m[k] if abs(gain) < _MIN_GAIN else None
+        problem, has_crossed = likelier, has_crossed or gain > 0
     return AnchorSides(problem.on_map if has_crossed else on_map, has_crossed, mirrors_m)
 
 
