@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
@@ -51,6 +52,8 @@ _MORE_OFTEN, _NUM_AGAIN = (10, 50), 5
 _NUM_BEST = 3
 # Number of places, of all allowed ones, that are tried for an anchor.
 _NUM_PLACES = 8
+# Number of places to which each anchor may be moved: those where one more anchor would gain most.
+_NUM_PLACES_TO_MOVE_TO = 2
 # Smallest relative reduction of a standard deviation for which a change is reported.
 _LEAST_GAIN = 0.02
 # The same in the warnings after a survey: the standard deviation is divided by 1.2 or more.
@@ -91,16 +94,25 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
 
     What the photos see is assumed to be the same with each change.
     """
-    before = expected if expected.refusal else expect_roughly(expected.planned, expected.vision)
-    found = []
-    for change in _changes(expected.planned):
-        if _leads_through_walls(expected.planned, change[3]):
-            continue
-        try:
-            found.append(_advice(change, expect_roughly(change[3], expected.vision), before, expected))
-        except GeometryError:  # a run will find too few ranges
-            continue
+    planned = expected.planned
+    before = expected if expected.refusal else expect_roughly(planned, expected.vision)
+
+    def tried(changes: Iterable[_Change]) -> Iterator[Advice]:
+        for change in changes:
+            if not _leads_through_walls(planned, change[3]):
+                with suppress(GeometryError):  # a run will find too few ranges
+                    yield _advice(change, expect_roughly(change[3], expected.vision), before, expected)
+
+    more = list(tried(_with_one_more(planned)))
+    found = [*more, *tried(_moved(planned, _best_places(more))), *tried(_changes(planned))]
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
+
+
+def _best_places(more: Sequence[Advice]) -> list[Array]:
+    """Return the places, each once, where one more anchor gains most for the scale and for the position."""
+    gains = attrgetter("scale_gain"), attrgetter("place_gain")
+    best = [each for gain in gains for each in sorted(more, key=gain, reverse=True)[:_NUM_PLACES_TO_MOVE_TO]]
+    return list({id(each): each.planned.anchors_m[-1] for each in best}.values())
 
 
 def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
@@ -150,8 +162,6 @@ def _advice(change: _Change, after: Expected, before: Expected, stated: Expected
 
 def _changes(planned: PlannedSurvey) -> Iterator[_Change]:
     yield from _raised(planned)
-    yield from _moved(planned)
-    yield from _with_one_more(planned)
     path = planned.trajectory
     if planned.anchor_frame == "unknown" and len(planned.anchors) > 2:
         known = tuple(replace(anchor, position_stddev_m=_SURVEYED_M) for anchor in planned.anchors)
@@ -226,10 +236,10 @@ def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
                 yield "anchor height", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
-def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
+def _moved(planned: PlannedSurvey, places: Sequence[Array]) -> Iterator[_Change]:
     """Yield the plan with each anchor moved to each of some allowed places."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
-        for place in _free_places(planned):
+        for place in places:
             words = f"move anchor {anchor.anchor_id} to {coordinates_text(place)}"
             yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
