@@ -11,6 +11,7 @@ surveyed (site frame), known in the first pose's frame, all unknown, or each one
 With --by_photo, ranges name the nearest pose instead of a time. With --turned, the unscaled path lies in another frame,
 which should change nothing. With --leave_radio_out, the expected errors come from all radios but the present one. With
 --calibrated, an error curve is subtracted that was learnt on another log of the same radio, if there is one.
+The last column has the mistakes that the tests of the map name; none is known to have been made.
 """
 
 from __future__ import annotations
@@ -29,13 +30,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from rangesfm.diagnostics.anchor_sides import likelier_sides
+from rangesfm.diagnostics.bent_path import bent_to_ranges
+from rangesfm.diagnostics.diagnosis import diagnose_ranges
+from rangesfm.diagnostics.linearized import ranges_on_map
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.reference import Reference, read_reference
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import AssociationOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.association import associate
+from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.errors.components import components, population
 from rangesfm.ranging.errors.error_curve import ErrorCurve, correct_ranges
 from rangesfm.ranging.errors.radio_calibration import calibrate_ranges
@@ -43,6 +49,7 @@ from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 FACTOR, MIN_STEP_S, MAX_GAP_S = 4.63, 0.1, 0.25
 
@@ -80,15 +87,15 @@ def main() -> None:
                 observations = placed(log, case, given, sets[name], by_photo=args.by_photo)
                 with patch("rangesfm.ranging.errors.learned.COMPONENTS", expected):
                     found.append(one_survey(name, case, observations, given))
-    known = np.array([row for row in found if row is not None])
+    known = np.array([row for row in found if row is not None], dtype=np.float64)
     if len(known):
-        errors, low, high = known.T
+        errors, low, high, num_named = known.T
         half_widths = (high - low) / 2
         from_middle = 1.96 * (errors + (low + high) / 2) / half_widths
         print(
             f"{len(known)} of {len(found)}: {100 * np.mean((low <= -errors) & (-errors <= high)):.0f} % covered, the "
             f"truth from the middle in stddevs {np.sqrt(np.mean(from_middle**2)):.2f} (rms), median half width "
-            f"{100 * np.median(half_widths):.2f} %"
+            f"{100 * np.median(half_widths):.2f} %, a mistake named in {np.count_nonzero(num_named)}"
         )
 
 
@@ -176,8 +183,11 @@ def curve_of(data: Path, described: dict[str, Any]) -> ErrorCurve:
 
 def one_survey(
     name: str, case: Case, observations: RangeObservations, path: Trajectory
-) -> tuple[float, float, float] | None:
-    """Return the error of the scale's logarithm, and its interval about the estimate; None if refused."""
+) -> tuple[float, float, float, int] | None:
+    """Return the error of the scale's logarithm, its interval about the estimate, and the number of mistakes named.
+
+    None if refused.
+    """
     began = time.process_time()
     options = ScaleOptions(max_relative_stddev=1.0)
     try:
@@ -186,14 +196,24 @@ def one_survey(
         print(f"{name:16}{case.name:10} refused: {refusal}", flush=True)
         return None
     error, (low, high) = float(np.log(found.value / FACTOR)), found.uncertainty.interval_95
+    causes = named(found, path)
+    seconds = time.process_time() - began
     largest = sorted(found.uncertainty.components.items(), key=lambda part: -part[1])[:3]
     print(
         f"{name:16}{case.name:10}{100 * error:+7.2f} %, truth within {100 * low:+6.2f} to {100 * high:+6.2f} % "
         f"{'covered' if low <= -error <= high else 'MISSED '} {found.verdict:9}"
-        f"{time.process_time() - began:5.1f} s  {', '.join(f'{part} {196 * stddev:.1f}' for part, stddev in largest)}",
+        f"{seconds:5.1f} s  {', '.join(f'{part} {196 * stddev:.1f}' for part, stddev in largest)}; {causes}",
         flush=True,
     )
-    return error, low, high
+    return error, low, high, len(causes)
+
+
+def named(found: ScaleEstimate, path: Trajectory) -> list[str]:
+    """Return the likeliest mistake, and those that cannot be told from it, in words."""
+    assert found.problem is not None
+    assert found.solution is not None
+    on_map = ranges_on_map(found.problem, found.solution, WalkBending(in_first_camera(path)))
+    return [cause.words for cause in diagnose_ranges(bent_to_ranges(likelier_sides(on_map).on_map)).causes]
 
 
 if __name__ == "__main__":
