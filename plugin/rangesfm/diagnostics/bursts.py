@@ -1,7 +1,8 @@
-"""Bursts of obstructed ranges: for seconds all ranges to an anchor read too long, as where somebody stands between.
+"""Bursts of erring ranges: for seconds all ranges to an anchor err alike, and then they are right again.
 
-Single obstructed ranges differ from those right before and after. Those of a burst agree with each other, so that they
-would count like all others, and a mistake of the same size at that time would explain them. They are no mistake.
+Somebody stands between, an echo is taken for the signal, or a logger hangs for a moment. Single outliers differ from
+the ranges right before and after. Those of a burst agree with each other, so that they would count like all others, and
+a mistake of the same size at that time would explain them. They are no mistake.
 """
 
 from __future__ import annotations
@@ -20,8 +21,7 @@ from rangesfm.scale.linear_map import FALSE_ALARM_RATE
 _LONGEST_S = 3.0
 # Standard deviation, metres, of the bins of a burst: they say nothing any more.
 _NOTHING_SAID_M = 10.0
-# Name of the errors of left out bins.
-_OBSTRUCTED = "obstructed"
+_NAME = "bursts"
 
 
 @dataclass(frozen=True)
@@ -39,24 +39,23 @@ class Burst:
 
 
 def likeliest_burst(solved: Factorization) -> Burst:
-    """Return the burst that explains the residuals best; its statistic is 0 if none makes ranges too long."""
+    """Return the burst that explains the residuals best."""
     windows = _windows(solved.problem)
     columns = np.zeros((len(solved.problem.bins), len(windows)))
     for column, window in enumerate(windows):
-        columns[window, column] = -1.0  # a longer range is a smaller residual
+        columns[window, column] = 1.0
     left = solved.left(solved.whitened(columns, np.zeros((solved.num_priors, len(windows)))))
-    pulls = left.T @ solved.residual / np.maximum(np.linalg.norm(left, axis=0), 1e-12)
-    best = int(np.argmax(pulls))
+    statistics = (left.T @ solved.residual / np.maximum(np.linalg.norm(left, axis=0), 1e-12)) ** 2
+    best = int(np.argmax(statistics))
     threshold = float(special.chdtri(1, FALSE_ALARM_RATE / len(windows)))
-    return Burst(windows[best], max(float(pulls[best]), 0.0) ** 2, threshold)
+    return Burst(windows[best], float(statistics[best]), threshold)
 
 
 def without(problem: Linearized, burst: Burst) -> Linearized:
     """Return the problem with the ranges of a burst left out."""
-    known = dict(problem.expected.known)
-    variances_m2 = np.zeros(len(problem.bins))
-    variances_m2[burst.bins] = _NOTHING_SAID_M**2
-    known[_OBSTRUCTED] = known.get(_OBSTRUCTED, np.zeros((len(problem.bins),) * 2)) + np.diag(variances_m2)
+    known, num = problem.expected.known, len(problem.bins)
+    variances_m2 = np.bincount(burst.bins, np.full(len(burst.bins), _NOTHING_SAID_M**2), num)
+    known = {**known, _NAME: known.get(_NAME, np.zeros((num, num))) + np.diag(variances_m2)}
     return replace(problem, expected=replace(problem.expected, known=known))
 
 

@@ -64,11 +64,11 @@ def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     found = find_mistakes(on_map, seed=seed)
     shown = list(_evidence(found.problem))
     before = _before_causes(found, shown)
-    after = [row for row in shown if row not in before]
+    seen = [row for row in shown if row.rejected and row not in before]
     named = {(cause.name, cause.subject) for cause in found.causes}
     others = (row_of(test) for test in found.tests if test.hypothesis.key not in named)
-    rows = (*before, *map(_row_of_cause, found.causes), *others, *after)
-    reasons = [f"{row.words}: {row.remedy}" for row in (*before, *(row for row in after if row.rejected))]
+    rows = (*before, *map(_row_of_cause, found.causes), *seen, *others, *(row for row in shown if not row.rejected))
+    reasons = [f"{row.words}: {row.remedy}" for row in (*before, *seen)]
     if found.causes:
         reasons.insert(len(before), causes_in_words(found.causes))
     return Diagnosis(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.posed.rows, found.hidden)

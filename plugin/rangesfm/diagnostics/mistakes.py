@@ -25,8 +25,8 @@ _NUM_TRIED, _NUM_OF_KIND, _NUM_NEARLY = 6, 2, 3
 _NUM_FITTED = 12
 # Smallest difference of scores (twice a log-likelihood, less a penalty) that tells two explanations apart.
 _AS_LIKELY = 6.0
-# The same for alternatives where no test exceeds its threshold. By Markov's inequality a likelihood ratio is as large
-# by chance in one of 100 surveys at most: the mean of each ratio is 1, and the penalty counts the alternatives.
+# The same where no test exceeds its threshold. By Markov's inequality a likelihood ratio is as large
+# by chance in one of 100 surveys at most: the mean of each ratio is 1, and the penalty counts what is tried.
 _BEYOND_CHANCE = 2 * float(np.log(100))
 # Overlap of two hypotheses from which on nothing tells them apart, and most causes that are named beside the likeliest.
 _SAME, _MAX_NUM_RIVALS = 0.95, 2
@@ -97,7 +97,7 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     tests = _best_of_each(all_tests, problem)
     possible = [test for test in tests if test.is_possible]
     rejected = [test for test in possible if test.is_rejected]
-    causes = _causes(problem, rejected or possible[:_NUM_NEARLY], is_sure=bool(rejected))
+    causes = _causes(problem, rejected or possible[:_NUM_NEARLY], len(all_tests), is_sure=bool(rejected))
     if causes and causes[0].test is not None:
         problem = _learnt(problem, [*standing, causes[0].test.hypothesis])
         tests = _best_of_each(Factorization(problem).test(hypotheses, seed), problem)
@@ -107,7 +107,7 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
 def _tested(
     problem: Linearized, standing: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis], seed: int
 ) -> tuple[Linearized, list[Test]]:
-    """Test all hypotheses, without the bursts of obstructed ranges that explain the residuals better than any.
+    """Test all hypotheses, without the bursts of erring ranges that explain the residuals better than any.
 
     Returns:
         the problem with the errors learnt while the standing mistakes explain what they can, and the tests.
@@ -130,8 +130,13 @@ def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized
     return problem.with_learnt_errors(effects.columns, effects.priors)
 
 
-def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) -> list[Cause]:
-    """Return the likeliest explanation and those as good; empty if none is better than chance."""
+def _causes(problem: Linearized, nominated: Sequence[Test], num_tests: int, *, is_sure: bool) -> list[Cause]:
+    """Return the likeliest explanation and those as good; empty if none is better than chance.
+
+    Args:
+        nominated: tests whose hypotheses are tried. num_tests: number of all tests.
+        is_sure: whether the nominated tests exceed their thresholds.
+    """
     before = Factorization(_learnt(_settled(problem), [])).deviance()
     num = len(problem.residual_m)
     causes = []
@@ -143,7 +148,9 @@ def _causes(problem: Linearized, nominated: Sequence[Test], *, is_sure: bool) ->
         # The first step of a nonlinear hypothesis says little about a large mistake, so it needs more than the penalty.
         # An explanation fails if the errors alone explain as much once no other mistake takes part of it.
         penalty = _penalty(again, num)
-        enough = penalty if is_sure and test.hypothesis.is_linear else test.threshold
+        enough = penalty if test.hypothesis.is_linear else test.threshold
+        if not is_sure:
+            enough = penalty + 2 * float(np.log(num_tests)) + _BEYOND_CHANCE
         if is_found and gain > enough:
             causes.append(_cause(replace(again, threshold=test.threshold), state, gain, penalty))
     if not causes and not is_sure:
