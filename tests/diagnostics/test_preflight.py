@@ -146,6 +146,11 @@ def test_ranges_that_last_a_fraction_of_the_walk_are_told() -> None:
     assert note.startswith("the ranges last 0.12 s, the photos 120 s")
 
 
+@pytest.mark.parametrize(("num_ranges", "num_photos"), [(1, 400), (400, 1), (0, 400)])
+def test_one_range_or_one_photo_lasts_for_no_time_and_is_not_compared(num_ranges: int, num_photos: int) -> None:
+    assert not list(notes_on_times(WALK_S[:num_ranges], WALK_S[:num_photos]))
+
+
 def test_keyframes_too_far_apart_for_the_ranges_between_them_are_told_and_one_pause_is_not() -> None:
     assert not list(notes_on_gaps(np.append(np.arange(10.0), 11.5), 2.0))
     assert not list(notes_on_gaps(np.array([3.0]), 2.0))

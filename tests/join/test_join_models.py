@@ -152,6 +152,19 @@ def test_halves_of_a_walk_are_where_they_were_if_the_anchors_are_known(exact: Ha
     assert predicted == pytest.approx(np.tile(joined.path.trajectory.centers[HALF + 3], (len(predicted), 1)), abs=1e-9)
 
 
+def test_anchors_that_noise_moves_are_not_called_elsewhere_and_all_ranges_count_in_the_end(
+    exact: Halves, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noise_m = 0.05 * np.random.default_rng(0).standard_normal(len(exact.log))
+    rough = replace(exact, log=replace(exact.log, range_m=exact.log.range_m + noise_m))
+    joined = rough.with_ranges(np.ones(len(noise_m), dtype=bool)).join("unknown")
+    assert joined.notes == ()
+    # Places are searched for with a part of the ranges.
+    monkeypatch.setattr("rangesfm.scale.model_placement.SUBSET_PER_ANCHOR", 6)
+    again = rough.with_ranges(np.ones(len(noise_m), dtype=bool)).join("unknown")
+    np.testing.assert_allclose(again.path.trajectory.centers, joined.path.trajectory.centers, atol=1e-5)
+
+
 def test_a_half_that_shares_too_few_anchors_is_left_out_and_nothing_invented(exact: Halves) -> None:
     index = exact.log.anchor_ids.index("A1")
     halves = exact.with_ranges(of_half(exact, 0) | (exact.log.anchor_index == index))

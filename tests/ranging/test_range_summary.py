@@ -101,6 +101,12 @@ def test_noise_is_found_whatever_the_rate(rate_hz: float, stddev_m: float) -> No
     assert estimate_noise_m(time, noisy) == pytest.approx(stddev_m, rel=0.1)
 
 
+def test_the_curve_of_a_walk_is_no_noise() -> None:
+    noise_m = estimate_noise_m(*walk(5.0, 500))
+    assert noise_m is not None
+    assert noise_m < 0.003  # a tenth of a good radio's
+
+
 def test_noise_is_that_of_most_ranges_in_spite_of_outliers_gaps_and_order() -> None:
     time, range_m = walk(10.0, 3000)
     random = np.random.default_rng(2)

@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
+import pytest
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import orbit_path
 
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.refine.bundle_adjustment import bundle_adjustment
+from rangesfm.refine.bundle_adjustment import bundle_adjustment, solve_bundle_adjustment, solve_until_still
+
+
+def orbit() -> pycolmap.Reconstruction:
+    times, path = np.arange(6.0), orbit_path(8.0)
+    poses = (times, path.centers(times), path.world_from_cam(times))
+    return synthetic_model(*poses, num_observations=20, pixel_stddev=1.0).reconstruction
+
+
+@pytest.mark.parametrize(("num_left", "expected"), [(1, False), (20, True)])
+def test_a_map_is_at_rest_only_after_the_iterations_that_it_needs(num_left: int, expected: bool) -> None:
+    model = orbit()
+    rng = np.random.default_rng(0)
+    for point in model.points3D.values():
+        point.xyz += 0.3 * rng.standard_normal(3)
+    one_step = RefineOptions(max_num_iterations=1)
+    bundle = bundle_adjustment(model, CameraOptions(), one_step, fixed_frame_id=None, num_threads=1)
+    run = solve_bundle_adjustment(bundle, tolerance_m=1e-4)
+    assert not run.is_still
+    assert solve_until_still(bundle, run, tolerance_m=1e-4, num_left=num_left)[1] == expected
 
 
 def test_points_that_are_left_out_take_no_part_and_stay_in_the_model() -> None:
-    times, path = np.arange(6.0), orbit_path(8.0)
-    poses = (times, path.centers(times), path.world_from_cam(times))
-    model = synthetic_model(*poses, num_observations=20, pixel_stddev=1.0).reconstruction
+    model = orbit()
     before = {point_id: (point.xyz.copy(), point.track.length()) for point_id, point in model.points3D.items()}
     num_seen = {image_id: image.num_points3D for image_id, image in model.images.items()}
     left_out = sorted(before)[2:5]

@@ -993,4 +993,5 @@ class TestProblem:
             point.xyz += 0.02 * rng.standard_normal(3)
         _, summary = survey.refine(survey.anchors(0.0), 1.05, options=RefineOptions(max_num_iterations=1))
         assert not summary.converged
+        assert ", not converged," in repr(summary)
         assert summary.message

@@ -51,7 +51,7 @@ class PhotoBending:
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
         functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)
-        parts = functions.reshape(len(by_pose), -1, 6)
+        parts = functions.reshape(len(by_pose), len(self.path), 6)
         by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
         covariance, shift_m = self.photos.of_functions(self.frame_ids, parts[:, :, :3], by_center)
         found = bending_part("bending", covariance, _FACTOR, _SPREAD)

@@ -7,6 +7,7 @@ known in the frame of the path, maximum consensus over the scale is exact.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TypeVar
@@ -194,8 +195,8 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
         for side in (height, -height):
             at = RangeState(IDENTITY, (on_plane + side * normal)[None], state.bias_m[k : k + 1])
             fits.append(solve(alone, at, tolerance=1e-8))
-        if fits[0].cost - fits[1].cost > SAME_COST * (1 + fits[0].cost):
-            fits.reverse()
+        if not math.isclose(fits[0].cost, fits[1].cost, rel_tol=SAME_COST, abs_tol=SAME_COST):
+            fits.sort(key=lambda fit: fit.cost)
         anchors[k], others[k] = (fit.state.anchors_m[0] for fit in fits)
         rise[k] = fits[1].cost - fits[0].cost
     return replace(state, anchors_m=anchors), others, rise
@@ -295,7 +296,7 @@ def consensus_scales(problem: RangeProblem) -> list[float]:
 def _hilltops(scales: Array, counts: Indices) -> list[float]:
     """Return the highest scale of each local maximum on the grid, best first."""
     cells = np.floor(np.log(scales) / _LOG_CELL).astype(np.int64)
-    first = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
+    first = np.unique(cells, return_index=True)[1]
     best = np.maximum.reduceat(counts, first)
     if len(first) == 1:
         return [float(scales[np.argmax(counts)])]

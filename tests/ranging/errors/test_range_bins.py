@@ -30,3 +30,16 @@ def test_uncertain_places_of_one_gap_are_one_error_for_all_of_its_ranges() -> No
     np.testing.assert_allclose(covariance, drawn.T @ drawn / len(drawn), atol=4e-2 * covariance.max())
     apart = found.of_range[gap == 0][:, None], found.of_range[gap == 5]
     assert np.all(covariance[apart] == 0)
+
+
+def test_the_mean_of_a_bin_of_one_outlier_is_its_own_value() -> None:
+    found = range_bins(
+        np.zeros(1, dtype=np.int64),
+        np.zeros(1, dtype=np.int64),
+        np.zeros(1),
+        np.array([[5.0, 0.0, 0.0]]),
+        np.eye(3)[None],
+        np.array([0.01]),
+        np.ones(1),
+    )
+    np.testing.assert_allclose(found.mean(np.array([3.0])), 3.0)
