@@ -43,6 +43,7 @@ def test_the_worst_that_could_hide_is_named_where_it_does_more_than_a_good_scale
     (reason,) = found.reasons
     assert reason.startswith("a mistake could stay hidden here")
     hidden = [test for test in found.tests if f"({test.name} {test.subject}".strip() in reason]
+    assert "range scale" not in reason  # it changes the scale most, but the scale's interval includes it
     said = re.search(r"change the scale by ([0-9.]+) %", reason)
     assert hidden
     assert said is not None
@@ -237,6 +238,9 @@ def test_every_hypothesis_has_a_largest_size_that_can_happen() -> None:
     problem = linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
     hypotheses = [h for of_kind in (*STANDING, *SCANNING) for h in of_kind(problem)]
     assert {h.name for h in hypotheses} >= {"anchor moved", "map break", "clock jump", "common bias", "lever arm"}
+    # The scale's interval includes what radios have in small: constant errors and those that grow with the distance.
+    in_interval = {h.name for h in hypotheses if h.is_in_interval}
+    assert in_interval == {"anchor bias", "common bias", "range scale", "anchor range scale", "anchors' scale"}
     for each in hypotheses:
         assert 0 < each.most < 200
         assert each.can_be(np.zeros(each.num))

@@ -14,7 +14,9 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
+from rangesfm.distances.map_points import MapPoint
 from rangesfm.distances.tape import CLICKED_STDDEV_PX, Marker
+from rangesfm.geometry.map_errors import MapPointErrors
 from rangesfm.positions.control_points import ControlPoint, ControlPoints
 
 STDDEV_M, NUM_POINTS = 0.01, 6
@@ -50,6 +52,12 @@ def marked(walked_survey: WalkedSurvey) -> Marked:
         names = tuple(image.name for image in images)
         markers[f"M{k}"] = Marker(names, np.array(pixels), (0,) * len(names), CLICKED_STDDEV_PX)
     return Marked(model, markers, np.array([model.point3D(i).xyz for i in seen[:NUM_POINTS]]))
+
+
+def test_points_of_a_map_that_is_not_refined_are_as_far_off_as_it_is_bent() -> None:
+    exact = MapPoint("M", np.zeros(3), MapPointErrors({}, np.zeros((3, 3))))
+    found = Placed(np.zeros((7, 7)), np.zeros(3), bent_by_m=0.3).of([exact])
+    assert np.trace(found) == pytest.approx(0.3**2)
 
 
 def one_off(row: int, off_m: float) -> Array:

@@ -99,6 +99,16 @@ def test_a_point_that_the_photos_do_not_show_is_left_out_and_named() -> None:
     )
 
 
+def test_points_nearly_on_a_line_are_refused_as_they_leave_a_turn_open() -> None:
+    first, _, last = points()
+    between_m = (first.position_m + last.position_m) / 2
+    for off_m, is_refused in ((0.01, True), (1.0, False)):
+        middle = ControlPoint("middle", between_m + np.array([0.0, 0.0, off_m]), STDDEV_M, CONTROL, 7)
+        plan = plan_survey(replace(by_points(), points=(first, middle, last)))
+        assert any("nearly on one line" in line for line in plan.lines) == is_refused
+        assert (plan.verdict == "refused") == is_refused
+
+
 def test_two_points_beside_ranges_are_not_used_and_without_ranges_are_refused() -> None:
     beside = expect(replace(planned(FIVE_ANCHORS_M, "site", WALK), points=points(2)))
     assert beside.notes[0].startswith("the known positions are not used: 2 known positions are in the map")

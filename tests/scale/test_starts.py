@@ -12,7 +12,7 @@ from rangesfm.geometry.similarity import IDENTITY, path_shape
 from rangesfm.options import RangeModelOptions
 from rangesfm.scale.range_equation import RangeProblem, RangeState
 from rangesfm.scale.scale_problem import scale_problem
-from rangesfm.scale.starts import choose_sides, sphere_swaps
+from rangesfm.scale.starts import choose_sides, complete_unknown_anchors, sphere_swaps
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -42,6 +42,16 @@ def test_on_which_side_of_a_flat_path_an_anchor_is_put_does_not_hang_on_rounding
         assert heights.min() > -1e-3  # one anchor is in the plane
         assert heights.max() > 2.0
         np.testing.assert_allclose(rise, 0.0, atol=1e-6)
+
+
+def test_unknown_anchors_are_found_from_a_path_that_has_its_place_whatever_was_thought_of_them(
+    make_survey: MakeSurvey,
+) -> None:
+    survey = make_survey(scale=1.0)
+    true_m = survey.frame_from_site("first_camera").apply(np.array(list(survey.anchors_m.values())))
+    thought_m = true_m + 100.0
+    found = complete_unknown_anchors(unknown_anchors(survey), RangeState(IDENTITY, thought_m, np.zeros(5)))
+    np.testing.assert_allclose(found.anchors_m, true_m, atol=1e-6)
 
 
 @pytest.mark.parametrize("off_m", [0.0, 1e-15])

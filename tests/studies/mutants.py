@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 PACKAGE = Path("plugin/rangesfm")
 PACKAGES = ("scale", "refine", "ranging/errors", "ranging/anchors", "ranging/clock", "diagnostics", "ceres")
 USED_BY = {
-    "scale": ("join",),
-    "ranging/errors": ("scale", "refine"),
+    "scale": ("join", "planning"),
+    "ranging/errors": ("ranging", "scale", "refine"),
     "ranging/anchors": ("scale",),
     "ceres": ("refine",),
 }

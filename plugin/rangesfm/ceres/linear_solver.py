@@ -36,7 +36,7 @@ def max_num_images_direct(overlaps: csr_array, limit: int) -> int:
         overlaps: (n, n), symmetric; nonzero where two photos share a point.
         limit: COLMAP's ``max_num_images_direct_sparse_cpu_solver``.
     """
-    num = overlaps.shape[0]
+    num, _ = overlaps.shape
     return num if num > limit and _cost(overlaps) <= _cost_of_all(limit) else limit
 
 
@@ -46,7 +46,8 @@ def dense_is_faster(overlaps: csr_array) -> bool:
     Args:
         overlaps: as for ``max_num_images_direct``.
     """
-    return _cost_of_all(overlaps.shape[0]) < _BLOCKWISE_SLOWDOWN * _cost(overlaps)
+    num, _ = overlaps.shape
+    return _cost_of_all(num) < _BLOCKWISE_SLOWDOWN * _cost(overlaps)
 
 
 def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:
@@ -55,7 +56,7 @@ def inverse_is_affordable(overlaps: csr_array, limit: int) -> bool:
     Args:
         overlaps: as for ``max_num_images_direct``.
     """
-    num = overlaps.shape[0]
+    num, _ = overlaps.shape
     return bool(num <= limit) or cost_of_factor(overlaps) <= _cost_of_all(limit) * num / limit
 
 

@@ -246,7 +246,7 @@ class _Problem:
         for _ in range(_NUM_ROUNDS):
             off_m = known.misclosures_m(similarity)
             stddev_m = self._stddevs_m(off_m, used)
-            away = np.linalg.norm(off_m, axis=1) / stddev_m / np.sqrt(3)
+            away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
             weights = used * CAUCHY.weights(away)
             if self.refined is not None:  # the map has its place; only outliers are told apart
                 break
