@@ -11,8 +11,8 @@ from tests.studies.erring_surveys import SITES, run, surveyed
 
 from rangesfm.diagnostics import hypothesis_tests
 from rangesfm.diagnostics.catalogue import STANDING
-from rangesfm.diagnostics.hypothesis import Hypothesis
-from rangesfm.diagnostics.hypothesis_tests import Factorization, row_of
+from rangesfm.diagnostics.hypothesis import Correction, Effect, Hypothesis
+from rangesfm.diagnostics.hypothesis_tests import Factorization, overlap, row_of
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.diagnostics.mistakes import find_mistakes
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
@@ -75,6 +75,26 @@ def test_the_size_of_one_number_keeps_its_sign_and_that_of_more_is_their_length(
                 signed = -share * each.most if each.num == 1 else share * each.most
                 # Impossible sizes are not reported.
                 assert told == (pytest.approx(signed, rel=1e-4) if share < 1 else None)
+
+
+def test_hypotheses_that_explain_nearly_the_same_overlap_and_others_do_not(problem: Linearized) -> None:
+    of_key = {each.key: each for each in hypotheses(problem)}
+    bias, drift = of_key["common bias", ""], of_key["radio drift", ""]
+    effect = Effect.of_sum([bias.effect, Effect(0.1 * drift.effect.columns, 0.1 * drift.effect.priors)])
+    tests = Factorization(without_noise(problem)).test([bias, replace(bias, effect=effect), drift], 0)
+    assert overlap(tests[0], tests[0]) == pytest.approx(1.0)
+    assert 0.9 < overlap(tests[0], tests[1]) < 1.0
+    assert overlap(tests[0], tests[2]) < 0.9
+
+
+def test_the_effect_of_a_large_mistake_is_that_at_its_size(problem: Linearized) -> None:
+    bias = next(each for each in hypotheses(problem) if each.key == ("common bias", ""))
+    num = len(problem.on_map.problem.range_m)
+    squared = replace(bias, correction=lambda size: Correction(longer_m=np.full(num, size[0] ** 2)))
+    found = squared.at_size(problem, np.array([3.0]))
+    np.testing.assert_allclose(found.effect.columns, 6 * bias.effect.columns, rtol=1e-3)
+    turned = replace(bias, correction=lambda _: Correction(tag_moves_m={}))
+    assert turned.at_size(problem, np.array([3.0])) is turned  # its effect is found on the map that it moves
 
 
 def test_baardas_number() -> None:

@@ -211,6 +211,12 @@ def test_a_mistake_is_the_likeliest_cause(kind: str, size: float, name: str) -> 
     assert diagnosis(given).causes[0].name == name
 
 
+def test_heights_that_nobody_measured_are_told_beside_one_anchor_of_which_they_may_be() -> None:
+    given = surveyed(YARD, SEED)
+    given.anchors_m = {name: at * [1.0, 1.0, 0.0] for name, at in given.anchors_m.items()}
+    assert "all anchors are given the same height, 0 m, but the ranges fit heights that" in diagnosis(given).reasons[0]
+
+
 def test_a_clock_that_runs_as_no_quartz_does_is_not_named_so() -> None:
     """Times stretched by 2 % are a mistake and are found, but no clock drifts by 20 000 ppm."""
     given = surveyed(HALL, SEED)

@@ -30,6 +30,7 @@ from rangesfm.ranging.anchors.site import local_site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
+from rangesfm.scale.model_placement import ScaledModel, place_models
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
@@ -156,13 +157,18 @@ def test_anchors_that_noise_moves_are_not_called_elsewhere_and_all_ranges_count_
     exact: Halves, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     noise_m = 0.05 * np.random.default_rng(0).standard_normal(len(exact.log))
-    rough = replace(exact, log=replace(exact.log, range_m=exact.log.range_m + noise_m))
-    joined = rough.with_ranges(np.ones(len(noise_m), dtype=bool)).join("unknown")
+    noisy = replace(exact, log=replace(exact.log, range_m=exact.log.range_m + noise_m))
+    rough = noisy.with_ranges(np.ones(len(noise_m), dtype=bool))
+    joined = rough.join("unknown")
     assert joined.notes == ()
     # Places are searched for with a part of the ranges.
     monkeypatch.setattr("rangesfm.scale.model_placement.SUBSET_PER_ANCHOR", 6)
-    again = rough.with_ranges(np.ones(len(noise_m), dtype=bool)).join("unknown")
-    np.testing.assert_allclose(again.path.trajectory.centers, joined.path.trajectory.centers, atol=1e-5)
+    pairs = zip(rough.parts, joined.verdicts, strict=True)
+    models = [
+        ScaledModel(part.trajectory, known(verdict.estimate), is_in_anchor_frame=False) for part, verdict in pairs
+    ]
+    again = known(place_models(models).first_from_sfm[1])
+    assert again.scale == pytest.approx(known(joined.verdicts[1].joined_from_sfm).scale, rel=1e-6)
 
 
 def test_a_half_that_shares_too_few_anchors_is_left_out_and_nothing_invented(exact: Halves) -> None:
