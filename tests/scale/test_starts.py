@@ -44,6 +44,17 @@ def test_on_which_side_of_a_flat_path_an_anchor_is_put_does_not_hang_on_rounding
         np.testing.assert_allclose(rise, 0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+def test_a_path_that_is_nearly_flat_tells_the_sides_of_its_anchors(make_survey: MakeSurvey, turned: float) -> None:
+    centers = make_survey().centers_m * [1.0, 1.0, 0.1]
+    anchors_m = {"A": (6.0, 0.0, 3.0 * turned), "B": (0.0, 6.0, -3.0 * turned)}
+    survey = make_survey(scale=1.0, centers_m=centers, anchors_m=anchors_m)
+    true_m = survey.frame_from_site("first_camera").apply(np.array(list(anchors_m.values())))
+    state, _, rise = choose_sides(unknown_anchors(survey), RangeState(IDENTITY, true_m, np.zeros(2)))
+    np.testing.assert_allclose(state.anchors_m, true_m, atol=1e-6)
+    assert rise.min() > 0
+
+
 def test_unknown_anchors_are_found_from_a_path_that_has_its_place_whatever_was_thought_of_them(
     make_survey: MakeSurvey,
 ) -> None:
