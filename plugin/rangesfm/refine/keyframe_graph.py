@@ -30,7 +30,7 @@ from rangesfm.refine.radio import Antennas
 from rangesfm.refine.vision_information import Poses, VisionInformation, relative_poses
 
 _MAX_NUM_STEPS = 60
-_LEAST_DAMPING = 1e-12
+_INITIAL_DAMPING, _LEAST_DAMPING = 1e-8, 1e-12
 _MAX_DAMPING = 1e6
 # Number of random vectors for the estimated trace (number of parameters that the ranges determine).
 _NUM_PROBES = 12
@@ -112,7 +112,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
         tolerance_m: the solver stops when no keyframe moves further in a successful step, or in all steps to come.
     """
     layout = _Layout.of(graph)
-    state, damping = start, _LEAST_DAMPING
+    state, damping = start, _INITIAL_DAMPING
     terms = solved = _Terms.at(graph, layout, state)
     factored, used, step_count, movement = None, damping, 0, 0.0
     while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
@@ -128,7 +128,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
         state, terms, damping = trial, trial_terms, max(damping / 10, _LEAST_DAMPING)
         if min(movement, still_to_come(movement, last)) < tolerance_m:
             break
-    if factored is None or used > _LEAST_DAMPING:  # more would hide what the ranges determine
+    if factored is None or used > _INITIAL_DAMPING:  # more would hide what the ranges determine
         factored = _factor(solved.hessian_of_free, 0.0, layout.blocks)
     return GraphSolution(state, step_count, _num_absorbed(solved, factored))
 
@@ -385,7 +385,7 @@ def _factor(hessian: Array | sparse.csr_array, damping: float, blocks: tuple[Ind
     except SingularError:
         if damping > _MAX_DAMPING:  # then the matrix has entries that are not finite
             raise
-        return _factor(hessian, max(10 * damping, _LEAST_DAMPING), blocks)
+        return _factor(hessian, max(10 * damping, _INITIAL_DAMPING), blocks)
 
 
 def _moved(state: GraphState, layout: _Layout, free_step: Array) -> GraphState:
