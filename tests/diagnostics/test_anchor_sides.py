@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from tests.known import known
 from tests.studies.drifting_maps import Made, lap_of_drift, run
+from tests.studies.erring_surveys import SITES
+from tests.studies.erring_surveys import run as run_erring
+from tests.studies.erring_surveys import surveyed as surveyed_by_drone
 
 from rangesfm.diagnostics.anchor_sides import likelier_sides
 from rangesfm.diagnostics.linearized import ranges_on_map
@@ -69,3 +72,10 @@ def test_surveyed_anchors_are_left_alone(crossed: MetricResult) -> None:
     on_map = ranges_on_map(at.posed, at.solution, at.bending)
     surveyed_m = replace(on_map.problem, anchor_mean_m=on_map.state.anchors_m, anchor_stddev_m=np.array([0.02]))
     assert likelier_sides(replace(on_map, problem=surveyed_m)).mirrors_m == {}
+
+
+def test_a_path_that_goes_up_and_down_leaves_nothing_open() -> None:
+    on_map = known(run_erring(surveyed_by_drone(SITES[2], 3), 3).on_map)
+    sides = likelier_sides(on_map)
+    assert sides.on_map is on_map
+    assert sides.mirrors_m == {"B": None}

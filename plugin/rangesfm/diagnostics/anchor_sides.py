@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,22 +57,36 @@ def likelier_sides(on_map: RangesOnMap) -> AnchorSides:
     may depend on how the map drifts. Here the map may bend as its photos allow.
     """
     heard = np.unique(on_map.problem.anchor_index)
-    unknown = heard[np.isinf(on_map.problem.anchor_stddev_m[heard])]
-    mirrors_m: dict[str, Array | None] = {}
+    unknown = heard[np.isinf(on_map.problem.anchor_stddev_m[heard])].tolist()
+    nowhere_else = AnchorSides(on_map, False, {on_map.anchor_ids[k]: None for k in unknown})
+    if not unknown:
+        return nowhere_else
+    try:
+        return _likelier_sides(on_map, unknown)
+    except np.linalg.LinAlgError:  # the ranges determine too little to tell
+        return nowhere_else
+
+
+def _likelier_sides(on_map: RangesOnMap, unknown: Sequence[int]) -> AnchorSides:
+    mirrors_m: dict[str, Array | None] = {on_map.anchor_ids[k]: None for k in unknown}
     has_crossed = False
-    if not len(unknown):
-        return AnchorSides(on_map, has_crossed, mirrors_m)
     problem = linearized(on_map).with_learnt_errors()
-    for k in unknown.tolist():
+    for k in unknown:
         other = _on_other_side(problem, k)
+        if np.linalg.norm(_place_m(other, k) - _place_m(problem, k)) < problem.scatter_m:  # there is one place only
+            continue
         gain = _misfit(problem) - _misfit(other)
         if gain > 0:  # learning the errors takes time, and it hardly changes which side fits better
             other = other.with_learnt_errors()
             gain = Factorization(problem).deviance() - Factorization(other).deviance()
         likelier, less_likely = (other, problem) if gain > 0 else (problem, other)
-        mirrors_m[on_map.anchor_ids[k]] = less_likely.on_map.state.anchors_m[k] if abs(gain) < _MIN_GAIN else None
+        mirrors_m[on_map.anchor_ids[k]] = _place_m(less_likely, k) if abs(gain) < _MIN_GAIN else None
         problem, has_crossed = likelier, has_crossed or gain > 0
     return AnchorSides(problem.on_map if has_crossed else on_map, has_crossed, mirrors_m)
+
+
+def _place_m(problem: Linearized, k: int) -> Array:
+    return np.asarray(problem.on_map.state.anchors_m[k])
 
 
 def _on_other_side(problem: Linearized, k: int) -> Linearized:
