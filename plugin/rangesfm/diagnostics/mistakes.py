@@ -9,8 +9,8 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives, lever_arms_in_other_axes
-from rangesfm.diagnostics.bursts import likeliest_burst, without
 from rangesfm.diagnostics.catalogue import STANDING
+from rangesfm.diagnostics.error_bursts import likeliest_burst, without
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis, corrected, of_bins
 from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized

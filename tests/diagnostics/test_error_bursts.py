@@ -9,7 +9,7 @@ import pytest
 from tests.known import known
 from tests.studies.erring_surveys import SITES, Given, run, surveyed
 
-from rangesfm.diagnostics.bursts import likeliest_burst, without
+from rangesfm.diagnostics.error_bursts import likeliest_burst, without
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized, linearized
 
