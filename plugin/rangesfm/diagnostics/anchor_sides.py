@@ -13,11 +13,11 @@ from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, l
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
-from rangesfm.scale.range_equation import antenna_positions, state_after
+from rangesfm.scale.range_equation import RangeState, antenna_positions, state_after
 
 # Smallest gain in twice the log-likelihood that rules out the other side.
 _MIN_GAIN = 2 * MIN_COST_GAP
-# Gauss-Newton steps from an anchor's mirror image, which is near the minimum on that side.
+# Gauss-Newton steps to the likeliest state; the map and an anchor's mirror image are near it.
 _NUM_STEPS = 5
 
 
@@ -71,6 +71,7 @@ def _likelier_sides(on_map: RangesOnMap, unknown: Sequence[int]) -> AnchorSides:
     mirrors_m: dict[str, Array | None] = {on_map.anchor_ids[k]: None for k in unknown}
     has_crossed = False
     problem = linearized(on_map).with_learnt_errors()
+    problem = _settled(problem, on_map.state).with_learnt_errors()
     for k in unknown:
         other = _on_other_side(problem, k)
         if np.linalg.norm(_place_m(other, k) - _place_m(problem, k)) < problem.scatter_m:  # there is one place only
@@ -96,11 +97,15 @@ def _on_other_side(problem: Linearized, k: int) -> Linearized:
     path = path_shape(tags_m[on_map.problem.anchor_index == k])
     normal = path.axes[:, 2]
     anchors_m[k] -= 2 * ((anchors_m[k] - path.centroid) @ normal) * normal
-    state = replace(on_map.state, anchors_m=anchors_m)
+    return _settled(problem, replace(on_map.state, anchors_m=anchors_m))
+
+
+def _settled(problem: Linearized, state: RangeState) -> Linearized:
+    """Return the problem at the likeliest state near another one."""
     for _ in range(_NUM_STEPS):
-        problem = at_state(problem, replace(on_map, state=state))
+        problem = at_state(problem, replace(problem.on_map, state=state))
         state = state_after((problem.columns,), state, Factorization(problem).step)
-    return at_state(problem, replace(on_map, state=state))
+    return at_state(problem, replace(problem.on_map, state=state))
 
 
 def _misfit(problem: Linearized) -> float:
