@@ -85,6 +85,12 @@ def test_every_block_is_eliminated_once_and_its_ties_are_in_its_front_or_before(
     assert set(fronts[-1].own.tolist()) == {144, 145}
 
 
+def test_two_unequal_fields_fall_apart_at_the_narrowest_place_between_them() -> None:
+    tied = block_diag([field(6).toarray(), np.eye(1), field(8).toarray()]).toarray()
+    tied[36, 30:45] = tied[30:45, 36] = True  # one block is tied to an edge of either field
+    assert fronts_of(csr_array(tied), np.zeros(101, dtype=bool))[-1].own.tolist() == [36]
+
+
 def test_the_cost_of_a_field_grows_far_slower_than_that_of_a_dense_matrix() -> None:
     small, large = (cost_of_factor(field(side)) for side in (12, 24))
     assert large / small < 4**2  # the factor of a dense one is 64

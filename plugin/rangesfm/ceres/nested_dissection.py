@@ -19,12 +19,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow, reverse_cuthill_mckee
 
 from rangesfm.arrays import Array, Indices, Mask
 
 # Largest number of blocks that are not divided any further.
 _MAX_LEAF = 50
+# Share of the blocks at either end of their order that a separator leaves on that side. For 5000 keyframes over a
+# field (the study of growth), 0.25 costs 2 % more, 0.35 12 %.
+_END_SHARE = 0.3
+# Number of averages with the neighbours for the order of the blocks; 200 of them save 1 % more of the same cost.
+_NUM_SWEEPS = 60
 
 
 class SingularError(Exception):
@@ -82,18 +87,56 @@ def fronts_of(tied: csr_array, is_last: Mask) -> list[Front]:
 def _dissected(tied: csr_array, blocks: Indices) -> Iterator[Indices]:
     """Yield the blocks in parts, each separator after the parts that it separates."""
     if len(blocks) > _MAX_LEAF:
-        order = reverse_cuthill_mckee(tied, symmetric_mode=True)
-        is_second = np.zeros(len(blocks), dtype=bool)
-        is_second[order[len(order) // 2 :]] = True
-        rims = (~is_second & (tied @ is_second > 0), is_second & (tied @ ~is_second > 0))
-        is_between = min(rims, key=np.count_nonzero)
-        halves = [np.flatnonzero(half & ~is_between) for half in (~is_second, is_second)]
+        is_between, is_first = _separator(tied)
+        halves = [np.flatnonzero(half & ~is_between) for half in (is_first, ~is_first)]
         if all(map(len, halves)):
             for rows in halves:
                 yield from _dissected(csr_array(tied[rows][:, rows]), blocks[rows])
             blocks = blocks[is_between]
     if len(blocks):
         yield blocks
+
+
+def _separator(tied: csr_array) -> tuple[Mask, Mask]:
+    """Return the fewest blocks without which both ends of the blocks' order fall apart, and a mask of the first side.
+
+    They are the smallest cut between the ends by maximum flow (Schild and Sommer, "On balanced separators in road
+    networks", 2015, where the order is that of coordinates).
+    """
+    order = _order_along(tied)
+    num_of_end = int(_END_SHARE * len(order))
+    is_first, is_last = np.zeros((2, len(order)), dtype=bool)
+    is_first[order[:num_of_end]] = is_last[order[-num_of_end:]] = True
+    is_last &= ~(tied @ is_first > 0)  # a block that is tied to the other end itself may be part of the cut
+    middle = np.flatnonzero(~is_first & ~is_last)
+    ties, num = csr_array(tied[middle][:, middle]).tocoo(), len(middle)
+    after_first, before_last = (np.flatnonzero(tied[middle] @ end > 0) for end in (is_first, is_last))
+    # Each block is an edge of capacity 1 from its entry to its exit; all other edges are never the bottleneck.
+    entry, leave, source, sink = np.arange(num), num + np.arange(num), 2 * num, 2 * num + 1
+    starts = np.concatenate([entry, leave[ties.row], np.full(len(after_first), source), leave[before_last]])
+    ends = np.concatenate([leave, entry[ties.col], entry[after_first], np.full(len(before_last), sink)])
+    capacity = np.where(np.arange(len(starts)) < num, 1, num).astype(np.int32)
+    network = csr_array((capacity, (starts, ends)), shape=(2 * num + 2,) * 2)
+    rest = csr_array(network - maximum_flow(network, source, sink).flow)
+    rest.eliminate_zeros()
+    is_reached = np.zeros(2 * num + 2, dtype=bool)
+    is_reached[breadth_first_order(rest, source, return_predecessors=False)] = True
+    is_between = np.zeros(len(order), dtype=bool)
+    is_between[middle] = is_reached[entry] & ~is_reached[leave]
+    is_first[middle] = is_reached[leave]
+    return is_between, is_first
+
+
+def _order_along(tied: csr_array) -> Indices:
+    """Return the blocks in an order along their longest extent: that of the Fiedler vector, roughly."""
+    adjacency = csr_array((np.ones(tied.nnz), tied.indices, tied.indptr), shape=tied.shape)
+    degree = np.maximum(adjacency.sum(axis=1), 1.0)
+    place = np.empty(len(degree))
+    place[reverse_cuthill_mckee(tied, symmetric_mode=True)] = np.linspace(-1.0, 1.0, len(degree))
+    for _ in range(_NUM_SWEEPS):
+        place = (place + adjacency @ place / degree) / 2
+    # Rounded, so that the last digits, which differ between processors, do not change the order.
+    return np.argsort(place.round(9), kind="stable")
 
 
 def cost_of_factor(tied: csr_array) -> float:
