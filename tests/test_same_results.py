@@ -95,7 +95,7 @@ CASES = {
     ),
     "surveyed, a plane": Case("scale", ("--anchors", "flat.csv", "--camera_side", "above"), erring),
     "first camera, offset": Case("refine", (*IN_CAMERA, "--ranges_time_offset", "auto"), drifting),
-    "unknown": Case("refine", UNKNOWN, erring, "doubtful", "on the ranges to anchor A3 read about"),
+    "unknown": Case("refine", UNKNOWN, erring),
     "unknown, one": Case(
         "scale",
         (*UNKNOWN, "--use_anchors", "A1"),
@@ -106,7 +106,7 @@ CASES = {
     "unknown, offset": Case("scale", (*UNKNOWN, "--ranges_time_offset", "auto"), erring),
     "unknown and taped": Case("refine", (*UNKNOWN, "--distances", "taped.csv"), erring),
     "some unknown": Case("scale", ("--anchors", "some.csv"), erring),
-    "by photo": Case("refine", SITE, by_photo, "doubtful", "the ranges to anchor A2 read about"),
+    "by photo": Case("refine", SITE, by_photo),
     "a step": Case(
         "scale",
         SITE,

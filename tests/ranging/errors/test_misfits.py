@@ -28,6 +28,12 @@ def test_a_stretch_that_is_off_is_told() -> None:
     assert reason.remedy == "check clocks, lever arm and anchors"
 
 
+def test_one_stretch_of_many_in_which_somebody_stood_between_is_no_misfit() -> None:
+    residuals = noise((0.1, 0.1, 0.1))
+    residuals[300:320] += 1.0
+    assert misfits(make_errors(0.1), residuals, np.arange(3.0 * NUM_EACH)) == ()
+
+
 def test_drift_that_is_left_is_told_even_where_the_noise_was_estimated_with_it() -> None:
     drift = 3.0 * np.sin(np.arange(3 * NUM_EACH) / 150)
     errors = make_errors(loss=CAUCHY).seen_by_bending_map(noise((0.1, 0.1, 0.1)) + drift, 0.0)

@@ -38,6 +38,8 @@ _NUM_MEAN_ROUNDS = 10
 # A median residual of a stretch above this many standard deviations is not noise.
 _MAX_BLOCK_STDDEVS = 3.0
 _MIN_BLOCK = 5
+# Share of such stretches that is no reason for doubt: somebody stands between for some seconds.
+_FEW_BLOCKS = 0.02
 # Errors of real radios last for seconds, which makes residuals twice as large as their scatter, but not this many
 # times.
 _MAX_STDDEV_OVER_SCATTER = 5.0
@@ -329,7 +331,7 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
         reasons.append(Misfit(f"range residuals are typically {typical:.1f} times their stddev"))
     off = [np.median(stated[rows]) for rows in rows_by_key(errors.group) if len(rows) >= _MIN_BLOCK]
     num_off = int(np.sum(np.abs(off) > _MAX_BLOCK_STDDEVS))
-    if num_off:
+    if num_off > _FEW_BLOCKS * len(off):
         told = f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole"
         reasons.append(Misfit(told))
     order = np.lexsort((time_order, errors.anchor_index))
