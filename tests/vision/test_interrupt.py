@@ -133,5 +133,6 @@ def test_an_error_of_the_listener_stops_colmap_and_comes_through(many_photos: Ro
             mapper=MAPPER,
             progress=Broken(),
         )
-    assert num_done(tmp_path)["features"] < ALL["features"]
+    # A slow listener may hear of the features when the last of them is done; the next step has not begun then.
+    assert num_done(tmp_path)["matching"] == 0
     assert pycolmap.logging.alsologtostderr
