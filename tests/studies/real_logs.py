@@ -213,7 +213,7 @@ def named(found: ScaleEstimate, path: Trajectory) -> list[str]:
     assert found.problem is not None
     assert found.solution is not None
     on_map = ranges_on_map(found.problem, found.solution, WalkBending(in_first_camera(path)))
-    return [cause.words for cause in diagnose_ranges(bent_to_ranges(likelier_sides(on_map).on_map)).causes]
+    return [cause.words for cause in diagnose_ranges(likelier_sides(bent_to_ranges(on_map)).on_map).causes]
 
 
 if __name__ == "__main__":

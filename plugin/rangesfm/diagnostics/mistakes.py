@@ -11,7 +11,7 @@ from rangesfm.arrays import Array
 from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives, lever_arms_in_other_axes
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.error_bursts import likeliest_burst, without
-from rangesfm.diagnostics.hypothesis import Effect, Hypothesis, corrected, of_bins
+from rangesfm.diagnostics.hypothesis import Effect, Hypothesis, corrected
 from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized
 from rangesfm.diagnostics.scale_bound import HiddenMistake, hidden_among
@@ -93,7 +93,8 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     problem = linearized(on_map)
     standing = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     hypotheses = standing + [hypothesis for of_kind in SCANNING for hypothesis in of_kind(problem)]
-    problem, all_tests = _tested(problem, standing, hypotheses, seed)
+    problem = _without_bursts(problem, standing, hypotheses)
+    all_tests = Factorization(problem).test(hypotheses, seed)
     tests = _best_of_each(all_tests, problem)
     possible = [test for test in tests if test.is_possible]
     rejected = [test for test in possible if test.is_rejected]
@@ -104,29 +105,30 @@ def find_mistakes(on_map: RangesOnMap, *, seed: int = 0) -> Findings:
     return Findings(problem, tuple(tests), tuple(causes), hidden_among(all_tests))
 
 
-def _tested(
-    problem: Linearized, standing: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis], seed: int
-) -> tuple[Linearized, list[Test]]:
-    """Test all hypotheses, without the bursts of erring ranges that explain the residuals better than any.
+def _without_bursts(
+    problem: Linearized, standing: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis]
+) -> Linearized:
+    """Leave out the bursts of erring ranges that explain the residuals better than any hypothesis.
 
-    Returns:
-        the problem with the errors learnt while the standing mistakes explain what they can, and the tests.
+    The errors are learnt while the standing mistakes explain what they can.
     """
+    problem, num = _learnt(problem, standing), len(problem.residual_m)
     for _ in range(_MAX_NUM_BURSTS):
-        problem = _learnt(problem, standing)
         factorized = Factorization(problem)
-        tests = factorized.test(hypotheses, seed)
-        burst, num = likeliest_burst(factorized), len(problem.residual_m)
-        likeliest = max((test.statistic - _penalty(test, num) for test in tests if test.is_possible), default=0.0)
-        if burst.statistic < burst.threshold or burst.statistic - float(np.log(num)) < likeliest:
+        burst = likeliest_burst(factorized)
+        if burst.statistic < burst.threshold:
             break
-        problem = without(problem, burst)
-    return problem, tests
+        possible = (test for test in factorized.estimates(hypotheses) if test.is_possible)
+        likeliest = max((test.statistic - _penalty(test, num) for test in possible), default=0.0)
+        if burst.statistic - float(np.log(num)) < likeliest:
+            break
+        problem = _learnt(without(problem, burst), standing)
+    return problem
 
 
 def _learnt(problem: Linearized, explaining: Sequence[Hypothesis]) -> Linearized:
     """Return the problem with the errors learnt while some mistakes explain what they can."""
-    effects = Effect.of_all([of_bins(problem, problem.design[:, :0]), *(h.effect for h in explaining)])
+    effects = Effect.of_all([h.effect for h in explaining])
     return problem.with_learnt_errors(effects.columns, effects.priors)
 
 
@@ -137,7 +139,7 @@ def _causes(problem: Linearized, nominated: Sequence[Test], num_tests: int, *, i
         nominated: tests whose hypotheses are tried. num_tests: number of all tests.
         is_sure: whether the nominated tests exceed their thresholds.
     """
-    before = Factorization(_learnt(_settled(problem), [])).deviance()
+    before = Factorization(_settled(problem).with_learnt_errors()).deviance()
     num = len(problem.residual_m)
     causes = []
     factorized = Factorization(problem)
@@ -300,7 +302,7 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Alternativ
     # Its squares do not decide: by the errors that last, an explanation with larger squares may be the likelier one.
     for _, refitted, each in fits[:_NUM_TRIED]:
         moved = _settled(at_state(problem, refitted))
-        gain = before - Factorization(_learnt(moved, [])).deviance()
+        gain = before - Factorization(moved.with_learnt_errors()).deviance()
         num_free = 3 * sum(place is None for place in each.correction.anchors_m.values())
         penalty = 2 * float(np.log(len(tried))) + num_free * float(np.log(len(problem.residual_m)))
         if gain > penalty + _AS_LIKELY:
