@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve, solve_triangular
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, slopes_by_poses
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized, slopes_by_poses
 from rangesfm.geometry.similarity import rmse
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.range_observations import status_by_weight
+from rangesfm.scale.linear_map import regular
 from rangesfm.scale.range_equation import state_after
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem
@@ -24,6 +25,8 @@ from rangesfm.scale.uncertainty import KnownMap, bias_covariance
 _MAX_NUM_ROUNDS = 8
 # Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
 _STILL = 0.1
+# Most halvings of a step.
+_MAX_NUM_HALVES = 6
 
 
 def bent_to_ranges(on_map: RangesOnMap) -> RangesOnMap:
@@ -99,12 +102,34 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
     factors = walk.factors(problem.bins, slopes_by_poses(on_map), frame_is_free=is_free)
-    step = problem.solved(problem.errors.covariance_m2).step
-    left_m = problem.residual_m + problem.design @ step
-    pulls = cho_solve(cho_factor(problem.errors.covariance_m2), left_m)
+    lower: Array = np.linalg.cholesky(regular(problem.errors.covariance_m2))
+    moved = _moved(problem, lower)
+    pulls = cho_solve((lower, True), moved.residual_m)
     bent = walk.bent_back(factors, pulls, problem.errors.stddev_of_component, frame_is_free=is_free)
-    state = state_after((problem.columns,), on_map.state, step)
-    return _on_path(replace(on_map, state=state), walk, bent)
+    return _on_path(moved.on_map, walk, bent)
+
+
+def _moved(problem: Linearized, lower: Array) -> Linearized:
+    """Return the problem at the likeliest state, or only a part of the way to it.
+
+    A whole step moves an anchor by kilometres in a direction of which ranges say next to nothing, as its height above
+    a flat path. So a step that makes the map less likely is halved.
+
+    Args:
+        lower: (c, c) Cholesky factor of the residuals' covariance.
+    """
+
+    def cost(of: Linearized) -> float:
+        whitened = solve_triangular(lower, of.residual_m, lower=True)
+        return float(whitened @ whitened + of.prior_residual @ of.prior_residual)
+
+    step, before = problem.solved(problem.errors.covariance_m2).step, cost(problem)
+    for share in 0.5 ** np.arange(_MAX_NUM_HALVES + 1):
+        state = state_after((problem.columns,), problem.on_map.state, share * step)
+        moved = at_state(problem, replace(problem.on_map, state=state))
+        if cost(moved) <= before:
+            return moved
+    return problem
 
 
 def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> RangesOnMap:
