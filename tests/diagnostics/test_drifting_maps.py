@@ -74,3 +74,13 @@ def test_a_path_of_poses_is_scaled_to_where_ranges_bend_it_back() -> None:
     assert error_m(lap, found) < 1.1 * best_m + 0.1
     assert any("drifts" in reason for reason in found.estimate.reasons)
     assert known(found.place).worst_keyframe_stddev_m > 0.5 * best_m
+
+
+@pytest.mark.parametrize("seed", [1, 6])
+def test_a_path_that_fits_better_turned_over_is_placed_the_right_way_up(seed: int) -> None:
+    """A rigid path fits better with the anchors on its wrong side; a path that drifts does not."""
+    lap = without_points(lap_of_drift(3.0, seed, "site", with_radio=True, num_keyframes=NUM_KEYFRAMES))
+    found = run(lap, 0)
+    assert known(found.diagnosis).causes == ()
+    best_m = rmse(align_points(lap.trajectory.centers, lap.truth_m).apply(lap.trajectory.centers) - lap.truth_m)
+    assert error_m(lap, found) < 1.1 * best_m

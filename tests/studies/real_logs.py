@@ -31,7 +31,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rangesfm.diagnostics.anchor_sides import likelier_sides
-from rangesfm.diagnostics.bent_path import bent_to_ranges
+from rangesfm.diagnostics.bent_path import bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.diagnosis import diagnose_ranges
 from rangesfm.diagnostics.linearized import ranges_on_map
 from rangesfm.errors import GeometryError
@@ -191,12 +191,13 @@ def one_survey(
     began = time.process_time()
     options = ScaleOptions(max_relative_stddev=1.0)
     try:
-        found = initialize_scale(observations, path, case.anchors, anchor_frame=case.frame, options=options)
+        found, causes = judged(
+            initialize_scale(observations, path, case.anchors, anchor_frame=case.frame, options=options), path, options
+        )
     except GeometryError as refusal:
         print(f"{name:16}{case.name:10} refused: {refusal}", flush=True)
         return None
     error, (low, high) = float(np.log(found.value / FACTOR)), found.uncertainty.interval_95
-    causes = named(found, path)
     seconds = time.process_time() - began
     largest = sorted(found.uncertainty.components.items(), key=lambda part: -part[1])[:3]
     print(
@@ -208,12 +209,13 @@ def one_survey(
     return error, low, high, len(causes)
 
 
-def named(found: ScaleEstimate, path: Trajectory) -> list[str]:
-    """Return the likeliest mistake, and those that cannot be told from it, in words."""
+def judged(found: ScaleEstimate, path: Trajectory, options: ScaleOptions) -> tuple[ScaleEstimate, list[str]]:
+    """Return the estimate as a run delivers it, and the likeliest mistake and those not told from it, in words."""
     assert found.problem is not None
     assert found.solution is not None
     on_map = ranges_on_map(found.problem, found.solution, WalkBending(in_first_camera(path)))
-    return [cause.words for cause in diagnose_ranges(likelier_sides(bent_to_ranges(on_map)).on_map).causes]
+    on_map = likelier_sides(bent_to_ranges(on_map, found.solution.rivals)).on_map
+    return estimate_by_bent(found, on_map, options), [cause.words for cause in diagnose_ranges(on_map).causes]
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Factorization
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, after_step, at_state, linearized
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
-from rangesfm.scale.range_equation import RangeState, antenna_positions, state_after
+from rangesfm.scale.range_equation import RangeState, antenna_positions
 
 # Smallest gain in twice the log-likelihood that rules out the other side.
 _MIN_GAIN = 2 * MIN_COST_GAP
@@ -102,10 +102,10 @@ def _on_other_side(problem: Linearized, k: int) -> Linearized:
 
 def _settled(problem: Linearized, state: RangeState) -> Linearized:
     """Return the problem at the likeliest state near another one."""
+    problem = at_state(problem, replace(problem.on_map, state=state))
     for _ in range(_NUM_STEPS):
-        problem = at_state(problem, replace(problem.on_map, state=state))
-        state = state_after((problem.columns,), state, Factorization(problem).step)
-    return at_state(problem, replace(problem.on_map, state=state))
+        problem = after_step(problem)
+    return problem
 
 
 def _misfit(problem: Linearized) -> float:

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized, slopes_by_poses
+from rangesfm.diagnostics.hypothesis_tests import Factorization
+from rangesfm.diagnostics.linearized import (
+    Linearized,
+    RangesOnMap,
+    after_step,
+    at_other_map,
+    linearized,
+    slopes_by_poses,
+)
 from rangesfm.geometry.similarity import rmse
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.errors.components import BENDS
+from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_observations import status_by_weight
 from rangesfm.scale.linear_map import regular
-from rangesfm.scale.range_equation import state_after
+from rangesfm.scale.range_equation import RangeState
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import judge
@@ -25,17 +35,23 @@ from rangesfm.scale.uncertainty import KnownMap, bias_covariance
 _MAX_NUM_ROUNDS = 8
 # Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
 _STILL = 0.1
-# Most halvings of a step.
-_MAX_NUM_HALVES = 6
+# Smallest gain in twice the log-likelihood for which another place of the map is taken than that of a rigid path.
+_MIN_GAIN = 2 * MIN_COST_GAP
 
 
-def bent_to_ranges(on_map: RangesOnMap) -> RangesOnMap:
+def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> RangesOnMap:
     """Return the map where ranges and the random-walk model of drift together put it, by Gauss-Newton steps.
 
     A map that does not drift as a random walk is returned unchanged. The steps make the linear tests valid even for a
     path that has drifted far.
+
+    Args:
+        rivals: other states that fit the ranges nearly as well, or better if the path drifts.
     """
-    for _ in range(_MAX_NUM_ROUNDS if isinstance(on_map.bending, WalkBending) else 0):
+    if not isinstance(on_map.bending, WalkBending):
+        return on_map
+    on_map = _likeliest(on_map, rivals)
+    for _ in range(_MAX_NUM_ROUNDS):
         problem = linearized(on_map).with_learnt_errors()
         before, on_map = on_map, _bent_once(problem)
         moved_m = on_map.from_anchor_m - before.from_anchor_m
@@ -97,39 +113,29 @@ def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
     return KnownMap.between(problem, problem.errors, formal, by_others, problem.solved(simple_m2).step)
 
 
+def _likeliest(on_map: RangesOnMap, rivals: Sequence[RangeState]) -> RangesOnMap:
+    """Return the map in its own state or in a much likelier one, if it may drift.
+
+    A path of one piece that drifts by metres may fit better turned over, with its anchors on the wrong side.
+    """
+    if not rivals:
+        return on_map
+    problem = linearized(on_map)
+    others = [at_other_map(problem, replace(on_map, state=state)) for state in rivals]
+    deviances = [Factorization(each.with_learnt_errors()).deviance() for each in (problem, *others)]
+    best = int(np.argmin(deviances))
+    return on_map if deviances[best] > deviances[0] - _MIN_GAIN else others[best - 1].on_map
+
+
 def _bent_once(problem: Linearized) -> RangesOnMap:
     on_map, walk = problem.on_map, problem.on_map.bending
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
     factors = walk.factors(problem.bins, slopes_by_poses(on_map), frame_is_free=is_free)
-    lower: Array = np.linalg.cholesky(regular(problem.errors.covariance_m2))
-    moved = _moved(problem, lower)
-    pulls = cho_solve((lower, True), moved.residual_m)
+    moved = after_step(problem)
+    pulls = cho_solve(cho_factor(regular(problem.errors.covariance_m2)), moved.residual_m)
     bent = walk.bent_back(factors, pulls, problem.errors.stddev_of_component, frame_is_free=is_free)
     return _on_path(moved.on_map, walk, bent)
-
-
-def _moved(problem: Linearized, lower: Array) -> Linearized:
-    """Return the problem at the likeliest state, or only a part of the way to it.
-
-    A whole step moves an anchor by kilometres in a direction of which ranges say next to nothing, as its height above
-    a flat path. So a step that makes the map less likely is halved.
-
-    Args:
-        lower: (c, c) Cholesky factor of the residuals' covariance.
-    """
-
-    def cost(of: Linearized) -> float:
-        whitened = solve_triangular(lower, of.residual_m, lower=True)
-        return float(whitened @ whitened + of.prior_residual @ of.prior_residual)
-
-    step, before = problem.solved(problem.errors.covariance_m2).step, cost(problem)
-    for share in 0.5 ** np.arange(_MAX_NUM_HALVES + 1):
-        state = state_after((problem.columns,), problem.on_map.state, share * step)
-        moved = at_state(problem, replace(problem.on_map, state=state))
-        if cost(moved) <= before:
-            return moved
-    return problem
 
 
 def _on_path(on_map: RangesOnMap, before: WalkBending, after: WalkBending) -> RangesOnMap:

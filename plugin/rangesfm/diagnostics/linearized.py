@@ -25,6 +25,7 @@ from rangesfm.scale.range_equation import (
     prior_jacobian,
     prior_residuals,
     range_jacobian,
+    state_after,
 )
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
@@ -32,6 +33,8 @@ from rangesfm.scale.uncertainty import ruled_out
 
 # Fewer bins than for an interval, because the tests learn the errors many times.
 _MAX_NUM_BINS = 160
+# Most halvings of a step.
+_MAX_NUM_HALVES = 6
 # Number of consecutive ranges of an anchor whose median they are compared with.
 _NUM_NEIGHBOURS = 8
 # A range farther than this many standard deviations from the median of its neighbours is an outlier among them. For
@@ -193,12 +196,20 @@ def linearized(on_map: RangesOnMap, bins_of_ranges: RangeBins | None = None) -> 
         bins_of_ranges: for ranges without noise; None: bins are formed from the ranges that agree with their
             neighbours, however far they are from the map.
     """
-    found, scatter_m = _bins(on_map) if bins_of_ranges is None else (bins_of_ranges, 0.0)
+    return _with_usual_errors(on_map, *(_bins(on_map) if bins_of_ranges is None else (bins_of_ranges, 0.0)))
+
+
+def at_other_map(problem: Linearized, on_map: RangesOnMap) -> Linearized:
+    """Linearise the same ranges on another map, in the same bins, with the usual errors."""
+    return _with_usual_errors(on_map, problem.bins, problem.scatter_m)
+
+
+def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -> Linearized:
     towards = RangeGradient.of(on_map.from_anchor_m).by_tag
     placing_m = on_map.posed.placing_stddev_m(on_map.state.metric_from_model.scale)
-    others_m2 = _wandering(found) | {PLACES: found.shared_by_places(towards, placing_m, on_map.on_path.before)}
+    others_m2 = _wandering(bins) | {PLACES: bins.shared_by_places(towards, placing_m, on_map.on_path.before)}
     expected = ExpectedErrors.of(
-        found, on_map.posed.curve_stddev_m, ruled_out(on_map.problem), others_m2, _bending(on_map, found)
+        bins, on_map.posed.curve_stddev_m, ruled_out(on_map.problem), others_m2, _bending(on_map, bins)
     )
     return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
 
@@ -206,6 +217,26 @@ def linearized(on_map: RangesOnMap, bins_of_ranges: RangeBins | None = None) -> 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
     """Linearise the problem at another state or for corrected ranges, with the same bins and errors."""
     return _linearized(on_map, problem.expected, problem.scatter_m, problem.errors)
+
+
+def after_step(problem: Linearized) -> Linearized:
+    """Return the problem after a step to the likeliest state, or after a part of it.
+
+    A whole step moves an anchor by kilometres in a direction of which ranges say next to nothing, as its height above
+    a flat path. So a step that makes the state less likely is halved.
+    """
+    solved = problem.solved(problem.errors.covariance_m2)
+
+    def cost(of: Linearized) -> float:
+        return float(np.sum(solved.whitened(of.residual_m[:, None], of.prior_residual[:, None]) ** 2))
+
+    step, before = solved.step, cost(problem)
+    for share in 0.5 ** np.arange(_MAX_NUM_HALVES + 1):
+        state = state_after((problem.columns,), problem.on_map.state, share * step)
+        moved = at_state(problem, replace(problem.on_map, state=state))
+        if cost(moved) <= before:
+            return moved
+    return problem
 
 
 def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float, errors: LearnedErrors) -> Linearized:

@@ -183,7 +183,7 @@ class RangesAsUsed(TableFile):
         both = {"scaled": self.predicted_scaled_m - self.range_m, "refined": refined}
         return both if np.isfinite(refined).any() else {"scaled": both["scaled"]}
 
-    @property
+    @cached_property
     def is_used(self) -> Mask:
         """Return the mask (n,) of ranges that are used in the final model, with full or reduced weight."""
         return np.isin(np.array(self.status, dtype=str), USED_LABELS)

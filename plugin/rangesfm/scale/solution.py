@@ -87,12 +87,14 @@ class Solution:
         fit: the estimate.
         errors: of the problem's ranges; every formal standard deviation must be multiplied by their inflation.
         noise_stddev_m: standard deviation of an ordinary range, estimated from the fit.
+        rivals: states of other maps that fit worse, the likeliest first.
     """
 
     problem: RangeProblem
     fit: RangeFit
     errors: RangeErrors
     noise_stddev_m: float
+    rivals: tuple[RangeState, ...] = ()
 
 
 def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> Solution:
@@ -118,8 +120,11 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
     solutions = [solution_from(posed, start) for start in likeliest]
     solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
     on_side(problem, [solutions[0].fit], camera_side)
-    refuse_ambiguity(solutions[0], [solution.fit.state for solution in solutions[1:]], camera_side)
-    return solutions[0]
+    others = [solution.fit.state for solution in solutions[1:]]
+    refuse_ambiguity(solutions[0], others, camera_side)
+    sides = (camera_side, None)
+    rivals = [other for other in others if camera_side is None or camera_side_of(problem, other) in sides]
+    return replace(solutions[0], rivals=tuple(rivals))
 
 
 def _unlikeliness(problem: RangeProblem, errors: RangeErrors, state: RangeState) -> float:

@@ -200,7 +200,7 @@ def _ranges_on_scaled(estimate: ScaleEstimate, bending: MapBending | None) -> Ra
     if estimate.problem is None or estimate.solution is None:
         return None
     bending = bending or WalkBending(in_first_camera(estimate.problem.trajectory))
-    return bent_to_ranges(ranges_on_map(estimate.problem, estimate.solution, bending))
+    return bent_to_ranges(ranges_on_map(estimate.problem, estimate.solution, bending), estimate.solution.rivals)
 
 
 def _diagnose(survey: Survey, on_map: RangesOnMap | None) -> Diagnosis | None:
@@ -319,6 +319,8 @@ def refine_map(run: SurveyRun, metric: MetricResult, closing: LoopClosing | None
 def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: MetricResult) -> MetricResult:
     """Return the refined map, refined again if the ranges say that an unknown anchor is on the other side of the path.
 
+    If that breaks the map, the first refinement stays.
+
     Args:
         start: the scaled map. metric: the refined map.
     """
@@ -328,7 +330,8 @@ def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric:
     sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
     estimate = replace(start.estimate, anchors=sides.of(start.estimate.anchors))
     if sides.has_crossed:
-        return refine_map(run, replace(start, estimate=estimate))
+        again = refine_map(run, replace(start, estimate=estimate))
+        return metric if again.kept_refinement is None else again
     refinement = replace(metric.kept_refinement, anchors=sides.of(metric.kept_refinement.anchors))
     return replace(metric, estimate=estimate, refinement=refinement)
 
