@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations_with_replacement, pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -172,6 +172,12 @@ class _Shape(NamedTuple):
     def rest(self) -> Indices:
         return self.columns[self.num_own :]
 
+    def runs_of(self, child: _Shape) -> list[tuple[slice, slice]]:
+        """Return the rest of a child as runs of these columns: the places of each run here, and in the rest."""
+        at = np.searchsorted(self.columns, child.rest)
+        ends = [0, *(np.flatnonzero(np.diff(at) > 1) + 1).tolist(), len(at)]
+        return [(slice(at[first], at[last - 1] + 1), slice(first, last)) for first, last in pairwise(ends)]
+
 
 class _Eliminated(NamedTuple):
     """The eliminated part of a front.
@@ -231,13 +237,19 @@ class NestedFactor:
         self.pivots = np.concatenate([np.zeros(0), *squares])[place]
 
     def _from_below(self, matrix: Array | csr_array, rest_of: Callable[[int, Array], Array]) -> None:
-        """Assemble a matrix front by front; ``rest_of`` returns what a front adds to the next one, on its rest."""
+        """Assemble a symmetric matrix front by front, in its upper triangle.
+
+        Args:
+            rest_of: returns what a front adds to the next one, on its rest; only the upper triangle counts.
+        """
         rests = dict[int, Array]()
         for number, shape in enumerate(self._shapes):
             full = matrix if isinstance(matrix, np.ndarray) else self._rows_of_front(matrix, shape)
             for child in shape.children:
-                at = np.searchsorted(shape.columns, self._shapes[child].rest)
-                full[np.ix_(at, at)] += rests.pop(child)
+                rest = rests.pop(child)
+                runs = shape.runs_of(self._shapes[child])
+                for (rows, of_rows), (columns, of_columns) in combinations_with_replacement(runs, 2):
+                    full[rows, columns] += rest[of_rows, of_columns]
             rests[number] = rest_of(number, full)
 
     def _rows_of_front(self, matrix: csr_array, shape: _Shape) -> Array:
@@ -260,7 +272,8 @@ class NestedFactor:
         front = _Eliminated(lower, np.zeros((shape.num_own, 0)))
         front = front._replace(tie=front.solved(full[own, shape.num_own :]))
         self._eliminated.append(front)
-        return full[shape.num_own :, shape.num_own :] - front.tie.T @ front.tie
+        rest = full[shape.num_own :, shape.num_own :]
+        return np.asarray(linalg.blas.dsyrk(-1.0, front.tie, 1.0, rest.T, trans=1, lower=1).T) if rest.size else rest
 
     def solve(self, right: Array) -> Array:
         """Solve for a right side of shape (size, k) or (size,)."""
@@ -281,20 +294,22 @@ class NestedFactor:
         changes = self._changes(between)
         blocks: list[Array] = [np.zeros((0, 0))] * (len(self._starts) - 1)
         parent_of = {child: number for number, shape in enumerate(self._shapes) for child in shape.children}
-        of_fronts: dict[int, tuple[Array, Array]] = {}
+        of_fronts = dict[int, Array]()
         for number in reversed(range(len(self._shapes))):
-            shape, of_rest = self._shapes[number], (np.zeros((0, 0)), np.zeros((0, 0)))
+            shape = self._shapes[number]
+            both = np.empty((2,) + (len(shape.columns),) * 2)
             if (parent := parent_of.get(number)) is not None:
-                at = np.ix_(*[np.searchsorted(self._shapes[parent].columns, shape.rest)] * 2)
-                of_rest = of_fronts[parent][0][at], of_fronts[parent][1][at]
+                of_rest = both[:, shape.num_own :, shape.num_own :]
+                for (rows, of_rows), (columns, of_columns) in product(self._shapes[parent].runs_of(shape), repeat=2):
+                    of_rest[:, of_rows, of_columns] = of_fronts[parent][:, rows, columns]
                 if number == self._shapes[parent].children[0]:  # the last one that needs it
                     del of_fronts[parent]
-            inverse, product = _upwards(self._eliminated[number], *changes.pop(), *of_rest)
+            _upwards(self._eliminated[number], *changes.pop(), both)
             for block in np.unique(np.searchsorted(self._starts, self._order[shape.own], side="right") - 1).tolist():
-                rows = self._place[self._starts[block] : self._starts[block + 1]] - shape.own.start
-                blocks[block] = product[np.ix_(rows, rows)]
+                places = self._place[self._starts[block] : self._starts[block + 1]] - shape.own.start
+                blocks[block] = both[1][np.ix_(places, places)]
             if shape.children:
-                of_fronts[number] = inverse, product
+                of_fronts[number] = both
         return blocks
 
     def _changes(self, matrix: Array | csr_array) -> list[tuple[Array, Array]]:
@@ -303,37 +318,37 @@ class NestedFactor:
 
         def rest_of(number: int, full: Array) -> Array:
             num, front = self._shapes[number].num_own, self._eliminated[number]
-            own, tie = full[:num, :num].copy(), full[:num, num:].copy()
+            upper, tie, rest = full[:num, :num], full[:num, num:].copy(), full[num:, num:]
+            own = np.triu(upper) + np.triu(upper, 1).T
             changes.append((own, tie))
+            if not rest.size:
+                return rest
             by_rest = front.solved(front.tie, transposed=True)
-            crossed = (tie - 0.5 * own @ by_rest).T @ by_rest
-            return np.asarray(full[num:, num:] - crossed - crossed.T)
+            crossed = tie - 0.5 * own @ by_rest
+            return np.asarray(linalg.blas.dsyr2k(-1.0, crossed, by_rest, 1.0, rest.T, trans=1, lower=1).T)
 
         self._from_below(matrix, rest_of)
         return changes
 
 
-def _upwards(
-    front: _Eliminated, own_change: Array, tie_change: Array, inverse: Array, product: Array
-) -> tuple[Array, Array]:
-    """Return inverse, and inverse @ matrix @ inverse, of a whole front, given those of its rest.
+def _upwards(front: _Eliminated, own_change: Array, tie_change: Array, both: Array) -> None:
+    """Complete inverse, and inverse @ matrix @ inverse, of a whole front, of which the part of the rest is known.
 
     The second one is minus the derivative of the first one as a multiple of the matrix is added.
 
     Args:
-        own_change, tie_change: derivatives of the front's parts.
+        own_change, tie_change: derivatives of the front's parts. both: (2, size, size) the two results.
     """
+    own, rest = slice(len(front.lower)), slice(len(front.lower), None)
     of_own = front.inverse()
     by_rest = front.solved(front.tie, transposed=True)
     by_rest_change = of_own @ (tie_change - own_change @ by_rest)
-    inverse_tie = -by_rest @ inverse
-    product_tie = by_rest_change @ inverse - by_rest @ product
-    inverse_own = of_own - inverse_tie @ by_rest.T
-    product_own = of_own @ own_change @ of_own - product_tie @ by_rest.T + inverse_tie @ by_rest_change.T
-    return (
-        np.block([[inverse_own, inverse_tie], [inverse_tie.T, inverse]]),
-        np.block([[product_own, product_tie], [product_tie.T, product]]),
-    )
+    both[:, own, rest] = -by_rest @ both[:, rest, rest]
+    both[1, own, rest] += by_rest_change @ both[0, rest, rest]
+    both[:, rest, own] = np.swapaxes(both[:, own, rest], 1, 2)
+    both[:, own, own] = -both[:, own, rest] @ by_rest.T
+    both[0, own, own] += of_own
+    both[1, own, own] += of_own @ own_change @ of_own + both[0, own, rest] @ by_rest_change.T
 
 
 def _tied_blocks(matrix: csr_array, starts: Indices) -> csr_array:
