@@ -254,11 +254,12 @@ class _Inverse:
         of_free = self._solve_regular(np.asarray(spread.independent @ self._solve_regular(free)))
         of_free -= 0.5 * free @ (free.T @ of_free)
         by_error = self.solve(spread.by_error.toarray())
+        of_errors = by_error @ spread.covariance
         return [
             self._scale[rows] * block * self._scale[rows].T
             - of_free[rows] @ free[rows].T
             - free[rows] @ of_free[rows].T
-            + by_error[rows] @ spread.covariance @ by_error[rows].T
+            + of_errors[rows] @ by_error[rows].T
             for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
         ]
 
