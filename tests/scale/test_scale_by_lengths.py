@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import special
 from tests.known import known
 
 from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind, scale_by_lengths
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE
+from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind, _Lengths, scale_by_lengths
 
 SCALE, TAPE_M = 0.45, 0.005
 
@@ -61,6 +63,16 @@ def test_a_mistyped_length_is_left_out_and_its_size_found(rng: np.random.Generat
     assert found.too_long_m[2] == pytest.approx(off_m, abs=4 * found.stddev_m[2])
     assert found.statistic[2] > found.threshold[2]
     assert found.value == pytest.approx(SCALE, rel=0.01)
+
+
+def test_the_threshold_of_a_length_allows_for_every_size_that_the_bending_may_have(rng: np.random.Generator) -> None:
+    """Of lengths that are wrong by the bending alone, the errors are proportional to its size."""
+    taped = located(path(rng), 4, rng, bending=0.004)
+    lengths = _Lengths.of(replace(taped, stddev_m=np.full(4, 1e-9)), np.arange(4), 10.0)
+    fit = lengths.fit(np.arange(4) != 2)
+    limit = np.sqrt(lengths.test(np.ones(4, dtype=bool), 2).threshold)
+    risk = 2 * fit.probabilities @ special.ndtr(-limit / fit.sizes)
+    assert risk == pytest.approx(FALSE_ALARM_RATE / 4, rel=1e-3)
 
 
 def test_nothing_checks_a_single_length(rng: np.random.Generator) -> None:
