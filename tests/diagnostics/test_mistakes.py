@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +14,14 @@ from tests.known import known
 from tests.studies.erring_surveys import SITES, Given, run, surveyed
 from tests.studies.mistakes import kinds
 
+from rangesfm.arrays import Array, Mask
 from rangesfm.diagnostics.alternatives import alternatives
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.diagnosis import Diagnosis
+from rangesfm.diagnostics.hypothesis import Hypothesis
 from rangesfm.diagnostics.linearized import linearized
-from rangesfm.diagnostics.mistakes import _settled_test
-from rangesfm.diagnostics.timed_hypotheses import SCANNING
+from rangesfm.diagnostics.mistakes import _settled_test, _varied
+from rangesfm.diagnostics.timed_hypotheses import SCANNING, _changes
 
 HALL, YARD, DRONE = SITES
 SEED = 3
@@ -251,6 +256,33 @@ def test_every_hypothesis_has_a_largest_size_that_can_happen() -> None:
         assert 0 < each.most < 200
         assert each.can_be(np.zeros(each.num))
         assert not each.can_be(np.full(each.num, 1.01 * each.most))
+
+
+@pytest.mark.parametrize(("size", "said"), [(0.03, "3.0 % too long"), (-0.03, "3.0 % too short")])
+def test_ranges_that_grow_too_much_are_said_to_be_too_long(size: float, said: str) -> None:
+    problem = linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
+    (of_all,) = [h for of_kind in STANDING for h in of_kind(problem) if h.name == "range scale"]
+    assert of_all.words(np.array([size])) == f"all ranges read about {said}"
+
+
+def test_of_each_kind_of_mistake_only_the_first_few_are_tried() -> None:
+    tests: list[Any] = [SimpleNamespace(hypothesis=SimpleNamespace(name=name)) for name in "aaaaabab"]
+    assert _varied(tests) == [tests[0], tests[1], tests[5], tests[7]]
+
+
+def test_a_change_leaves_enough_bins_before_and_after_it() -> None:
+    problem = linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
+    (any_of_all, *_) = [h for of_kind in STANDING for h in of_kind(problem)]
+    num, later = len(problem.bins), list[float]()
+
+    def change(_: str, __: Callable[[], Mask], after: Array) -> Hypothesis:
+        later.append(float(after.sum()))
+        return any_of_all
+
+    least = num // 3
+    list(_changes(problem, None, least, change))
+    assert later
+    assert least <= min(later) <= max(later) <= num - least
 
 
 def test_a_mistake_whose_steps_grow_explains_nothing() -> None:

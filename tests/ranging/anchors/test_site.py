@@ -46,3 +46,18 @@ def test_near_anchors_and_those_of_other_frames_stay(frame: str) -> None:
 def test_a_coordinate_system_needs_positions_on_the_earth(frame: str, position: list[float] | None, said: str) -> None:
     with pytest.raises(InputError, match=said):
         local_site(anchors_at(position), frame, "EPSG:2056")
+
+
+@pytest.mark.parametrize(
+    ("of_site", "of_points", "said"),
+    [
+        (None, "EPSG:2056", "these coordinates have a coordinate system and the anchors have none"),
+        ("EPSG:2056", None, "the anchors have a coordinate system and these coordinates have none"),
+    ],
+)
+def test_points_without_the_coordinate_system_of_the_anchors_are_refused(
+    of_site: str | None, of_points: str | None, said: str
+) -> None:
+    site, _ = local_site(anchors_at([*FAR], [*(FAR + 10.0)]), "site", of_site)
+    with pytest.raises(InputError, match=said):
+        site.local(FAR[None], of_points)

@@ -9,7 +9,13 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors, learn_errors
+from rangesfm.ranging.errors.learned import (
+    ComponentLikelihood,
+    ExpectedErrors,
+    LearnedErrors,
+    learn_errors,
+    usual_stddevs,
+)
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, range_bins
 
 Array = npt.NDArray[np.float64]
@@ -144,3 +150,21 @@ def test_ranges_of_some_rows_keep_their_bins(walked: RangeBins) -> None:
     spread = replace(learned, of_range=learned.of_range[rows]).spread(rows, 30)
     np.testing.assert_array_equal(spread.of_range[rows], learned.of_range[rows])
     assert np.count_nonzero(spread.of_range < 0) == 27
+
+
+def test_the_usual_size_of_a_component_is_the_root_of_its_mean_square_over_radios() -> None:
+    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
+    usual = usual_stddevs(is_calibrated=False)
+    for component in COMPONENTS:
+        of_radios = component.median * np.exp(component.spread * nodes)
+        assert usual[component.name] == pytest.approx(np.sqrt(weights @ of_radios**2 / weights.sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("most_unusual", [0.5, 3.0])
+def test_no_component_is_more_unusual_than_it_may_be(most_unusual: float) -> None:
+    """Of errors a hundred times as large as usual, the component is as large as is allowed."""
+    off_m = np.random.default_rng(0).standard_normal(30)
+    one_cause = ComponentLikelihood(
+        np.eye(30)[None], np.log([0.01]), np.array([0.4]), 1e-6 * np.eye(30), off_m, np.ones((30, 1)), np.zeros((0, 1))
+    )
+    assert one_cause.most_likely(most_unusual)[0] == pytest.approx(np.log(0.01) + 0.4 * most_unusual)
