@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
-from rangesfm.ranging.anchors.anchor_file import read_anchors, write_anchors
+from rangesfm.ranging.anchors.anchor_file import _named_quantity, read_anchors, write_anchors
 
 HEADER = "anchor_id,x_m,y_m,z_m"
 FULL_HEADER = HEADER + ",position_stddev_m,range_bias_m,range_bias_stddev_m"
@@ -43,6 +43,14 @@ def test_optional_columns_are_read(tmp_path: Path) -> None:
     first, second = read_anchors(write(tmp_path, f"{FULL_HEADER}\n1,1,2,3,0.02,-0.1,0.03\n2,1,2,3,,,\n"))
     assert (first.position_stddev_m, first.range_bias_m, first.range_bias_stddev_m) == (0.02, -0.1, 0.03)
     assert (second.position_stddev_m, second.range_bias_m, second.range_bias_stddev_m) == (0.0, 0.0, None)
+
+
+@pytest.mark.parametrize(
+    ("words", "quantity"),
+    [("sigma", "position_stddev"), ("bias", "range_bias"), ("bias sigma", "range_bias_stddev")],
+)
+def test_a_stddev_is_that_of_the_position_unless_its_name_says_bias(words: str, quantity: str) -> None:
+    assert _named_quantity({*words.split()}) == quantity
 
 
 def test_empty_coordinates_are_those_of_an_unknown_anchor(tmp_path: Path) -> None:
