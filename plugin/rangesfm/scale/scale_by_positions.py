@@ -138,8 +138,10 @@ class PositionScale:
 
 def _determine(known: KnownPositions, used: Mask) -> bool:
     """Return whether positions determine a similarity: three or more that are not on one line."""
-    stddevs = path_shape(known.places[used]).stddevs if used.any() else np.zeros(3)
-    return int(used.sum()) >= MIN_NUM_POSITIONS and bool(stddevs[1] > _ON_LINE * stddevs[0])
+    if used.sum() < MIN_NUM_POSITIONS:
+        return False
+    stddevs = path_shape(known.places[used]).stddevs
+    return bool(stddevs[1] > _ON_LINE * stddevs[0])
 
 
 @with_one_blas_thread
@@ -440,15 +442,11 @@ def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:
     """
     places, targets = known.places[rows], known.position_m[rows]
     for _ in range(2):
-        best = align_points(places, targets)
-        least = _distance_sum(best, places, targets)
-        for triple in _triples(len(rows)):
-            chosen = list(triple)
-            if any(is_line(path_shape(each)) for each in (places[chosen], targets[chosen])):
-                continue
-            found = align_points(places[chosen], targets[chosen])
-            if (total := _distance_sum(found, places, targets)) < least:
-                best, least = found, total
+        candidates = [align_points(places, targets)]
+        for chosen in map(list, _triples(len(rows))):
+            if not any(is_line(path_shape(each)) for each in (places[chosen], targets[chosen])):
+                candidates.append(align_points(places[chosen], targets[chosen]))
+        best = candidates[int(np.argmin([_distance_sum(each, places, targets) for each in candidates]))]
         targets = known.position_m[rows] - known.arms_m[rows] @ best.rotation.T
     return best
 
