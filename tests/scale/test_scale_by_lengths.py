@@ -66,7 +66,7 @@ def test_a_mistyped_length_is_left_out_and_its_size_found(rng: np.random.Generat
 
 
 def test_the_threshold_of_a_length_allows_for_every_size_that_the_bending_may_have(rng: np.random.Generator) -> None:
-    """Of lengths that are wrong by the bending alone, the errors are proportional to its size."""
+    """Errors of lengths that are wrong by the bending alone are proportional to its size."""
     taped = located(path(rng), 4, rng, bending=0.004)
     lengths = _Lengths.of(replace(taped, stddev_m=np.full(4, 1e-9)), np.arange(4), 10.0)
     fit = lengths.fit(np.arange(4) != 2)

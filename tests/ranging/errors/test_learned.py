@@ -162,7 +162,7 @@ def test_the_usual_size_of_a_component_is_the_root_of_its_mean_square_over_radio
 
 @pytest.mark.parametrize("most_unusual", [0.5, 3.0])
 def test_no_component_is_more_unusual_than_it_may_be(most_unusual: float) -> None:
-    """Of errors a hundred times as large as usual, the component is as large as is allowed."""
+    """Errors a hundred times as large as usual make the component as large as is allowed."""
     off_m = np.random.default_rng(0).standard_normal(30)
     one_cause = ComponentLikelihood(
         np.eye(30)[None], np.log([0.01]), np.array([0.4]), 1e-6 * np.eye(30), off_m, np.ones((30, 1)), np.zeros((0, 1))
