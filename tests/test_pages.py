@@ -232,7 +232,9 @@ OF_THE_HELP = {"--num_photos", "--quiet"}
 OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--csv", "--ref_images_path", "--transform_path"}
 OF_STUDIES = {
     "--num",
+    "--num_clean",
     "--num_keyframes",
+    "--num_ranges_each",
     "--num_seeds",
     "--pixel_stddev",
     "--size_m",
