@@ -97,15 +97,22 @@ def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
     return "below" if share_above <= 1 - _ON_ONE_SIDE else "on both sides of"
 
 
+def is_on_side(problem: RangeProblem, state: RangeState, camera_side: str | None) -> bool:
+    """Return whether the path is on the given side of the anchors' plane or in it; true if no side is given.
+
+    Raises:
+        GeometryError: the plane stands upright.
+    """
+    return camera_side is None or camera_side_of(problem, state) in (camera_side, None)
+
+
 def on_side(problem: RangeProblem, fits: list[RangeFit], camera_side: str | None) -> list[RangeFit]:
     """Return the fits whose path is on the given side of the anchors' plane or in it; all fits if there is no plane.
 
     Raises:
         GeometryError: the plane is upright, or no fit is on that side.
     """
-    if camera_side is None:
-        return fits
-    kept = [fit for fit in fits if camera_side_of(problem, fit.state) in (camera_side, None)]
+    kept = [fit for fit in fits if is_on_side(problem, fit.state, camera_side)]
     if fits and not kept:
         raise GeometryError(
             f"the ranges put the camera {camera_side_of(problem, fits[0].state)} the anchors' plane, not "

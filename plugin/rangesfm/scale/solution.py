@@ -14,7 +14,7 @@ from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind,
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
-from rangesfm.scale.anchor_plane import camera_side_of, mirrored_map, on_side
+from rangesfm.scale.anchor_plane import is_on_side, mirrored_map, on_side
 from rangesfm.scale.range_equation import (
     RangeFit,
     RangeProblem,
@@ -122,9 +122,7 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
     on_side(problem, [solutions[0].fit], camera_side)
     others = [solution.fit.state for solution in solutions[1:]]
     refuse_ambiguity(solutions[0], others, camera_side)
-    sides = (camera_side, None)
-    rivals = [other for other in others if camera_side is None or camera_side_of(problem, other) in sides]
-    return replace(solutions[0], rivals=tuple(rivals))
+    return replace(solutions[0], rivals=tuple(each for each in others if is_on_side(problem, each, camera_side)))
 
 
 def _unlikeliness(problem: RangeProblem, errors: RangeErrors, state: RangeState) -> float:
@@ -256,7 +254,7 @@ def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_si
         return
     for rival in rivals:
         other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)
-        is_elsewhere = camera_side is not None and camera_side_of(problem, other.state) not in (camera_side, None)
+        is_elsewhere = not is_on_side(problem, other.state, camera_side)
         if is_elsewhere or _are_same(problem, other.state, solution.fit.state):
             continue
         gap = (other.cost - solution.fit.cost) / solution.errors.inflation**2
