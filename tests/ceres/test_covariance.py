@@ -26,7 +26,8 @@ from rangesfm.ceres import (
     range_cost,
     tangent_jacobian,
 )
-from rangesfm.ceres.covariance import PhotosAlone, ResidualErrors, joint_covariance
+from rangesfm.ceres.covariance import JointCovariance, PhotosAlone, ResidualErrors, joint_covariance
+from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import pose_of
@@ -48,6 +49,7 @@ class Joint:
     adjuster: pycolmap.CeresBundleAdjuster
     anchors: list[Array]
     biases: list[Array]
+    num_reprojections: int
 
     @property
     def problem(self) -> Any:
@@ -57,6 +59,14 @@ class Joint:
     def poses(self) -> list[Array]:
         frames = sorted(self.reconstruction.reg_frame_ids())
         return [pose_of(self.reconstruction.frame(i)).params for i in frames]
+
+    def covariance(self, **given: Any) -> JointCovariance:
+        """Return the covariance of all, with its own anchors and biases where no others are given."""
+        blocks = {"anchors": self.anchors, "others": self.biases, **given}
+        equations = NormalEquations.of(
+            self.problem, self.reconstruction, self.num_reprojections, blocks["anchors"], blocks["others"]
+        )
+        return joint_covariance(equations, **blocks)
 
 
 def model(seed: int = 0, num_frames: int = NUM_FRAMES) -> pycolmap.Reconstruction:
@@ -100,7 +110,8 @@ def joint(
     range_errors_m: Array | None = None,
 ) -> Joint:
     adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
-    survey = Joint(reconstruction, adjuster, list(ANCHORS_M[:num_anchors].copy()), [np.zeros(1) for _ in ANCHORS_M])
+    anchors, biases = list(ANCHORS_M[:num_anchors].copy()), [np.zeros(1) for _ in ANCHORS_M]
+    survey = Joint(reconstruction, adjuster, anchors, biases, adjuster.problem.num_residuals())
     frame, anchor = (index.ravel() for index in np.meshgrid(np.arange(len(survey.poses)), np.arange(num_anchors)))
     path = orbit_path(1.4 * len(survey.poses))
     times = np.arange(len(survey.poses), dtype=np.float64)
@@ -141,10 +152,7 @@ def test_it_is_the_same_of_blocks_that_are_kept_from_elimination() -> None:
     free, kept = joint(model(), hold_first=True), joint(model(), hold_first=True)
     for block in (*kept.anchors, *kept.biases):
         keep_from_elimination(kept.adjuster, block, next(iter(kept.reconstruction.points3D.values())).xyz)
-    expected, found = (
-        joint_covariance(one.problem, one.reconstruction, anchors=one.anchors, others=one.biases)
-        for one in (free, kept)
-    )
+    expected, found = (one.covariance() for one in (free, kept))
     np.testing.assert_allclose(found.anchors, expected.anchors, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(found.others, expected.others, rtol=1e-6)
     np.testing.assert_allclose(found.centers, expected.centers, rtol=1e-6, atol=1e-12)
@@ -153,9 +161,7 @@ def test_it_is_the_same_of_blocks_that_are_kept_from_elimination() -> None:
 @pytest.mark.parametrize("hold_anchors", [False, True], ids=["anchors free", "anchors held"])
 def test_it_is_the_inverse_of_all_normal_equations(hold_anchors: bool) -> None:
     survey = joint(model(), hold_first=not hold_anchors, hold_anchors=hold_anchors)
-    found = joint_covariance(
-        survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, residual_stddev=2.0
-    )
+    found = survey.covariance(residual_stddev=2.0)
     expected = 4.0 * covariance_of_all(survey.problem, variable(survey))
     assert found.num_free_directions == 0
     first = 0 if hold_anchors else 1
@@ -186,9 +192,7 @@ def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
     by_error = np.hstack([np.eye(num_ranges), rng.standard_normal((num_ranges, 3))])
     of_errors = np.diag(np.concatenate([np.full(num_ranges, 1.7), np.ones(3)]))
     errors = ResidualErrors(rows, csr_array(by_error), of_errors, np.arange(num - 1, num))
-    found = joint_covariance(
-        survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases, errors=errors
-    )
+    found = survey.covariance(errors=errors)
     jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
     of_residuals = np.eye(num)
     of_residuals[np.ix_(rows, rows)] = by_error @ of_errors @ by_error.T
@@ -198,13 +202,13 @@ def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
     first = 6 * (NUM_FRAMES - 1)
     np.testing.assert_allclose(found.anchors[0], expected[first : first + 3, first : first + 3], rtol=1e-5)
     np.testing.assert_allclose(np.diag(found.rig_from_world[1])[3:], np.diag(expected)[3:6], rtol=1e-5)
-    alone = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    alone = survey.covariance()
     assert found.relative_scale_stddev > 1.1 * alone.relative_scale_stddev
 
 
 def test_centers_err_as_their_poses_do() -> None:
     survey = joint(model(), hold_anchors=True)
-    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    found = survey.covariance()
     rng = np.random.default_rng(0)
     rotation, translation = Rotation.from_quat(survey.poses[3][:4]), survey.poses[3][4:]
     steps = rng.multivariate_normal(np.zeros(6), 1e-4 * found.rig_from_world[3], 20000)
@@ -219,7 +223,7 @@ def test_centers_err_as_their_poses_do() -> None:
 def test_motions_of_the_map_that_nothing_holds_are_counted(num_anchors: int, num_free: int) -> None:
     survey = joint(model(), num_anchors=num_anchors, hold_anchors=True)
     biases = survey.biases[:num_anchors]
-    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=biases)
+    found = survey.covariance(others=biases)
     assert found.num_free_directions == num_free
     assert np.all(np.linalg.eigvalsh(found.centers) > -1e-12)
 
@@ -227,7 +231,7 @@ def test_motions_of_the_map_that_nothing_holds_are_counted(num_anchors: int, num
 def test_a_free_map_errs_least_under_inner_constraints() -> None:
     """The covariance is the pseudo-inverse of the normal equations reduced by the points."""
     survey = joint(model(), num_anchors=1)
-    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases[:1])
+    found = survey.covariance(others=survey.biases[:1])
     jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
     normal, kept = jacobian.T @ jacobian, 6 * NUM_FRAMES + 4
     coupling = normal[:kept, kept:]
@@ -245,7 +249,7 @@ def test_it_agrees_with_colmaps_own_where_there_are_no_ranges() -> None:
     frames = sorted(reconstruction.reg_frame_ids())
     other = pose_of(reconstruction.frame(frames[4])).params
     adjuster.problem.set_parameter_block_constant(other)  # this pose and the first, which is held, fix the scale
-    found = joint_covariance(adjuster.problem, reconstruction)
+    found = joint_covariance(NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals()))
     options = pycolmap.BACovarianceOptions(damping=0.0)
     theirs = pycolmap.estimate_ba_covariance_from_problem(options, reconstruction, adjuster.problem)
     assert theirs is not None
@@ -262,7 +266,7 @@ def test_two_points_with_a_taped_distance_are_eliminated_together() -> None:
     distance = float(np.linalg.norm(first - second))
     tape = distance_cost(distance_m=distance, stddev_m=1e-4)
     add_residual_block(survey.adjuster, tape, None, [first, second])
-    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    found = survey.covariance()
     expected = covariance_of_all(survey.problem, variable(survey))
     turn = np.diag([2.0, 2, 2, 1, 1, 1])
     assert found.rig_from_world[2] == pytest.approx(turn @ expected[12:18, 12:18] @ turn, rel=1e-5, abs=1e-12)
@@ -274,9 +278,7 @@ def test_large_problems_are_solved_sparsely_with_the_same_answer(monkeypatch: py
     for dense_from in (0.0, 1.0):
         monkeypatch.setattr("rangesfm.ceres.linear_solver._DENSE_FROM", dense_from)
         monkeypatch.setattr("rangesfm.ceres.nested_dissection._MAX_LEAF", 3)
-        answers.append(
-            joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
-        )
+        answers.append(survey.covariance())
     assert answers[0].rig_from_world == pytest.approx(answers[1].rig_from_world, rel=1e-6, abs=1e-12)
     assert answers[0].relative_scale_stddev == pytest.approx(answers[1].relative_scale_stddev, rel=1e-6)
 
@@ -284,7 +286,7 @@ def test_large_problems_are_solved_sparsely_with_the_same_answer(monkeypatch: py
 def test_a_block_that_nobody_named_is_an_error() -> None:
     survey = joint(model(), hold_anchors=True)
     with pytest.raises(ValueError, match="the problem has"):
-        joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors)
+        survey.covariance(others=())
 
 
 def test_an_anchor_that_its_ranges_do_not_determine_is_named() -> None:
@@ -293,7 +295,7 @@ def test_an_anchor_that_its_ranges_do_not_determine_is_named() -> None:
     cost = range_cost(range_m=3.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
     add_residual_block(survey.adjuster, cost, None, [survey.poses[0], lonely, survey.biases[0]])
     with pytest.raises(GeometryError, match="do not determine the problem's anchor number 0"):
-        joint_covariance(survey.problem, survey.reconstruction, anchors=[*survey.anchors, lonely], others=survey.biases)
+        survey.covariance(anchors=[*survey.anchors, lonely])
 
 
 def test_surveys_err_as_the_covariance_says() -> None:
@@ -308,7 +310,7 @@ def test_surveys_err_as_the_covariance_says() -> None:
         biases = BIAS_STDDEV_M * rng.standard_normal((len(ANCHORS_M), 1))
         survey = joint(model(seed), hold_first=True, range_errors_m=noise + biases)
         assert survey.adjuster.solve().is_solution_usable()
-        found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+        found = survey.covariance()
         now = np.array([-Rotation.from_quat(pose[:4]).inv().apply(pose[4:]) for pose in survey.poses])
         errors = now - truth
         centers.append([e @ np.linalg.solve(c, e) / 3 for e, c in zip(errors[1:], found.centers[1:], strict=True)])
@@ -336,7 +338,7 @@ def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None
         cost = range_cost(range_m=3.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
         add_residual_block(survey.adjuster, cost, None, [survey.poses[0], at, survey.biases[0]])
         survey.problem.set_parameter_block_constant(survey.biases[0])
-        found = joint_covariance(survey.problem, survey.reconstruction, anchors=[at], others=survey.biases[:1])
+        found = survey.covariance(anchors=[at], others=survey.biases[:1])
         counts.append(found.num_free_directions)
     assert counts[0] == counts[1]
 
@@ -372,9 +374,8 @@ def test_what_photos_leave_open_is_the_inverse_of_all_their_normal_equations(hol
     reconstruction, adjuster = photos_alone(hold_first=hold_first)
     frames = np.array(sorted(reconstruction.reg_frame_ids()))
     _, slopes = ratios(reconstruction)
-    found, shift = PhotosAlone(adjuster.problem, reconstruction, 0.7).of_functions(
-        frames, np.zeros_like(slopes), slopes
-    )
+    equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
+    found, shift = PhotosAlone(equations, 0.7).of_functions(frames, np.zeros_like(slopes), slopes)
     poses = [pose_of(reconstruction.frame(i)).params for i in frames.tolist()]
     blocks = [*poses, *(point.xyz for point in reconstruction.points3D.values())]
     is_free = [adjuster.problem.has_parameter_block(block) for block in blocks]
@@ -392,6 +393,20 @@ def test_what_photos_leave_open_is_the_inverse_of_all_their_normal_equations(hol
     assert np.abs(shift).max() < 1e-3 * np.sqrt(found.diagonal().min())
 
 
+def test_what_photos_leave_open_does_not_depend_on_the_world_of_the_map() -> None:
+    """Another world has other coordinates held to fix the free motions, and only rounding may show it."""
+    reconstruction, adjuster = photos_alone()
+    frames = np.array(sorted(reconstruction.reg_frame_ids()))
+    found = []
+    for seed in range(4):
+        _, slopes = ratios(reconstruction)
+        equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
+        found.append(PhotosAlone(equations, 1.0).of_functions(frames, np.zeros_like(slopes), slopes)[0])
+        rotation = pycolmap.Rotation3d(Rotation.random(rng=seed).as_quat())
+        reconstruction.transform(pycolmap.Sim3d(1.5, rotation, np.array([20.0, -5.0, 3.0])))
+    np.testing.assert_allclose(found, np.broadcast_to(found[0], np.shape(found)), rtol=1e-10)
+
+
 def test_photos_say_how_far_a_map_was_moved_from_where_they_have_it() -> None:
     reconstruction, adjuster = photos_alone()
     before, _ = ratios(reconstruction)
@@ -399,7 +414,8 @@ def test_photos_say_how_far_a_map_was_moved_from_where_they_have_it() -> None:
     for frame in frames.tolist():
         pose_of(reconstruction.frame(frame)).params[4:] += 1e-3 * rng.standard_normal(3)
     after, slopes = ratios(reconstruction)
-    _, shift = PhotosAlone(adjuster.problem, reconstruction, 1.0).of_functions(frames, np.zeros_like(slopes), slopes)
+    equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
+    _, shift = PhotosAlone(equations, 1.0).of_functions(frames, np.zeros_like(slopes), slopes)
     np.testing.assert_allclose(shift, before - after, rtol=0.05)
 
 
@@ -409,13 +425,11 @@ def test_priors_may_err_otherwise_than_the_residuals_of_photos() -> None:
     rows = np.zeros(0, dtype=np.int64)
     nothing = csr_array((0, 1))
     usual, better = (
-        joint_covariance(
-            survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases,
-            errors=ResidualErrors(rows, nothing, np.eye(1), rows, variance),
+        survey.covariance(errors=ResidualErrors(rows, nothing, np.eye(1), rows, variance),
         )
         for variance in (1.0, 0.0)
     )  # fmt: skip
-    plain = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    plain = survey.covariance()
     np.testing.assert_allclose(usual.centers, plain.centers, rtol=1e-9)
     assert (np.trace(better.centers, axis1=1, axis2=2) < np.trace(usual.centers, axis1=1, axis2=2)).all()
 
@@ -437,9 +451,7 @@ def test_an_anchor_whose_ranges_weigh_far_more_than_they_err_keeps_a_positive_va
     rows = add_ranges(survey.adjuster, ranges, RangeBlocks(survey.poses, [anchor], [bias], [TAG_IN_CAM_M]))
     survey.problem.set_parameter_block_constant(bias)
     errors = ResidualErrors(rows, csr_array(np.ones((NUM_FRAMES, 1))), np.full((1, 1), 1e-8), np.zeros(0, dtype=int))
-    (found,) = joint_covariance(
-        survey.problem, survey.reconstruction, anchors=[anchor], others=[bias], errors=errors
-    ).anchors
+    (found,) = survey.covariance(anchors=[anchor], others=[bias], errors=errors).anchors
     blocks = variable(replace(survey, anchors=[anchor], biases=[bias]))
     gain = np.linalg.pinv(tangent_jacobian(survey.problem, blocks).toarray())
     of_residuals = np.eye(survey.problem.num_residuals())

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tests.ceres.test_covariance import Joint, covariance_of_all, joint, model, variable
 
 from rangesfm.ceres import part_errors
-from rangesfm.ceres.covariance import JointCovariance, joint_covariance
+from rangesfm.ceres.covariance import JointCovariance
 from rangesfm.ceres.part_errors import PartSteps, map_errors
 from rangesfm.geometry.map_errors import MapErrors, MapPointErrors
 
@@ -19,13 +19,7 @@ Array = npt.NDArray[np.float64]
 
 
 def found_in(survey: Joint) -> JointCovariance:
-    return joint_covariance(
-        survey.problem,
-        survey.reconstruction,
-        anchors=survey.anchors,
-        others=survey.biases,
-        anchor_ids=[f"A{k}" for k in range(len(survey.anchors))],
-    )
+    return survey.covariance(anchor_ids=[f"A{k}" for k in range(len(survey.anchors))])
 
 
 def center_of(frame_id: int) -> MapPointErrors:

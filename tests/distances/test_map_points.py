@@ -22,7 +22,6 @@ from tests.ceres.test_covariance import (
 )
 from tests.known import known
 
-from rangesfm.ceres.covariance import joint_covariance
 from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import InputError
@@ -149,7 +148,7 @@ def test_a_marker_errs_by_its_marks_as_much_as_it_moves_with_them() -> None:
 
 def test_points_err_relative_to_each_other_as_in_the_inverse_of_all_normal_equations() -> None:
     survey = joint(model(), hold_first=True)
-    found = joint_covariance(survey.problem, survey.reconstruction, anchors=survey.anchors, others=survey.biases)
+    found = survey.covariance()
     points, blocks = points_in(survey.reconstruction), variable(survey)
     whole = covariance_of_all(survey.problem, blocks)
     ids = list(survey.reconstruction.points3D)
@@ -210,13 +209,7 @@ def test_distances_of_solved_surveys_are_in_their_intervals() -> None:
         names += [image.name for image in reconstruction.images.values()]
         true_m = {name: MapPoints(reconstruction, {}, {}, 1.0).find(name).position_m.copy() for name in names}
         assert survey.adjuster.solve().is_solution_usable()
-        found = joint_covariance(
-            survey.problem,
-            reconstruction,
-            anchors=survey.anchors,
-            others=survey.biases,
-            anchor_ids=[f"A{k}" for k in range(len(ANCHORS_M))],
-        )
+        found = survey.covariance(anchor_ids=[f"A{k}" for k in range(len(ANCHORS_M))])
         anchors_m = {f"A{k}": at for k, at in enumerate(survey.anchors)}
         true_m |= {f"A{k}": at for k, at in enumerate(ANCHORS_M)}
         uncertainty = ScaleUncertainty(found.relative_scale_stddev, {})

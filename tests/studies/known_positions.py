@@ -40,6 +40,7 @@ from tests.studies.simulated_survey import TAG_IN_CAM_M, photos_adjuster
 from tests.studies.simulated_survey import Survey as Truth
 
 from rangesfm.ceres.covariance import PhotosAlone
+from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.similarity import align_points, similarity_motions
@@ -213,9 +214,8 @@ class Known:
         known_offset = antenna and replace(antenna, offset_s=None if antenna.log.timestamp_s is None else 0.0)
         known = replace(self.surveyed, antenna=known_offset).located(truth.reconstruction, path)
         assert known is not None
-        photos = PhotosAlone(
-            photos_adjuster(self.truth, truth.reconstruction).problem, truth.reconstruction, pixel_stddev
-        )
+        problem = photos_adjuster(self.truth, truth.reconstruction).problem
+        photos = PhotosAlone(NormalEquations.of(problem, truth.reconstruction, problem.num_residuals()), pixel_stddev)
         bending = PhotoBending(photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, True)
         found = scale_by_positions(known, path, bending)
         parts = {part.name: part.alike for part in found.equations.parts}

@@ -14,6 +14,7 @@ from tests.simulated.path import lap_path, loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
+from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.colmap.transform import rescale
 from rangesfm.costs import add_residual_block, joint_prior_cost, range_cost
 from rangesfm.demo.simulated_radio import CameraPath, Radio
@@ -280,9 +281,11 @@ def covariance_at_truth(
 ) -> JointCovariance:
     """Return the covariance of a model that has the truth's poses, as ``rmse_bound_m`` needs it."""
     adjuster, anchors, biases = photos_adjuster(survey, truth), _anchor_blocks(survey), _bias_blocks(survey)
+    num_reprojections = adjuster.problem.num_residuals()
     if with_ranges:
         _add_ranges(adjuster, truth, survey, true_ranges_m(survey), anchors, biases, pixel_stddev)
-    return joint_covariance(adjuster.problem, truth, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
+    equations = NormalEquations.of(adjuster.problem, truth, num_reprojections, anchors, biases)
+    return joint_covariance(equations, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
 
 
 def likeliest_path(survey: Survey, pixel_errors: Array, log: RangeLog, *, pixel_stddev: float) -> Trajectory:

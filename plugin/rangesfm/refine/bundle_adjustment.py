@@ -165,7 +165,7 @@ def bundle_adjustment(
     num_reprojections = adjuster.problem.num_residuals()
     if num_reprojections == 0:
         raise SolverError("no point of the model takes part in the bundle adjustment")
-    pixel_stddev = _pixel_stddev(adjuster, num_reprojections)
+    pixel_stddev = pixel_stddev_of(adjuster, num_reprojections)
     tie_points = _tie_points(metric, adjuster, marker_ids)
     return BundleAdjustment(metric, adjuster, num_reprojections, pixel_stddev, tie_points)
 
@@ -319,11 +319,11 @@ def _bundle_adjuster(
     return pycolmap.create_default_ceres_bundle_adjuster(ba, config, metric)
 
 
-def _pixel_stddev(adjuster: pycolmap.CeresBundleAdjuster, num_residuals: int) -> float:
+def pixel_stddev_of(adjuster: pycolmap.CeresBundleAdjuster, num_reprojections: int) -> float:
     """Estimate the standard deviation of a feature's coordinate; parameters have absorbed a part of the residuals."""
-    residuals = np.asarray(adjuster.problem.evaluate_residuals())
-    degrees_of_freedom = max(num_residuals - adjuster.problem.num_parameters(), 1)
-    return max(robust_stddev(residuals) * float(np.sqrt(num_residuals / degrees_of_freedom)), _MIN_PIXEL_STDDEV)
+    residuals = np.asarray(adjuster.problem.evaluate_residuals())[:num_reprojections]
+    degrees_of_freedom = max(num_reprojections - adjuster.problem.num_parameters(), 1)
+    return max(robust_stddev(residuals) * float(np.sqrt(num_reprojections / degrees_of_freedom)), _MIN_PIXEL_STDDEV)
 
 
 class ConvergenceMonitor:

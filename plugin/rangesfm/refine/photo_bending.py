@@ -10,6 +10,7 @@ import pycolmap
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import PhotosAlone
+from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import CameraOptions, RefineOptions
@@ -20,7 +21,7 @@ from rangesfm.ranging.errors.bending import (
     bending_part,
     without_similarity,
 )
-from rangesfm.refine.bundle_adjustment import BundleAdjustment, bundle_adjustment
+from rangesfm.refine.bundle_adjustment import bundle_adjustment
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
@@ -93,27 +94,34 @@ def bending_of_model(
         bundle = bundle_adjustment(
             model, camera, options, fixed_frame_id=None, num_threads=num_threads, left_out_ids=misplaced.tolist()
         )
-        return by_photos(bundle, trajectory, 1.0, is_at_optimum=True)
+        if bundle.has_covariance:
+            equations = NormalEquations.of(bundle.adjuster.problem, model, bundle.num_reprojections)
+            return by_photos(equations, bundle.pixel_stddev, trajectory, 1.0, is_at_optimum=True)
     except (SolverError, GeometryError, InputError):
-        return WalkBending(path)
+        pass
+    return WalkBending(path)
 
 
 def by_photos(
-    bundle: BundleAdjustment, trajectory: Trajectory, metres_per_unit: float, *, is_at_optimum: bool
+    equations: NormalEquations,
+    pixel_stddev: float,
+    trajectory: Trajectory,
+    metres_per_unit: float,
+    *,
+    is_at_optimum: bool,
 ) -> PhotoBending:
-    """Return the bending of a map from its bundle adjustment of photos alone.
+    """Return the bending of a map from the photos' part of its normal equations.
 
     Args:
+        pixel_stddev: standard deviation of a reprojection error's coordinate.
         trajectory: of the map, in its world.
         metres_per_unit: metres of that world per unit of the model to which the ranges refer.
 
     Raises:
-        GeometryError: the photos do not determine the map up to a similarity, or are too many.
+        GeometryError: the photos do not determine the map up to a similarity.
     """
-    if not bundle.has_covariance:
-        raise GeometryError("too many photos")
     return PhotoBending(
-        PhotosAlone(bundle.adjuster.problem, bundle.metric, bundle.pixel_stddev),
+        PhotosAlone(equations, pixel_stddev),
         trajectory.frame_ids,
         in_first_camera(trajectory, metres_per_unit),
         trajectory.world_from_cam[0],

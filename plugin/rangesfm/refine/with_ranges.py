@@ -13,6 +13,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
+from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_radio
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
@@ -26,7 +27,13 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import Misfit, RangeErrors, fit_with_own_errors, misfits
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
-from rangesfm.refine.bundle_adjustment import BundleAdjustment, SolverRun, solve_bundle_adjustment, solve_until_still
+from rangesfm.refine.bundle_adjustment import (
+    BundleAdjustment,
+    SolverRun,
+    pixel_stddev_of,
+    solve_bundle_adjustment,
+    solve_until_still,
+)
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
 from rangesfm.refine.graph_presolve import SAME_ERRORS, Presolved, presolve, presolve_again
 from rangesfm.refine.positions import HeldPositions
@@ -117,7 +124,9 @@ class AtRest:
         tags_m, centers_m: (k, 3) positions of tag and camera at each range.
         anchors: with their biases. errors: as weighted.
         shared_m: (k,) by how much the map takes the ranges to be too long because of shared errors.
-        photos: bundle adjustment of the photos alone.
+        metric: the map.
+        equations: of photos and all other measurements; None if the photos are too many.
+        pixel_stddev: standard deviation of a reprojection error's coordinate.
     """
 
     trajectory_m: Trajectory
@@ -127,7 +136,9 @@ class AtRest:
     anchors: tuple[AnchorEstimate, ...]
     errors: RangeErrors
     shared_m: Array
-    photos: BundleAdjustment
+    metric: pycolmap.Reconstruction
+    equations: NormalEquations | None
+    pixel_stddev: float
 
 
 @dataclass(frozen=True)
@@ -365,22 +376,44 @@ def _adjust(
     )
     more, is_still = solve_until_still(bundle, last.solutions[-1], _tolerance_m(problem, errors), last.num_left)
     last = replace(last, radio=added.estimate(last.radio), solutions=(*last.solutions, *more))
-    learnt = Learnt(errors.learned, 1.0) if learn is None else learn(_at_rest(problem, last.radio, errors))
+    equations = _equations(problem, bundle, added) if bundle.has_covariance else None
+    rest = _at_rest(problem, bundle, last.radio, errors, equations)
+    learnt = Learnt(errors.learned, 1.0) if learn is None else learn(rest)
     errors = replace(errors, learned=learnt.errors)
-    # Ranges that are too coarse to see any bending do not make it smaller than the noise of the features does.
-    covariance = _covariance(problem, bundle, added, errors, max(learnt.bending_factor, 1.0))
+    covariance = None
+    if problem.options.covariance and equations is not None:
+        # Ranges that are too coarse to see any bending do not make it smaller than the noise of the features does.
+        covariance = _covariance(problem, bundle, added, errors, equations, max(learnt.bending_factor, 1.0))
     problem.metric.update_point_3d_errors()
     return _summary(problem, start, bundle, last, errors, covariance, learnt.bending_factor, is_still=is_still)
 
 
-def _at_rest(problem: RefinementProblem, radio: RadioEstimate, errors: RangeErrors) -> AtRest:
+def _equations(problem: RefinementProblem, bundle: BundleAdjustment, added: AddedRadio) -> NormalEquations:
+    return NormalEquations.of(
+        bundle.adjuster.problem,
+        problem.metric,
+        bundle.num_reprojections,
+        added.blocks.anchors,
+        added.all_but_anchors,
+    )
+
+
+def _at_rest(
+    problem: RefinementProblem,
+    bundle: BundleAdjustment,
+    radio: RadioEstimate,
+    errors: RangeErrors,
+    equations: NormalEquations | None,
+) -> AtRest:
     ranges = problem.ranges
     path = ranges.trajectory.as_in(problem.metric)
     tags_m, centers_m = (places[ranges.rows] for places in ranges.places(path, radio))
     scale = align_points(ranges.trajectory.centers, path.centers).scale
-    photos = problem.of_photos(problem.options.max_num_iterations)
     shared_m = ranges.shared_m(radio)[ranges.rows]
-    return AtRest(path, scale, tags_m, centers_m, radio.anchors, errors, shared_m, photos)
+    pixel_stddev = pixel_stddev_of(bundle.adjuster, bundle.num_reprojections)
+    return AtRest(
+        path, scale, tags_m, centers_m, radio.anchors, errors, shared_m, problem.metric, equations, pixel_stddev
+    )
 
 
 def _tolerance_m(problem: RefinementProblem, errors: RangeErrors) -> float:
@@ -393,14 +426,12 @@ def _covariance(
     bundle: BundleAdjustment,
     added: AddedRadio,
     errors: RangeErrors,
+    equations: NormalEquations,
     bending_factor: float,
 ) -> JointCovariance | None:
-    if not (problem.options.covariance and bundle.has_covariance):
-        return None
     try:
         return joint_covariance(
-            bundle.adjuster.problem,
-            problem.metric,
+            equations,
             anchors=added.blocks.anchors,
             others=added.all_but_anchors,
             residual_stddev=bending_factor * bundle.pixel_stddev,

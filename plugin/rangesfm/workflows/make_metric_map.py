@@ -369,16 +369,12 @@ def _refined(
 
 
 def _positions_at_rest(surveyed: SurveyedPositions, rest: AtRest, lengths: LengthScale | None) -> PositionScale:
-    known = surveyed.located(rest.photos.metric, rest.trajectory_m)
+    known = surveyed.located(rest.metric, rest.trajectory_m)
     assert known is not None, "the positions placed the map"
-    try:
-        bending: MapBending = by_photos(rest.photos, rest.trajectory_m, 1.0, is_at_optimum=False)
-    except GeometryError:
-        bending = WalkBending(in_first_camera(rest.trajectory_m))
     return scale_by_positions(
         known,
         rest.trajectory_m,
-        bending,
+        _bending_at_rest(rest, 1.0),
         lengths=lengths,
         refined=IDENTITY,
         lasting_s=surveyed.lasting_s,
@@ -390,17 +386,23 @@ def _lengths_at_rest(metric: MetricResult, rest: AtRest) -> LengthScale | None:
     if metric.tape is None:
         return None
     anchor_ids = metric.observations.log.anchor_ids
-    return scale_by_lengths(locate_distances(metric.tape, rest.photos.metric, anchor_ids), rest.trajectory_m.centers)
+    return scale_by_lengths(locate_distances(metric.tape, rest.metric, anchor_ids), rest.trajectory_m.centers)
+
+
+def _bending_at_rest(rest: AtRest, metres_per_unit: float) -> MapBending:
+    """Return the bending of a refined map; ``metres_per_unit``: of the model to which the measurements refer."""
+    if rest.equations is not None:
+        try:
+            return by_photos(rest.equations, rest.pixel_stddev, rest.trajectory_m, metres_per_unit, is_at_optimum=False)
+        except GeometryError:
+            pass
+    return WalkBending(in_first_camera(rest.trajectory_m, metres_per_unit))
 
 
 def _at_rest(metric: MetricResult, rest: AtRest, positions: PositionScale | None) -> MapWithRanges:
     path = rest.trajectory_m
     # The model's frame is that of the first camera, in the unit of the unscaled model.
     model_from_map = replace(IDENTITY, scale=1 / rest.scale) @ first_camera_from(path)
-    try:
-        bending: MapBending = by_photos(rest.photos, rest.trajectory_m, rest.scale, is_at_optimum=False)
-    except GeometryError:
-        bending = WalkBending(in_first_camera(rest.trajectory_m, rest.scale))
     return MapWithRanges.of(
         metric.estimate,
         rest.trajectory_m,
@@ -411,7 +413,7 @@ def _at_rest(metric: MetricResult, rest: AtRest, positions: PositionScale | None
         np.array([anchor.range_bias_m for anchor in rest.anchors]),
         rest.errors,
         rest.shared_m,
-        bending,
+        _bending_at_rest(rest, rest.scale),
         placement=None if positions is None else positions.prior(path, model_from_map),
         lengths=_lengths_at_rest(metric, rest),
     )
