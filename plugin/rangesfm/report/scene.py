@@ -330,12 +330,17 @@ def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str
     photos = {image_names[i]: _small_copy(folder / image_names[i]) for i in chosen}
     made: dict[str, str] = {}
     for width in _WIDTHS_PX:
-        small = {name: ImageOps.contain(photo, (width, width)) for name, photo in photos.items() if photo is not None}
-        made = {name: data_uri(photo, "JPEG", quality=_QUALITY) for name, photo in small.items()}
-        if sum(map(len, made.values())) <= MAX_THUMBNAIL_BYTES:
-            return made
-    num_bytes = np.cumsum([len(uri) for uri in made.values()])
-    return {name: uri for (name, uri), up_to_it in zip(made.items(), num_bytes) if up_to_it <= MAX_THUMBNAIL_BYTES}
+        made, num_bytes = {}, 0
+        for name, photo in photos.items():
+            if photo is not None:
+                uri = data_uri(ImageOps.contain(photo, (width, width)), "JPEG", quality=_QUALITY)
+                num_bytes += len(uri)
+                if num_bytes > MAX_THUMBNAIL_BYTES:
+                    break
+                made[name] = uri
+        else:
+            break
+    return made
 
 
 def _small_copy(path: Path) -> Image.Image | None:
