@@ -76,11 +76,21 @@ def test_a_path_of_poses_is_scaled_to_where_ranges_bend_it_back() -> None:
     assert known(found.place).worst_keyframe_stddev_m > 0.5 * best_m
 
 
-@pytest.mark.parametrize("seed", [1, 6])
-def test_a_path_that_fits_better_turned_over_is_placed_the_right_way_up(seed: int) -> None:
+@pytest.mark.parametrize(("drift_m", "seed"), [(3.0, 1), (3.0, 6), (15.0, 11)])
+def test_a_path_that_fits_better_turned_over_is_placed_the_right_way_up(drift_m: float, seed: int) -> None:
     """A rigid path fits better with the anchors on its wrong side; a path that drifts does not."""
-    lap = without_points(lap_of_drift(3.0, seed, "site", with_radio=True, num_keyframes=NUM_KEYFRAMES))
+    lap = without_points(lap_of_drift(drift_m, seed, "site", with_radio=True, num_keyframes=NUM_KEYFRAMES))
     found = run(lap, 0)
     assert known(found.diagnosis).causes == ()
     best_m = rmse(align_points(lap.trajectory.centers, lap.truth_m).apply(lap.trajectory.centers) - lap.truth_m)
     assert error_m(lap, found) < 1.1 * best_m
+
+
+def test_a_path_that_drifts_by_a_hundred_times_the_usual_has_no_mistake_named() -> None:
+    """However far it drifts, drift is no mistake, and all ranges that fit the bent path are used."""
+    lap = without_points(lap_of_drift(15.0, 10, "site", with_radio=True, num_keyframes=NUM_KEYFRAMES))
+    found = run(lap, 0)
+    assert known(found.diagnosis).causes == ()
+    assert found.estimate.verdict == "good"
+    low, high = found.estimate.interval_95
+    assert low < true_scale(lap) < high

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -46,11 +47,26 @@ def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> Ra
     path that has drifted far.
 
     Args:
-        rivals: other states that fit the ranges nearly as well, or better if the path drifts.
+        rivals: other states that fit the ranges nearly as well, or better if the path drifts. A path of one piece that
+            drifts by metres may fit better turned over, with its anchors on the wrong side. So each is bent, too, and
+            one that is then much likelier is taken.
     """
     if not isinstance(on_map.bending, WalkBending):
         return on_map
-    on_map = _likeliest(on_map, rivals)
+    problem, bent = linearized(on_map), _bent(on_map)
+    if not drifts(at_other_map(problem, bent)):
+        return bent
+
+    def likelier(bent: RangesOnMap, other: RangesOnMap) -> RangesOnMap:
+        deviances = [Factorization(at_other_map(problem, at).with_learnt_errors()).deviance() for at in (bent, other)]
+        return other if deviances[1] < deviances[0] - _MIN_GAIN else bent
+
+    bent = reduce(likelier, (_bent(replace(on_map, state=state)) for state in rivals), bent)
+    # The place of the bent path is a better start than that of a path of one piece.
+    return likelier(bent, _bent(as_given(bent)))
+
+
+def _bent(on_map: RangesOnMap) -> RangesOnMap:
     for _ in range(_MAX_NUM_ROUNDS):
         problem = linearized(on_map).with_learnt_errors()
         before, on_map = on_map, _bent_once(problem)
@@ -60,12 +76,25 @@ def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> Ra
     return on_map
 
 
+def as_given(on_map: RangesOnMap) -> RangesOnMap:
+    """Return the map before it was bent to the ranges, at the same state."""
+    walk = on_map.bending
+    if not isinstance(walk, WalkBending) or walk.steps is None:
+        return on_map
+    return _on_path(on_map, walk, WalkBending(walk.given))
+
+
 def bends_m(on_map: RangesOnMap) -> Array:
     """Return (k,) how far the ranges moved each pose from the given path, metres; (0,) for a map that is no walk."""
     walk, scale = on_map.bending, on_map.state.metric_from_model.scale
     if not isinstance(walk, WalkBending) or walk.steps is None:
         return np.zeros(0)
     return np.asarray(scale * np.linalg.norm(walk.path.centers - walk.given.centers, axis=1))
+
+
+def drifts(problem: Linearized) -> bool:
+    """Return whether the ranges moved the poses by more than single ranges scatter: a rigid path then fits worse."""
+    return rmse(bends_m(problem.on_map)[:, None]) > problem.scatter_m
 
 
 def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: ScaleOptions) -> ScaleEstimate:
@@ -83,15 +112,15 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     posed, solution, bent_by_m = estimate.problem, estimate.solution, bends_m(on_map)
     if posed is None or solution is None or not len(bent_by_m):
         return estimate
-    problem, drift_m = linearized(on_map).with_learnt_errors(), rmse(bent_by_m[:, None])
-    if drift_m < problem.scatter_m:
+    problem = linearized(on_map).with_learnt_errors()
+    if not drifts(problem):
         return estimate
     known = _known(problem, posed, estimate.uncertainty.formal)
     uncertainty, covariance = known.uncertainty, known.covariance
     fit = replace(solution.fit, state=on_map.state, weights=problem.bins.robust_weight)
     judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, options)
     positions = zip(estimate.anchors, on_map.state.anchors_m, strict=True)
-    drift = f"the path drifts by {drift_m:.2g} m (root mean square) from where the ranges have it"
+    drift = f"the path drifts by {rmse(bent_by_m[:, None]):.2g} m (root mean square) from where the ranges have it"
     status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
     status[posed.rows] = status_by_weight(problem.bins.robust_weight)
     stddev_m[posed.rows] = problem.scatter_m
@@ -111,20 +140,6 @@ def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
     simple_m2 = problem.errors.only("white", *BENDS).covariance_m2 + bias_covariance(problem.bins, posed.ranges)
     by_others, _ = problem.with_weights(simple_m2, problem.errors.covariance_m2)
     return KnownMap.between(problem, problem.errors, formal, by_others, problem.solved(simple_m2).step)
-
-
-def _likeliest(on_map: RangesOnMap, rivals: Sequence[RangeState]) -> RangesOnMap:
-    """Return the map in its own state or in a much likelier one, if it may drift.
-
-    A path of one piece that drifts by metres may fit better turned over, with its anchors on the wrong side.
-    """
-    if not rivals:
-        return on_map
-    problem = linearized(on_map)
-    others = [at_other_map(problem, replace(on_map, state=state)) for state in rivals]
-    deviances = [Factorization(each.with_learnt_errors()).deviance() for each in (problem, *others)]
-    best = int(np.argmin(deviances))
-    return on_map if deviances[best] > deviances[0] - _MIN_GAIN else others[best - 1].on_map
 
 
 def _bent_once(problem: Linearized) -> RangesOnMap:

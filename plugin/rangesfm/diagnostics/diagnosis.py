@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Indices
+from rangesfm.diagnostics.bent_path import drifts
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, Test, row_of
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
 from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
@@ -144,9 +145,11 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
         yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")
     on_map, bins = problem.on_map, problem.bins
     index = on_map.problem.anchor_index
+    # Which ranges fit a path that drifts is seen where it is bent, not where it is of one piece.
+    weights = bins.robust_weight if drifts(problem) else on_map.weights
     for k in np.unique(index).tolist():
         is_of, name = index == k, on_map.anchor_ids[k]
-        unused = float(np.mean(on_map.weights[is_of] < OUTLIER_BELOW))
+        unused = float(np.mean(weights[is_of] < OUTLIER_BELOW))
         num = int(np.count_nonzero(is_of))
         words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
         remedy = "look whether it is the anchor that it is taken for, and where it stands"

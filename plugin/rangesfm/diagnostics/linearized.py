@@ -48,8 +48,8 @@ _NO_WEIGHT = 1e-6
 # bodies move. It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where
 # steps may explain it. It is too slow to be confused with a step.
 _WANDERING_M, _WANDERING_S = 0.025, 60.0
-# Limit on learnt errors, in standard deviations of their spread over radios: more is a mistake and must not pass for
-# noise.
+# Limit on learnt errors of a radio, in standard deviations of their spread over radios: more is a mistake and must not
+# pass for noise.
 _MOST_UNUSUAL = 3.0
 
 

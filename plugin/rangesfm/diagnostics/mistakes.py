@@ -9,13 +9,15 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives, lever_arms_in_other_axes
+from rangesfm.diagnostics.bent_path import as_given, bent_to_ranges, drifts
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.error_bursts import likeliest_burst, without
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis, corrected
 from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_state, linearized
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_other_map, at_state, linearized
 from rangesfm.diagnostics.scale_bound import HiddenMistake, hidden_among
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
+from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.scale.range_equation import RangeState, state_after
 
 # Numbers of explanations that are tried, each with the noise that it leaves: in all, of one kind, and when no test
@@ -23,6 +25,8 @@ from rangesfm.scale.range_equation import RangeState, state_after
 _NUM_TRIED, _NUM_OF_KIND, _NUM_NEARLY = 6, 2, 3
 # Number of alternatives that are fitted. The right one starts near its minimum, where the map itself sees the anchors.
 _NUM_FITTED = 12
+# Number of alternatives to which a path without points is bent; the right one is likely before, but for its bending.
+_NUM_BENT = 2
 # Smallest difference of scores (twice a log-likelihood, less a penalty) that tells two explanations apart.
 _AS_LIKELY = 6.0
 # The same where no test exceeds its threshold. By Markov's inequality a likelihood ratio is as large
@@ -157,10 +161,12 @@ def _causes(problem: Linearized, nominated: Sequence[Test], num_tests: int, *, i
             causes.append(_cause(replace(again, threshold=test.threshold), state, gain, penalty))
     if not causes and not is_sure:
         # A lever arm is so short that one with the wrong sign may change the ranges less than the other tests can see.
-        arms = list(lever_arms_in_other_axes(problem.on_map))
-        causes += [cause for cause in _alternatives(problem, before, arms) if cause.score > _BEYOND_CHANCE]
+        # A path that drifts is bent to any mistake, so that no test sees one.
+        unseen = alternatives if drifts(problem) else lever_arms_in_other_axes
+        tried = list(unseen(as_given(problem.on_map)))
+        causes += [cause for cause in _alternatives(problem, before, tried) if cause.score > _BEYOND_CHANCE]
     else:
-        causes += _alternatives(problem, before, list(alternatives(problem.on_map)))
+        causes += _alternatives(problem, before, list(alternatives(as_given(problem.on_map))))
     causes.sort(key=lambda cause: -cause.score)
     likeliest = [cause for k, cause in enumerate(causes) if not k or _is_rival(causes[0], cause)]
     return [_narrowed(problem, cause, before) for cause in likeliest[: 1 + _MAX_NUM_RIVALS]]
@@ -293,20 +299,33 @@ def _cause(test: Test, state: RangeState, gain: float, penalty: float) -> Cause:
 
 def _alternatives(problem: Linearized, before: float, tried: Sequence[Alternative]) -> Iterator[Cause]:
     """Yield those of the alternatives that make the ranges likelier than chance would."""
-    on_map = problem.on_map
     if not tried:
         return
-    refits = Refits(on_map, problem.scatter_m)
+    refits = Refits(as_given(problem.on_map), problem.scatter_m)
     starts = sorted(((*refits.start(each.correction), each) for each in tried), key=lambda start: start[0])
     fits = sorted(((*refits.of(start), each) for _, start, each in starts[:_NUM_FITTED]), key=lambda fit: fit[0])
     # Its squares do not decide: by the errors that last, an explanation with larger squares may be the likelier one.
-    for _, refitted, each in fits[:_NUM_TRIED]:
-        moved = _settled(at_state(problem, refitted))
-        gain = before - Factorization(moved.with_learnt_errors()).deviance()
+    found = [(_likeliest_near(problem, refitted), each) for _, refitted, each in fits[:_NUM_TRIED]]
+    if isinstance(problem.on_map.bending, WalkBending):
+        found.sort(key=lambda one: Factorization(one[0]).deviance())
+        found = [(_bent_anew(problem, near), each) for near, each in found[:_NUM_BENT]]
+    for near, each in found:
+        gain = before - Factorization(near).deviance()
         num_free = 3 * sum(place is None for place in each.correction.anchors_m.values())
         penalty = 2 * float(np.log(len(tried))) + num_free * float(np.log(len(problem.residual_m)))
         if gain > penalty + _AS_LIKELY:
-            yield Cause(**vars(each), gain=gain, penalty=penalty, state=moved.on_map.state, test=None)
+            yield Cause(**vars(each), gain=gain, penalty=penalty, state=near.on_map.state, test=None)
+
+
+def _likeliest_near(problem: Linearized, corrected_map: RangesOnMap) -> Linearized:
+    """Move to the likeliest state of corrected ranges near a state, and learn their errors."""
+    is_walk = isinstance(corrected_map.bending, WalkBending)
+    at = at_other_map(problem, corrected_map) if is_walk else at_state(problem, corrected_map)
+    return _settled(at).with_learnt_errors()
+
+
+def _bent_anew(problem: Linearized, near: Linearized) -> Linearized:
+    return at_other_map(problem, bent_to_ranges(near.on_map)).with_learnt_errors()
 
 
 def _settled(problem: Linearized) -> Linearized:

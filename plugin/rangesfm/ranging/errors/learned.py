@@ -19,8 +19,9 @@ from rangesfm.ranging.errors.range_bins import RangeBins
 # With more noise than usual all other components may be larger too, to this power: an old radio with five times the
 # noise reads 7 % too long, while the others are right to a percent.
 _WIDENING_POWER = 1.5
-# Bounds of the logarithms of standard deviations, relative to the median; farther away the likelihood is flat.
-_FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 4.0
+# Bounds of the logarithms of standard deviations, relative to the median. Farther below, the likelihood is flat. Above,
+# a path without loops may drift by some hundred times the median.
+_FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 8.0
 # Relative singular value below which a combination of unknowns has no effect.
 _DEPENDENT = 1e-7
 # Share of a covariance's trace that is added to its diagonal, as rounding may leave it singular.
@@ -190,7 +191,8 @@ class ExpectedErrors:
         """Learn the errors as in ``learn_errors``, from (c,) and (c, p) bins of the map as it is.
 
         Args:
-            most_unusual: largest standard deviation above its median, in spreads over radios.
+            most_unusual: largest standard deviation of a radio's error above its median, in spreads over radios. A map
+                may bend by any amount.
         """
         # Bending does not depend on the radio, and the noise is measured itself.
         widening = max(1.0, noise_m / START_STDDEV_M) ** _WIDENING_POWER
@@ -203,7 +205,8 @@ class ExpectedErrors:
             off_m - self.shift_m,
             *independent_unknowns(design, prior_design),
         )
-        stddevs = likelihood.mean_stddevs(likelihood.most_likely(most_unusual))
+        above = np.array([np.inf if c.name in BENDS else most_unusual for c in self.components])
+        stddevs = likelihood.mean_stddevs(likelihood.most_likely(above))
         off_expected = [
             np.log(stddev / _median(component, self.is_calibrated)) / component.spread
             for component, stddev in zip(self.components, stddevs, strict=True)
@@ -249,8 +252,8 @@ class ComponentLikelihood:
     design: Array
     prior_design: Array
 
-    def most_likely(self, most_unusual: float = np.inf) -> Array:
-        """Return the (k,) most likely logarithms, at most ``most_unusual`` spreads above their medians."""
+    def most_likely(self, most_unusual: Array | float = np.inf) -> Array:
+        """Return the (k,) most likely logarithms, each at most ``most_unusual`` spreads above its median."""
         above = np.minimum(most_unusual * self.spreads, _FARTHEST_ABOVE)
         bounds = np.column_stack([self.log_medians - _FARTHEST_BELOW, self.log_medians + above])
         found = minimize(self._negative_with_gradient, self.log_medians, jac=True, method="L-BFGS-B", bounds=bounds)
