@@ -102,9 +102,12 @@ def joint_covariance(
     Raises:
         GeometryError: a block is not determined by the residuals.
     """
-    columns = equations.columns
-    inverse = _Inverse(equations.of_photos + equations.others.T @ equations.others, equations.free, columns)
-    spread = _Spread.of(equations, errors)
+    try:
+        inverse = _joint_inverse(equations)
+    except GeometryError:
+        equations = equations.with_loose_poses_held()
+        inverse = _joint_inverse(equations)
+    columns, spread = equations.columns, _Spread.of(equations, errors)
     size, num_free_directions = inverse.free.shape
     blocks = inverse.diagonal_blocks(spread)
     variance = residual_stddev**2
@@ -151,10 +154,17 @@ class PhotosAlone:
             GeometryError: the photos do not determine the map up to a similarity.
         """
         seen = equations.seen_blocks
-        rows = equations.columns.of_blocks(seen)
+        self._rows = equations.columns.of_blocks(seen)
         self._columns, self._stddev = equations.columns.subset(seen), residual_stddev
-        self._gradient = equations.gradient[rows]
-        self._inverse = _Inverse(equations.of_photos[rows][:, rows], equations.free_of_photos[rows], self._columns)
+        self._gradient = equations.gradient[self._rows]
+        try:
+            self._inverse = self._inverse_of(equations)
+        except GeometryError:
+            self._inverse = self._inverse_of(equations.with_loose_poses_held())
+
+    def _inverse_of(self, equations: NormalEquations) -> _Inverse:
+        rows = self._rows
+        return _Inverse(equations.of_photos[rows][:, rows], equations.free_of_photos[rows], self._columns)
 
     def of_functions(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
         """Return the errors of functions that do not depend on the place and the size of the map.
@@ -262,6 +272,11 @@ class _Inverse:
             + of_errors[rows] @ by_error[rows].T
             for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
         ]
+
+
+def _joint_inverse(equations: NormalEquations) -> _Inverse:
+    of_all = equations.of_photos + equations.others.T @ equations.others
+    return _Inverse(of_all, equations.free, equations.columns)
 
 
 def _factored(normal: Array | csr_array, columns: BlockColumns) -> NestedFactor:

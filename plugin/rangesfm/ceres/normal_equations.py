@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pycolmap
-from scipy.sparse import bsr_array, csc_array, csr_array
+from scipy.sparse import bsr_array, csc_array, csr_array, diags_array
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
@@ -190,6 +190,16 @@ class NormalEquations:
             _free_motions(motions, effects[:, :num_reprojections])[kept],
             _size_m(columns),
         )
+
+    def with_loose_poses_held(self) -> NormalEquations:
+        """Return the equations with each pose held by a trillionth of what its photos say of it.
+
+        One that hangs loose, as by points that only its neighbour sees, too, is then known to be anywhere, and all
+        others are as certain as before.
+        """
+        is_pose = np.repeat([kind == "pose" for kind in self.columns.kinds], np.diff(self.columns.starts))
+        held = diags_array(_UNDETERMINED * is_pose * self.of_photos.diagonal())
+        return replace(self, of_photos=self.of_photos + held)
 
     @property
     def seen_blocks(self) -> Indices:
