@@ -101,15 +101,23 @@ class Browser:
         self._driver.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
 
     def picture(self, selector: str) -> Pixels:
-        """(h, w, 3) pixels of an element, once the next frame is drawn."""
+        """(h, w, 3) pixels of an element that fits the window, scrolled into its middle, once the next frame is drawn.
+
+        The whole window is captured and cut here: a picture of a part of the page may leave the page scrolled by some
+        hundred pixels and, as on a phone, magnified, so that later clicks miss.
+        """
+        self.run("document.querySelector(arguments[0]).scrollIntoView({block: 'center'})", selector)
         self.draw_frame()
-        box = self.run(
-            "const box = document.querySelector(arguments[0]).getBoundingClientRect();"
-            "return {x: box.x + scrollX, y: box.y + scrollY, width: box.width, height: box.height, scale: 1}",
+        data = self.command("Page.captureScreenshot")["data"]
+        window = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), dtype=np.int64)
+        left, top, right, bottom = self.run(
+            "const {left, top, right, bottom} = document.querySelector(arguments[0]).getBoundingClientRect();"
+            "return [left, top, right, bottom].map(Math.round)",
             selector,
         )
-        data = self.command("Page.captureScreenshot", clip=box, captureBeyondViewport=True)["data"]
-        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), dtype=np.int64)
+        assert 0 <= left < right <= window.shape[1]
+        assert 0 <= top < bottom <= window.shape[0]
+        return window[top:bottom, left:right]
 
     def console(self) -> list[str]:
         """Return the messages on the console."""
