@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -260,19 +261,16 @@ class ComponentLikelihood:
         return np.asarray(found.x)
 
     def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:
-        lower, inverse = self._factored(logs)
+        log_determinant, inverse = self._factored(logs)
         whitened, spread, determinant = self._unknowns(inverse)
         moved = spread @ (whitened.T @ self.off_m)
         pulls = inverse @ self.off_m - whitened @ moved
-        projector = inverse - whitened @ spread @ whitened.T
         off_median = (logs - self.log_medians) / self.spreads
-        negative = (
-            np.log(np.diag(lower)).sum()
-            + 0.5 * determinant
-            + 0.5 * float(self.off_m @ pulls)
-            + 0.5 * float(off_median @ off_median)
-        )
-        slopes = self.of_components.reshape(len(logs), -1) @ (projector - np.outer(pulls, pulls)).ravel()
+        negative = 0.5 * (log_determinant + determinant + float(self.off_m @ pulls) + float(off_median @ off_median))
+        inverse -= (whitened @ spread) @ whitened.T
+        inverse -= np.outer(pulls, pulls)
+        half = self._half
+        slopes = half.components @ (half.counts * inverse.take(half.places))
         return negative, np.exp(2 * logs) * slopes + off_median / self.spreads
 
     def mean_stddevs(self, logs: Array) -> Array:
@@ -287,25 +285,61 @@ class ComponentLikelihood:
         information = 2 * np.einsum("kij,lji->kl", seen, seen, optimize=True) * np.exp(2 * np.add.outer(logs, logs))
         return np.asarray(np.exp(logs + np.diag(np.linalg.inv(information + np.diag(self.spreads**-2)))))
 
-    def _factored(self, logs: Array) -> tuple[Array, Array]:
-        """Return the (c, c) lower Cholesky factor and the inverse of the covariance."""
-        covariance = np.tensordot(np.exp(2 * logs), self.of_components, axes=1) + self.known
-        covariance[np.diag_indices_from(covariance)] += ROUNDING * np.trace(covariance)
-        lower = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-        return lower, _inverse_of(lower)
+    @cached_property
+    def _half(self) -> _Half:
+        return _Half.of(self.of_components, self.known)
+
+    def _factored(self, logs: Array) -> tuple[float, Array]:
+        """Return the log-determinant and the inverse (c, c) of the covariance."""
+        half, num = self._half, len(self.off_m)
+        covariance = np.zeros(num * num)
+        covariance[half.places] = np.exp(2 * logs) @ half.components + half.known
+        return _determinant_and_inverse(covariance.reshape(num, num))
 
     def _unknowns(self, inverse: Array) -> tuple[Array, Array, float]:
         """Return the (c, p) whitened design, the (p, p) covariance, and the log-determinant of the latter's inverse."""
         whitened = inverse @ self.design
         information: Array = self.design.T @ whitened + self.prior_design.T @ self.prior_design
-        lower = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
-        return whitened, _inverse_of(lower), 2 * float(np.log(np.diag(lower)).sum())
+        determinant, covariance = _determinant_and_inverse(information)
+        return whitened, covariance, determinant
 
 
-def _inverse_of(lower: Array) -> Array:
-    """Return the inverse of L @ L.T, given the lower Cholesky factor L, shape (n, n)."""
-    below = np.tril(lapack.dpotri(lower, lower=True)[0])
-    return np.asarray(below + np.tril(below, -1).T)
+@dataclass(frozen=True)
+class _Half:
+    """The upper triangles of symmetric (c, c) matrices, as the sums over these take most of the time.
+
+    Attributes:
+        places: (h,) of the elements in a matrix. counts: (h,) how often each is in it.
+        components, known: (k, h) and (h,) elements, with what rounding needs added.
+    """
+
+    places: Indices
+    counts: Array
+    components: Array
+    known: Array
+
+    @classmethod
+    def of(cls, components: Array, known: Array) -> _Half:
+        num = len(known)
+        places = np.flatnonzero(np.triu(np.ones((num, num))))
+        on_diagonal = places % (num + 1) == 0
+        stacked = np.concatenate([components, known[None]])
+        of_all = np.take(stacked.reshape(len(stacked), -1), places, axis=1)
+        of_all[:, on_diagonal] += ROUNDING * np.trace(stacked, axis1=1, axis2=2)[:, None]
+        return cls(places, np.where(on_diagonal, 1.0, 2.0), of_all[:-1], of_all[-1])
+
+
+def _determinant_and_inverse(upper: Array) -> tuple[float, Array]:
+    """Return the log-determinant and the inverse of a symmetric (n, n) matrix, given its upper triangle; it is lost."""
+    # LAPACK has the columns one after the other: the upper triangle is the lower one there.
+    lower, failed = lapack.dpotrf(upper.T, lower=True, overwrite_a=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    log_determinant = 2 * float(np.log(np.diag(lower)).sum())
+    half = lapack.dpotri(lower, lower=True, overwrite_c=True)[0]
+    inverse = half + half.T
+    inverse[np.diag_indices_from(inverse)] *= 0.5
+    return log_determinant, inverse
 
 
 def independent_unknowns(design: Array, prior_design: Array) -> tuple[Array, Array]:
