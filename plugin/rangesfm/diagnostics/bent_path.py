@@ -21,7 +21,7 @@ from rangesfm.diagnostics.linearized import (
 )
 from rangesfm.geometry.similarity import rmse
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.errors.bending import WalkBending
+from rangesfm.ranging.errors.bending import WalkBending, averaged
 from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_observations import status_by_weight
@@ -146,10 +146,11 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
     on_map, walk = problem.on_map, problem.on_map.bending
     assert isinstance(walk, WalkBending)
     is_free = on_map.problem.frame_is_free
-    factors = walk.factors(problem.bins, slopes_by_poses(on_map), frame_is_free=is_free)
-    moved = after_step(problem)
+    moved, stddevs_m = after_step(problem), problem.errors.stddev_of_component
     pulls = cho_solve(cho_factor(regular(problem.errors.covariance_m2)), moved.residual_m)
-    bent = walk.bent_back(factors, pulls, problem.errors.stddev_of_component, frame_is_free=is_free)
+    by_pose = averaged(problem.bins, slopes_by_poses(on_map), len(walk.path))
+    sizes = {part.name: stddevs_m[part.name] / part.median for part in problem.expected.components}
+    bent = walk.bent_back(pulls @ by_pose, sizes, frame_is_free=is_free)
     return _on_path(moved.on_map, walk, bent)
 
 

@@ -120,9 +120,10 @@ def test_bins_grow_by_each_step_of_a_walk_as_its_factors_say(path: Trajectory) -
     """Motions of the map as a whole are left out, because they are estimated otherwise."""
     of_ranges, walk = in_bins(path), WalkBending(path)
     by_range = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, *placed(path)[1:], ON_PATH)
-    factors = walk.factors(of_ranges, by_range, frame_is_free=True)
+    by_bin = averaged(of_ranges, by_range, NUM_POSES)
+    factors = walk.factors(by_bin, frame_is_free=True)
     starts, unit = walk._steps_of_path
-    functions = without_similarity(averaged(of_ranges, by_range, NUM_POSES), path, frame_is_free=True)
+    functions = without_similarity(by_bin, path, frame_is_free=True)
     for step, number in ((3, 0), (8, 2), (15, 5)):
         steps = np.zeros((len(starts), 7))
         steps[step, number] = STEP * unit[step, number]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, similarity_motions
+from rangesfm.geometry.similarity import Similarity, align_points, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.components import BENDS, Component
 from rangesfm.ranging.errors.range_bins import RangeBins
@@ -201,7 +202,7 @@ class WalkBending:
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
         num = len(by_pose)
-        factors = self._factors(by_pose, frame_is_free=frame_is_free)
+        factors = self.factors(by_pose, frame_is_free=frame_is_free)
         shift_m = np.zeros(num) if self.steps is None else -np.einsum("csi,si->c", factors, self.steps)
         found = []
         for name, which in _OF_STEP.items():
@@ -209,27 +210,24 @@ class WalkBending:
             found.append(bending_part(name, own @ own.T, _OF_PATH[name], _SPREAD))
         return BendingOfBins(tuple(each for each in found if each is not None), np.zeros((num, num)), shift_m)
 
-    def factors(self, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> Array:
-        """Return the (c, s, 7) derivatives of the bins by each step."""
-        return self._factors(averaged(bins, by_pose, len(self.path)), frame_is_free=frame_is_free)
-
-    def _factors(self, by_pose: Array, *, frame_is_free: bool) -> Array:
+    def factors(self, by_pose: Array, *, frame_is_free: bool) -> Array:
+        """Return the (c, s, 7) derivatives of c functions of the path by each step; arguments as in of_functions."""
         path = self.path
         functions = without_similarity(by_pose, path, frame_is_free=frame_is_free)
         starts, unit = self._steps_of_path
         return np.asarray(_after(functions, path, starts) * unit)
 
-    def bent_back(self, factors: Array, pulls: Array, errors: LearnedSizes, *, frame_is_free: bool) -> WalkBending:
+    def bent_back(self, pull: Array, sizes: LearnedSizes, *, frame_is_free: bool) -> WalkBending:
         """Return the walk corrected by the most likely steps.
 
         Args:
-            factors: of the bins. pulls: (c,) residuals multiplied by their inverse covariance.
-            errors: learnt standard deviations in metres, by name.
+            pull: (6 k,) derivatives by the poses of the sum of all bins, each multiplied by its residual times the
+                inverse covariance.
+            sizes: learnt sizes of the parts, in medians, by name.
         """
-        steps = -np.einsum("csi,c->si", factors, pulls)
+        steps = -self.factors(pull[None], frame_is_free=frame_is_free)[0]
         for name, which in _OF_STEP.items():
-            size_m2 = float(np.sum(factors[:, :, which] ** 2)) / len(factors)
-            steps[:, which] *= errors.get(name, 0.0) ** 2 / size_m2 if size_m2 > 0 else 0.0
+            steps[:, which] *= (sizes.get(name, 0.0) * _OF_PATH[name]) ** 2
         return WalkBending(self.given, steps, frame_is_free)
 
     @cached_property
@@ -262,35 +260,22 @@ def bent_path(path: Trajectory, starts: Indices, steps: Array) -> Trajectory:
     Args:
         starts: (s,) poses about which the later ones move. steps: (s, 7) logarithm of scale, turn and shift.
     """
-    centers, rotations = path.centers.copy(), path.world_from_cam.copy()
-    total = IDENTITY
-    ends = np.append(starts[1:], len(path) - 1)
-    for start, end, step in zip(starts.tolist(), ends.tolist(), steps, strict=True):
-        at = centers[start]
-        scale, turn = float(np.exp(step[0])), Rotation.from_rotvec(step[1:4]).as_matrix()
-        total = Similarity(scale, turn, at - scale * turn @ at + step[4:]) @ total
-        rows = slice(start + 1, end + 1)
-        centers[rows] = total.apply(path.centers[rows])
-        rotations[rows] = total.rotation @ path.world_from_cam[rows]
-    return replace(path, centers=centers, world_from_cam=rotations)
+    each = Rotation.from_rotvec(steps[:, 1:4]).as_matrix()
+    turns = np.array(list(accumulate(each, lambda before, turn: turn @ before, initial=np.eye(3))))
+    grown = np.exp(np.cumsum(np.append(0.0, steps[:, 0])))[:, None, None] * turns
+    # Each step leaves the pose about which it moves where the steps before have it.
+    shifts = np.einsum("sij,sj->si", grown[:-1] - grown[1:], path.centers[starts]) + steps[:, 4:]
+    shifts = np.cumsum(np.vstack([np.zeros(3), shifts]), axis=0)
+    num_before = np.searchsorted(starts, np.arange(len(path)))
+    centers = np.einsum("kij,kj->ki", grown[num_before], path.centers) + shifts[num_before]
+    return replace(path, centers=centers, world_from_cam=turns[num_before] @ path.world_from_cam)
 
 
 def _after(functions: Array, path: Trajectory, starts: Indices) -> Array:
     """Return the (c, s, 7) change of functions as all poses after each of s move together about that pose."""
-    parts = functions.reshape(len(functions), len(path), 6)
-    turns = np.einsum("cki,kji->ckj", parts[:, :, :3], path.world_from_cam)
-    centers = path.centers - path.centers[0]
-    about_first = np.concatenate(
-        [
-            np.einsum("cki,ki->ck", parts[:, :, 3:], centers)[:, :, None],
-            turns + np.cross(centers, parts[:, :, 3:]),
-            parts[:, :, 3:],
-        ],
-        axis=2,
-    )
-    later = np.cumsum(about_first[:, ::-1], axis=1)[:, ::-1]
-    after = np.concatenate([later[:, 1:], np.zeros_like(later[:, :1])], axis=1)[:, starts]
-    at = centers[starts]
-    after[:, :, 0] -= np.einsum("csi,si->cs", after[:, :, 4:], at)
-    after[:, :, 1:4] -= np.cross(at, after[:, :, 4:])
-    return np.asarray(after)
+    of_poses = functions.reshape(len(functions), len(path), 6).swapaxes(0, 1)
+    about_first = of_poses @ _motions(path).reshape(len(path), 6, 7)
+    after = np.cumsum(np.add.reduceat(about_first, starts + 1)[::-1], axis=0)[::-1]
+    about_starts = similarity_motions(path.centers[starts] - path.centers[0])[:, :, :4]
+    after[:, :, :4] -= after[:, :, 4:] @ about_starts
+    return after.swapaxes(0, 1)

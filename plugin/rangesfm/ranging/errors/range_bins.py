@@ -68,9 +68,10 @@ class RangeBins:
             towards: (n, 3) unit vectors from anchor to tag. placing_m: (n,) standard deviation of each coordinate.
             gap: (n,) index of each range's gap.
         """
-        in_gap = csr_array((placing_m, (np.arange(len(gap)), gap)), shape=(len(gap), int(gap.max()) + 1))
-        of_gaps = [self.averages @ (in_gap * along[:, None]) for along in towards.T]
-        return np.asarray(sum(along @ along.T for along in of_gaps).toarray())
+        num, column = len(gap), 3 * gap[:, None] + np.arange(3)
+        by_place = csr_array(((placing_m[:, None] * towards).ravel(), column.ravel(), 3 * np.arange(num + 1)))
+        of_bins = self.averages @ by_place
+        return np.asarray((of_bins @ of_bins.T).toarray())
 
     def total(self, values: Array) -> Array:
         """Return the (c,) sums of (n,) values of the ranges."""
