@@ -32,8 +32,9 @@ from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import judge
 from rangesfm.scale.uncertainty import KnownMap, bias_covariance
 
-# Most Gauss-Newton steps.
-_MAX_NUM_ROUNDS = 8
+# Most Gauss-Newton steps, and the number of them after which the bins are kept: with bins and outliers chosen anew each
+# time, a map may swing to and fro for ever.
+_MAX_NUM_ROUNDS, _NUM_BINNED_ANEW = 8, 3
 # Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
 _STILL = 0.1
 # Smallest gain in twice the log-likelihood for which another place of the map is taken than that of a rigid path.
@@ -67,8 +68,11 @@ def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> Ra
 
 
 def _bent(on_map: RangesOnMap) -> RangesOnMap:
-    for _ in range(_MAX_NUM_ROUNDS):
-        problem = linearized(on_map).with_learnt_errors()
+    problem = linearized(on_map).with_learnt_errors()
+    for num in range(_MAX_NUM_ROUNDS):
+        if num:
+            again = linearized(on_map) if num < _NUM_BINNED_ANEW else at_other_map(problem, on_map)
+            problem = again.with_learnt_errors(near=problem.errors)
         before, on_map = on_map, _bent_once(problem)
         moved_m = on_map.from_anchor_m - before.from_anchor_m
         if float(np.sqrt(np.mean(moved_m**2))) < _STILL * problem.scatter_m:

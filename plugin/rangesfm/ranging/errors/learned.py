@@ -187,29 +187,38 @@ class ExpectedErrors:
         return self._of(sizes, sizes[:, None, None] ** 2 * self.of_components)
 
     def learnt(
-        self, off_m: Array, design: Array, prior_design: Array, noise_m: float, most_unusual: float = np.inf
+        self,
+        off_m: Array,
+        design: Array,
+        prior_design: Array,
+        noise_m: float,
+        most_unusual: float = np.inf,
+        near: Mapping[str, float] | None = None,
     ) -> LearnedErrors:
         """Learn the errors as in ``learn_errors``, from (c,) and (c, p) bins of the map as it is.
 
         Args:
             most_unusual: largest standard deviation of a radio's error above its median, in spreads over radios. A map
                 may bend by any amount.
+            near: standard deviations to start from, by name; the others start from their medians.
         """
         # Bending does not depend on the radio, and the noise is measured itself.
         widening = max(1.0, noise_m / START_STDDEV_M) ** _WIDENING_POWER
         widened = [1.0 if c.name in (*BENDS, "white") else widening**2 for c in self.components]
+        medians = {component.name: _median(component, self.is_calibrated) for component in self.components}
         likelihood = ComponentLikelihood(
             np.array(widened)[:, None, None] * self.of_components if widening > 1 else self.of_components,
-            np.log([_median(component, self.is_calibrated) for component in self.components]),
+            np.log(list(medians.values())),
             np.array([component.spread for component in self.components]),
             np.sum([*self.known.values(), np.zeros((len(self.bins), len(self.bins)))], axis=0),
             off_m - self.shift_m,
             *independent_unknowns(design, prior_design),
         )
         above = np.array([np.inf if c.name in BENDS else most_unusual for c in self.components])
-        stddevs = likelihood.mean_stddevs(likelihood.most_likely(above))
+        start = np.log([(near or {}).get(name, median) for name, median in medians.items()])
+        stddevs = likelihood.mean_stddevs(likelihood.most_likely(above, start))
         off_expected = [
-            np.log(stddev / _median(component, self.is_calibrated)) / component.spread
+            np.log(stddev / medians[component.name]) / component.spread
             for component, stddev in zip(self.components, stddevs, strict=True)
         ]
         found = self._of(stddevs, stddevs[:, None, None] ** 2 * likelihood.of_components)
@@ -253,11 +262,16 @@ class ComponentLikelihood:
     design: Array
     prior_design: Array
 
-    def most_likely(self, most_unusual: Array | float = np.inf) -> Array:
-        """Return the (k,) most likely logarithms, each at most ``most_unusual`` spreads above its median."""
+    def most_likely(self, most_unusual: Array | float = np.inf, start: Array | None = None) -> Array:
+        """Return the (k,) most likely logarithms near a start, each at most ``most_unusual`` spreads above its median.
+
+        Args:
+            start: (k,); None: the medians.
+        """
         above = np.minimum(most_unusual * self.spreads, _FARTHEST_ABOVE)
         bounds = np.column_stack([self.log_medians - _FARTHEST_BELOW, self.log_medians + above])
-        found = minimize(self._negative_with_gradient, self.log_medians, jac=True, method="L-BFGS-B", bounds=bounds)
+        start = self.log_medians if start is None else start
+        found = minimize(self._negative_with_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds)
         return np.asarray(found.x)
 
     def _negative_with_gradient(self, logs: Array) -> tuple[float, Array]:
