@@ -58,13 +58,16 @@ def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> Ra
     if not drifts(at_other_map(problem, bent)):
         return bent
 
-    def likelier(bent: RangesOnMap, other: RangesOnMap) -> RangesOnMap:
-        deviances = [Factorization(at_other_map(problem, at).with_learnt_errors()).deviance() for at in (bent, other)]
-        return other if deviances[1] < deviances[0] - _MIN_GAIN else bent
+    def with_deviance(bent: RangesOnMap) -> tuple[float, RangesOnMap]:
+        return Factorization(at_other_map(problem, bent).with_learnt_errors()).deviance(), bent
 
-    bent = reduce(likelier, (_bent(replace(on_map, state=state)) for state in rivals), bent)
+    def likelier(best: tuple[float, RangesOnMap], start: RangesOnMap) -> tuple[float, RangesOnMap]:
+        other = with_deviance(_bent(start))
+        return other if other[0] < best[0] - _MIN_GAIN else best
+
+    best = reduce(likelier, (replace(on_map, state=state) for state in rivals), with_deviance(bent))
     # The place of the bent path is a better start than that of a path of one piece.
-    return likelier(bent, _bent(as_given(bent)))
+    return likelier(best, as_given(best[1]))[1]
 
 
 def _bent(on_map: RangesOnMap) -> RangesOnMap:

@@ -116,6 +116,14 @@ def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_r
     assert stddevs(scaled_free)["slope"] == pytest.approx(expected, rel=0.02)
 
 
+def test_errors_are_learnt_alike_from_a_start_nearby(walked: RangeBins) -> None:
+    off_m = 0.1 * np.random.default_rng(2).standard_normal(len(walked))
+    expected, design = ExpectedErrors.of(walked), np.zeros((len(walked), 1))
+    learned = expected.learnt(off_m, design, NO_MAP, 0.05)
+    again = expected.learnt(off_m, design, NO_MAP, 0.05, near=learned.stddev_of_component)
+    np.testing.assert_allclose(again.stddevs, learned.stddevs, rtol=1e-3)
+
+
 def test_a_learnt_curve_counts_as_it_is_stated(walked: RangeBins) -> None:
     off_m = 0.02 * np.random.default_rng(3).standard_normal(len(walked))
     learned = learn_errors(walked, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.02, np.full(len(off_m), 0.03))
