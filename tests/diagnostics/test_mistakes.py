@@ -19,12 +19,18 @@ from rangesfm.diagnostics.alternatives import alternatives
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import Hypothesis
-from rangesfm.diagnostics.linearized import linearized
+from rangesfm.diagnostics.linearized import Linearized, linearized
 from rangesfm.diagnostics.mistakes import _settled_test, _varied
 from rangesfm.diagnostics.timed_hypotheses import SCANNING, _changes
 
 HALL, YARD, DRONE = SITES
 SEED = 3
+
+
+@pytest.fixture(scope="module")
+def of_yard() -> Linearized:
+    """The linear problem of a clean survey."""
+    return linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
 
 
 def diagnosis(given: Given) -> Diagnosis:
@@ -245,9 +251,8 @@ def test_a_tag_that_is_found_farther_than_its_camera_is_large_did_not_slip() -> 
     assert all(test.size is None or test.size < 0.75 for test in found.tests if test.name == "tag slipped")
 
 
-def test_every_hypothesis_has_a_largest_size_that_can_happen() -> None:
-    problem = linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
-    hypotheses = [h for of_kind in (*STANDING, *SCANNING) for h in of_kind(problem)]
+def test_every_hypothesis_has_a_largest_size_that_can_happen(of_yard: Linearized) -> None:
+    hypotheses = [h for of_kind in (*STANDING, *SCANNING) for h in of_kind(of_yard)]
     assert {h.name for h in hypotheses} >= {"anchor moved", "map break", "clock jump", "common bias", "lever arm"}
     # The scale's interval includes what radios have in small: constant errors and those that grow with the distance.
     in_interval = {h.name for h in hypotheses if h.is_in_interval}
@@ -259,9 +264,8 @@ def test_every_hypothesis_has_a_largest_size_that_can_happen() -> None:
 
 
 @pytest.mark.parametrize(("size", "said"), [(0.03, "3.0 % too long"), (-0.03, "3.0 % too short")])
-def test_ranges_that_grow_too_much_are_said_to_be_too_long(size: float, said: str) -> None:
-    problem = linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
-    (of_all,) = [h for of_kind in STANDING for h in of_kind(problem) if h.name == "range scale"]
+def test_ranges_that_grow_too_much_are_said_to_be_too_long(size: float, said: str, of_yard: Linearized) -> None:
+    (of_all,) = [h for of_kind in STANDING for h in of_kind(of_yard) if h.name == "range scale"]
     assert of_all.words(np.array([size])) == f"all ranges read about {said}"
 
 
@@ -270,17 +274,16 @@ def test_of_each_kind_of_mistake_only_the_first_few_are_tried() -> None:
     assert _varied(tests) == [tests[0], tests[1], tests[5], tests[7]]
 
 
-def test_a_change_leaves_enough_bins_before_and_after_it() -> None:
-    problem = linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
-    (any_of_all, *_) = [h for of_kind in STANDING for h in of_kind(problem)]
-    num, later = len(problem.bins), list[float]()
+def test_a_change_leaves_enough_bins_before_and_after_it(of_yard: Linearized) -> None:
+    (any_of_all, *_) = [h for of_kind in STANDING for h in of_kind(of_yard)]
+    num, later = len(of_yard.bins), list[float]()
 
     def change(_: str, __: Callable[[], Mask], after: Array) -> Hypothesis:
         later.append(float(after.sum()))
         return any_of_all
 
     least = num // 3
-    list(_changes(problem, None, least, change))
+    list(_changes(of_yard, None, least, change))
     assert later
     assert least <= min(later) <= max(later) <= num - least
 
