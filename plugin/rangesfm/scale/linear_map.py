@@ -167,8 +167,9 @@ class Solved:
         pulls, smallest, effect = basis.T @ self.residual, np.inf, np.inf
         if shown.all():
             # The mistake with the largest effect among those that are just detectable.
-            size = np.sqrt(noncentrality(len(shown)))
-            smallest, effect = (float(size * np.linalg.norm(each, 2)) for each in (root, by_unknowns[:1] @ root))
+            size = float(np.sqrt(noncentrality(len(shown))))
+            smallest = size * float(np.linalg.norm(root, 2) if len(root) > 1 else abs(root[0, 0]))
+            effect = size * float(np.linalg.norm(by_unknowns[:1] @ root))
         return EstimatedMistake(root @ pulls, root, float(pulls @ pulls), by_unknowns, basis, smallest, effect)
 
 
