@@ -14,7 +14,6 @@ _SCALE = {
     "relative_stddev": {
         "formal": 0.003,
         "components": {"time": 0.004, "curve": 0.009},
-        "lean": 0.0,
     },
     "error_stddevs": {"time": 0.02, "curve": 0.04},
     "method": "robust",

@@ -617,7 +617,8 @@ class TestRunOnPhotos:
         true = photo_run.survey.centers_m
         errors = np.linalg.norm(first_run.centers("sparse_metric") - true, axis=1)
         assert len(errors) == 14
-        assert np.sqrt(np.mean(errors**2)) < 0.15
+        stated_m = np.linalg.norm(first_run.result["place"]["stddev_m"])
+        assert np.sqrt(np.mean(errors**2)) < 1.5 * stated_m < 0.21
         (refined,) = (row for row in first_run.result["comparison"] if row["name"] == "refined")
         assert abs(refined["scale_error_percent"]) < 1.0
         sfm = first_run.centers("sparse")

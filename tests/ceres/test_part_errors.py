@@ -32,7 +32,7 @@ def anchor(anchor_id: str) -> MapPointErrors:
 
 def relative(errors: MapErrors, first: MapPointErrors, second: MapPointErrors) -> Array:
     """Return the relative covariance as the problem has it, with its own uncertainty of the scale."""
-    return errors.relative(first, second, errors.scale_stddev)[0]
+    return errors.relative(first, second, errors.scale_stddev)
 
 
 def centers_by_steps(survey: Joint, frames: range, num_columns: int) -> Array:
@@ -98,14 +98,15 @@ def test_a_stated_uncertainty_of_the_scale_replaces_that_of_the_problem() -> Non
     errors = found_in(survey).errors
     frames = sorted(survey.reconstruction.reg_frame_ids())
     first, last = center_of(frames[0]), center_of(frames[4])
-    own, by_scale = errors.relative(first, last, errors.scale_stddev)
-    exact, wide = (errors.relative(first, last, stddev)[0] for stddev in (0.0, 0.1))
+    own = errors.relative(first, last, errors.scale_stddev)
+    exact, wide = (errors.relative(first, last, stddev) for stddev in (0.0, 0.1))
     assert np.linalg.eigvalsh(exact).min() > -1e-12
     assert np.trace(exact) < np.trace(own) < np.trace(wide)
     at = {frame: survey.poses[k] for k, frame in enumerate(frames)}
     centers = [-Rotation.from_quat(at[f][:4]).inv().apply(at[f][4:]) for f in (frames[0], frames[4])]
     along = (centers[1] - centers[0]) / np.linalg.norm(centers[1] - centers[0])
-    assert along @ by_scale == pytest.approx(float(np.linalg.norm(centers[1] - centers[0])), rel=0.1)
+    by_scale = np.sqrt(along @ (wide - exact) @ along) / 0.1
+    assert by_scale == pytest.approx(float(np.linalg.norm(centers[1] - centers[0])), rel=0.1)
     assert np.sqrt(along @ wide @ along) == pytest.approx(0.1 * np.linalg.norm(centers[1] - centers[0]), rel=0.15)
 
 

@@ -8,6 +8,7 @@ from tests.known import known
 from tests.studies.drifting_maps import Made, lap_of_drift, run, without_points
 
 from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.result.metric_result import MetricResult
 
 NUM_KEYFRAMES = 100
@@ -53,6 +54,21 @@ def test_the_scale_that_is_stated_is_the_refined_maps_and_the_truth_is_in_its_in
     low, high = refined.estimate.interval_95
     assert low < true_scale(lap) < high
     assert refined.estimate.uncertainty.half_width_95 < 0.02
+
+
+def test_scale_and_ranges_are_those_of_the_delivered_map(lap: Made, refined: MetricResult) -> None:
+    """After the refinement the map is moved as a whole, and its ranges with it."""
+    centers_m = refined.trajectory.as_in(refined.final).centers
+    assert align_points(refined.trajectory.centers, centers_m).scale == pytest.approx(refined.estimate.value, rel=1e-9)
+    predicted_m = ranges_predicted_by_model(
+        refined.final,
+        refined.trajectory,
+        refined.observations,
+        refined.estimate.metric_from_sfm,
+        lap.tag_in_cam_m,
+        refined.anchors,
+    )
+    assert refined.predicted_m == pytest.approx(predicted_m, abs=1e-6, nan_ok=True)
 
 
 def test_keyframes_err_as_their_covariances_say(lap: Made, refined: MetricResult) -> None:

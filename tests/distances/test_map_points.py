@@ -160,7 +160,7 @@ def test_points_err_relative_to_each_other_as_in_the_inverse_of_all_normal_equat
         apart[:, starts[second] : starts[second] + 3] += np.eye(3)
         expected = apart @ whole @ apart.T
         ends = [points.find(f"point:{ids[k]}").errors for k in (first, second)]
-        relative, _ = found.errors.relative(ends[0], ends[1], found.errors.scale_stddev)
+        relative = found.errors.relative(ends[0], ends[1], found.errors.scale_stddev)
         np.testing.assert_allclose(relative, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
 
 

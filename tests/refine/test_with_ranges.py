@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from tests.few_links import leave_few_links
 from tests.known import known
 from tests.known_errors import known_errors
+from tests.scale.robust_scale import metric_from_sfm_by_robust_weights
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import lap_path, loop_path, sequence_path
 from tests.simulated.ranges import simulate_ranges_at
@@ -592,13 +593,14 @@ class TestWithNoise:
         survey = make_survey(pixel_stddev=0.3, radio=Radio(range_stddev_m=0.1, obstructed_share=0.3), num_epochs=8)
         surveyed = [Anchor(name, survey.anchors_m[name]) for name in survey.observations.log.anchor_ids]
         scale = initialize_scale(survey.observations, survey.trajectory, surveyed, anchor_frame="site")
-        scaled = replace(survey, metric_from_sfm=scale.metric_from_sfm)
+        metric_from_sfm = metric_from_sfm_by_robust_weights(scale)
+        scaled = replace(survey, metric_from_sfm=metric_from_sfm)
         refined, _ = scaled.refine(
             scale.anchors,
             observations=scale.observations,
             errors=scale.errors,
         )
-        before, after = scale.metric_from_sfm.apply(survey.trajectory.centers), survey.centers(refined)
+        before, after = metric_from_sfm.apply(survey.trajectory.centers), survey.centers(refined)
         assert rmse(before - survey.centers_m) < 0.1
         assert rmse(after - before) < 0.01
 

@@ -84,7 +84,7 @@ def test_the_same_input_gives_the_same_bits(survey: Survey) -> None:
 def test_a_tag_exactly_on_an_anchor_does_no_harm(make_survey: MakeSurvey, survey: Survey) -> None:
     tag_m = survey.centers_m[5] + survey.world_from_cam[5] @ survey.tag_in_cam_m
     on_it = make_survey(num_keyframes=20, anchors_m={"A": tuple(tag_m), "B": (6.0, 0.0, 2.5)})
-    log = on_it.log_with(np.maximum(on_it.simulated.log.range_m, 1e-9))
+    log = on_it.log_with(np.maximum(on_it.simulated.distance_m, 1e-9))
     found = on_it.scale("first_camera", ("A", "B"), log)
     assert on_it.relative_error(found) == pytest.approx(0, abs=1e-6)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.scale.conftest import MakeSurvey
+from tests.scale.robust_scale import metric_from_sfm_by_robust_weights
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.scale import model_placement
@@ -34,13 +35,14 @@ def test_a_model_weighs_the_same_alone_and_in_a_join(make_survey: MakeSurvey) ->
     assert errors.inflation > 1.3
     assert np.nanmax(errors.share) > 2 * np.nanmin(errors.share)
     places = {anchor.anchor_id: anchor.position_m for anchor in estimate.anchors}
+    alone = metric_from_sfm_by_robust_weights(estimate)
     joined = model_placement._Group([model], None).solve([estimate.metric_from_sfm], places)
-    assert joined.state.metric_from_model.scale == pytest.approx(estimate.value, rel=1e-6)
-    np.testing.assert_allclose(joined.state.metric_from_model.rotation, estimate.metric_from_sfm.rotation, atol=1e-6)
+    assert joined.state.metric_from_model.scale == pytest.approx(alone.scale, rel=1e-6)
+    np.testing.assert_allclose(joined.state.metric_from_model.rotation, alone.rotation, atol=1e-6)
     alone_stddev = errors.inflation * estimate.uncertainty.formal
     assert joined.log_scale_stddev == pytest.approx(alone_stddev, rel=0.02)
     # This would not hold if all its ranges counted alike.
     part = replace(model_placement._problem(model, estimate.anchors), share=None)
     alike = solve(part, joined.state, loss=errors.loss)
-    assert abs(alike.state.metric_from_model.scale / estimate.value - 1) > 1e-4
+    assert abs(alike.state.metric_from_model.scale / alone.scale - 1) > 1e-4
     assert alike.log_scale_stddev < 0.8 * alone_stddev

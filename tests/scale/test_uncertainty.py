@@ -93,13 +93,6 @@ def test_the_components_add_as_variances_and_are_never_less_than_the_formal_stdd
     assert ScaleUncertainty(0.001, {"a": 0.003, "b": 0.004}).half_width_95 == pytest.approx(1.96 * 0.005)
 
 
-def test_the_interval_lies_about_where_the_estimate_leans_to_and_is_as_wide_as_the_stddev_says() -> None:
-    found = ScaleUncertainty(0.001, {"a": 0.003, "b": 0.004, "reweighting": 0.012}, 0.012)
-    assert found.empirical == pytest.approx(0.013)
-    assert found.half_width_95 == pytest.approx(1.96 * 0.013)
-    assert found.interval_95 == pytest.approx((0.012 - 1.96 * 0.013, 0.012 + 1.96 * 0.013))
-
-
 def test_four_times_the_ranges_halve_what_is_noise(make_survey: MakeSurvey) -> None:
     few, many = (
         make_survey(anchors_m=FAR_ANCHORS_M, radio=Radio(range_stddev_m=0.1), num_epochs=num).scale(
@@ -153,12 +146,11 @@ def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(
     for share in (1.0, 1e-6):
         told = replace(learned, covariances_m2=share * learned.covariances_m2)
         known = known_map(found.problem, found.solution, told)
-        uncertainty, by_robust = known.uncertainty, known.by_own_weights[0, 0]
-        stated = uncertainty.components
+        stated, by_robust = known.uncertainty.components, known.by_own_weights[0, 0]
         best = np.array([stated[name] for name in stated if name != "reweighting"])
         chance = np.sqrt(by_robust - np.sum(best**2))
-        assert stated["reweighting"] == abs(uncertainty.lean) <= 0.5 * chance * (1 + 1e-9)
-    # With a covariance a millionth as large, the lean of the best weights exceeds chance, and is limited to it.
+        assert stated["reweighting"] == abs(known.half_way[0]) <= 0.5 * chance * (1 + 1e-9)
+    # With a covariance a millionth as large, the difference exceeds chance, and is limited to it.
     assert stated["reweighting"] == pytest.approx(0.5 * chance)
 
 

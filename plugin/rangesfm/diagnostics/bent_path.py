@@ -26,7 +26,7 @@ from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_observations import status_by_weight
 from rangesfm.scale.linear_map import regular
-from rangesfm.scale.range_equation import RangeState
+from rangesfm.scale.range_equation import RangeState, state_after
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import judge
@@ -124,16 +124,17 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
         return estimate
     known = _known(problem, posed, estimate.uncertainty.formal)
     uncertainty, covariance = known.uncertainty, known.covariance
-    fit = replace(solution.fit, state=on_map.state, weights=problem.bins.robust_weight)
+    state = state_after((problem.columns,), on_map.state, known.half_way)
+    fit = replace(solution.fit, state=state, weights=problem.bins.robust_weight)
     judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, options)
-    positions = zip(estimate.anchors, on_map.state.anchors_m, strict=True)
+    positions = zip(estimate.anchors, state.anchors_m, strict=True)
     drift = f"the path drifts by {rmse(bent_by_m[:, None]):.2g} m (root mean square) from where the ranges have it"
     status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
     status[posed.rows] = status_by_weight(problem.bins.robust_weight)
     stddev_m[posed.rows] = problem.scatter_m
     return estimate.judged(
         replace(judged, reasons=(*judged.reasons, drift)),
-        metric_from_sfm=on_map.state.metric_from_model @ posed.first_camera_from_sfm,
+        metric_from_sfm=state.metric_from_model @ posed.first_camera_from_sfm,
         uncertainty=uncertainty,
         placement=problem.columns.placement(covariance),
         observations=replace(estimate.observations, status=status),

@@ -81,7 +81,7 @@ def diagnose_points(
         return Diagnosis((), ())
     finder = MapPoints(model, {}, points.markers, np.nan, points.markers_path or points.path)
     found = [finder.find_marker(of.name) for of in tested]
-    of_map = placed.of(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)[0]
+    of_map = placed.of(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)
     if errors is not None and placed.by_antenna:  # the errors of the refined map have none that last
         of_map = of_map + placed.of_place(found)
     own = np.repeat([of.stddev_m**2 for of in tested], 3)

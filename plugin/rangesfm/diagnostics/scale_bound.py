@@ -122,11 +122,11 @@ def scale_bound(uncertainty: ScaleUncertainty, hidden: Sequence[HiddenMistake]) 
 
 
 def _bound(uncertainty: ScaleUncertainty, changes: Array, missed: Array) -> float:
-    farthest = float(np.max(changes)) + abs(uncertainty.lean) + 10 * uncertainty.empirical
+    farthest = float(np.max(changes)) + 10 * uncertainty.empirical
     return float(brentq(lambda bound: np.max(missed * _beyond(uncertainty, changes, bound)) - RISK, 0.0, farthest))
 
 
 def _beyond(uncertainty: ScaleUncertainty, changes: Array, bound: float) -> Array:
     """Return the probabilities (k,) that the scale is off by more than a bound, given changes (k,) of its logarithm."""
-    middles, stddev = changes + abs(uncertainty.lean), max(uncertainty.empirical, 1e-300)
+    middles, stddev = changes, max(uncertainty.empirical, 1e-300)
     return np.asarray(special.ndtr((middles - bound) / stddev) + special.ndtr((-middles - bound) / stddev))

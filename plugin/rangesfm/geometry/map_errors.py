@@ -72,7 +72,7 @@ class MapErrors:
     parts: Mapping[Kind, PartErrors]
     scale_stddev: float
 
-    def relative(self, first: MapPointErrors, second: MapPointErrors, scale_stddev: float) -> tuple[Array, Array]:
+    def relative(self, first: MapPointErrors, second: MapPointErrors, scale_stddev: float) -> Array:
         """Return how a point errs relative to another one.
 
         Args:
@@ -81,18 +81,16 @@ class MapErrors:
                 that this covariance implies; how the map errs at a given scale stays as it is.
 
         Returns:
-            (3, 3) covariance of second minus first in square metres, and (3,) its expected change where the logarithm
-            of the scale changes by 1.
+            (3, 3) covariance of second minus first in square metres.
         """
-        covariance, by_scale = self.joint([first, second], scale_stddev)
         apart = np.hstack([-np.eye(3), np.eye(3)])
-        return apart @ covariance @ apart.T, apart @ by_scale
+        return np.asarray(apart @ self.joint([first, second], scale_stddev) @ apart.T)
 
-    def joint(self, points: Sequence[MapPointErrors], scale_stddev: float) -> tuple[Array, Array]:
+    def joint(self, points: Sequence[MapPointErrors], scale_stddev: float) -> Array:
         """Return how k points err together in the world; arguments and values as for ``relative``.
 
         Returns:
-            (3 k, 3 k) covariance of their coordinates, and (3 k,) their expected change by the logarithm of the scale.
+            (3 k, 3 k) covariance of their coordinates.
         """
         covariance: Array = block_diag(*(point.own_m2 for point in points))
         by_mode, by_scale = np.zeros((len(covariance), self._num_modes)), np.zeros(len(covariance))
@@ -106,7 +104,7 @@ class MapErrors:
             by_scale += slope @ errors.by_scale[row, :num]
             covariance = covariance + slope @ errors.rests[row, :num, :num] @ slope.T
         covariance = covariance + by_mode @ by_mode.T
-        return covariance + (scale_stddev**2 - self.scale_stddev**2) * np.outer(by_scale, by_scale), by_scale
+        return np.asarray(covariance + (scale_stddev**2 - self.scale_stddev**2) * np.outer(by_scale, by_scale))
 
     @property
     def _num_modes(self) -> int:

@@ -38,7 +38,7 @@ from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import Verdict, judge, judge_positions
 from rangesfm.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
-from rangesfm.scale.uncertainty import KnownMap, bias_covariance, errors_to_expect, linear_map
+from rangesfm.scale.uncertainty import KnownMap, bias_covariance, chance_differences, errors_to_expect, linear_map
 
 # Numbers of ranges, of bins and of keyframes in the quick computation that compares plans.
 _NUM_COMPARED_RANGES, _NUM_COMPARED_BINS, _NUM_COMPARED_KEYFRAMES = 600, 120, 15
@@ -100,7 +100,7 @@ class Expected:
         """Return that a run will refuse the survey, and know nothing of its map."""
         none, is_placed = np.zeros(0, dtype=np.int64), planned.anchor_frame == "site"
         columns, open_ = Columns(0, 1 if is_placed else -1, none, none, 7), OPEN**4 * np.eye(7)
-        known = KnownMap(ScaleUncertainty(np.inf, {}), open_, columns, open_)
+        known = KnownMap(ScaleUncertainty(np.inf, {}), open_, columns, open_, np.zeros(7), np.zeros(0))
         errors = ErrorParts((), np.zeros(0), np.zeros((0, 0, 0)))
         open_m = np.full(len(planned.trajectory), np.inf)
         return cls(replace(planned, photos=None), None, None, known, errors, open_m, 0, (), refusal)
@@ -333,8 +333,9 @@ class _BendingMap:
         simple_m2 = block_diag(*(each.simple_m2 for each in observed)) + bent_m2[:num, :num]
         by_others, _ = linear.with_weights(simple_m2, errors.covariance_m2)
         # The estimates with different weights will differ by about one standard deviation.
-        known = KnownMap.between(linear, errors, formal, by_others, np.full(columns.num, np.inf))
-        known = replace(known, uncertainty=replace(known.uncertainty, lean=0.0))
+        best = linear.solved(errors.covariance_m2)
+        half_way = chance_differences(by_others, best.covariance) / 2
+        known = KnownMap.of(best, errors, formal, columns, by_others, half_way)
         whitened = cho_solve(cho_factor(regular(errors.covariance_m2)), np.hstack([bent_m2[:num, num:], design]))
         of_places, of_design = whitened[:, : bent_m2.shape[0] - num], whitened[:, bent_m2.shape[0] - num :]
         left = self._motions(columns) - bent_m2[num:, :num] @ of_design

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
 from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_radio
@@ -108,6 +108,28 @@ class RefineSummary:
     observations: RangeObservations
     predicted_m: Array
     weights: Array
+
+    def moved(self, change: Similarity, anchors_m: Array, rows: Indices, longer_m: Array) -> RefineSummary:
+        """Return the summary of the same map moved as a whole.
+
+        Args:
+            change: from the world of this map to that of the moved one. anchors_m: (m, 3) positions of anchors there.
+            rows: (k,) ranges that took part. longer_m: (k,) by how much longer they are there.
+        """
+        predicted_m, weights, status = self.predicted_m.copy(), self.weights.copy(), self.observations.status.copy()
+        predicted_m[rows] += longer_m
+        weights[rows] = self.errors.subset(rows).robust_weights((predicted_m - self.observations.log.range_m)[rows])
+        status[rows] = status_by_weight(weights[rows])
+        mirrors_m = [each.mirror_position_m for each in self.anchors]
+        moved_m = [None if at_m is None else change.apply(at_m[None])[0] for at_m in mirrors_m]
+        places = zip(self.anchors, anchors_m, moved_m, strict=True)
+        return replace(
+            self,
+            anchors=tuple(replace(a, position_m=at_m, mirror_position_m=mirror_m) for a, at_m, mirror_m in places),
+            observations=replace(self.observations, status=status),
+            predicted_m=predicted_m,
+            weights=weights,
+        )
 
     def __repr__(self) -> str:
         """Return what the refinement did on one line."""

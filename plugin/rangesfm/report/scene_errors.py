@@ -43,7 +43,6 @@ def errors_of_scene(
         "rests": pack(rests, "float32"),
         "by_scale": pack(by_scale, "float32"),
         "scale_variance_change": scale.empirical**2 - errors.scale_stddev**2,
-        "scale_lean": scale.lean,
         "up": None if up is None else up[0].tolist(),
         "tilt_stddev": None if up is None else up[1],
     }

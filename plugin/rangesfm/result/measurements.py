@@ -75,28 +75,25 @@ class MeasuredMap:
     def _between(self, first: MapPoint, second: MapPoint) -> Measurement:
         apart = second.position_m - first.position_m
         distance_m = float(np.linalg.norm(apart))
-        covariance, by_scale = self._relative(first, second)
+        covariance = self._relative(first, second)
         along = apart / distance_m if distance_m > 0 else np.zeros(3)
-        low, high = self._interval(distance_m, along, covariance, by_scale)
+        low, high = self._interval(distance_m, along, covariance)
         height = interval = None
         if self.up is not None:
             up, tilt_stddev = self.up
             height = float(up @ apart)
             if self.errors is not None:
                 level_m = float(np.linalg.norm(apart - height * up))
-                interval = self._interval(height, up, covariance, by_scale, tilt_stddev * level_m)
+                interval = self._interval(height, up, covariance, tilt_stddev * level_m)
         return Measurement((first.name, second.name), distance_m, (max(low, 0.0), high), height, interval)
 
-    def _relative(self, first: MapPoint, second: MapPoint) -> tuple[Array, Array]:
-        """Return the covariance (3, 3) of second minus first, and its change (3,) by the logarithm of the scale."""
+    def _relative(self, first: MapPoint, second: MapPoint) -> Array:
+        """Return the covariance (3, 3) of second minus first."""
         if self.errors is None:
             apart = second.position_m - first.position_m
-            return self.scale.empirical**2 * np.outer(apart, apart), apart
+            return self.scale.empirical**2 * np.outer(apart, apart)
         return self.errors.relative(first.errors, second.errors, self.scale.empirical)
 
-    def _interval(
-        self, value: float, along: Array, covariance: Array, by_scale: Array, more_stddev: float = 0.0
-    ) -> Interval:
-        middle = value + self.scale.lean * float(along @ by_scale)
+    def _interval(self, value: float, along: Array, covariance: Array, more_stddev: float = 0.0) -> Interval:
         half = NORMAL_95 * math.sqrt(max(float(along @ covariance @ along), 0.0) + more_stddev**2)
-        return middle - half, middle + half
+        return value - half, value + half

@@ -15,7 +15,7 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.scale.placement_prior import PlacementPrior
-from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
+from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges, state_after
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
@@ -88,6 +88,21 @@ class MapWithRanges:
         solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
         return cls(posed, solution, bending)
 
+    @property
+    def metric_from_model(self) -> Similarity:
+        return self.solution.fit.state.metric_from_model
+
+    @property
+    def predicted_m(self) -> Array:
+        """Return the (k,) predicted ranges."""
+        return predicted_ranges(self.solution.problem, self.solution.fit.state)
+
+    def moved(self, known: KnownMap) -> MapWithRanges:
+        """Return the map moved as a whole to where its uncertainty refers to, with its anchors."""
+        solution = self.solution
+        state = state_after((known.columns,), solution.fit.state, known.half_way)
+        return replace(self, solution=replace(solution, fit=fit_at(solution.problem, state, solution.fit.weights)))
+
     def learned(self) -> LearnedErrors:
         """Estimate the errors of the ranges and of the map from the residuals at this map."""
         return learned_errors(self.posed, self.solution, self.bending)
@@ -113,8 +128,8 @@ class MapWithRanges:
 
 def estimate_at(
     on_map: MapWithRanges, learned: LearnedErrors, start: ScaleEstimate, options: ScaleOptions
-) -> ScaleEstimate:
-    """Return the scale estimate of a refined map, judged at that map.
+) -> tuple[ScaleEstimate, MapWithRanges]:
+    """Return the scale estimate of a refined map, and the map moved as a whole to this scale.
 
     Args:
         start: the estimate before the refinement; everything that is no judgement is taken from it.
@@ -123,16 +138,17 @@ def estimate_at(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     known = on_map.known(learned, start.shared_errors_m)
-    value = on_map.solution.fit.state.metric_from_model.scale
-    judged = judge(on_map.posed, on_map.solution, known.uncertainty, {}, start.anchors, options)
-    return start.judged(
+    moved = on_map.moved(known)
+    judged = judge(moved.posed, moved.solution, known.uncertainty, {}, start.anchors, options)
+    estimate = start.judged(
         judged,
-        refined_value=value,
+        refined_value=moved.metric_from_model.scale,
         uncertainty=known.uncertainty,
         placement=known.columns.placement(known.covariance),
         errors=replace(start.errors, learned=learned.spread(on_map.posed.rows, len(start.observations.log))),
-        noise_stddev_m=on_map.solution.noise_stddev_m,
+        noise_stddev_m=moved.solution.noise_stddev_m,
     )
+    return estimate, moved
 
 
 def estimate_by_positions_at(

@@ -363,14 +363,14 @@ class _Problem:
         others, of_groups = linear.with_weights(weighed, errors.covariance_m2)
         found = KnownMap.between(linear, errors, formal, others)
         return PositionScale(
-            site_from_model=fit.similarity,
+            site_from_model=moved_similarity(fit.similarity, found.half_way, self.path),
             known=self.known,
             weights=fit.weights,
             is_left_out=is_left_out,
             threshold=threshold,
             uncertainty=found.uncertainty,
             covariance=found.covariance,
-            best_step=linear.solved(errors.covariance_m2).step,
+            best_step=linear.solved(errors.covariance_m2).step - found.half_way,
             equations=fit.equations,
             bending_m2=fit.bending.formal_m2,
             stddev_m=self._own_stddev_m(fit),

@@ -31,12 +31,10 @@ class ScaleUncertainty:
     Attributes:
         formal: from the Jacobian, as if all ranges erred independently (Cramer-Rao bound).
         components: standard deviation due to each component of the ranges' errors, by its name.
-        lean: offset of the interval's middle from the estimate, in the logarithm of the scale.
     """
 
     formal: float
     components: dict[str, float]
-    lean: float = 0.0
 
     @property
     def empirical(self) -> float:
@@ -50,14 +48,13 @@ class ScaleUncertainty:
         )
 
     def about(self, value: float) -> ScaleByKind:
-        """Return the middle of the interval about an estimate, with its standard deviation."""
-        middle = value * float(np.exp(self.lean))
-        return ScaleByKind(middle, middle * self.empirical)
+        """Return an estimate with its standard deviation."""
+        return ScaleByKind(value, value * self.empirical)
 
     @property
     def interval_95(self) -> tuple[float, float]:
         """Bounds, with 95 % probability, of the logarithm of the true scale divided by the estimate."""
-        return self.lean - self.half_width_95, self.lean + self.half_width_95
+        return -self.half_width_95, self.half_width_95
 
     @property
     def half_width_95(self) -> float:

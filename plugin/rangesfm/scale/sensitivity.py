@@ -5,24 +5,31 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.scale.range_equation import predicted_ranges, range_gradient
 from rangesfm.scale.scale_estimate import ScaleSensitivity
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
+from rangesfm.scale.uncertainty import KnownMap
 
 _CM = 0.01
 # Ranges must be shorter than the median by this factor to count as the shorter half: rounding spreads equal ranges.
 _SHORTER = 1 - 1e-9
 
 
-def scale_sensitivity(solution: Solution, posed: ScaleProblem) -> ScaleSensitivity:
-    """Return the changes of the scale in percent, to first order."""
+def scale_sensitivity(solution: Solution, posed: ScaleProblem, known: KnownMap, bins: RangeBins) -> ScaleSensitivity:
+    """Return the changes of the scale in percent, to first order.
+
+    Args:
+        known: uncertainty of the solution. bins: of the problem's ranges.
+    """
     problem, fit, state = solution.problem, solution.fit, solution.fit.state
-    # Relative change of the scale per metre by which each range is longer.
-    influence = fit.gradients @ fit.covariance[0] / problem.stddev_m
+    # Relative change of the scale with the robust weights per metre by which each range is longer.
+    robust = fit.gradients @ fit.covariance[0] / problem.stddev_m
 
     def percent(range_error_m: Array) -> float:
-        return 100 * float(influence @ range_error_m)
+        # The scale is half-way between that with the robust weights and that with the best weights.
+        return 50 * float(robust @ range_error_m + known.best_by_bins @ bins.mean(range_error_m))
 
     distance = predicted_ranges(problem, state)
     world_from_cam = state.metric_from_model.rotation @ posed.model_from_cam

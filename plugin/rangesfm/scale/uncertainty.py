@@ -12,7 +12,7 @@ from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_i
 from rangesfm.ranging.errors.components import BENDS, CLOCKS, GIVEN, PLACES, REWEIGHTING
 from rangesfm.ranging.errors.learned import ErrorParts, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisiness, range_bins
-from rangesfm.scale.linear_map import LinearMap
+from rangesfm.scale.linear_map import LinearMap, Solved
 from rangesfm.scale.range_equation import (
     Columns,
     RangeProblem,
@@ -138,12 +138,30 @@ class KnownMap:
         uncertainty: of the scale.
         covariance: (p, p) of the scale's logarithm, the map's turn and shift, and the anchors, as in ``columns``.
         by_own_weights: (p, p) the same for the estimate as it is weighted, without the best weights.
+        half_way: (p,) step of the unknowns from where the map is to the middle between two estimates, to which
+            everything else refers.
+        best_by_bins: (c,) change of the scale's logarithm, with the best weights, per metre that each bin is longer.
     """
 
     uncertainty: ScaleUncertainty
     covariance: Array
     columns: Columns
     by_own_weights: Array
+    half_way: Array
+    best_by_bins: Array
+
+    @classmethod
+    def of(
+        cls, best: Solved, learned: ErrorParts, formal: float, columns: Columns, by_others: Array, half_way: Array
+    ) -> KnownMap:
+        """Return what is known at the middle between two estimates, which are twice ``half_way`` (p,) apart."""
+        of_bins, of_priors = best.gains
+        components = learned.stddev_of_bins(of_bins[0])
+        if (given := float(np.linalg.norm(of_priors[0]))) > 0:
+            components[GIVEN] = given
+        components[REWEIGHTING] = abs(float(half_way[0]))
+        covariance = best.covariance + np.outer(half_way, half_way)
+        return cls(ScaleUncertainty(formal, components), covariance, columns, by_others, half_way, of_bins[0])
 
     @classmethod
     def between(
@@ -157,10 +175,10 @@ class KnownMap:
         """Combine the estimate with the best weights for the errors and the estimate with other weights.
 
         Best weights (Gauss-Markov) are only as good as the model of the errors, which real radios do not always follow.
-        Robust weights depend less on the model. The truth is taken to be equally likely at either estimate: this moves
-        the middle of the interval by half of their difference and widens it by as much. The variance of the difference
-        is the difference of the variances (Hausman, "Specification tests in econometrics", 1978). A difference of more
-        than one standard deviation is evidence against the model, so only one standard deviation of it is used.
+        Robust weights depend less on the model. The truth is taken to be equally likely at either estimate: the map is
+        best placed half-way between them, and its interval is wider by as much. The variance of the difference is the
+        difference of the variances (Hausman, "Specification tests in econometrics", 1978). A difference of the scale of
+        more than one standard deviation is evidence against the model, so only one standard deviation of it is used.
 
         Args:
             formal: relative standard deviation of the scale, as if all ranges erred independently.
@@ -169,16 +187,16 @@ class KnownMap:
                 with the other weights; None: the map is at the estimate with the other weights.
         """
         best = linear.solved(learned.covariance_m2)
-        of_bins, of_priors = best.gains
         change = best.step if change_by_others is None else change_by_others
-        chance = np.sqrt(np.maximum(np.diag(by_others - best.covariance), 0.0))
-        half = np.clip(change, -chance, chance) / 2
-        components = learned.stddev_of_bins(of_bins[0])
-        if (given := float(np.linalg.norm(of_priors[0]))) > 0:
-            components[GIVEN] = given
-        components[REWEIGHTING] = abs(float(half[0]))
-        uncertainty = ScaleUncertainty(formal, components, float(half[0]))
-        return cls(uncertainty, best.covariance + np.outer(half, half), linear.columns, by_others)
+        chance = chance_differences(by_others, best.covariance)[0]
+        # The whole step is shortened, because a shorter one of the scale alone would not fit the anchors' places.
+        share = min(1.0, chance / max(abs(float(change[0])), 1e-300))
+        return cls.of(best, learned, formal, linear.columns, by_others, share * change / 2)
+
+
+def chance_differences(by_others: Array, by_best: Array) -> Array:
+    """Return the (p,) standard deviations of the difference of two estimates with these covariances (p, p)."""
+    return np.sqrt(np.maximum(np.diag(by_others - by_best), 0.0))
 
 
 def known_map(

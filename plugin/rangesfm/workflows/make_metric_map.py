@@ -485,8 +485,24 @@ def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array
     )
 
 
+def _moved(metric: MetricResult, before: MapWithRanges, after: MapWithRanges) -> MetricResult:
+    """Return the result with the refined map moved as a whole."""
+    assert metric.refined is not None
+    assert metric.kept_refinement is not None
+    change, rows = after.metric_from_model @ before.metric_from_model.inverse(), after.posed.rows
+    longer_m = after.predicted_m - before.predicted_m
+    known = metric.positions_at_refined
+    return replace(
+        metric,
+        refined=rescale(metric.refined, change),
+        refinement=metric.kept_refinement.moved(change, after.solution.fit.state.anchors_m, rows, longer_m),
+        refined_with_ranges=after,
+        positions_at_refined=known and replace(known, site_from_model=change),
+    )
+
+
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
-    """Return the result with the estimate of the final map's scale, and the ranges on the final map.
+    """Return the result with the estimate of the final map's scale, and the ranges on the map before it is moved to it.
 
     Raises:
         GeometryError: the scale is less certain than asked for.
@@ -499,9 +515,11 @@ def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, Rang
         on_map = metric.on_map or _ranges_on_scaled(start, None)
     try:
         if at is not None and learned is not None:
-            estimate = estimate_at(at, learned.subset(at.posed.rows), start, survey.scale)
-        elif metric.positions_at_refined is not None and metric.kept_refinement is not None:
-            estimate = estimate_by_positions_at(metric.positions_at_refined, metric.refined_scale, start, survey.scale)
+            estimate, moved = estimate_at(at, learned.subset(at.posed.rows), start, survey.scale)
+            metric = _moved(metric, at, moved)
+        elif (known := metric.positions_at_refined) is not None and metric.kept_refinement is not None:
+            metric = replace(metric, refined=metric.refined and rescale(metric.refined, known.site_from_model))
+            estimate = estimate_by_positions_at(known, metric.refined_scale, start, survey.scale)
         else:
             refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)
             estimate = replace(start, refined_value=None if metric.kept_refinement is None else metric.refined_scale)

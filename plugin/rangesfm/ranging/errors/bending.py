@@ -161,8 +161,10 @@ def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool)
         path: the poses, in the model's world.
     """
     motions = _motions(path)
-    weighted = motions * np.tile(np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3), len(path))[:, None] ** 2
-    of_poses = np.linalg.pinv(motions.T @ weighted, rcond=1e-12, hermitian=True) @ weighted.T
+    weights = np.tile(np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3), len(path))
+    weighted = motions * weights[:, None]
+    lengths = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)  # in no unit, so that none is too small to count
+    of_poses = np.linalg.pinv(weighted / lengths, rcond=1e-6) / lengths[:, None] * weights
     if not frame_is_free:
         of_poses[1:] = 0.0
         of_poses[1:4, :3] = path.world_from_cam[0]

@@ -27,8 +27,7 @@ class RelativeErrors {
       variance += (shift * this.steps[mode]) ** 2;
     }
     const half = NORMAL_95 * Math.sqrt(Math.max(variance, 0));
-    const middle = value + this.scale_lean * byScale;
-    return [middle - half, middle + half];
+    return [value - half, value + half];
   }
 }
 
