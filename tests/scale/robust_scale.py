@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.scale.range_equation import solve
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 
@@ -11,5 +10,4 @@ def metric_from_sfm_by_robust_weights(estimate: ScaleEstimate) -> Similarity:
     problem, solution = estimate.problem, estimate.solution
     assert problem is not None
     assert solution is not None
-    fit = solve(solution.problem, solution.fit.state, loss=solution.errors.loss)
-    return fit.state.metric_from_model @ problem.first_camera_from_sfm
+    return solution.fit.state.metric_from_model @ problem.first_camera_from_sfm

@@ -182,8 +182,8 @@ class _Given:
         posed = problem if lengths is None else _bent(problem, lengths)
         known = known_map(posed, solution, learned)
         uncertainty = known.uncertainty
-        solution = replace(solution, fit=_moved(solution, known))
-        found = anchor_estimates(solution, observations.log.anchor_ids, known.by_own_weights)
+        moved = replace(solution, fit=_moved(solution, known))
+        found = anchor_estimates(moved, observations.log.anchor_ids, known.by_own_weights)
         judged = judge(problem, solution, uncertainty, per_anchor, found, options)
         verdict, remarks = judged.verdict, (*open_place, *self.remarks)
         if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
@@ -198,14 +198,14 @@ class _Given:
         status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
         status[problem.rows] = status_by_weight(solution.fit.weights)
         return ScaleEstimate(
-            metric_from_sfm=_by_method(options.method, solution, table) @ problem.first_camera_from_sfm,
+            metric_from_sfm=_by_method(options.method, moved, table) @ problem.first_camera_from_sfm,
             frame=problem.frame,
             method=options.method,
             uncertainty=uncertainty,
             verdict=verdict,
             reasons=reasons,
             advice=judged.advice,
-            sensitivity=scale_sensitivity(solution, problem, known, learned.bins),
+            sensitivity=scale_sensitivity(moved, problem, known, learned.bins),
             per_anchor=per_anchor,
             two_candidate=table,
             anchors=found,

@@ -100,7 +100,7 @@ class ScaleEstimate:
         observations: all ranges, with their status by final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal standard deviation.
         noise_stddev_m: standard deviation of an ordinary range.
-        problem, solution: what the estimate was computed from; None where there were no ranges.
+        problem, solution: what the estimate was computed from, by the robust weights; None where there were no ranges.
         placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
             first camera, from all error components; None in the first camera's frame.
         lengths: what the measured lengths alone say; None without lengths between points of the map.
