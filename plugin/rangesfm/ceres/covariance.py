@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,11 +102,7 @@ def joint_covariance(
     Raises:
         GeometryError: a block is not determined by the residuals.
     """
-    try:
-        inverse = _joint_inverse(equations)
-    except GeometryError:
-        equations = equations.with_loose_poses_held()
-        inverse = _joint_inverse(equations)
+    equations, inverse = _held_if_loose(equations, _joint_inverse)
     columns, spread = equations.columns, _Spread.of(equations, errors)
     size, num_free_directions = inverse.free.shape
     blocks = inverse.diagonal_blocks(spread)
@@ -157,10 +153,7 @@ class PhotosAlone:
         self._rows = equations.columns.of_blocks(seen)
         self._columns, self._stddev = equations.columns.subset(seen), residual_stddev
         self._gradient = equations.gradient[self._rows]
-        try:
-            self._inverse = self._inverse_of(equations)
-        except GeometryError:
-            self._inverse = self._inverse_of(equations.with_loose_poses_held())
+        _, self._inverse = _held_if_loose(equations, self._inverse_of)
 
     def _inverse_of(self, equations: NormalEquations) -> _Inverse:
         rows = self._rows
@@ -272,6 +265,17 @@ class _Inverse:
             + of_errors[rows] @ by_error[rows].T
             for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
         ]
+
+
+def _held_if_loose(
+    equations: NormalEquations, inverse_of: Callable[[NormalEquations], _Inverse]
+) -> tuple[NormalEquations, _Inverse]:
+    """Return the equations and their inverse, with loose poses held if they are not determined otherwise."""
+    try:
+        return equations, inverse_of(equations)
+    except GeometryError:
+        held = equations.with_loose_poses_held()
+        return held, inverse_of(held)
 
 
 def _joint_inverse(equations: NormalEquations) -> _Inverse:

@@ -184,7 +184,7 @@ class Linearized(LinearMap):
             prior_design=np.hstack([self.prior_design, priors]),
             noise_m=self.scatter_m,
             most_unusual=_MOST_UNUSUAL,
-            near={} if near is None else near.stddev_of_component,
+            near=None if near is None else near.stddev_of_component,
         )
         return replace(self, errors=learnt)
 

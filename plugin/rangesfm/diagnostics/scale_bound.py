@@ -128,5 +128,5 @@ def _bound(uncertainty: ScaleUncertainty, changes: Array, missed: Array) -> floa
 
 def _beyond(uncertainty: ScaleUncertainty, changes: Array, bound: float) -> Array:
     """Return the probabilities (k,) that the scale is off by more than a bound, given changes (k,) of its logarithm."""
-    middles, stddev = changes, max(uncertainty.empirical, 1e-300)
-    return np.asarray(special.ndtr((middles - bound) / stddev) + special.ndtr((-middles - bound) / stddev))
+    stddev = max(uncertainty.empirical, 1e-300)
+    return np.asarray(special.ndtr((changes - bound) / stddev) + special.ndtr((-changes - bound) / stddev))

@@ -120,9 +120,10 @@ class RefineSummary:
         predicted_m[rows] += longer_m
         weights[rows] = self.errors.subset(rows).robust_weights((predicted_m - self.observations.log.range_m)[rows])
         status[rows] = status_by_weight(weights[rows])
-        mirrors_m = [each.mirror_position_m for each in self.anchors]
-        moved_m = [None if at_m is None else change.apply(at_m[None])[0] for at_m in mirrors_m]
-        places = zip(self.anchors, anchors_m, moved_m, strict=True)
+        mirrors_m = [
+            None if each.mirror_position_m is None else change.apply(each.mirror_position_m) for each in self.anchors
+        ]
+        places = zip(self.anchors, anchors_m, mirrors_m, strict=True)
         return replace(
             self,
             anchors=tuple(replace(a, position_m=at_m, mirror_position_m=mirror_m) for a, at_m, mirror_m in places),

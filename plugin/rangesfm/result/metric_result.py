@@ -172,7 +172,7 @@ class MetricResult:
         if self.refined is None:
             return None
         if self.refined_with_ranges is not None:
-            return self.refined_with_ranges.solution.fit.state.metric_from_model.scale
+            return self.refined_with_ranges.metric_from_model.scale
         return align_points(self.trajectory.centers, self.trajectory.as_in(self.refined).centers).scale
 
     def moved(self, offset_m: Array) -> MetricResult:

@@ -15,7 +15,7 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.scale.placement_prior import PlacementPrior
-from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges, state_after
+from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
@@ -97,12 +97,6 @@ class MapWithRanges:
         """Return the (k,) predicted ranges."""
         return predicted_ranges(self.solution.problem, self.solution.fit.state)
 
-    def moved(self, known: KnownMap) -> MapWithRanges:
-        """Return the map moved as a whole to where its uncertainty refers to, with its anchors."""
-        solution = self.solution
-        state = state_after((known.columns,), solution.fit.state, known.half_way)
-        return replace(self, solution=replace(solution, fit=fit_at(solution.problem, state, solution.fit.weights)))
-
     def learned(self) -> LearnedErrors:
         """Estimate the errors of the ranges and of the map from the residuals at this map."""
         return learned_errors(self.posed, self.solution, self.bending)
@@ -138,7 +132,7 @@ def estimate_at(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     known = on_map.known(learned, start.shared_errors_m)
-    moved = on_map.moved(known)
+    moved = replace(on_map, solution=known.moved(on_map.solution))
     judged = judge(moved.posed, moved.solution, known.uncertainty, {}, start.anchors, options)
     estimate = start.judged(
         judged,

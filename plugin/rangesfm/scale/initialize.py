@@ -21,7 +21,7 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
-from rangesfm.scale.range_equation import RangeFit, RangeProblem, fit_at, solve, state_after
+from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind, scale_by_lengths
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
@@ -30,7 +30,7 @@ from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, 
 from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
-from rangesfm.scale.uncertainty import KnownMap, known_map, learned_errors, shared_errors_m
+from rangesfm.scale.uncertainty import known_map, learned_errors, shared_errors_m
 
 # Smallest factor on the weights of ranges beside other measurements, below which they would have no effect.
 _LEAST_SHARE = 1e-4
@@ -182,7 +182,7 @@ class _Given:
         posed = problem if lengths is None else _bent(problem, lengths)
         known = known_map(posed, solution, learned)
         uncertainty = known.uncertainty
-        moved = replace(solution, fit=_moved(solution, known))
+        moved = known.moved(solution)
         found = anchor_estimates(moved, observations.log.anchor_ids, known.by_own_weights)
         judged = judge(problem, solution, uncertainty, per_anchor, found, options)
         verdict, remarks = judged.verdict, (*open_place, *self.remarks)
@@ -267,13 +267,7 @@ def _solved(solution: Solution, problem: RangeProblem) -> Solution:
 
 def _by_ranges(posed: ScaleProblem, alone: Solution, learned: LearnedErrors) -> ScaleByKind:
     known = known_map(replace(posed, ranges=_ranges_alone(posed.ranges)), alone, learned)
-    return known.uncertainty.about(_moved(alone, known).state.metric_from_model.scale)
-
-
-def _moved(solution: Solution, known: KnownMap) -> RangeFit:
-    """Return the fit at the map to which the uncertainty refers, with the same robust weights."""
-    state = state_after((known.columns,), solution.fit.state, known.half_way)
-    return fit_at(solution.problem, state, solution.fit.weights)
+    return known.uncertainty.about(known.moved(alone).fit.state.metric_from_model.scale)
 
 
 def _ranges_alone(problem: RangeProblem) -> RangeProblem:

@@ -18,11 +18,13 @@ from rangesfm.scale.range_equation import (
     RangeProblem,
     RangeState,
     columns_of,
+    fit_at,
     predicted_ranges,
     prior_jacobian,
     prior_residuals,
     range_gradient,
     range_jacobian,
+    state_after,
 )
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
@@ -192,6 +194,11 @@ class KnownMap:
         # The whole step is shortened, because a shorter one of the scale alone would not fit the anchors' places.
         share = min(1.0, chance / max(abs(float(change[0])), 1e-300))
         return cls.of(best, learned, formal, linear.columns, by_others, share * change / 2)
+
+    def moved(self, solution: Solution) -> Solution:
+        """Return the solution from which this was computed, moved half-way, with the same robust weights."""
+        state = state_after((self.columns,), solution.fit.state, self.half_way)
+        return replace(solution, fit=fit_at(solution.problem, state, solution.fit.weights))
 
 
 def chance_differences(by_others: Array, by_best: Array) -> Array:
