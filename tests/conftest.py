@@ -66,18 +66,36 @@ def blas_kernels() -> list[str]:
     return [str(library.get("architecture")) for library in threadpool_info() if library["user_api"] == "blas"]
 
 
-# Test files that take eight seconds or more, the longest first, by the sums of ``pytest --durations=0``.
+# Test files that take seven seconds or more, the longest first, by the sums of ``pytest --durations=0``, and then those
+# of which the slow tests take 15 seconds or more.
 LONG_FILES = """
-    test_mistakes test_commands test_same_results test_kernels test_initialize test_pages test_batch
-    test_reconstruct test_surroundings test_run test_same_everywhere test_broken_refinement test_kills
-    test_trilateration test_report_page test_drifting_maps test_bad_input test_view test_with_ranges
-    test_uncertainty test_cpp_part test_numbers test_own_files test_report test_positions_alone test_lengths_alone
-    test_join_models test_workflows test_matching test_interrupt test_scale_crb test_odd_names
+    test_commands test_initialize test_mistakes test_trilateration test_with_ranges test_reconstruct test_pages
+    test_report_page test_bad_input test_time_offset test_same_results test_cpp_part test_view test_surroundings
+    test_report test_broken_refinement test_run test_join_models test_survey_plan test_positions_alone
+    test_external_mapping test_close_loops test_site_anchors test_same_everywhere test_measure test_rigs
+    test_scale_verdict test_learned test_anchor_sides test_main test_uncertainty test_drifting_maps test_kernels
+    test_kills test_batch test_numbers test_workflows
 """
+# Tests that take seconds and are left out unless they are asked for: see the head of ``slow_tests.txt``.
+SLOW_TESTS = Path(__file__).parent / "slow_tests.txt"
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start the longest files first; otherwise one of two processes would work alone on the last of them."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the slow tests, and start the longest files first; otherwise one of two processes would end alone.
+
+    Raises:
+        pytest.UsageError: a test that the list of slow tests names is not there.
+    """
+    slow = {line for line in SLOW_TESTS.read_text(encoding="utf-8").splitlines() if line.startswith("tests/")}
+    for item in items:
+        if item.nodeid in slow:
+            item.add_marker("slow")
+    if not any("::" in argument for argument in config.args):
+        files = {item.nodeid.split("::")[0] for item in items}
+        missing = {name for name in slow if name.split("::")[0] in files} - {item.nodeid for item in items}
+        if missing:
+            raise pytest.UsageError(f"{SLOW_TESTS.name} names tests that are not there: {', '.join(sorted(missing))}")
     place = {name: number for number, name in enumerate(LONG_FILES.split())}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 

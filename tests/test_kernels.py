@@ -17,7 +17,7 @@ from tests.conftest import blas_kernels
 
 # Flags in /proc/cpuinfo that a processor must have for each kernel.
 NEEDED_FLAGS = {"Haswell": "avx2", "SkylakeX": "avx512vl", "Nehalem": "sse4_2"}
-# Tests of decisions that are made on computed numbers, if they are quick.
+# Tests of decisions that are made on computed numbers; the slow ones are left out, as in any run of the tests.
 TESTS = (
     "tests/ceres/test_covariance.py",
     "tests/comparison/test_with_reference.py",
@@ -41,32 +41,6 @@ TESTS = (
     "tests/scale/test_starts.py",
     "tests/scale/test_two_candidate.py",
 )
-# Tests among them that take seconds and are left out: mostly statistics over many draws, which rounding does not
-# change.
-SLOW = (
-    "tests/ceres/test_covariance.py::test_surveys_err_as_the_covariance_says",
-    "tests/distances/test_map_points.py::test_a_marker_errs_by_its_marks_as_much_as_it_moves_with_them",
-    "tests/distances/test_map_points.py::test_distances_of_solved_surveys_are_in_their_intervals",
-    "tests/ranging/anchors/test_trilateration.py::TestCovariance",
-    "tests/ranging/anchors/test_trilateration.py::TestErrorCurve",
-    "tests/ranging/anchors/test_trilateration.py::TestWithoutNoise::test_the_anchor_is_exact",
-    "tests/ranging/anchors/test_trilateration.py::test_ranges_that_say_how_noisy_they_are_weigh_accordingly",
-    "tests/ranging/anchors/test_trilateration.py::test_study_in_small",
-    "tests/ranging/anchors/test_trilateration.py::test_three_good_ranges_in_ten_decide",
-    "tests/ranging/errors/test_radio_calibration.py",
-    "tests/ranging/errors/test_inlier_noise.py::test_without_outliers_it_is_the_standard_deviation",
-    "tests/ranging/errors/test_learned.py::test_a_radio_with_far_more_noise_may_be_off_by_more_in_all_else",
-    "tests/ranging/errors/test_learned.py::test_unknowns_that_say_the_same_twice_change_nothing",
-    "tests/ranging/errors/test_learned.py::test_errors_ten_times_as_large_as_usual_are_seen_whatever_they_are_taken_for",
-    "tests/ranging/errors/test_range_errors.py::test_independent_errors_keep_their_say",
-    "tests/scale/test_initialize.py::TestRefused::test_a_camera_that_moves_less_than_the_noise",
-    "tests/scale/test_initialize.py::TestRefused::test_a_flat_path_among_anchors_in_a_plane",
-    "tests/scale/test_initialize.py::TestRefused::test_a_straight_path_in_the_site_frame",
-    "tests/scale/test_initialize.py::TestWithoutNoise::test_so_it_is_from_millimetres_with_the_tag_in_the_camera",
-    "tests/scale/test_initialize.py::TestWithoutNoise::test_the_similarity_is_recovered[five",
-    "tests/scale/test_initialize.py::TestWithoutNoise::test_the_similarity_is_recovered[site",
-    "tests/scale/test_range_equation.py::test_formal_stddev_is_the_scatter_of_estimates",
-)
 
 
 def why_not(kernel: str) -> str:
@@ -83,7 +57,7 @@ def test_numeric_tests_pass_with_the_kernel(kernel: str, tmp_path: Path) -> None
     others = [name for name in NEEDED_FLAGS if not why_not(name)]
     tests = TESTS[others.index(kernel) :: len(others)]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-    options = ["-p", "no:cacheprovider", f"--basetemp={tmp_path / 'base'}", *(f"--deselect={name}" for name in SLOW)]
+    options = ["-p", "no:cacheprovider", f"--basetemp={tmp_path / 'base'}"]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *options, *tests],
         cwd=Path(__file__).parents[1],
