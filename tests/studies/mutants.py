@@ -64,13 +64,14 @@ def mutants_of(path: Path) -> list[tuple[Mutant, int]]:
 
 
 def test_commands(path: Path) -> list[list[str]]:
-    """Return the arguments of pytest for each set of tests, the nearest tests first."""
+    """Return the arguments of pytest for each set of tests: the quick and the nearest tests first."""
     folder = path.parent.relative_to(PACKAGE)
     tests = Path("tests") / folder
     own = tests / f"test_{path.stem}.py"
     commands = [[str(own)]] if own.is_file() else []
     commands += [["tests/test_same_results.py"], [str(tests), f"--ignore={own}"]]
-    return commands + [[str(Path("tests") / user)] for user in (*USED_BY.get(str(folder), ()), "workflows")]
+    commands += [[str(Path("tests") / user)] for user in (*USED_BY.get(str(folder), ()), "workflows")]
+    return [[*command, "-m", marked] for marked in ("not slow", "slow") for command in commands]
 
 
 def survives(mutant: Mutant, copy: Path) -> tuple[bool, str]:
