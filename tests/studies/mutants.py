@@ -4,9 +4,9 @@
     python -m tests.studies.mutants --num 60 --seed 0 [--first 31]
 
 Draws mutants (another operator, a number one off, a negated condition, ...) at random from the packages, and puts each
-into a copy of the checkout. Then it runs the tests that mirror its file: its own, the tests of its folder, of the folders
-that use it, and of the workflows, quick ones first. Results of small surveys that are compared with a file of numbers
-have no say. A mutant that all of these pass has survived.
+into a copy of the checkout. Then it runs the tests that mirror its file: its own, the tests of its folder, of the
+folders that use it, and of the workflows, quick ones first. Results of small surveys that are compared with a file of
+numbers have no say. A mutant that all of these pass has survived.
 Type hints, ``frozen=True`` and ``strict=True`` are not changed: no run depends on them unless it is wrong already.
 """
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import pycolmap
 import pytest
 from tests.outputs import names_in
@@ -15,6 +16,7 @@ from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
 from rangesfm.errors import InputError
 from rangesfm.files.manifest import content_hash
 from rangesfm.geometry.reference import Reference, write_reference
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.readers import write_ranges_csv
@@ -27,6 +29,7 @@ from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.loop_database import LoopDatabase
 from rangesfm.workflows.close_loops import close_loops
 from rangesfm.workflows.run import refine_model
+from rangesfm.workflows.run_results import RunResult, write_results
 
 
 class Listener(SilentProgress):
@@ -97,10 +100,12 @@ class ClosedLaps:
     """The result of a run that was interrupted after the matching, and then done again.
 
     Attributes:
+        last: the map of which the result was written.
         counts: numbers of pairs done and of all pairs, as the second run told them in the stage of loops.
     """
 
     summary: ResultSummary
+    last: MetricResult
     counts: list[tuple[int, int | None]]
 
 
@@ -111,9 +116,17 @@ def closed(laps: Laps) -> ClosedLaps:
         patch.setattr(LoopDatabase, "keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             refine_model(laps.survey, progress=SilentProgress())
-    summary = refine_model(laps.survey, progress=listener).summary
+    written: list[MetricResult] = []
+
+    def write(run: SurveyRun, made: MetricResult) -> RunResult:
+        written.append(made)
+        return write_results(run, made)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rangesfm.workflows.run.write_results", write)
+        summary = refine_model(laps.survey, progress=listener).summary
     assert content_hash(laps.database) == before
-    return ClosedLaps(summary, listener.counts)
+    return ClosedLaps(summary, written[0], listener.counts)
 
 
 def num_pairs(path: Path) -> int:
@@ -139,6 +152,16 @@ def test_a_model_with_its_database_has_its_loops_closed(closed: ClosedLaps, laps
     assert num_pairs(out / "database.db") == num_pairs(laps.database) + loops.num_closed
     assert set(names_in(out / ".rangesfm")) == {"manifest.json"}
     assert 'id="loops"' in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_map_before_its_loops_were_closed_is_in_the_world_of_the_final_one(closed: ClosedLaps) -> None:
+    last, loops = closed.last, closed.last.loops
+    assert loops is not None
+    assert last.refined_with_ranges is not None
+    final = last.trajectory.as_in(last.final)
+    np.testing.assert_allclose(loops.after.centers, final.centers, atol=1e-9)
+    change = Similarity(1.01, np.eye(3), np.ones(3))
+    np.testing.assert_allclose(loops.moved(change).before.centers, change.apply(loops.before.centers), atol=1e-12)
 
 
 def test_an_interrupted_run_goes_on_with_the_matches_that_it_has(closed: ClosedLaps) -> None:
