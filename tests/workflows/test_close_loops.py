@@ -16,7 +16,6 @@ from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
 from rangesfm.errors import InputError
 from rangesfm.files.manifest import content_hash
 from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.geometry.similarity import Similarity
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.readers import write_ranges_csv
@@ -154,14 +153,14 @@ def test_a_model_with_its_database_has_its_loops_closed(closed: ClosedLaps, laps
     assert 'id="loops"' in (out / "report.html").read_text(encoding="utf-8")
 
 
-def test_the_map_before_its_loops_were_closed_is_in_the_world_of_the_final_one(closed: ClosedLaps) -> None:
+def test_both_paths_are_those_that_would_be_delivered(closed: ClosedLaps, laps: Laps, tmp_path: Path) -> None:
     last, loops = closed.last, closed.last.loops
     assert loops is not None
-    assert last.refined_with_ranges is not None
-    final = last.trajectory.as_in(last.final)
-    np.testing.assert_allclose(loops.after.centers, final.centers, atol=1e-9)
-    change = Similarity(1.01, np.eye(3), np.ones(3))
-    np.testing.assert_allclose(loops.moved(change).before.centers, change.apply(loops.before.centers), atol=1e-12)
+    np.testing.assert_allclose(loops.after.centers, last.trajectory.as_in(last.final).centers, atol=1e-9)
+    changes = {"output.path": tmp_path / "out", "mapper.close_loops": False, "scale.max_relative_stddev": 10.0}
+    rows = {row.name: row.rmse_m for row in refine_model(laps.survey.changed(changes)).summary.comparison}
+    (before_m,) = (row.rmse_m for row in closed.summary.comparison if row.name == "refined, loops open")
+    assert before_m == pytest.approx(rows["refined"], rel=1e-6)
 
 
 def test_an_interrupted_run_goes_on_with_the_matches_that_it_has(closed: ClosedLaps) -> None:

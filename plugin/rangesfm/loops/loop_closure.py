@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from rangesfm.geometry.similarity import Similarity, rmse
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.similarity import rmse
 from rangesfm.geometry.trajectory import Trajectory
 
 NamedPair = tuple[str, str]
@@ -46,7 +49,7 @@ class LoopClosure:
             f" is {first}, and loops.csv has all"
         )
 
-    def moved(self, new_from_old: Similarity) -> LoopClosure:
-        """Return the same in another world."""
-        to = (new_from_old.scale, new_from_old.rotation, new_from_old.translation)
-        return replace(self, before=self.before.transformed(*to), after=self.after.transformed(*to))
+    def moved(self, offset_m: Array) -> LoopClosure:
+        """Return the same in a world whose coordinates are larger by ``offset_m`` (3,)."""
+        before, after = (path.transformed(1.0, np.eye(3), offset_m) for path in (self.before, self.after))
+        return replace(self, before=before, after=after)

@@ -195,7 +195,7 @@ class MetricResult:
             refined=None if self.refined is None else rescale(self.refined, shift),
             positions=self.positions.moved(offset_m),
             refinement=refinement,
-            loops=self.loops and self.loops.moved(shift),
+            loops=self.loops and self.loops.moved(offset_m),
         )
 
     def doubted(self, reasons: Sequence[str], advice: Sequence[str] = ()) -> MetricResult:

@@ -120,6 +120,15 @@ class MapWithRanges:
         return bending_of_bins(self.bending, bins, self.posed, self.solution.fit.state)
 
 
+def half_way(on_map: MapWithRanges, learned: LearnedErrors, start: ScaleEstimate) -> tuple[KnownMap, MapWithRanges]:
+    """Return what is known of a refined map, and the map moved as a whole to where its estimates are half-way.
+
+    Arguments as for ``estimate_at``.
+    """
+    known = on_map.known(learned, start.shared_errors_m)
+    return known, replace(on_map, solution=known.moved(on_map.solution))
+
+
 def estimate_at(
     on_map: MapWithRanges, learned: LearnedErrors, start: ScaleEstimate, options: ScaleOptions
 ) -> tuple[ScaleEstimate, MapWithRanges]:
@@ -131,8 +140,7 @@ def estimate_at(
     Raises:
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
-    known = on_map.known(learned, start.shared_errors_m)
-    moved = replace(on_map, solution=known.moved(on_map.solution))
+    known, moved = half_way(on_map, learned, start)
     judged = judge(moved.posed, moved.solution, known.uncertainty, {}, start.anchors, options)
     estimate = start.judged(
         judged,

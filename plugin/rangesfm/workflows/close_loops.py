@@ -11,6 +11,7 @@ import pycolmap
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import InputError
 from rangesfm.files.output_folder import sole_writer
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.loops.loop_closure import LoopClosure
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
@@ -18,6 +19,7 @@ from rangesfm.loops.resection import Loop
 from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
 from rangesfm.refine.with_ranges import LoopClosing
 from rangesfm.result.metric_result import MetricResult
+from rangesfm.scale.at_map import half_way
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.workflows.loop_matching import LoopMatching
 
@@ -102,10 +104,20 @@ def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: Trie
         tuple((after.final.image(first).name, after.final.image(second).name) for first, second in sorted(pairs))
         for pairs in (tried.closed, tried.contradicted)
     )
-    paths = (metric.trajectory.as_in(metric.final) for metric in (before, after))
+    paths = (_delivered(before), _delivered(after)) if closed else (_delivered(after),) * 2
     loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, *paths)
     run.journal.warn(*filter(None, [loops.warning]))
     if before.refinement is None or after.refinement is None:
         return replace(after, loops=loops)
     # The bend that the ranges took out of the map is that of the first refinement; the others began with its map.
     return replace(after, loops=loops, refinement=replace(after.refinement, bend_m=before.refinement.bend_m))
+
+
+def _delivered(metric: MetricResult) -> Trajectory:
+    """Return the path of a refined map as it would be the result: moved as a whole to where its interval lies."""
+    path, at, refinement = metric.trajectory.as_in(metric.final), metric.refined_with_ranges, metric.kept_refinement
+    if at is None or refinement is None or refinement.errors.learned is None:
+        return path
+    _, moved = half_way(at, refinement.errors.learned.subset(at.posed.rows), metric.estimate)
+    change = moved.metric_from_model @ at.metric_from_model.inverse()
+    return path.transformed(change.scale, change.rotation, change.translation)

@@ -31,7 +31,7 @@ from rangesfm.distances.locate_lengths import locate_distances, surveyed_distanc
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import gravity_of
-from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import in_first_camera
 from rangesfm.join.join_models import ModelVerdict, join_models
 from rangesfm.positions.surveyed_positions import SurveyedPositions
@@ -487,22 +487,18 @@ def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array
 
 def _moved(metric: MetricResult, before: MapWithRanges, after: MapWithRanges) -> MetricResult:
     """Return the result with the refined map moved as a whole."""
+    assert metric.refined is not None
     assert metric.kept_refinement is not None
     change, rows = after.metric_from_model @ before.metric_from_model.inverse(), after.posed.rows
     longer_m = after.predicted_m - before.predicted_m
     known = metric.positions_at_refined
     return replace(
-        _refined_moved(metric, change),
+        metric,
+        refined=rescale(metric.refined, change),
         refinement=metric.kept_refinement.moved(change, after.solution.fit.state.anchors_m, rows, longer_m),
         refined_with_ranges=after,
         positions_at_refined=known and replace(known, site_from_model=change),
     )
-
-
-def _refined_moved(metric: MetricResult, change: Similarity) -> MetricResult:
-    """Return the result with the refined map, and with that before its loops were closed, in another world."""
-    refined, loops = metric.refined and rescale(metric.refined, change), metric.loops and metric.loops.moved(change)
-    return replace(metric, refined=refined, loops=loops)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
@@ -522,7 +518,7 @@ def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, Rang
             estimate, moved = estimate_at(at, learned.subset(at.posed.rows), start, survey.scale)
             metric = _moved(metric, at, moved)
         elif (known := metric.positions_at_refined) is not None and metric.kept_refinement is not None:
-            metric = _refined_moved(metric, known.site_from_model)
+            metric = replace(metric, refined=metric.refined and rescale(metric.refined, known.site_from_model))
             estimate = estimate_by_positions_at(known, metric.refined_scale, start, survey.scale)
         else:
             refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)
