@@ -231,6 +231,7 @@ def test_flags_in_the_text_exist() -> None:
 OF_THE_HELP = {"--num_photos", "--quiet"}
 OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--csv", "--ref_images_path", "--transform_path"}
 OF_STUDIES = {
+    "--kinds",
     "--num",
     "--num_clean",
     "--num_keyframes",
