@@ -10,7 +10,13 @@ from tests.simulated.path import loop_path
 from tests.studies import anchor_initialization
 
 from rangesfm.errors import GeometryError
-from rangesfm.ranging.anchors.trilateration import Trilateration, TrilaterationOptions, trilaterate, trilaterate_anchors
+from rangesfm.ranging.anchors.trilateration import (
+    AnchorPlacement,
+    Trilateration,
+    TrilaterationOptions,
+    trilaterate,
+    trilaterate_anchors,
+)
 from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.ranging.errors.range_bins import range_bins
 from rangesfm.ranging.range_log import RangeLog
@@ -101,6 +107,11 @@ class TestPositionsInAPlane:
         assert found.mirror_position_m is not None
         np.testing.assert_allclose(sorted([found.position_m[2], found.mirror_position_m[2]]), [-1.5, 3.5], atol=0.1)
         np.testing.assert_allclose(found.mirror_position_m[:2], ANCHOR_M[:2], atol=0.1)
+
+    def test_put_no_anchor_into_a_file_that_may_be_at_either(self) -> None:
+        either, one = (trilaterate(path, distances(path) + noise(100, 0.02)) for path in (flat(), flight()))
+        assert AnchorPlacement("A", 100, either, None).anchor.position_m is None
+        np.testing.assert_array_equal(AnchorPlacement("A", 100, one, None).anchor.position_m, one.position_m)
 
     @pytest.mark.parametrize(("toward", "height"), [((0, 0, 1), 3.5), ((0, 0, -1), -1.5)])
     def test_give_the_one_that_is_asked_for(self, toward: tuple[float, float, float], height: float) -> None:
