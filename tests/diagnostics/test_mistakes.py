@@ -263,6 +263,14 @@ def test_every_hypothesis_has_a_largest_size_that_can_happen(of_yard: Linearized
         assert not each.can_be(np.full(each.num, 1.01 * each.most))
 
 
+def test_one_step_finds_the_size_of_those_that_change_the_ranges_in_proportion(of_yard: Linearized) -> None:
+    for each in (h for of_kind in (*STANDING, *SCANNING) for h in of_kind(of_yard)):
+        once_m, thrice_m = (each.correction(np.full(each.num, size)).longer_m for size in (0.01, 0.03))
+        # Ranges that are too long by a share are divided by it, so that their correction is no share of theirs.
+        if once_m is not None and thrice_m is not None and each.name != "range scale":
+            assert each.is_linear == np.allclose(thrice_m, 3 * once_m, atol=1e-12), each.key
+
+
 @pytest.mark.parametrize(("size", "said"), [(0.03, "3.0 % too long"), (-0.03, "3.0 % too short")])
 def test_ranges_that_grow_too_much_are_said_to_be_too_long(size: float, said: str, of_yard: Linearized) -> None:
     (of_all,) = [h for of_kind in STANDING for h in of_kind(of_yard) if h.name == "range scale"]
