@@ -1,4 +1,4 @@
-"""How far a map may be bent is told by its photos, and for a path without points by a random walk."""
+"""The photos tell how far a map may be bent, and for a path without points a random walk does."""
 
 from __future__ import annotations
 

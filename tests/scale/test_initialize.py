@@ -376,6 +376,9 @@ def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_s
     assert abs(alone.value / truth - 1) > 0.02
     assert held.value == pytest.approx(truth, rel=0.005)
     assert held.uncertainty.formal < 0.5 * alone.uncertainty.formal
+    # The judged problem holds the scale no better than the lengths do in a map that bends.
+    lengths, posed = known(held.lengths), known(known(held.problem).ranges.distances)
+    assert posed.stddev_m[0] == pytest.approx(lengths.value * lengths.relative_stddev)
 
 
 @pytest.mark.parametrize("wrong", [0, 1])
