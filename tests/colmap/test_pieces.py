@@ -7,10 +7,12 @@ import pycolmap
 import pytest
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import sequence_path
+from tests.simulated.pieces import leave_across, points_across
 
 from rangesfm.colmap.pieces import MIN_NUM_SHARED, loose_pieces
 
-NUM_PHOTOS, FIRST_OF_SECOND = 30, 19
+NUM_PHOTOS = 30
+SECOND = tuple(f"frame_{k:05d}.jpg" for k in range(19, NUM_PHOTOS + 1))
 
 
 @pytest.fixture
@@ -24,25 +26,15 @@ def model() -> pycolmap.Reconstruction:
     return walk.reconstruction
 
 
-def shared_across(model: pycolmap.Reconstruction, first_of_second: int) -> list[int]:
-    """Return the ids of the points that photos on both sides of a gap see; ids of photos count from 1."""
-    return [
-        point_id
-        for point_id, point in model.points3D.items()
-        if len({element.image_id >= first_of_second for element in point.track.elements}) == 2
-    ]
-
-
 def with_neck(model: pycolmap.Reconstruction, num_points: int) -> pycolmap.Reconstruction:
     """Return the model with only so many points seen on both sides of the gap."""
     cut = pycolmap.Reconstruction(model)
-    for point_id in sorted(shared_across(model, FIRST_OF_SECOND))[num_points:]:
-        cut.delete_point3D(point_id)
+    leave_across(cut, SECOND, num_points)
     return cut
 
 
 def test_a_chain_of_photos_that_share_points_is_one_piece(model: pycolmap.Reconstruction) -> None:
-    assert len(shared_across(model, FIRST_OF_SECOND)) > 2 * MIN_NUM_SHARED
+    assert len(points_across(model, SECOND)) > 2 * MIN_NUM_SHARED
     assert loose_pieces(model) == ()
 
 
@@ -50,7 +42,7 @@ def test_a_chain_of_photos_that_share_points_is_one_piece(model: pycolmap.Recons
 def test_a_neck_of_few_points_leaves_two_pieces(model: pycolmap.Reconstruction, num_points: int) -> None:
     (piece,) = loose_pieces(with_neck(model, num_points))
     assert piece.num_shared == num_points
-    assert piece.image_names == tuple(f"frame_{k:05d}.jpg" for k in range(FIRST_OF_SECOND, NUM_PHOTOS + 1))
+    assert piece.image_names == SECOND
 
 
 def test_enough_points_in_a_neck_hold_the_model_together(model: pycolmap.Reconstruction) -> None:

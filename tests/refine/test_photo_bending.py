@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
+from tests.simulated.pieces import leave_across
 
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RefineOptions
@@ -75,13 +76,7 @@ def test_parts_that_share_few_points_are_not_held_together(num_across: int, are_
     model = simulated(pixel_stddev=0.5).reconstruction
     names = sorted(image.name for image in model.images.values())
     second = set(names[NUM // 2 :])
-    across = [
-        point_id
-        for point_id, point in sorted(model.points3D.items())
-        if len({model.image(element.image_id).name in second for element in point.track.elements}) == 2
-    ]
-    for point_id in across[num_across:]:
-        model.delete_point3D(point_id)
+    leave_across(model, second, num_across)
     bending = bending_of(model)
     assert isinstance(bending, PhotoBending)
     assert bending.hold_together(second) == are_held

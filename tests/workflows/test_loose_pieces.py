@@ -8,6 +8,7 @@ import re
 import pycolmap
 import pytest
 from tests.conftest import Command, WalkedSurvey
+from tests.simulated.pieces import leave_across
 
 
 @pytest.mark.parametrize(("num_across", "is_held"), [(5, False), (8, True)])
@@ -18,13 +19,7 @@ def test_a_model_of_two_pieces_is_named_as_such_if_their_few_points_leave_the_sc
     model = pycolmap.Reconstruction(folder)
     names = sorted(image.name for image in model.images.values())
     second = set(names[25:])
-    across = [
-        point_id
-        for point_id, point in sorted(model.points3D.items())
-        if len({model.image(element.image_id).name in second for element in point.track.elements}) == 2
-    ]
-    for point_id in across[num_across:]:
-        model.delete_point3D(point_id)
+    leave_across(model, second, num_across)
     model.write(folder)
     flags = (*own_survey.flags, "--anchors", "anchors.csv", "--no_report", "--output_path", "out")
     said = rangesfm_command("scale", *flags, cwd=own_survey.folder)

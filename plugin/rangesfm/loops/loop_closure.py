@@ -23,20 +23,18 @@ class LoopClosure:
         num_verified: pairs of these that match.
         closed: pairs of these that were used.
         contradicted: pairs of these that the ranges contradict.
-        before, after: keyframes of the refined map before and after, metres.
+        before: keyframes of the map that would be the result with its loops open, metres; None if none was closed.
     """
 
     num_proposed: int
     num_verified: int
     closed: tuple[NamedPair, ...]
     contradicted: tuple[NamedPair, ...]
-    before: Trajectory
-    after: Trajectory
+    before: Trajectory | None
 
-    @property
-    def moved_m(self) -> float:
-        """Return the root mean square movement of the keyframes."""
-        return rmse(self.after.centers - self.before.centers)
+    def moved_m(self, after: Trajectory) -> float:
+        """Return the root mean square movement of the keyframes, whose path is now ``after``."""
+        return 0.0 if self.before is None else rmse(after.centers - self.before.centers)
 
     @property
     def warning(self) -> str | None:
@@ -51,5 +49,4 @@ class LoopClosure:
 
     def moved(self, offset_m: Array) -> LoopClosure:
         """Return the same in a world whose coordinates are larger by ``offset_m`` (3,)."""
-        before, after = (path.transformed(1.0, np.eye(3), offset_m) for path in (self.before, self.after))
-        return replace(self, before=before, after=after)
+        return replace(self, before=self.before and self.before.transformed(1.0, np.eye(3), offset_m))

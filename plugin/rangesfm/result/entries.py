@@ -322,7 +322,7 @@ class LoopsEntry(Record):
             num_verified=loops.num_verified,
             num_closed=len(loops.closed),
             num_contradicted=len(loops.contradicted),
-            moved_m=loops.moved_m,
+            moved_m=loops.moved_m(found.trajectory.as_in(found.final)),
         )
 
 

@@ -24,6 +24,7 @@ from rangesfm.loops.loop_closure import LoopClosure
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.clock.time_offset import TimeOffset
+from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.at_map import MapWithRanges
@@ -106,6 +107,13 @@ class MetricResult:
     def kept_refinement(self) -> RefineSummary | None:
         """Return the summary of the refinement; None where the final model is the scaled one."""
         return None if self.why_broken else self.refinement
+
+    @property
+    def learned_at_refined(self) -> LearnedErrors | None:
+        """Return the learnt errors of the ranges that take part in the kept refined map; None without any."""
+        at, kept = self.refined_with_ranges, self.kept_refinement
+        learned = None if kept is None else kept.errors.learned
+        return None if at is None or learned is None else learned.subset(at.posed.rows)
 
     @property
     def by_positions(self) -> PositionScale | None:

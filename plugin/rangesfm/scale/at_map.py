@@ -97,6 +97,10 @@ class MapWithRanges:
         """Return the (k,) predicted ranges."""
         return predicted_ranges(self.solution.problem, self.solution.fit.state)
 
+    def change_to(self, moved: MapWithRanges) -> Similarity:
+        """Return the change of the world by which this map becomes the same one moved as a whole."""
+        return moved.metric_from_model @ self.metric_from_model.inverse()
+
     def learned(self) -> LearnedErrors:
         """Estimate the errors of the ranges and of the map from the residuals at this map."""
         return learned_errors(self.posed, self.solution, self.bending)

@@ -104,8 +104,8 @@ def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: Trie
         tuple((after.final.image(first).name, after.final.image(second).name) for first, second in sorted(pairs))
         for pairs in (tried.closed, tried.contradicted)
     )
-    paths = (_delivered(before), _delivered(after)) if closed else (_delivered(after),) * 2
-    loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, *paths)
+    path_before = _delivered(before) if closed else None
+    loops = LoopClosure(len(tried.proposed), len(tried.verified), closed, contradicted, path_before)
     run.journal.warn(*filter(None, [loops.warning]))
     if before.refinement is None or after.refinement is None:
         return replace(after, loops=loops)
@@ -115,9 +115,8 @@ def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: Trie
 
 def _delivered(metric: MetricResult) -> Trajectory:
     """Return the path of a refined map as it would be the result: moved as a whole to where its interval lies."""
-    path, at, refinement = metric.trajectory.as_in(metric.final), metric.refined_with_ranges, metric.kept_refinement
-    if at is None or refinement is None or refinement.errors.learned is None:
+    path, at, learned = metric.trajectory.as_in(metric.final), metric.refined_with_ranges, metric.learned_at_refined
+    if at is None or learned is None:
         return path
-    _, moved = half_way(at, refinement.errors.learned.subset(at.posed.rows), metric.estimate)
-    change = moved.metric_from_model @ at.metric_from_model.inverse()
+    change = at.change_to(half_way(at, learned, metric.estimate)[1])
     return path.transformed(change.scale, change.rotation, change.translation)

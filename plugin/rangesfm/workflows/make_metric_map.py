@@ -489,7 +489,7 @@ def _moved(metric: MetricResult, before: MapWithRanges, after: MapWithRanges) ->
     """Return the result with the refined map moved as a whole."""
     assert metric.refined is not None
     assert metric.kept_refinement is not None
-    change, rows = after.metric_from_model @ before.metric_from_model.inverse(), after.posed.rows
+    change, rows = before.change_to(after), after.posed.rows
     longer_m = after.predicted_m - before.predicted_m
     known = metric.positions_at_refined
     return replace(
@@ -507,15 +507,14 @@ def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, Rang
     Raises:
         GeometryError: the scale is less certain than asked for.
     """
-    start, at, learned = metric.estimate, metric.refined_with_ranges, None
+    start, at, learned = metric.estimate, metric.refined_with_ranges, metric.learned_at_refined
     if at is not None and metric.kept_refinement is not None:
-        learned = metric.kept_refinement.errors.learned
         on_map: RangesOnMap | None = ranges_on_map(at.posed, at.solution, at.bending)
     else:
         on_map = metric.on_map or _ranges_on_scaled(start, None)
     try:
         if at is not None and learned is not None:
-            estimate, moved = estimate_at(at, learned.subset(at.posed.rows), start, survey.scale)
+            estimate, moved = estimate_at(at, learned, start, survey.scale)
             metric = _moved(metric, at, moved)
         elif (known := metric.positions_at_refined) is not None and metric.kept_refinement is not None:
             metric = replace(metric, refined=metric.refined and rescale(metric.refined, known.site_from_model))

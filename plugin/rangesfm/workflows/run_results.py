@@ -131,8 +131,7 @@ def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tu
     frame = metric.estimate.frame
     scaled = metric.trajectory.as_in(metric.scaled)
     refined = None if metric.kept_refinement is None else metric.trajectory.as_in(metric.final)
-    loops = metric.loops
-    loops_open = loops.before if loops is not None and loops.closed else None
+    loops_open = None if metric.loops is None else metric.loops.before
     rows = papers_table(scaled, refined, inputs.reference, frame=frame, loops_open=loops_open)
     in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
     if in_frame is not None:
