@@ -11,14 +11,18 @@ from scipy.spatial.transform import Rotation
 from tests.known import known
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges
+from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
+from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 TAG_IN_CAM_M = (0.0, 0.0, 0.0)
 ANCHOR_M = np.array([8.0, -6.0, 0.3])
@@ -74,3 +78,53 @@ def test_bends_are_in_metres_and_of_each_pose() -> None:
     assert expected.max() > 0
     assert bends_m(found) == pytest.approx(expected)
     assert not len(bends_m(on_map(None)))
+
+
+def drifting(share: float, seed: int) -> tuple[ScaleEstimate, RangesOnMap, Array, Array]:
+    """A walk of three rounds whose scale shrinks by a share from its start to its end, among four surveyed anchors.
+
+    Returns the estimate for the path as one piece, its ranges, and the unscaled and the true places (n, 3).
+    """
+    rng = np.random.default_rng(seed)
+    times = np.arange(240.0)
+    angle = 2 * np.pi * times / 80
+    places = np.column_stack([6 * np.cos(angle), 4 * np.sin(angle), 1.5 + 0.5 * np.sin(3 * angle)])
+    steps = np.diff(places, axis=0) * (1 - share * times[1:, None] / times[-1])
+    drifted = np.vstack([places[:1], places[0] + np.cumsum(steps, axis=0)])
+    turned = Rotation.from_euler("z", angle[:, None]).as_matrix()
+    names = tuple(f"{k:03d}" for k in range(len(times)))
+    path = Trajectory(np.arange(1, len(times) + 1), names, times, drifted / 2.0, turned)
+    anchors_m = np.array([(9, 7, 2.5), (-9, 7, 0.3), (-9, -7, 2.8), (9, -7, 0.4)], dtype=np.float64)
+    at_s = np.sort(rng.uniform(0.0, times[-1], 1600))
+    tags = np.column_stack([np.interp(at_s, times, column) for column in places.T])
+    which = rng.integers(4, size=len(at_s))
+    range_m = np.linalg.norm(tags - anchors_m[which], axis=1) + 0.05 * rng.standard_normal(len(at_s))
+    log = RangeLog.from_arrays(np.array(list("ABCD"))[which], range_m, timestamp_s=at_s)
+    anchors = [Anchor(name, at) for name, at in zip("ABCD", anchors_m, strict=True)]
+    found = initialize_scale(associate(log, path, TAG_IN_CAM_M), path, anchors, anchor_frame="site")
+    bending = WalkBending(in_first_camera(path))
+    return found, ranges_on_map(known(found.problem), known(found.solution), bending), path.centers, places
+
+
+def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much() -> None:
+    rigid, given, path, places = drifting(0.3, seed=0)
+    bent = bent_to_ranges(given)
+    placed = estimate_by_bent(rigid, bent, ScaleOptions())
+    best = align_points(path, places)
+    off_m = rmse(best.apply(path) - places)
+    assert off_m > 0.5
+    assert rmse(placed.metric_from_sfm.apply(path) - places) < 1.02 * off_m
+    # As one piece, the path leaves the scale open by what it drifts; the bent one knows it several times better.
+    half_width = placed.uncertainty.half_width_95
+    assert half_width < 0.5 * rigid.uncertainty.half_width_95
+    assert abs(np.log(placed.value / best.scale)) < half_width
+    assert placed.reasons[-1] == "the path drifts by 0.52 m (root mean square) from where the ranges have it"
+    assert rmse(bends_m(bent)[:, None]) == pytest.approx(off_m, abs=0.02)
+    used = placed.observations.status == RangeStatus.USED
+    assert used.mean() > 0.95
+    np.testing.assert_allclose(placed.errors.stddev_m, 0.05, rtol=0.2)
+
+
+def test_a_path_that_does_not_drift_stays_as_it_was() -> None:
+    rigid, given, _, _ = drifting(0.0, seed=1)
+    assert estimate_by_bent(rigid, bent_to_ranges(given), ScaleOptions()) is rigid

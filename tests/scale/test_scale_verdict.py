@@ -14,6 +14,9 @@ from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_estimate import ScaleUncertainty
+from rangesfm.scale.scale_verdict import judge_lengths, judge_positions
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey
@@ -123,3 +126,38 @@ def test_a_radio_that_reads_short_at_short_range_is_noticed(make_survey: MakeSur
         off.append(abs(survey.relative_error(estimate)) / estimate.uncertainty.half_width_95)
     assert short_m[1] > short_m[0]
     assert max(off) < 1
+
+
+def test_known_positions_that_leave_the_scale_open_are_too_close_together() -> None:
+    options, narrow, wide = ScaleOptions(), ScaleUncertainty(0.01, {}), ScaleUncertainty(0.03, {})
+    assert judge_positions(3, narrow, options, has_check=True).verdict == "good"
+    assert judge_positions(4, narrow, options, has_check=False).verdict == "good"
+    alone = judge_positions(3, narrow, options, has_check=False)
+    assert (alone.verdict, len(alone.reasons)) == ("doubtful", 1)
+    assert alone.reasons[0].startswith("the map rests on 3 known positions")
+    doubted = judge_positions(4, wide, options, has_check=False)
+    assert doubted.verdict == "doubtful"
+    assert doubted.reasons == (
+        "the scale is known to 5.9 % (95 % interval), worse than 4 %",
+        "the known positions are close together for their standard deviations",
+    )
+    with pytest.raises(
+        GeometryError, match=r"only known to 21.6 % .*, worse than the 19.6 % allowed .* close together"
+    ):
+        judge_positions(4, ScaleUncertainty(0.11, {}), options, has_check=False)
+
+
+def test_short_lengths_are_said_to_be_short() -> None:
+    two, one = (
+        LengthScale(1.0, {"tape": 0.01}, rows, rows > 0, *np.ones((5, len(rows))))
+        for rows in (np.arange(2), np.arange(1))
+    )
+    options, narrow, wide = ScaleOptions(), ScaleUncertainty(0.01, {}), ScaleUncertainty(0.03, {})
+    assert judge_lengths(two, narrow, options).verdict == "good"
+    assert judge_lengths(one, narrow, options).reasons[0].startswith("the scale depends on one length")
+    doubted = judge_lengths(two, wide, options)
+    assert (doubted.verdict, doubted.reasons[1:]) == (
+        "doubtful",
+        ("the lengths are short for their standard deviations",),
+    )
+    assert doubted.advice == ("measure more and longer lengths",)

@@ -1,12 +1,15 @@
 """Put small mistakes into the estimation packages, and count how many their tests notice.
 
-    pip install cosmic-ray
-    python -m tests.studies.mutants --num 60 --seed 0 [--first 31]
+    pip install cosmic-ray pytest-cov
+    python -m tests.studies.mutants --num 60 --seed 0 [--first 31] [--keep seen]
 
 Draws mutants (another operator, a number one off, a negated condition, ...) at random from the packages, and puts each
-into a copy of the checkout. Then it runs the tests that mirror its file: its own, the tests of its folder, of the
-folders that use it, and of the workflows, quick ones first. Results of small surveys that are compared with a file of
-numbers have no say. A mutant that all of these pass has survived.
+into a copy of the checkout. Its judges are the tests that run its line, and then the others of their files in the
+folder of its package, as these may use what was made once for all; quick ones first, of four minutes in all. (A
+constant is run where it is read, and the head of a function or class, by what runs any line of it.) A mutant that all
+of these pass has survived. Which test runs which line, and how long it takes, is measured once, before anything is
+changed; ``--keep`` names a folder for that. Results of small surveys that are compared with a file of numbers have no
+say, nor do tests of pages.
 Type hints, ``frozen=True`` and ``strict=True`` are not changed: no run depends on them unless it is wrong already.
 """
 
@@ -26,14 +29,10 @@ import venv
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tests.studies.tests_of_lines import PYTEST, TestsOfLines
+
 PACKAGE = Path("plugin/rangesfm")
 PACKAGES = ("scale", "refine", "ranging/errors", "ranging/anchors", "ranging/clock", "diagnostics", "ceres")
-USED_BY = {
-    "scale": ("join", "planning"),
-    "ranging/errors": ("ranging", "scale", "refine"),
-    "ranging/anchors": ("scale",),
-    "ceres": ("refine",),
-}
 MAX_SECONDS = 1200
 # Operators that are left out: they only apply to type hints, change nothing that runs, or (those of variables) need
 # names.
@@ -67,17 +66,6 @@ def mutants_of(path: Path) -> list[tuple[Mutant, int]]:
     return found
 
 
-def test_commands(path: Path) -> list[list[str]]:
-    """Return the arguments of pytest for each set of tests: the quick and the nearest tests first."""
-    folder = path.parent.relative_to(PACKAGE)
-    tests = Path("tests") / folder
-    own = tests / f"test_{path.stem}.py"
-    commands = [[str(own)]] if own.is_file() else []
-    commands.append([str(tests), f"--ignore={own}"])
-    commands += [[str(Path("tests") / user)] for user in (*USED_BY.get(str(folder), ()), "workflows")]
-    return [[*command, "-m", marked] for marked in ("not slow", "slow") for command in commands]
-
-
 def checkout_of(folder: Path) -> tuple[Path, Path]:
     """Copy what is mutated and what judges it into a folder, and return the copy and a Python that imports from it.
 
@@ -104,7 +92,7 @@ def checkout_of(folder: Path) -> tuple[Path, Path]:
     return copy, python
 
 
-def survives(mutant: Mutant, copy: Path, python: Path) -> tuple[bool, str]:
+def survives(mutant: Mutant, copy: Path, python: Path, judges: list[list[str]]) -> tuple[bool, str]:
     """Return whether every test passes, and the change as a diff."""
     from cosmic_ray.mutating import use_mutation
     from cosmic_ray.plugins import get_operator
@@ -113,13 +101,13 @@ def survives(mutant: Mutant, copy: Path, python: Path) -> tuple[bool, str]:
     with use_mutation(copy / mutant.path, get_operator(mutant.operator)(), mutant.occurrence) as (before, after):
         old, new = before.split("\n"), (after or before).split("\n")
         changed = "; ".join(f"{a.strip()} -> {b.strip()}" for a, b in zip(old, new, strict=False) if a != b)
-        for arguments in test_commands(mutant.path):
-            command = [str(python), "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *arguments]
+        for tests in judges:
+            command = [str(python), *PYTEST, "-x", *tests]
             try:
                 done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, timeout=MAX_SECONDS)
             except subprocess.TimeoutExpired:
                 return False, changed
-            if done.returncode not in (0, 5):  # 5: there are no tests
+            if done.returncode != 0:
                 return False, changed
     return True, changed
 
@@ -129,6 +117,7 @@ def main() -> None:
     parser.add_argument("--num", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=1, help="of those drawn, to go on where a run was cut")
+    parser.add_argument("--keep", type=Path, help="folder for what tests run, which is used again")
     args = parser.parse_args()
     files = sorted(path for package in PACKAGES for path in (PACKAGE / package).glob("*.py") if path.stem != "__init__")
     # Each place counts once, however many changes it allows.
@@ -142,9 +131,11 @@ def main() -> None:
     survivors, left = 0, list(enumerate(drawn, 1))[args.first - 1 :]
     with tempfile.TemporaryDirectory(prefix="mutants_") as folder:
         copy, python = checkout_of(Path(folder))
+        tests_of = TestsOfLines.measured(copy, python, (args.keep or Path(folder)).absolute())
         for num, (mutant, line) in left:
             begun = time.monotonic()
-            survived, changed = survives(mutant, copy, python)
+            judges = tests_of.judges(mutant.path.relative_to(PACKAGE), line)
+            survived, changed = survives(mutant, copy, python, judges)
             survivors += survived
             word = "SURVIVED" if survived else "noticed"
             print(f"{num:3d} {word} {mutant.path}:{line} {changed} ({time.monotonic() - begun:.0f} s)", flush=True)
