@@ -1,4 +1,4 @@
-"""Which tests run a line of the package, and how long each takes: measured once, for all that test what is computed."""
+"""Finding of the tests that run a line of the package, and of how long each takes, by running all of them once."""
 
 from __future__ import annotations
 
