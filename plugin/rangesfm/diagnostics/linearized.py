@@ -135,7 +135,7 @@ class Linearized(LinearMap):
     Its residuals are those of the map as the photos alone would have it. Priors are first those of the anchors' places.
 
     Attributes:
-        place: (c, 3, p) derivative of the camera's position in each bin.
+        place: (c, 3, p) derivative of the tag's position in each bin.
         bins: how ranges are averaged. time_s: (c,) mean times.
         gradient: of the c distances.
         by_lever_arm: (c, 3) derivative of the residual by the lever arm in the camera's frame.

@@ -128,7 +128,7 @@ def _on_ranges(log: RangeLog) -> Iterator[str]:
     shares = np.array([_share_of_one_value(ranges_m) for ranges_m in of_anchors])
     for k in np.flatnonzero(shares > _STUCK_SHARE):
         others = np.delete(shares, k)
-        if len(others) and np.nanmedian(np.append(others, np.nan)) < _MOVING_SHARE:
+        if len(others) and np.median(others) < _MOVING_SHARE:
             yield (
                 f"anchor {log.anchor_ids[k]} reads one and the same value in {100 * shares[k]:.0f} % of its ranges "
                 "while the others change: it is probably stuck; leave it out (--use_anchors)"

@@ -72,7 +72,7 @@ class MapWithRanges:
         placed = Similarity(scale, from_map.rotation.T, trajectory_m.centers[0])
         distances = start.problem.ranges.distances
         if distances is not None and lengths is not None:
-            distances = lengths.at_scale(1 / scale).beside_ranges(distances, with_bending=True)
+            distances = lengths.scaled_by(1 / scale).beside_ranges(distances, with_bending=True)
         problem = replace(
             start.problem.ranges,
             centers=placed.inverse().apply(centers_m),

@@ -89,9 +89,9 @@ class LengthScale:
         """(m,) squared excess of each length, in standard deviations."""
         return (self.too_long_m / self.stddev_m) ** 2
 
-    def at_scale(self, metres_per_unit: float) -> LengthScale:
-        """Return the lengths for a map whose unit is ``metres_per_unit`` of this one's."""
-        return replace(self, value=self.value / metres_per_unit)
+    def scaled_by(self, factor: float) -> LengthScale:
+        """Return the lengths for the map with all its coordinates multiplied by a factor."""
+        return replace(self, value=self.value / factor)
 
     def beside_ranges(self, distances: LocatedDistances, *, with_bending: bool = False) -> LocatedDistances:
         """Return the distances with one length that gives the same scale in place of all those between points, if used.

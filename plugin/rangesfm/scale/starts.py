@@ -79,7 +79,7 @@ def scale_candidates(problem: RangeProblem) -> Array:
         far = moved > max(0.5 * moved.max(initial=0.0), rounding_of(centers))
         changed = np.abs(ranges[first] - ranges[second])
         ratios.append(np.where(changed > rounding_of(ranges), changed, 0.0)[far] / moved[far])
-    ratio = np.concatenate(ratios) if ratios else np.empty(0)
+    ratio = np.concatenate(ratios)
     lower = float(np.quantile(ratio, 0.75)) if len(ratio) else 0.0
     if not lower > 0:
         raise GeometryError("the scale is not determined: the camera hardly moved, or no range changed as it did")
@@ -177,7 +177,7 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
 
     Returns:
         the state, the (m, 3) places on the other side, and (m,) by how much the robust cost is higher there; inf for
-        known anchors.
+        known anchors, and where both sides lead to one place.
     """
     anchors, rise = state.anchors_m.copy(), np.full(problem.num_anchors, np.inf)
     others = anchors.copy()
@@ -198,7 +198,12 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
         if not math.isclose(fits[0].cost, fits[1].cost, rel_tol=SAME_COST, abs_tol=SAME_COST):
             fits.sort(key=lambda fit: fit.cost)
         anchors[k], others[k] = (fit.state.anchors_m[0] for fit in fits)
-        rise[k] = fits[1].cost - fits[0].cost
+        between = [
+            0.5 * (first + second) for first, second in zip(*((f.state.anchors_m, f.state.bias_m) for f in fits))
+        ]
+        ridge = solve(alone, RangeState(IDENTITY, *between), max_num_evaluations=1).cost
+        if ridge > max(fit.cost for fit in fits):
+            rise[k] = fits[1].cost - fits[0].cost
     return replace(state, anchors_m=anchors), others, rise
 
 
@@ -298,8 +303,6 @@ def _hilltops(scales: Array, counts: Indices) -> list[float]:
     cells = np.floor(np.log(scales) / _LOG_CELL).astype(np.int64)
     first = np.unique(cells, return_index=True)[1]
     best = np.maximum.reduceat(counts, first)
-    if len(first) == 1:
-        return [float(scales[np.argmax(counts)])]
     beside = np.diff(cells[first]) == 1
     lower = np.concatenate([[0], np.where(beside, best[:-1], 0)])
     higher = np.concatenate([np.where(beside, best[1:], 0), [0]])

@@ -53,7 +53,7 @@ _MAX_NUM_WINDOWS = 20_000
 _MAX_STRETCH = 3.0  # a window longer than this many typical ones has a gap in it
 _NUM_PARABOLA_ROUNDS = 8
 _STEPS_M = (0.1, 0.01)
-_ROUNDED_TO_M = 1e-5  # rounding of 32-bit numbers, for ranges of some hundred metres
+_ROUNDING = np.finfo(np.float32).eps  # of a log with 32-bit numbers, relative
 
 
 def robust_stddev(residuals: npt.ArrayLike) -> float:
@@ -230,7 +230,7 @@ def find_quantization_m(range_m: Array) -> float | None:
     if len(range_m) < MIN_NUM_OF_SCATTER:
         return None
     for step in _STEPS_M:
-        if np.all(np.abs(range_m - np.round(range_m / step) * step) < _ROUNDED_TO_M):
+        if np.all(np.abs(range_m - np.round(range_m / step) * step) <= _ROUNDING * range_m):
             return step
     return None
 
