@@ -7,7 +7,8 @@ import numpy.typing as npt
 import pytest
 from scipy.sparse import block_diag, csr_array
 
-from rangesfm.ceres.nested_dissection import NestedFactor, SingularError, cost_of_factor, fronts_of
+from rangesfm.ceres import nested_dissection
+from rangesfm.ceres.nested_dissection import Front, NestedFactor, SingularError, cost_of_factor, fronts_of
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -102,3 +103,117 @@ def test_a_singular_matrix_names_a_column_of_the_dependent_block() -> None:
     with pytest.raises(SingularError) as raised:
         NestedFactor(csr_array(matrix), starts, np.zeros(36, dtype=bool))
     assert raised.value.column == 40
+    assert str(raised.value) == "column 40 depends on others"
+
+
+def path(num: int, seed: int | None = None) -> csr_array:
+    """Return blocks each of which is tied to the next one; with a seed, they are numbered in random order."""
+    name = np.arange(num) if seed is None else np.random.default_rng(seed).permutation(num)
+    tied = np.eye(num)
+    tied[name[1:], name[:-1]] = tied[name[:-1], name[1:]] = 1.0
+    return csr_array(tied)
+
+
+@pytest.mark.parametrize(("max_leaf", "is_own"), [(4, False), (50, True)])
+def test_only_more_blocks_than_a_leaf_has_are_divided(
+    max_leaf: int, is_own: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if is_own:
+        monkeypatch.undo()  # the module's own number, which the other tests make smaller
+    (whole,) = fronts_of(path(max_leaf), np.zeros(max_leaf, dtype=bool))
+    assert sorted(whole.own.tolist()) == list(range(max_leaf))
+    assert len(whole.boundary) == 0
+    parts = fronts_of(path(max_leaf + 1), np.zeros(max_leaf + 1, dtype=bool))
+    assert sorted(len(front.boundary) for front in parts) == [0, 1, 1]
+    assert len(parts[-1].own) == 1  # one block of a path separates its ends
+
+
+@pytest.mark.parametrize("seed", [None, 0, 1])
+def test_the_order_of_a_path_is_along_it(seed: int | None) -> None:
+    name = np.arange(20) if seed is None else np.random.default_rng(seed).permutation(20)
+    order = nested_dissection._order_along(path(20, seed)).tolist()
+    assert order in (name.tolist(), name[::-1].tolist())
+
+
+@pytest.mark.parametrize("seed", [None, 0, 1])
+def test_a_separator_leaves_30_percent_at_either_end(seed: int | None) -> None:
+    """It is one block of a path, and the smallest row of a field with more columns than rows."""
+    for tied, num_between in ((path(21, seed), 1), (strip_of(7, 3), 3)):
+        num = tied.shape[0]
+        is_between, is_first = nested_dissection._separator(tied)
+        assert is_between.sum() == num_between
+        halves = [np.flatnonzero(half & ~is_between) for half in (is_first, ~is_first)]
+        assert min(map(len, halves)) >= 6  # 30 % of 21, rounded down
+        assert sum(map(len, halves)) == num - num_between
+        assert not tied.toarray()[np.ix_(*halves)].any()
+
+
+def strip_of(num_columns: int, num_rows: int) -> csr_array:
+    """Return blocks in columns and rows that are tied to their neighbours."""
+    place = np.array([(x, y) for x in range(num_columns) for y in range(num_rows)])
+    return csr_array((np.abs(place[:, None] - place).max(axis=2) <= 1).astype(float))
+
+
+def test_blocks_that_all_overlap_are_not_divided() -> None:
+    (front,) = fronts_of(csr_array(np.ones((9, 9))), np.zeros(9, dtype=bool))
+    assert sorted(front.own.tolist()) == list(range(9))
+    assert cost_of_factor(csr_array(np.ones((9, 9)))) == pytest.approx(9**3 / 3)
+
+
+def test_the_cost_is_that_of_the_fronts(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second, third = np.arange(2), np.arange(2, 3), np.arange(3, 8)
+    fronts = [Front(first, third[:3], ()), Front(second, third[:1], ()), Front(third, third[:0], (0, 1))]
+    monkeypatch.setattr(nested_dissection, "fronts_of", lambda tied, is_last: fronts)
+    # The factor of a front's own part, its inverse times the tie, and the square of this.
+    expected = (8 / 3 + 4 * 3 + 2 * 9) + (1 / 3 + 1 * 1 + 1 * 1) + 125 / 3
+    assert cost_of_factor(csr_array((8, 8))) == pytest.approx(expected)
+
+
+def test_blocks_are_tied_where_a_matrix_has_entries() -> None:
+    starts = np.array([0, 2, 3, 6])
+    matrix = np.zeros((6, 6))
+    matrix[1, 4] = matrix[4, 1] = 3.0
+    matrix[2, 2] = 1.0
+    expected = [[False, False, True], [False, True, False], [True, False, False]]
+    assert (nested_dissection._tied_blocks(csr_array(matrix), starts).toarray() > 0).tolist() == expected
+
+
+def test_columns_of_blocks_are_block_by_block() -> None:
+    starts = np.array([0, 2, 3, 6])
+    blocks = [np.array([2]), np.array([0, 1])]
+    assert nested_dissection._columns_of(blocks, starts).tolist() == [3, 4, 5, 0, 1, 2]
+    assert nested_dissection._columns_of([], starts).tolist() == []
+
+
+def test_the_rest_of_a_child_is_found_in_runs() -> None:
+    child = nested_dissection._Shape(np.array([3, 4, 7, 8, 10, 12, 13]), 2, ())
+    parent = nested_dissection._Shape(np.array([7, 8, 9, 10, 11, 12, 13]), 3, (0,))
+    assert child.own == slice(3, 5)
+    assert child.rest.tolist() == [7, 8, 10, 12, 13]
+    assert parent.runs_of(child) == [
+        (slice(0, 2), slice(0, 2)),
+        (slice(3, 4), slice(2, 3)),
+        (slice(5, 7), slice(3, 5)),
+    ]
+
+
+def test_an_eliminated_part_is_solved_and_inverted_by_its_factor() -> None:
+    lower = np.array([[2.0, 0, 0], [1.0, 3.0, 0], [-1.0, 0.5, 4.0]])
+    part = nested_dissection._Eliminated(np.asfortranarray(lower), np.zeros((3, 0)))
+    right = np.arange(6.0).reshape(3, 2)
+    np.testing.assert_allclose(part.solved(right), np.linalg.solve(lower, right))
+    np.testing.assert_allclose(part.solved(right, transposed=True), np.linalg.solve(lower.T, right))
+    np.testing.assert_allclose(part.inverse(), np.linalg.inv(lower @ lower.T))
+    assert part.solved(right[:, :0]).shape == (3, 0)
+
+
+def test_a_matrix_of_no_blocks_has_no_pivots() -> None:
+    factor = NestedFactor(np.zeros((0, 0)), np.array([0]), np.zeros(0, dtype=bool))
+    assert factor.pivots.shape == (0,)
+    assert factor.blocks_of_sandwich(np.zeros((0, 0))) == []
+
+
+def test_the_pivots_are_in_the_order_of_the_columns() -> None:
+    diagonal = np.random.default_rng(0).uniform(1.0, 2.0, 24)
+    factor = NestedFactor(csr_array(np.diag(diagonal)), np.arange(0, 25, 2), np.zeros(12, dtype=bool))
+    np.testing.assert_allclose(factor.pivots, diagonal)

@@ -126,3 +126,162 @@ def test_the_modes_of_many_keyframes_take_memory_in_proportion_to_them(monkeypat
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak_bytes < 0.5 * 8 * (6 * num) ** 2  # half of a matrix with an entry for each two numbers
+
+
+def covariance_like(size: int, rank: int, seed: int = 0) -> Array:
+    """Return a random covariance matrix of a rank."""
+    factor = np.random.default_rng(seed).normal(size=(size, rank))
+    return factor @ factor.T
+
+
+def some_parts() -> list[PartSteps]:
+    """Return two frames around an anchor and a camera that is held; the first two columns belong to none of them."""
+    rng = np.random.default_rng(1)
+    return [
+        PartSteps("frame", 7, 5, rng.normal(size=(4, 3)), np.array([10.0, 10.0, 1.0, 1.0])),
+        PartSteps("anchor", "A", 2, np.diag([1.0, 2.0, 3.0]), np.ones(3)),
+        PartSteps("camera", 3, None, np.eye(2), np.array([0.1, 0.2])),
+        PartSteps("frame", 8, 8, rng.normal(size=(4, 3)), np.array([10.0, 10.0, 1.0, 1.0])),
+    ]
+
+
+def of_all_numbers(parts: list[PartSteps], covariance: Array) -> Array:
+    """Return the (size, numbers) derivatives of all numbers of all parts, part by part."""
+    steps = []
+    for part in parts:
+        slopes = np.zeros((len(covariance), len(part.unit)))
+        if part.start is not None:
+            slopes[part.start : part.start + part.by_step.shape[1]] = part.by_step.T
+        steps.append(slopes)
+    return np.hstack(steps)
+
+
+def errors_of(
+    parts: list[PartSteps], covariance: Array, of_scale: Array | None = None, scale_stddev: float = 0.0
+) -> MapErrors:
+    widths = {part.start: part.by_step.shape[1] for part in parts}
+    slopes = np.zeros(len(covariance)) if of_scale is None else of_scale
+    return map_errors(
+        parts,
+        len(covariance),
+        lambda right: covariance @ right,
+        lambda start: covariance[start : start + widths[start], start : start + widths[start]],
+        slopes,
+        scale_stddev,
+    )
+
+
+def test_the_modes_of_few_numbers_have_their_whole_covariance() -> None:
+    parts, covariance = some_parts(), covariance_like(11, 11)
+    found = errors_of(parts, covariance).parts
+    assert {kind: of.ids for kind, of in found.items()} == {"frame": (7, 8), "anchor": ("A",), "camera": (3,)}
+    modes = np.vstack([found["frame"].modes[0], found["anchor"].modes[0], found["camera"].modes[0]])
+    modes = np.vstack([modes, found["frame"].modes[1]])
+    steps = of_all_numbers(parts, covariance)
+    expected = steps.T @ covariance @ steps
+    np.testing.assert_allclose(modes @ modes.T, expected, rtol=0, atol=1e-8 * expected.max())
+    for of in found.values():
+        assert np.abs(of.rests).max() < 1e-8 * expected.max()
+
+
+def test_what_few_modes_leave_of_a_part_is_independent_of_other_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(part_errors, "MAX_NUM_MODES", 4)
+    parts, covariance = some_parts(), covariance_like(11, 11)
+    found = errors_of(parts, covariance).parts
+    steps = of_all_numbers(parts, covariance)
+    whole = steps.T @ covariance @ steps
+    for kind, row, first in (("frame", 0, 0), ("anchor", 0, 4), ("camera", 0, 7), ("frame", 1, 9)):
+        modes, rest = found[kind].modes[row], found[kind].rests[row]  # type: ignore[index]
+        numbers = slice(first, first + len(modes))
+        assert modes.shape[1] == 4
+        np.testing.assert_allclose(modes @ modes.T + rest, whole[numbers, numbers], atol=1e-8 * whole.max())
+        assert np.linalg.eigvalsh(rest).min() > -1e-9 * whole.max()
+        assert (np.trace(rest) > 1e-3) == (kind != "camera")
+
+
+def test_the_largest_modes_are_the_largest_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(part_errors, "MAX_NUM_MODES", 1)
+    parts = [
+        PartSteps("frame", 1, 0, np.eye(2), np.array([1.0, 100.0])),
+        PartSteps("anchor", "A", 2, np.eye(2), np.ones(2)),
+    ]
+    found = errors_of(parts, np.diag([9.0, 1.0, 16.0, 4.0])).parts
+    # The second number has a variance of 1 in its own unit, but 10 000 square metres.
+    (mode,), (others,) = found["frame"].modes[..., 0], found["anchor"].modes[..., 0]
+    assert abs(mode[1]) == pytest.approx(1.0, abs=1e-6)
+    assert abs(mode[0]) < 1e-3
+    assert np.abs(others).max() < 1e-3
+    np.testing.assert_allclose(found["anchor"].rests[0], np.diag([16.0, 4.0]), atol=1e-3)
+
+
+def test_parts_change_with_the_scale_as_their_covariance_with_it_says() -> None:
+    parts, covariance = some_parts(), covariance_like(11, 11)
+    of_scale = np.random.default_rng(2).normal(size=11)
+    scale_stddev = float(np.sqrt(of_scale @ covariance @ of_scale))
+    errors = errors_of(parts, covariance, of_scale, scale_stddev)
+    assert errors.scale_stddev == scale_stddev
+    expected = of_all_numbers(parts, covariance).T @ covariance @ of_scale / scale_stddev**2
+    found = errors.parts
+    np.testing.assert_allclose(found["frame"].by_scale, [expected[:4], expected[9:]])
+    np.testing.assert_allclose(found["anchor"].by_scale, [expected[4:7]])
+    np.testing.assert_array_equal(found["camera"].by_scale, np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("scale_stddev", [0.0, np.nan])
+def test_nothing_changes_with_a_scale_that_does_not_err(scale_stddev: float) -> None:
+    found = errors_of(some_parts(), covariance_like(11, 11), np.ones(11), scale_stddev).parts
+    assert not any(of.by_scale.any() for of in found.values())
+
+
+def test_no_parts_have_no_errors() -> None:
+    assert errors_of([], covariance_like(3, 3)).parts == {}
+
+
+@pytest.mark.parametrize(("size", "num_modes", "num_products"), [(3, 3, 1), (4, 4, 1), (5, 4, 3)])
+def test_only_of_more_numbers_than_modes_a_subspace_is_looked_for(
+    size: int, num_modes: int, num_products: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A product is a solution of the normal equations for many right sides, so there are only two further ones."""
+    monkeypatch.setattr(part_errors, "MAX_NUM_MODES", 4)
+    covariance, widths = covariance_like(size, 3), []
+
+    def product(right: Array) -> Array:
+        widths.append(right.shape[1])
+        return covariance @ right
+
+    found = part_errors._largest_modes(product, size)
+    assert found.shape == (size, num_modes)
+    assert widths == [num_modes] * num_products
+    np.testing.assert_allclose(found @ found.T, covariance, atol=1e-9)  # 4 modes have all of a covariance of rank 3
+
+
+def test_there_are_at_most_300_modes() -> None:
+    variances = np.ones(301)
+    assert part_errors._largest_modes(lambda right: variances[:, None] * right, 301).shape == (301, 300)
+
+
+def test_modes_that_may_be_rounding_are_made_smaller() -> None:
+    variances = np.array([4.0, 4.4e-10, 3.6e-10, 4e-12, -1e-16, 0.0])
+    found = part_errors._largest_modes(lambda right: variances[:, None] * right, 6)
+    # Below 1e-10 of the largest variance, the mode is the variance over the root of that.
+    expected = [4.0, 4.4e-10, 3.6e-10**2 / 4e-10, 4e-12**2 / 4e-10, 0.0, 0.0]
+    np.testing.assert_allclose(np.diag(found @ found.T), expected, rtol=1e-9, atol=1e-20)
+
+
+def test_a_covariance_of_zero_has_modes_of_zero() -> None:
+    assert not part_errors._largest_modes(np.zeros_like, 3).any()
+    assert part_errors._largest_modes(np.zeros_like, 0).shape == (0, 0)
+
+
+def test_the_rest_of_a_part_has_no_negative_variance() -> None:
+    part = PartSteps("anchor", "A", 5, np.array([[0.0, 1.0], [2.0, 0.0]]), np.ones(2))
+    asked: list[int] = []
+
+    def block(start: int) -> Array:
+        asked.append(start)
+        return np.diag([1.0, 9.0])
+
+    # The two numbers have the variances 9 and 4, of which the modes have 5 and 4.5.
+    found = part_errors._rest(part, block, np.diag(np.sqrt([5.0, 4.5])))
+    np.testing.assert_allclose(found, [[4.0, 0.0], [0.0, 0.0]], atol=1e-12)
+    assert asked == [5]

@@ -10,18 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.diagnostics.test_alternatives import on_map
+from tests.diagnostics.test_hypothesis_tests import made_test
 from tests.known import known
 from tests.studies.erring_surveys import SITES, Given, run, surveyed
 from tests.studies.mistakes import kinds
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.diagnostics.alternatives import alternatives
+from rangesfm.diagnostics import hypothesis_tests, mistakes
+from rangesfm.diagnostics.alternatives import Alternative, alternatives
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis import Hypothesis
+from rangesfm.diagnostics.hypothesis import Correction, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized, linearized
-from rangesfm.diagnostics.mistakes import _settled_test, _varied
+from rangesfm.diagnostics.mistakes import Cause, _settled_test, _varied
 from rangesfm.diagnostics.timed_hypotheses import SCANNING, _changes
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.scale.range_equation import RangeState
 
 HALL, YARD, DRONE = SITES
 SEED = 3
@@ -320,3 +325,291 @@ def test_a_lever_arm_in_other_axes_is_as_long_as_it_was_given() -> None:
     assert len(moves_m) == 5
     np.testing.assert_allclose(np.linalg.norm(arm_m + np.array(moves_m), axis=1), np.linalg.norm(arm_m), rtol=1e-6)
     assert len(np.unique(np.round(moves_m, 6), axis=0)) == 5
+
+
+@pytest.mark.parametrize(
+    ("steps", "num_until_told"),
+    [
+        ([3.0, 2.0, 1.0, 0.5], None),
+        ([1.0, 2.0, 3.0], 3),  # the first may be too short, with a large mistake
+        ([1.0, 2.0, 1.5, 2.5, 2.0], None),  # steps that go up and down do not grow
+        ([4.0, 1.0, 1.0, 1.0, 1.0], None),
+        ([3.0, 1.0, 2.0, 2.5, 1.0], 4),
+        ([1.0, np.nan, np.inf], 3),
+        ([np.inf, np.inf], 2),
+    ],
+)
+def test_steps_that_grow_twice_in_a_row_do_not_shrink(steps: list[float], num_until_told: int | None) -> None:
+    of_all = mistakes._Steps()
+    told = [of_all.grow(step) for step in steps]
+    assert (told.index(True) + 1 if any(told) else None) == num_until_told
+
+
+STATE = RangeState(IDENTITY, np.zeros((1, 3)), np.zeros(1))
+NUM_BINS = 20
+# What is needed of a linear problem by those that only count its residuals.
+PROBLEM: Any = SimpleNamespace(residual_m=np.zeros(NUM_BINS), scatter_m=0.1, on_map=SimpleNamespace(bending=None))
+
+
+def cause_of(gain: float, penalty: float = 0.0, test: hypothesis_tests.Test | None = None) -> Cause:
+    return Cause("bias", "A2", "words", "remedy", Correction(), gain, penalty, STATE, test)
+
+
+def test_a_rival_is_about_as_likely_or_explains_nearly_the_same() -> None:
+    """The score is the gain less the penalty."""
+    best = cause_of(120.0, 20.0)
+    assert best.score == 100.0
+    assert mistakes._is_rival(best, cause_of(104.1, 10.0))
+    assert not mistakes._is_rival(best, cause_of(103.9, 10.0))
+
+    def along(share: float) -> hypothesis_tests.Test:
+        return made_test(stddevs=[1.0], basis=np.array([[share], [np.sqrt(1 - share**2)], *[[0.0]] * 7]))
+
+    sure = cause_of(100.0, test=along(1.0))
+    assert mistakes._is_rival(sure, cause_of(10.0, test=along(0.96)))
+    assert not mistakes._is_rival(sure, cause_of(10.0, test=along(0.94)))
+    assert not mistakes._is_rival(sure, cause_of(10.0))
+    assert not mistakes._is_rival(cause_of(100.0), cause_of(10.0, test=along(1.0)))
+
+
+def test_each_number_that_a_hypothesis_chooses_costs_the_logarithm_of_the_number_of_bins() -> None:
+    assert mistakes._penalty(made_test(sizes=(1, 1, 1), stddevs=(1, 1, 1)), 100) == pytest.approx(3 * np.log(100))
+
+
+def test_of_each_kind_and_subject_the_test_that_fits_best_is_kept() -> None:
+    """An impossible size is only kept if there is no possible one."""
+    steps = [
+        made_test(name="step", statistic=statistic, smallest_detectable=smallest, most=most)
+        for statistic, smallest, most in ((9.0, 0.1, 5.0), (30.0, 0.2, 5.0), (99.0, 0.3, 0.5), (8.0, 9.0, 5.0))
+    ]
+    places = [
+        made_test(name="anchor place", subject=name, statistic=33.0, sizes=(1, 1, 1), stddevs=(1, 1, 1))
+        for name in ("A1", "A2")
+    ]
+    impossible = made_test(name="drift", statistic=50.0, most=0.5)
+    found = mistakes._best_of_each([*steps[:2], places[0], impossible, *steps[2:], places[1]], PROBLEM)
+    # Statistics less the penalties: 50 - 3, 30 - 3, and 33 - 9 for three numbers each.
+    assert [(test.hypothesis.key, test.statistic) for test in found] == [
+        (("drift", ""), 50.0),
+        (("step", ""), 30.0),
+        (("anchor place", "A1"), 33.0),
+        (("anchor place", "A2"), 33.0),
+    ]
+    assert found[1].smallest_detectable == pytest.approx(0.25)
+
+
+def test_a_mistake_with_a_time_is_tried_between_the_times_that_were_searched() -> None:
+    statistics = {"given": 5.0, "earlier": 7.0, "later": 6.0}
+    of_name = {name: made_test(name=name).hypothesis for name in statistics}
+    factorized: Any = SimpleNamespace(
+        estimates=lambda tried: [SimpleNamespace(hypothesis=h, statistic=statistics[h.name]) for h in tried]
+    )
+    timed = replace(of_name["given"], refine_time=lambda: iter([of_name["earlier"], of_name["later"]]))
+    assert mistakes._at_best_time(factorized, timed).name == "earlier"
+    statistics["given"] = 8.0
+    assert mistakes._at_best_time(factorized, timed) is timed
+    statistics["given"] = 5.0
+    assert mistakes._at_best_time(factorized, of_name["given"]) is of_name["given"]
+
+
+def test_a_cause_says_its_size_and_has_the_changes_to_adopt() -> None:
+    undo, adopt = Correction(time_shift_s=1.0), Correction(time_shift_s=2.0)
+    test = made_test(sizes=(-0.5,), name="step", subject="A2", correction=lambda _: undo)
+    found = mistakes._cause(test, STATE, 30.0, 3.0)
+    assert (found.name, found.subject, found.words, found.remedy) == ("step", "A2", "it is -0.50 m", "measure")
+    assert (found.gain, found.penalty, found.state, found.test) == (30.0, 3.0, STATE, test)
+    assert found.correction is undo
+    adopted = replace(test, hypothesis=replace(test.hypothesis, adoption=lambda _: adopt))
+    assert mistakes._cause(adopted, STATE, 30.0, 3.0).correction is adopt
+
+
+def test_a_cause_is_undone_by_its_own_correction_and_not_by_what_is_adopted() -> None:
+    made = on_map()
+    longer_m = np.full(len(made.time_s), 0.25)
+    test = made_test(correction=lambda size: Correction(longer_m=size[0] * longer_m), sizes=(2.0,))
+    cause = replace(cause_of(30.0, test=test), state=replace(made.state, metric_from_model=IDENTITY))
+    for each, change_m in ((cause, -0.5), (replace(cause, test=None, correction=Correction(longer_m=longer_m)), -0.25)):
+        undone = each.undone(made)
+        np.testing.assert_allclose(undone.problem.range_m - made.problem.range_m, change_m)
+        assert undone.state.metric_from_model is IDENTITY
+
+
+def narrowed(
+    monkeypatch: pytest.MonkeyPatch, deviances: dict[str, float], gain: float, most: float = 5.0
+) -> tuple[Cause, Cause]:
+    """Narrow a cause of three numbers to one with a single number, of those that leave such deviances."""
+    tests = {name: made_test(name=name, most=most, threshold=np.inf) for name in deviances}
+    monkeypatch.setattr(mistakes, "_settled_test", lambda _, h: (tests[h.name], deviances[h.name], STATE))
+    wide = made_test(
+        sizes=(1, 1, 1), stddevs=(1, 1, 1), threshold=17.0, sub_hypotheses=tuple(t.hypothesis for t in tests.values())
+    )
+    cause = cause_of(gain, 3 * float(np.log(NUM_BINS)), wide)
+    return cause, mistakes._narrowed(PROBLEM, cause, 100.0)
+
+
+def test_a_cause_is_narrowed_to_fewer_numbers_if_they_explain_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two numbers fewer are worth 2 log(20) = 5.99 in twice the log-likelihood."""
+    deviances = {"x": 90.0, "y": 60.0, "z": 80.0}
+    cause, found = narrowed(monkeypatch, deviances, gain=45.9)
+    assert found.name == "y"
+    assert found.gain == pytest.approx(100.0 - 60.0)
+    assert found.penalty == pytest.approx(np.log(20))
+    assert known(found.test).threshold == 17.0
+    cause, found = narrowed(monkeypatch, deviances, gain=46.1)
+    assert found is cause
+    cause, found = narrowed(monkeypatch, deviances, gain=1.0, most=0.5)  # none of them is possible
+    assert found is cause
+    cause, found = narrowed(monkeypatch, {}, gain=1.0)
+    assert found is cause
+    assert mistakes._narrowed(PROBLEM, cause_of(1.0), 100.0).test is None
+
+
+def likelier_than_chance(
+    monkeypatch: pytest.MonkeyPatch, deviances: dict[str, float], costs: dict[str, float] | None = None
+) -> list[Cause]:
+    """Try alternatives that leave such deviances, of a problem with one of 100; C makes an anchor unknown."""
+    costs = costs or dict.fromkeys(deviances, 1.0)
+    tried = [
+        Alternative(name, "", f"it is {name}", "remedy", Correction({"A": None} if name == "C" else {"A": np.ones(3)}))
+        for name in deviances
+    ]
+    of_correction = {id(each.correction): each.name for each in tried}
+    refits = SimpleNamespace(
+        start=lambda correction: (costs[of_correction[id(correction)]], of_correction[id(correction)]),
+        of=lambda start: (costs[start], start),
+    )
+    monkeypatch.setattr(mistakes, "Refits", lambda *_: refits)
+    monkeypatch.setattr(mistakes, "as_given", lambda given: given)
+    at = SimpleNamespace(state=STATE)
+    monkeypatch.setattr(
+        mistakes, "_likeliest_near", lambda _, name: SimpleNamespace(deviance=deviances[name], on_map=at)
+    )
+    monkeypatch.setattr(mistakes, "Factorization", lambda near: SimpleNamespace(deviance=lambda: near.deviance))
+    return list(mistakes._alternatives(PROBLEM, 100.0, tried))
+
+
+def test_an_alternative_needs_a_gain_beyond_its_penalty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of two alternatives costs 2 log(2), an unknown anchor 3 log(20) more, and chance 6."""
+    least = 2 * np.log(2) + 6.0
+    free = 3 * np.log(20)
+    (found,) = likelier_than_chance(monkeypatch, {"A": 100.0 - least - 0.01, "B": 100.0 - least + 0.01})
+    assert (found.name, found.words, found.test, found.state) == ("A", "it is A", None, STATE)
+    assert found.gain == pytest.approx(least + 0.01)
+    assert found.penalty == pytest.approx(2 * np.log(2))
+    (found,) = likelier_than_chance(monkeypatch, {"C": 100.0 - least - free - 0.01, "D": 100.0})
+    assert found.penalty == pytest.approx(2 * np.log(2) + free)
+    assert likelier_than_chance(monkeypatch, {"C": 100.0 - least - free + 0.01, "D": 100.0}) == []
+    assert likelier_than_chance(monkeypatch, {}) == []
+
+
+def test_only_the_alternatives_that_start_and_fit_best_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"N{k}" for k in range(15)]
+    costs = {name: float(15 - k) for k, name in enumerate(names)}
+    found = likelier_than_chance(monkeypatch, dict.fromkeys(names, 0.0), costs)
+    assert [each.name for each in found] == names[:-7:-1]  # six of them, the one that costs least first
+
+
+class OfCauses:
+    """Choice of the likeliest causes, with results of all tests and alternatives as they are given.
+
+    Attributes:
+        gains: by name of a hypothesis, how much it lowers the deviance from 100.
+        impossible: names of hypotheses whose size is impossible.
+        more: alternatives that are likelier than chance. asked: which alternatives were looked at.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_drifting: bool = False) -> None:
+        self.gains: dict[str, float] = {}
+        self.impossible: set[str] = set()
+        self.more: list[Cause] = []
+        self.asked = ""
+        for name, fake in {
+            "_settled": lambda problem: SimpleNamespace(with_learnt_errors=lambda: problem),
+            "Factorization": lambda _: SimpleNamespace(deviance=lambda: 100.0),
+            "_at_best_time": lambda _, hypothesis: hypothesis,
+            "_settled_test": self.settled,
+            "as_given": lambda given: given,
+            "drifts": lambda _: is_drifting,
+            "alternatives": lambda _: ["all"],
+            "lever_arms_in_other_axes": lambda _: ["lever arms"],
+            "_alternatives": self.likelier,
+            "_narrowed": lambda _, cause, __: cause,
+        }.items():
+            monkeypatch.setattr(mistakes, name, fake)
+
+    def settled(self, _: object, hypothesis: Hypothesis) -> tuple[hypothesis_tests.Test, float, RangeState]:
+        again = made_test(threshold=np.inf)
+        again = replace(again, hypothesis=replace(hypothesis, most=0.1 if hypothesis.name in self.impossible else 9.0))
+        return again, 100.0 - self.gains[hypothesis.name], STATE
+
+    def likelier(self, _: object, before: float, tried: list[str]) -> list[Cause]:
+        assert before == 100.0
+        [self.asked] = tried
+        return self.more
+
+    def found(self, gains: dict[str, float], *, is_sure: bool = True, num_tests: int = 50) -> list[str]:
+        """Return the names of the causes; a name that ends with ~ is of a hypothesis that is not linear."""
+        self.gains = gains
+        nominated = [made_test(name=name, threshold=15.0, is_linear=not name.endswith("~")) for name in gains]
+        return [cause.name for cause in mistakes._causes(PROBLEM, nominated, num_tests, is_sure=is_sure)]
+
+
+ONE_NUMBER = float(np.log(NUM_BINS))
+
+
+def test_a_mistake_is_a_cause_if_it_is_likelier_than_its_numbers_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    of = OfCauses(monkeypatch)
+    assert of.found({"bias": ONE_NUMBER + 0.01}) == ["bias"]
+    assert of.found({"bias": ONE_NUMBER - 0.01}) == []
+    assert of.found({"bias~": 15.01}) == ["bias~"]  # the threshold of its test
+    assert of.found({"bias~": 14.99}) == []
+    assert of.found({"bias": -np.inf}) == []
+    of.impossible = {"bias"}
+    assert of.found({"bias": 60.0}) == []
+
+
+def test_a_mistake_that_no_test_shows_must_be_likelier_than_all_that_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    of = OfCauses(monkeypatch)
+    least = ONE_NUMBER + 2 * np.log(50) + 2 * np.log(100)
+    assert of.found({"bias": least + 0.01}, is_sure=False) == ["bias"]
+    assert of.found({"bias~": least - 0.01}, is_sure=False) == []
+    of.more = [replace(cause_of(2 * np.log(100) + gain), name=f"{gain}") for gain in (0.01, -0.01)]
+    assert of.found({"bias": 0.0}, is_sure=False) == ["0.01"]
+
+
+@pytest.mark.parametrize(
+    ("gain", "is_sure", "is_drifting", "asked"),
+    [
+        (0.0, False, False, "lever arms"),
+        (0.0, False, True, "all"),
+        (90.0, False, False, "all"),
+        (0.0, True, False, "all"),
+    ],
+)
+def test_all_alternatives_are_tried_unless_nothing_speaks_for_a_mistake(
+    gain: float, is_sure: bool, is_drifting: bool, asked: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of = OfCauses(monkeypatch, is_drifting=is_drifting)
+    of.found({"bias": gain}, is_sure=is_sure)
+    assert of.asked == asked
+
+
+def test_the_likeliest_cause_comes_first_with_two_rivals_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    of = OfCauses(monkeypatch)
+    of.more = [replace(cause_of(gain), name=f"{gain}") for gain in (50.0, 53.0, 41.0)]
+    assert of.found({}) == ["53.0", "50.0"]
+    of.more += [replace(cause_of(gain), name=f"{gain}") for gain in (52.0, 49.0)]
+    assert of.found({}) == ["53.0", "52.0", "50.0"]
+    # A hypothesis with a gain of 56 has a score of 53.004, as its number costs something.
+    of.more = of.more[:1]
+    assert of.found({"bias": 56.0}) == ["bias", "50.0"]
+
+
+def test_of_the_tests_only_some_are_tried_and_their_threshold_is_that_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    of = OfCauses(monkeypatch)
+    of.gains = {"bias": 40.0}
+    nominated = [made_test(name="bias", threshold=15.0 + k, is_linear=True) for k in range(3)]
+    causes = mistakes._causes(PROBLEM, nominated, 50, is_sure=True)
+    assert [known(cause.test).threshold for cause in causes] == [15.0, 16.0]

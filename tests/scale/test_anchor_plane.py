@@ -101,7 +101,14 @@ def test_the_mirrored_map_has_its_path_as_far_on_the_other_side_with_the_same_ra
 
 @pytest.mark.parametrize(
     ("height_m", "share_below", "side"),
-    [(3, 0, "above"), (0, 0, "below"), (3, 0.05, "above"), (3, 0.3, "on both sides of"), (3, 0.95, "below")],
+    [
+        (3, 0, "above"),
+        (0, 0, "below"),
+        (3, 0.05, "above"),
+        (3, 0.3, "on both sides of"),
+        (3, 0.95, "below"),
+        (1.5, 0, "below"),
+    ],
 )
 def test_a_path_is_on_the_side_where_nine_tenths_of_it_are(height_m: float, share_below: float, side: str) -> None:
     heights = np.where(np.arange(20) < 20 * share_below, -2.0, 0.0) * (1 if height_m > 2 else 0)
@@ -113,14 +120,17 @@ def test_a_path_is_on_the_side_where_nine_tenths_of_it_are(height_m: float, shar
     assert is_on_side(of, state, None)
 
 
-def test_a_path_in_the_plane_is_on_either_side() -> None:
-    of = problem(LEVEL_M, PATH * (1, 1, 1e-4))
-    assert camera_side_of(of, at(2.0, of)) is None
-    assert is_on_side(of, at(2.0, of), "below")
-    assert camera_side_of(of, at(2.01, of)) == "above"
+@pytest.mark.parametrize("scale", [0.1, 1.0, 3.0])
+def test_a_path_within_a_thousandth_of_its_length_of_the_plane_is_on_either_side(scale: float) -> None:
+    of = problem(LEVEL_M, PATH * (1, 1, 0))
+    length_m = scale * np.linalg.svd(of.centers - of.centers.mean(axis=0))[1][0] / np.sqrt(len(PATH))
+    near, off = at(2 + 0.9e-3 * length_m, of, scale), at(2 + 1.1e-3 * length_m, of, scale)
+    assert camera_side_of(of, near) is None
+    assert is_on_side(of, near, "below")
+    assert camera_side_of(of, off) == "above"
 
 
-@pytest.mark.parametrize("tilt_deg", [55.0, 65.0])
+@pytest.mark.parametrize("tilt_deg", [59.5, 60.5])
 def test_an_upright_plane_has_nothing_above_it(tilt_deg: float) -> None:
     c, s = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
     tilted = (np.array(LEVEL_M, dtype=np.float64) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]).T).tolist()

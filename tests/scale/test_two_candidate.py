@@ -104,3 +104,42 @@ def test_where_a_ray_is_nearest_to_the_anchor_the_two_candidates_are_one() -> No
     assert table is not None
     assert table.num_without_root == 0
     np.testing.assert_allclose(table.duplets, 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("length", [1.0, 2.0])
+@pytest.mark.parametrize(("share", "has_root"), [(5e-13, True), (2e-12, False)])
+def test_a_range_too_short_by_rounding_has_one_candidate_and_one_too_short_by_more_has_none(
+    length: float, share: float, has_root: bool
+) -> None:
+    """A camera along y comes as near to the anchor as 4 m, and the range is shorter by a share of its square."""
+    centers = [[0.0, length, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
+    table = estimate(centers, [4.0 * np.sqrt(1 - share), 3.0, 2.0])
+    assert table is not None
+    assert table.rows.tolist() == ([0, 1, 2] if has_root else [1, 2])
+    assert table.num_without_root == (0 if has_root else 1)
+    if has_root:
+        assert table.duplets[0].tolist() == [0.0, 0.0]
+
+
+def test_two_candidates_that_only_rounding_tells_apart_are_one() -> None:
+    for share, is_one in ((5e-13, True), (2e-12, False)):
+        table = estimate([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], [4.0 * np.sqrt(1 + share), 3.0])
+        assert table is not None
+        low, high = table.duplets[0].tolist()
+        assert (low == high) == is_one
+        assert high == pytest.approx(0.0 if is_one else 4.0 * np.sqrt(share), rel=1e-2)
+
+
+def test_of_branches_that_scatter_alike_the_smaller_root_is_chosen() -> None:
+    """Ranges of 3 m and 1 m at the same camera: alpha is 1 or 7, and 3 or 5."""
+    table = estimate([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [3.0, 1.0])
+    assert table is not None
+    np.testing.assert_allclose(table.duplets, [[1.0, 7.0], [3.0, 5.0]])
+    assert table.chosen == "alpha0"
+    assert table.scale == pytest.approx(2.0)
+
+
+def test_two_ranges_with_candidates_are_enough_and_one_is_not() -> None:
+    centers, range_m = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [3.0, 3.0, 2.0]
+    assert estimate(centers, range_m) is not None
+    assert estimate(centers[:2], range_m[:2]) is None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.site import local_site
+from rangesfm.ranging.anchors.site import Site, local_site, site_of
 
 FAR = np.array([2_600_000.25, 1_200_000.5, 400.0])
 
@@ -61,3 +63,41 @@ def test_points_without_the_coordinate_system_of_the_anchors_are_refused(
     site, _ = local_site(anchors_at([*FAR], [*(FAR + 10.0)]), "site", of_site)
     with pytest.raises(InputError, match=said):
         site.local(FAR[None], of_points)
+
+
+@pytest.mark.parametrize(("distance_m", "offset_m"), [(999.0, 0.0), (1001.0, 1001.0)])
+def test_a_site_is_moved_if_its_middle_is_farther_than_a_kilometre(distance_m: float, offset_m: float) -> None:
+    across = np.array([0.0, 400.0, 0.0])
+    coordinates = np.array([distance_m, 0.0, 0.0]) + np.stack([across, np.full(3, np.nan), -across])
+    site, local = site_of(coordinates, None)
+    np.testing.assert_array_equal(site.offset_m, [offset_m, 0.0, 0.0])
+    np.testing.assert_array_equal(local, coordinates - np.array([offset_m, 0.0, 0.0]))
+
+
+def test_further_points_are_moved_with_the_anchors() -> None:
+    points = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    np.testing.assert_array_equal(Site(np.array([1.0, 1.0, 2.0])).local(points, None), [[0, 1, 1], [3, 4, 4]])
+
+
+def test_further_points_of_a_coordinate_system_are_where_anchors_there_are() -> None:
+    places = np.array([[2_600_000.0, 1_200_000.0, 500.0], [2_600_050.0, 1_200_020.0, 510.0]])
+    site, anchors = local_site(anchors_at(*places.tolist(), None), "site", "EPSG:2056")
+    assert not site.offset_m.any()
+    assert anchors[2].position_m is None
+    local = site.local(places, "EPSG:2056")
+    np.testing.assert_allclose(local, np.array([anchor.position_m for anchor in anchors[:2]], dtype=float), atol=1e-6)
+    # Lengths are those of the map, but for its scale and the height above the sea.
+    assert np.linalg.norm(local[1] - local[0]) == pytest.approx(np.linalg.norm(places[1] - places[0]), rel=1e-3)
+
+
+def test_no_anchors_have_no_coordinate_system_and_the_file_is_named() -> None:
+    with pytest.raises(InputError) as caught:
+        local_site((), "site", "EPSG:2056", Path("anchors.csv"))
+    assert str(caught.value) == (
+        "anchors.csv: [anchors] crs is EPSG:2056, which is for anchors surveyed in a site frame, but no anchor has a "
+        "position"
+    )
+    site, anchors = local_site((), "site", None)
+    assert (anchors, site.georeference) == ((), None)
+    with pytest.raises(InputError, match=r"^anchors\.csv: .*EPSG:2056"):
+        site_of(np.zeros((1, 3)), "EPSG:2056", Path("anchors.csv"))

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -10,10 +14,22 @@ from tests.simulated.path import loop_path
 from tests.studies import anchor_initialization
 
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import PathShape
+from rangesfm.ranging.anchors import trilateration
+from rangesfm.ranging.anchors.point_fit import FitErrors, PointFit, PointProblem, improve
 from rangesfm.ranging.anchors.trilateration import (
     AnchorPlacement,
+    AnchorRanges,
     Trilateration,
     TrilaterationOptions,
+    _conclude,
+    _covariance,
+    _Found,
+    _gap,
+    _inverse,
+    _mirror,
+    _refuse_uncertain,
+    _unless_along_plane,
     trilaterate,
     trilaterate_anchors,
 )
@@ -362,3 +378,352 @@ class TestRounding:
         ranges = distances(line, np.array([1.0, away_m, 3.0])) + noise(100, 0.02, seed)
         with pytest.raises(GeometryError, match="on a line, and the anchor may be anywhere on a circle"):
             trilaterate(line, ranges, options=KNOWN_BIAS)
+
+
+INSIDE_M = np.array([0.5, 0.2, 0.3])
+
+
+def found_in(
+    positions: Array, anchor: Array = ANCHOR_M, *, off_m: Array | float = 0.0, stddev_m: float = 0.1, alike: float = 0.0
+) -> _Found:
+    """A fit to ranges with a prior of the bias of 0.2 m, in which all ranges share a part of their variance."""
+    num = len(positions)
+    problem = PointProblem(
+        positions_m=positions,
+        range_m=distances(positions, anchor) + off_m,
+        stddev_m=np.full(num, stddev_m),
+        shared_stddev_m=np.zeros(num),
+        prior_mean=np.zeros(4),
+        prior=np.array([[0.0, 0.0, 0.0, 5.0]]),
+    )
+    fit = PointFit(problem, improve(problem, np.append(anchor, 0.0)), problem.stddev_m)
+    covariance = stddev_m**2 * ((1 - alike) * np.eye(num) + alike)
+    return _Found.of(fit, FitErrors(np.arange(num), covariance))
+
+
+def grid() -> Array:
+    """Positions of which lengths, widths and heights are the principal axes, with the middle at the origin."""
+    steps = np.linspace(-1.0, 1.0, 4)
+    return np.stack(np.meshgrid(4 * steps, 3 * steps, 1.5 * steps), axis=-1).reshape(-1, 3)
+
+
+class TestRangesOfAnAnchor:
+    def test_are_timed_by_a_tag_of_a_metre_a_second_where_there_are_no_times(self) -> None:
+        places = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.0, 4.0, 2.0]])
+        np.testing.assert_allclose(AnchorRanges(places, np.ones(3)).times_s, [0.0, 5.0, 7.0])
+        timed = AnchorRanges(places, np.ones(3), timestamp_s=np.array([3.0, 9.0, 4.0]), tag_index=np.array([1, 0, 1]))
+        np.testing.assert_array_equal(timed.times_s, [3.0, 9.0, 4.0])
+        np.testing.assert_array_equal(timed.tags, [1, 0, 1])
+        np.testing.assert_array_equal(AnchorRanges(places, np.ones(3)).tags, [0, 0, 0])
+
+    def test_have_the_shape_of_the_path_or_of_its_plan_where_the_height_is_known(self) -> None:
+        positions = grid()[:, [2, 1, 0]] + 7.0
+        shape, plan = (AnchorRanges(positions, np.ones(64), height_m=height).shape for height in (None, 2.0))
+        std = np.linspace(-1.0, 1.0, 4).std()
+        np.testing.assert_allclose(shape.stddevs, std * np.array([4.0, 3.0, 1.5]))
+        np.testing.assert_allclose(np.abs(shape.axes[:, 0]), [0.0, 0.0, 1.0], atol=1e-12)
+        np.testing.assert_allclose(shape.centroid, 0.0, atol=1e-12)
+        np.testing.assert_allclose(plan.stddevs, std * np.array([3.0, 1.5, 0.0]), atol=1e-12)
+
+    def asked(
+        self, monkeypatch: pytest.MonkeyPatch, anchor: AnchorRanges, **options: Any
+    ) -> tuple[PointProblem, Array]:
+        """Return the problem that a fit would solve, and the noise it is given."""
+        found: list[tuple[PointProblem, Array]] = []
+        monkeypatch.setattr(trilateration, "fit_with_own_noise", lambda problem, given: found.append((problem, given)))
+        anchor.fit(TrilaterationOptions(**options))
+        return found[0]
+
+    def test_are_fitted_about_their_middle_with_a_prior_of_the_bias(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        positions = grid() + np.array([10.0, 20.0, 30.0])
+        anchor = AnchorRanges(positions, np.full(64, 2.0))
+        problem, given = self.asked(monkeypatch, anchor, range_bias_m=0.3, range_bias_stddev_m=0.5)
+        np.testing.assert_allclose(problem.positions_m, grid(), atol=1e-12)
+        np.testing.assert_array_equal(problem.prior_mean, [0.0, 0.0, 0.0, 0.3])
+        np.testing.assert_array_equal(problem.prior, [[0.0, 0.0, 0.0, 2.0]])
+        np.testing.assert_allclose(problem.shared_stddev_m, 2.0 * np.exp(-2.0))
+        assert np.isnan(given).all()
+
+    def test_hold_a_known_bias_and_a_known_height(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        anchor = AnchorRanges(
+            grid() + np.array([0.0, 0.0, 5.0]), np.full(64, 2.0), height_m=3.0, shared_stddev_m=np.full(64, 0.07)
+        )
+        problem, given = self.asked(monkeypatch, anchor, range_bias_stddev_m=0.0, range_stddev_m=0.04)
+        np.testing.assert_allclose(problem.prior_mean, [0.0, 0.0, -2.0, 0.0], atol=1e-12)
+        np.testing.assert_allclose(problem.prior, [[0.0, 0.0, 0.0, 1e6], [0.0, 0.0, 100.0, 0.0]])
+        np.testing.assert_array_equal(problem.shared_stddev_m, 0.07)
+        np.testing.assert_array_equal(given, 0.04)
+
+    def test_keep_the_noise_that_they_state(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        stated = np.where(np.arange(64) < 9, 0.5, np.nan)
+        anchor = AnchorRanges(grid(), np.full(64, 2.0), range_stddev_m=stated)
+        np.testing.assert_array_equal(self.asked(monkeypatch, anchor)[1], stated)
+        given = self.asked(monkeypatch, anchor, range_stddev_m=0.2)[1]
+        np.testing.assert_array_equal(given, np.where(np.arange(64) < 9, 0.5, 0.2))
+
+
+class TestFound:
+    def test_the_prior_gains_what_common_errors_take_from_the_ranges(self) -> None:
+        found = found_in(grid(), INSIDE_M, off_m=0.3, alike=0.5)
+        assert found.inflation > 1.5
+        np.testing.assert_allclose(found.fit.problem.prior, [[0.0, 0.0, 0.0, 5.0 * found.inflation]])
+        np.testing.assert_allclose(found.fit.x, improve(found.fit.problem, found.fit.x), atol=1e-7)
+        judged = found.judged_by(3.0)
+        np.testing.assert_allclose(judged.stddev_m, 0.3)
+        np.testing.assert_allclose(judged.prior, [[0.0, 0.0, 0.0, 5.0]])
+
+    def test_the_inverse_of_an_information_is_that_of_numpy(self) -> None:
+        root = np.random.default_rng(0).standard_normal((4, 4)) * [[1.0], [2.0], [0.5], [30.0]]
+        information = root @ root.T
+        np.testing.assert_allclose(_inverse(information), np.linalg.inv(information), rtol=1e-6)
+
+    def test_an_open_direction_is_uncertain_however_well_the_bias_is_known(self) -> None:
+        found = _inverse(np.diag([4.0, 4.0, 0.0, 1e12]))
+        np.testing.assert_allclose(np.diag(found)[[0, 1, 3]], [0.25, 0.25, 1e-12])
+        assert found[2, 2] > 1e10
+
+    def test_the_covariance_of_independent_errors_is_the_inverse_information(self) -> None:
+        found = found_in(grid())
+        slopes = found.fit.problem.slopes(found.fit.x)
+        expected = np.linalg.inv(slopes.T @ slopes / 0.1**2 + np.diag([0.0, 0.0, 0.0, 25.0]))
+        np.testing.assert_allclose(_covariance(found), expected, rtol=1e-6, atol=1e-9)
+
+    def test_the_covariance_of_common_errors_is_that_of_the_estimate(self) -> None:
+        """The estimate is linear in the errors of the ranges, and in the prior's, which are strengthened for it."""
+        found = found_in(grid(), INSIDE_M, alike=0.3)
+        slopes = found.fit.problem.slopes(found.fit.x)
+        prior = np.diag([0.0, 0.0, 0.0, (5.0 * found.inflation) ** 2])
+        inverse = np.linalg.inv(slopes.T @ slopes / 0.1**2 + prior)
+        gain = inverse @ slopes.T / 0.1**2
+        of_ranges = gain @ (0.1**2 * (0.7 * np.eye(64) + 0.3)) @ gain.T
+        of_prior = np.outer(inverse[:, 3], inverse[:, 3]) * 25.0 * found.inflation**4
+        np.testing.assert_allclose(_covariance(found), of_ranges + of_prior, rtol=1e-6, atol=1e-9)
+
+    def test_the_height_above_a_plane_is_as_uncertain_as_the_cost_says(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """An anchor in the plane at a distance of 5 m: a height of h lengthens all ranges by about h^2 / 10."""
+        monkeypatch.setattr(trilateration, "_PROFILE_STEPS_M", np.geomspace(0.2, 2.0, 11))
+        flat = np.array([5.0, 0.0, 0.0]) + 0.5 * grid()[::4] * [1.0, 1.0, 0.0]
+        found = found_in(flat, np.zeros(3), stddev_m=0.05)
+        covariance = _covariance(found)
+        # It is one of the heights at which the cost was computed, of which ten make a decade.
+        height = float(np.sqrt(covariance[2, 2]))
+        assert rise_at(found, 10**-0.1 * height) < 0.5 < rise_at(found, 1.001 * height)
+        np.testing.assert_allclose(covariance[2, [0, 1, 3]], 0.0, atol=1e-3)
+        # The horizontal coordinates keep the covariance of their curvature.
+        level = found.fit.problem.slopes(found.fit.x)[:, [0, 1, 3]]
+        expected = np.linalg.inv(level.T @ level / 0.05**2 + np.diag([0.0, 0.0, 25.0]))
+        np.testing.assert_allclose(covariance[:2, :2], expected[:2, :2], rtol=0.02, atol=1e-9)
+
+
+def rise_at(found: _Found, height: float) -> float:
+    """Return by how much the cost rises if the point is held at a height, with the other unknowns free."""
+    problem, at = found.fit.problem, np.array([0.0, 0.0, height, 0.0])
+    held = replace(problem, prior=np.vstack([problem.prior, [0.0, 0.0, 1e5, 0.0]]), prior_mean=at)
+    return problem.cost(improve(held, at)) - problem.cost(found.fit.x)
+
+
+class TestRefusalByTheCovariance:
+    AXES = np.eye(3)
+
+    def said(self, stddevs_m: list[float], extents_m: list[float], turn: Array = AXES, limit_m: float = 1.0) -> str:
+        covariance = np.zeros((4, 4))
+        covariance[:3, :3] = turn @ np.diag(np.square(stddevs_m)) @ turn.T
+        shape = PathShape(np.zeros(3), np.eye(3), np.array(extents_m))
+        with pytest.raises(GeometryError) as caught:
+            _refuse_uncertain(covariance, shape, TrilaterationOptions(max_position_stddev_m=limit_m))
+        return str(caught.value)
+
+    def test_is_of_a_larger_stddev_than_allowed_in_any_direction(self) -> None:
+        shape = PathShape(np.zeros(3), np.eye(3), np.ones(3))
+        _refuse_uncertain(np.diag([0.99**2, 0.5, 0.1, 9.0]), shape, TrilaterationOptions())
+        assert self.said([1.02, 0.5, 0.1], [3.0, 2.0, 1.0]) == (
+            "the position is not determined: the tag's positions extend over 3 by 2 m only, or are too far away "
+            "(stddev 1 m along 1.00, 0.00, 0.00)"
+        )
+
+    @pytest.mark.parametrize(("length_m", "is_short"), [(0.199, True), (0.201, False)])
+    def test_names_positions_within_a_tenth_of_what_is_allowed(self, length_m: float, is_short: bool) -> None:
+        said = self.said([2.5, 1.0, 1.0], [length_m, 0.1, 0.0], limit_m=2.0)
+        assert (f"the tag's positions lie within {length_m:.3g} m of each other (stddev 2.5 m" in said) == is_short
+
+    @pytest.mark.parametrize(("width_m", "is_line"), [(0.39, True), (0.41, False)])
+    def test_names_a_path_that_is_less_wide_than_a_tenth_of_its_length(self, width_m: float, is_line: bool) -> None:
+        said = self.said([0.1, 500.0, 0.3], [4.0, width_m, 0.0])
+        assert ("lie on a line, and the anchor may be anywhere on a circle around that line" in said) == is_line
+        assert said.endswith("(stddev 1e+02 m along 0.00, 1.00, 0.00)")
+
+    @pytest.mark.parametrize(("angle_deg", "is_across"), [(25.0, True), (27.0, False), (-155.0, True)])
+    def test_names_the_direction_across_the_plane(self, angle_deg: float, is_across: bool) -> None:
+        """The cosine of 26 degrees is 0.9."""
+        cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+        turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+        said = self.said([0.1, 0.2, 5.0], [4.0, 3.0, 0.1], turn)
+        assert ("the anchor is near the plane of the tag's positions" in said) == is_across
+        upward = np.abs(cosine), np.sign(cosine) * sine
+        assert said.endswith(f"(stddev 5 m along {upward[1]:.2f}, 0.00, {upward[0]:.2f})")
+
+
+class TestMirrorImage:
+    FLAT = grid() * [1.0, 1.0, 0.0]
+
+    def test_in_a_plane_fits_as_well(self) -> None:
+        found = found_in(self.FLAT)
+        mirror = _mirror(found, _covariance(found), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        assert mirror is not None
+        np.testing.assert_allclose(mirror[:3], ANCHOR_M * [1.0, 1.0, -1.0], atol=1e-6)
+        assert _gap(found, mirror) == pytest.approx(0.0, abs=1e-6)
+
+    def test_is_about_the_middle_of_the_path(self) -> None:
+        raised = self.FLAT + np.array([0.0, 0.0, 1.0])
+        found = found_in(raised)
+        mirror = _mirror(found, _covariance(found), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]))
+        assert mirror is not None
+        np.testing.assert_allclose(mirror[:3], ANCHOR_M * [1.0, 1.0, 0.0] + [0.0, 0.0, 2.0 - ANCHOR_M[2]], atol=1e-6)
+
+    def test_of_an_anchor_within_two_stddevs_of_the_plane_is_the_same_place(self) -> None:
+        """The images are 7 m apart."""
+        found = found_in(self.FLAT)
+        up = np.array([0.0, 0.0, 1.0])
+        for stddev, is_other in ((3.4, True), (3.6, False)):
+            mirror = _mirror(found, np.diag([0.0, 0.0, stddev**2, 0.0]), np.zeros(3), up)
+            assert (mirror is not None) == is_other
+
+    @pytest.mark.parametrize(("stddev_m", "is_told"), [(0.9, False), (1.1, True)])
+    def test_whose_cost_is_larger_by_four_and_a_half_is_told_from_the_anchor(
+        self, stddev_m: float, is_told: bool
+    ) -> None:
+        """The limit is a difference of the costs, which is as the inverse of the noise's variance."""
+        tilted = grid() * [1.0, 1.0, 0.12]
+        unit = found_in(tilted, stddev_m=0.3)
+        up = np.array([0.0, 0.0, 1.0])
+        other = improve(unit.fit.problem, np.append(ANCHOR_M * [1.0, 1.0, -1.0], 0.0))
+        squares = np.sum(unit.fit.problem.residuals_m(other) ** 2)
+        assert _gap(unit, other) == pytest.approx(0.5 * squares / 0.3**2, rel=0.1)
+        found = found_in(tilted, stddev_m=stddev_m * float(np.sqrt(squares / 9)))
+        assert (_mirror(found, 1e-9 * np.eye(4), np.zeros(3), up) is not None) == is_told
+
+    def test_costs_less_by_errors_that_the_ranges_have_in_common(self) -> None:
+        tilted = grid() * [1.0, 1.0, 0.12]
+        found = found_in(tilted, stddev_m=1.0)
+        other = improve(found.fit.problem, np.append(ANCHOR_M * [1.0, 1.0, -1.0], 0.0))
+        four_times = replace(found.errors, covariance_m2=4 * found.errors.covariance_m2)
+        assert _gap(replace(found, errors=four_times), other) == pytest.approx(_gap(found, other) / 4, rel=0.03)
+
+    def test_is_told_by_a_direction_unless_that_is_along_the_plane(self) -> None:
+        up = np.array([0.0, 0.0, 7.0])
+        for direction, tells in (([3.0, 4.0, 6e-6], True), ([3.0, 4.0, 4e-6], False), ([0.0, 0.0, -1.0], True)):
+            told = _unless_along_plane(np.array(direction), up)
+            assert (told is not None) == tells
+
+
+class TestConclusion:
+    """Positions in a plane at a height of 1 m, whose middle is off the origin."""
+
+    FLAT = TestMirrorImage.FLAT + np.array([10.0, 0.0, 1.0])
+
+    def concluded(self, side: float, **known: Any) -> Trilateration:
+        anchor = AnchorRanges(self.FLAT, distances(self.FLAT, np.array([16.0, -4.0, 3.5])), **known)
+        found = found_in(TestMirrorImage.FLAT, np.array([6.0, -4.0, 2.5 * side]))
+        return _conclude(anchor, found, TrilaterationOptions())
+
+    @pytest.mark.parametrize("side", [1.0, -1.0])
+    def test_puts_the_upper_of_two_places_first(self, side: float) -> None:
+        found = self.concluded(side)
+        np.testing.assert_allclose(found.position_m, [16.0, -4.0, 3.5], atol=1e-6)
+        assert found.mirror_position_m is not None
+        np.testing.assert_allclose(found.mirror_position_m, [16.0, -4.0, -1.5], atol=1e-6)
+        np.testing.assert_allclose(found.residuals_m, 0.0, atol=1e-6)
+        assert found.noise_stddev_m == 0.1
+        assert 0.0 < found.range_bias_stddev_m < 0.2
+
+    @pytest.mark.parametrize("side", [1.0, -1.0])
+    @pytest.mark.parametrize(("toward", "height"), [([0.0, 1.0, 2.0], 3.5), ([0.0, 1.0, -2.0], -1.5)])
+    def test_takes_the_place_that_is_told(self, side: float, toward: list[float], height: float) -> None:
+        found = self.concluded(side, toward=np.array(toward))
+        np.testing.assert_allclose(found.position_m, [16.0, -4.0, height], atol=1e-6)
+        assert found.mirror_position_m is None
+
+    def test_has_no_stddev_of_a_bias_that_is_known(self) -> None:
+        anchor = AnchorRanges(self.FLAT, distances(self.FLAT))
+        known = TrilaterationOptions(range_bias_stddev_m=0.0)
+        assert _conclude(anchor, found_in(TestMirrorImage.FLAT), known).range_bias_stddev_m == 0.0
+
+    def test_becomes_an_anchor_with_its_stddev_and_bias(self) -> None:
+        found = replace(
+            self.concluded(1.0), covariance_m2=np.diag([1.0, 4.0, 7.0]), range_bias_m=0.1, range_bias_stddev_m=0.02
+        )
+        assert found.position_stddev_m == 2.0
+        both, one, none = (
+            AnchorPlacement("A", 64, each, None).anchor
+            for each in (found, replace(found, mirror_position_m=None), None)
+        )
+        assert (both.position_m, both.position_stddev_m) == (None, 0.0)
+        assert (both.range_bias_m, both.range_bias_stddev_m) == (0.1, 0.02)
+        assert one.position_m is not None
+        assert (one.position_stddev_m, one.range_bias_m, one.range_bias_stddev_m) == (2.0, 0.1, 0.02)
+        assert none.anchor_id == "A"
+        assert none.position_m is None
+
+
+def test_each_anchor_of_a_log_has_its_ranges_at_known_places_and_what_is_known_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[Mapping[str, AnchorRanges], TrilaterationOptions]] = []
+    monkeypatch.setattr(trilateration, "_trilaterate_together", lambda *given: asked.append(given))
+    log = RangeLog.from_arrays(
+        ["a", "b", "a", "b"],
+        [1.0, 2.0, 3.0, 4.0],
+        timestamp_s=[0.0, 1.0, 2.0, 3.0],
+        range_stddev_m=[0.1, 0.2, 0.3, 0.4],
+        tag_id=["t", "t", "u", "u"],
+    )
+    places = np.arange(12.0).reshape(4, 3)
+    places[0, 1] = np.nan
+    trilaterate_anchors(log, places, toward={"a": [0, 0, 1]}, height_m={"b": 2.5})
+    anchors, options = asked[0]
+    assert options == TrilaterationOptions()
+    a, b = anchors["a"], anchors["b"]
+    np.testing.assert_array_equal(a.tag_positions_m, places[[2]])
+    np.testing.assert_array_equal(a.range_m, [3.0])
+    np.testing.assert_array_equal(b.range_m, [2.0, 4.0])
+    np.testing.assert_array_equal(b.range_stddev_m, [0.2, 0.4])
+    np.testing.assert_array_equal(b.timestamp_s, [1.0, 3.0])
+    np.testing.assert_array_equal(b.tags, [0, 1])
+    np.testing.assert_array_equal(a.toward, [0.0, 0.0, 1.0])
+    assert (b.toward, a.height_m, b.height_m, a.shared_stddev_m) == (None, None, 2.5, None)
+    trilaterate_anchors(replace(log, shared_stddev_m=np.arange(4.0)), places, options=KNOWN_BIAS)
+    anchors, options = asked[1]
+    assert options is KNOWN_BIAS
+    np.testing.assert_array_equal(anchors["b"].shared_stddev_m, [1.0, 3.0])
+    assert (anchors["a"].toward, anchors["a"].height_m) == (None, None)
+
+
+def test_anchors_without_enough_ranges_are_told_and_do_not_hinder_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    calibrated: list[bool] = []
+
+    def errors(fits: list[PointFit], times: object, tags: object, *, is_calibrated: bool) -> list[FitErrors]:
+        calibrated.append(is_calibrated)
+        return [FitErrors(np.arange(len(fit.own_stddev_m)), np.diag(fit.own_stddev_m**2)) for fit in fits]
+
+    monkeypatch.setattr(trilateration, "errors_of_fits", errors)
+    monkeypatch.setattr(trilateration, "_profile_stddev", lambda *given: 50.0)
+    monkeypatch.setattr(AnchorRanges, "fit", lambda anchor, options: found_in(anchor.tag_positions_m).fit)
+
+    def ranges(num: int, shared: float | None) -> AnchorRanges:
+        places = grid()[np.linspace(0, 63, num).astype(np.int64)]
+        return AnchorRanges(places, distances(places), shared_stddev_m=None if shared is None else np.full(num, shared))
+
+    anchors = {"few": ranges(3, None), "all": ranges(64, 0.1), "least": ranges(4, 0.1)}
+    options = TrilaterationOptions(max_position_stddev_m=0.3)
+    few, whole, least = trilateration._trilaterate_together(anchors, options)
+    assert (few.anchor_id, few.num_ranges, few.found) == ("few", 3, None)
+    assert few.why_not == "3 ranges at known positions of the tag, 4 are needed"
+    assert whole.found is not None
+    np.testing.assert_allclose(whole.found.position_m, ANCHOR_M, atol=1e-6)
+    assert (whole.why_not, whole.num_ranges) == (None, 64)
+    assert least.found is None
+    assert "the position is not determined" in str(least.why_not)
+    assert calibrated == [True]
+    trilateration._trilaterate_together(anchors | {"other": ranges(64, None)}, options)
+    assert calibrated == [True, False]
+    assert trilateration._trilaterate_together({"few": ranges(3, None)}, options)[0].found is None

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.stats import norm
 
+from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
+from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
 NUM_EACH = 400
@@ -214,3 +219,197 @@ def test_fits_and_errors_alternate_until_the_last_is_good_enough() -> None:
     assert run(3, 0.0) == (1.0, 7.0, 8.0)
     assert fits == [(1.0, None), (5.0, 4.0), (7.0, 2.0)]
     assert run(9, 2.0) == (2.0, 5.0, 7.0)
+
+
+def few(num: int, stddev_m: float = 1.0, **others: Any) -> RangeErrors:
+    """Errors of some ranges, each of an anchor, a stretch and a place of its own."""
+    return replace(
+        RangeErrors(
+            stddev_m=np.full(num, stddev_m),
+            share=np.ones(num),
+            inflation=1.0,
+            given_m=np.full(num, np.nan),
+            shared_m=np.zeros(num),
+            placing_m=np.zeros(num),
+            anchor_index=np.arange(num),
+            block=np.arange(num),
+            place=np.arange(num),
+            loss=GEMAN_MCCLURE,
+            common_bias_stddev_m=0.1,
+        ),
+        **others,
+    )
+
+
+def begun(log: RangeLog, rows: list[int], **options: float) -> RangeErrors:
+    observations: Any = SimpleNamespace(log=log, before=np.array([5, 6, 7]))
+    return RangeErrors.begin(observations, np.array(rows), RangeModelOptions(**options))
+
+
+def test_before_a_map_is_used_ranges_have_their_own_the_given_or_the_usual_noise() -> None:
+    log = RangeLog.from_arrays(
+        ["a", "b", "a"], [1.0, 60.0, 2.0], timestamp_s=[0.0, 90.0, 45.0], range_stddev_m=[0.3, np.nan, np.nan]
+    )
+    usual = begun(log, [2, 0], common_bias_stddev_m=0.07)
+    shared = 2.0 * np.exp([-2.0, -1.0])
+    np.testing.assert_allclose(usual.shared_m, shared)
+    np.testing.assert_allclose(usual.stddev_m, np.hypot([0.1, 0.3], shared))
+    np.testing.assert_array_equal(usual.given_m, [np.nan, 0.3])
+    np.testing.assert_array_equal(usual.is_estimated, [True, False])
+    np.testing.assert_array_equal(usual.anchor_index, [0, 0])
+    assert (usual.inflation, usual.common_bias_stddev_m, usual.loss) == (1.0, 0.07, GEMAN_MCCLURE)
+    np.testing.assert_array_equal(usual.worth, [1.0, 1.0])
+    np.testing.assert_array_equal(usual.placing_m, [0.0, 0.0])
+    np.testing.assert_array_equal(usual.place, [0, 0])
+    given = begun(log, [0, 1, 2], range_stddev_m=0.2)
+    np.testing.assert_array_equal(given.given_m, [0.3, 0.2, 0.2])
+    assert given.stddev_m[1] == pytest.approx(0.2)
+
+
+def test_stretches_last_ten_seconds_or_where_there_are_no_times_from_photo_to_photo() -> None:
+    ids, ranges = ["a"] * 3, [3.0, 4.0, 5.0]
+    timed = RangeLog.from_arrays(ids, ranges, timestamp_s=[9.9, 90.0, 10.1])
+    np.testing.assert_array_equal(begun(timed, [0, 2, 1]).block, [0, 0, 8])
+    named = RangeLog.from_arrays(ids, ranges, image_name=["x.jpg", "y.jpg", "z.jpg"])
+    np.testing.assert_array_equal(begun(named, [2, 0]).block, [7, 5])
+
+
+def test_correlation_in_time_lowers_what_a_range_is_worth() -> None:
+    np.testing.assert_allclose(few(2, share=np.array([1.0, 0.5]), inflation=2.0).worth, [0.25, 0.125])
+
+
+def test_a_group_is_the_ranges_of_one_anchor_in_one_stretch() -> None:
+    block, anchor = np.divmod(np.arange(12), 3)
+    group = few(24, block=np.tile(block, 2), anchor_index=np.tile(anchor, 2)).group
+    np.testing.assert_array_equal(group[:12], group[12:])
+    assert len(set(group.tolist())) == 12
+
+
+def test_robust_weights_are_those_of_residuals_in_standard_deviations() -> None:
+    weights = few(2, stddev_m=0.5, loss=CAUCHY).robust_weights(np.array([0.0, 0.5 * CAUCHY.width]))
+    np.testing.assert_allclose(weights, [1.0, 0.5])
+
+
+def test_learnt_components_go_with_their_ranges() -> None:
+    learned: Any = SimpleNamespace(subset=lambda rows: ("some", *rows), spread=lambda rows, num: ("all", *rows, num))
+    errors = few(3, learned=learned)
+    some: Any = errors.subset(np.array([2, 0])).learned
+    spread: Any = errors.spread(np.array([2, 0, 4]), 5).learned
+    assert some == ("some", 2, 0)
+    assert spread == ("all", 2, 0, 4, 5)
+    assert few(3).spread(np.array([2, 0, 4]), 5).learned is None
+
+
+def test_ranges_without_a_place_have_no_number_and_label_zero() -> None:
+    spread = few(2).spread(np.array([2, 1]), 4)
+    np.testing.assert_array_equal(spread.stddev_m, [np.nan, 1.0, 1.0, np.nan])
+    np.testing.assert_array_equal(spread.anchor_index, [0, 1, 0, 0])
+
+
+def test_places_are_told_by_where_the_tag_is() -> None:
+    placing = np.array([0.1, 0.2, 0.3])
+    placed = few(3, anchor_index=np.zeros(3, dtype=np.int64)).at(np.array([[1.1] * 3, [2.1] * 3, [1.1] * 3]), placing)
+    assert placed.place[0] == placed.place[2] != placed.place[1]
+    np.testing.assert_array_equal(placed.placing_m, placing)
+
+
+def test_without_the_error_that_short_ranges_share_a_millimetre_remains() -> None:
+    without = few(2, stddev_m=0.5, shared_m=np.array([0.3, 0.5])).without_shared()
+    np.testing.assert_allclose(without.stddev_m, [0.4, 1e-3])
+    np.testing.assert_array_equal(without.shared_m, [0.0, 0.0])
+
+
+def test_a_bending_map_begins_with_the_noise_of_those_ranges_that_do_not_state_theirs() -> None:
+    given = np.array([np.nan, np.nan, np.nan, 0.9, 0.9])
+    stddev = np.sqrt(np.array([0.1, 0.2, 0.5, 0.9, 0.9]) ** 2 + 0.3**2 + 0.4**2)
+    errors = few(5, given_m=given, shared_m=np.full(5, 0.3), placing_m=np.full(5, 0.4))
+    assert replace(errors, stddev_m=stddev).for_bending_map(CAUCHY).noise_m == pytest.approx(0.2)
+    assert replace(errors, stddev_m=np.full(5, 0.1)).for_bending_map(CAUCHY).noise_m == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize(("num_ordinary", "counts"), [(3, False), (4, True)])
+def test_ranges_with_a_large_common_error_show_no_noise_where_others_are_three_of_ten(
+    num_ordinary: int, counts: bool
+) -> None:
+    """The ordinary ones are off by 1 m, all others by 5 m; of few residuals the noise is by their median size."""
+    is_ordinary = np.arange(10) < num_ordinary
+    residuals = np.where(is_ordinary, 1.0, 5.0)
+    for given, usual in ((np.nan, 0.1), (0.4, 0.4)):
+        together = np.where(is_ordinary, 0.99 * usual, 1.01 * usual)
+        errors = few(10, given_m=np.full(10, given), shared_m=together)
+        assert errors.noise_of_all(residuals).stddev == pytest.approx(1.4826 * (1.0 if counts else 5.0))
+
+
+def test_noise_that_is_stated_is_not_estimated_and_the_place_of_a_range_adds_to_its_common_error() -> None:
+    residuals = np.array([1.0, 1.0, 2.0, 2.0, 2.0, 7.0, 7.0, 7.0, 7.0])
+    given = np.where(residuals == 7.0, 0.1, np.nan)
+    # The first two have a common error below the usual noise, the next three only without their place.
+    shared, placing = np.full(9, 0.06), np.where(residuals == 1.0, 0.07, 0.09)
+    errors = few(9, given_m=given, shared_m=shared, placing_m=placing)
+    assert errors.noise_of_estimated(residuals).stddev == pytest.approx(1.4826 * 1.0)
+    assert errors.noise_of_estimated(residuals).num == 2
+    assert errors.noise_of_all(residuals).stddev == pytest.approx(1.4826 * 2.0)
+    assert replace(errors, given_m=np.full(9, 1.0)).noise_of_estimated(residuals).num == 9, "all state theirs"
+
+
+def test_a_map_that_takes_all_freedom_from_the_residuals_is_taken_to_leave_a_tenth() -> None:
+    plain, widened = (make_errors().seen_by_bending_map(noise((0.1, 0.1, 0.1)), num) for num in (0.0, 1e4))
+    assert widened.stddev_m[0] == pytest.approx(np.sqrt(10) * plain.stddev_m[0])
+
+
+def test_noise_is_at_least_a_millimetre_and_what_is_stated_stays() -> None:
+    """The uncertainty of the places and what short ranges share is added to the noise."""
+    given = np.where(np.arange(3 * NUM_EACH) < 9, 0.5, np.nan)
+    errors = replace(make_errors(loss=CAUCHY), given_m=given, stddev_m=np.full(3 * NUM_EACH, 0.7))
+    found = errors.seen_by_bending_map(np.zeros(3 * NUM_EACH), 0.0).stddev_m
+    np.testing.assert_allclose(found, np.where(np.arange(3 * NUM_EACH) < 9, 0.7, 1e-3))
+    errors = replace(errors, placing_m=np.full(3 * NUM_EACH, 0.02), shared_m=np.full(3 * NUM_EACH, 0.03))
+    found = errors.seen_by_bending_map(np.zeros(3 * NUM_EACH), 0.0).stddev_m
+    np.testing.assert_allclose(found[9:], np.sqrt(0.02**2 + 0.03**2 + 1e-6))
+
+
+def test_a_map_seen_to_bend_keeps_its_likelihood() -> None:
+    residuals = noise((0.1, 0.1, 0.1))
+    seen = make_errors().seen_by_bending_map(residuals, 0.0)
+    gaussian = np.sum(norm.logpdf(residuals, scale=0.1))
+    assert seen.log_likelihood == pytest.approx(gaussian, rel=0.02)
+
+
+def normal_residuals(nums: tuple[int, ...], stddevs_m: tuple[float, ...]) -> tuple[RangeErrors, Array]:
+    """Errors of anchors and residuals that are evenly drawn from a normal distribution for each."""
+    residuals = [stddev * norm.ppf((np.arange(num) + 0.5) / num) for num, stddev in zip(nums, stddevs_m, strict=True)]
+    return few(sum(nums), anchor_index=np.repeat(np.arange(len(nums)), nums)), np.concatenate(residuals)
+
+
+@pytest.mark.parametrize(("inflation", "within", "beyond"), [(1.0, 1.17, 1.32), (2.0, 1.45, 1.8)])
+def test_an_anchor_has_a_noise_of_its_own_from_three_standard_deviations(
+    inflation: float, within: float, beyond: float
+) -> None:
+    """The logarithm of the noise of 300 ranges has a standard deviation of the root of 2.7 / 600, times inflation."""
+    for stddev, expected in ((within, 1.0), (beyond, beyond), (1 / beyond, 1 / beyond)):
+        errors, residuals = normal_residuals((2000, 300), (0.1, 0.1 * stddev))
+        ratios = replace(errors, inflation=inflation)._noise_ratios(residuals, 0.1)
+        assert ratios[0] == 1.0
+        assert ratios[1] == pytest.approx(expected, rel=1e-9 if expected == 1.0 else 0.12)
+
+
+def test_an_anchor_with_less_than_twenty_ranges_has_no_noise_of_its_own() -> None:
+    for num, is_own in ((19, False), (20, True)):
+        errors, residuals = normal_residuals((100, num, 100), (0.1, 2.0, 0.1))
+        ratios = errors._noise_ratios(residuals, 0.1)
+        assert (ratios[1] > 5.0) == is_own
+        np.testing.assert_array_equal(ratios[[0, 2]], [1.0, 1.0])
+
+
+def test_the_mean_of_those_that_fit_is_not_moved_by_those_that_do_not() -> None:
+    errors = few(1)
+    assert errors._bulk_mean(np.array([0.1, 0.2, 0.3, 90.0]), 0.1) == pytest.approx(0.2, abs=1e-3)
+    assert errors._bulk_mean(np.array([0.3, 0.5]), 0.1) == pytest.approx(0.4, abs=1e-4)
+    assert errors._bulk_mean(np.zeros(0), 0.1) == 0.0
+
+
+def test_fits_go_on_to_the_last_round_where_nothing_is_said() -> None:
+    found = fit_with_own_errors(
+        lambda errors, before: (before or 0) + 1, lambda errors, fitted: errors * 2, 1, max_num_rounds=4
+    )
+    assert found == (4, 8, 16)
