@@ -29,7 +29,7 @@ import venv
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.studies.tests_of_lines import PYTEST, TestsOfLines
+from tests.studies.tests_of_lines import PYTEST, TESTS, TestsOfLines
 
 PACKAGE = Path("plugin/rangesfm")
 PACKAGES = ("scale", "refine", "ranging/errors", "ranging/anchors", "ranging/clock", "diagnostics", "ceres")
@@ -73,7 +73,7 @@ def checkout_of(folder: Path) -> tuple[Path, Path]:
     copy is given that part, and an environment whose path names the installed packages without what they install there.
     """
     copy, environment = folder / "checkout", folder / "environment"
-    for part in ("plugin", "tests"):
+    for part in ("plugin", "tests", "examples", "cpp_ext"):
         shutil.copytree(part, copy / part)
     shutil.copy("pyproject.toml", copy)
     compiled = importlib.util.find_spec("rangesfm._cpp")
@@ -90,7 +90,7 @@ def checkout_of(folder: Path) -> tuple[Path, Path]:
     if not Path(imported).is_relative_to(copy):
         sys.exit(f"rangesfm is imported from {imported}, expected from {copy}: no change would be noticed")
     # This leaves compiled files, which are not written later: two changes of a file within a second would look alike.
-    subprocess.run([str(python), *PYTEST, "--collect-only", "tests"], cwd=copy, capture_output=True, check=True)
+    subprocess.run([str(python), *PYTEST, "--collect-only", *TESTS], cwd=copy, capture_output=True, check=True)
     return copy, python
 
 

@@ -10,10 +10,11 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-TESTS = """
+NAMES = """
     ceres cli comparison diagnostics distances geometry join loops planning positions ranging refine scale survey
     survey_discovery workflows test_numbers.py test_same_everywhere.py
 """
+TESTS = tuple(f"tests/{name}" for name in NAMES.split())
 # Largest sum of the times of the tests that judge one line: some lines are run by most tests.
 MAX_SECONDS = 240.0
 PYTEST = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "slow or not slow")
@@ -52,8 +53,7 @@ class TestsOfLines:
             folder.mkdir(exist_ok=True)
             settings.write_text(f"[run]\nsource = rangesfm\ndata_file = {folder / 'coverage'}\n", encoding="utf-8")
             options = [f"--cov-config={settings}", "--cov=rangesfm", "--cov-context=test", "--cov-report=", "-n", "2"]
-            tests = [str(Path("tests") / name) for name in TESTS.split()]
-            subprocess.run([str(python), *PYTEST, *options, f"--junitxml={times}", *tests], cwd=checkout, check=True)
+            subprocess.run([str(python), *PYTEST, *options, f"--junitxml={times}", *TESTS], cwd=checkout, check=True)
         return cls(checkout, folder)
 
     def judges(self, path: Path, line: int) -> list[list[str]]:
