@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from tests.known import known
+from tests.simulated.range_problem import range_problem
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import Gravity
@@ -25,21 +26,7 @@ PATH = np.column_stack([np.linspace(0, 4, 20), np.sin(np.linspace(0, 5, 20)), 0.
 def problem(
     anchors_m: Sequence[Sequence[float]], centers: Array = PATH, gravity: Gravity | None = None
 ) -> RangeProblem:
-    num, num_anchors = len(centers), len(anchors_m)
-    return RangeProblem(
-        centers=centers,
-        tag_from_center=np.zeros((num, 3)),
-        anchor_index=np.arange(num) % num_anchors,
-        range_m=np.ones(num),
-        stddev_m=np.ones(num),
-        anchor_mean_m=np.array(anchors_m, dtype=np.float64),
-        anchor_stddev_m=np.zeros(num_anchors),
-        bias_mean_m=np.zeros(num_anchors),
-        bias_stddev_m=np.zeros(num_anchors),
-        common_bias_stddev_m=0.0,
-        frame_is_free=True,
-        gravity=gravity,
-    )
+    return range_problem(centers, np.array(anchors_m, dtype=np.float64), gravity=gravity)
 
 
 def at(height_m: float, of: RangeProblem, scale: float = 1.0) -> RangeState:

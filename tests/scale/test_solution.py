@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.known import known
+from tests.simulated.range_problem import range_problem
 
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
@@ -40,20 +41,7 @@ def on_a_sphere() -> Array:
 
 
 def problem_of(centers: Array = BENT, anchors_m: Array = ANCHORS_M, *, frame_is_free: bool = True) -> RangeProblem:
-    num, num_anchors = len(centers), len(anchors_m)
-    return RangeProblem(
-        centers=centers,
-        tag_from_center=np.zeros((num, 3)),
-        anchor_index=np.arange(num) % num_anchors,
-        range_m=np.ones(num),
-        stddev_m=np.full(num, 0.1),
-        anchor_mean_m=anchors_m,
-        anchor_stddev_m=np.where(np.isnan(anchors_m[:, 0]), np.inf, 0.0),
-        bias_mean_m=np.zeros(num_anchors),
-        bias_stddev_m=np.zeros(num_anchors),
-        common_bias_stddev_m=0.0,
-        frame_is_free=frame_is_free,
-    )
+    return range_problem(centers, anchors_m, frame_is_free=frame_is_free)
 
 
 def state_of(scale: float, rotation: Array | None = None, translation: Array | None = None) -> RangeState:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.simulated.range_problem import range_problem
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
@@ -38,33 +39,6 @@ SITE_M = np.array([[6.0, 0.0, 2.5], [-6.0, 1.0, 0.4], [0.5, 6.0, 3.0], [1.0, -6.
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def problem_of(
-    centers: Array,
-    anchors_m: Array,
-    range_m: Array | None = None,
-    *,
-    bias_m: Array | None = None,
-    stddev_m: float | Array = 0.1,
-    gravity: Gravity | None = None,
-) -> RangeProblem:
-    """Return ranges to each anchor in turn; an anchor at NaN is unknown."""
-    num, num_anchors = len(centers), len(anchors_m)
-    return RangeProblem(
-        centers=centers,
-        tag_from_center=np.zeros((num, 3)),
-        anchor_index=np.arange(num) % num_anchors,
-        range_m=np.ones(num) if range_m is None else range_m,
-        stddev_m=np.broadcast_to(stddev_m, num).astype(np.float64),
-        anchor_mean_m=anchors_m,
-        anchor_stddev_m=np.where(np.isnan(anchors_m[:, 0]), np.inf, 0.0),
-        bias_mean_m=np.zeros(num_anchors) if bias_m is None else bias_m,
-        bias_stddev_m=np.zeros(num_anchors),
-        common_bias_stddev_m=0.0,
-        frame_is_free=True,
-        gravity=gravity,
-    )
-
-
 def wavy_path(num: int) -> Array:
     """Return a path that is neither flat nor round, of about 2 units."""
     at = np.linspace(0.0, 5.0, num)
@@ -74,7 +48,7 @@ def wavy_path(num: int) -> Array:
 def placed_at(similarity: Similarity, num: int = 60, gravity: Gravity | None = None) -> RangeProblem:
     """Return exact ranges from a path at a known place among five surveyed anchors, with arms and biases."""
     bias_m = np.array([0.3, -0.2, 0.1, 0.0, 0.4])
-    at = problem_of(wavy_path(num), SITE_M, bias_m=bias_m, gravity=gravity)
+    at = range_problem(wavy_path(num), SITE_M, bias_mean_m=bias_m, gravity=gravity)
     at = replace(at, tag_from_center=np.random.default_rng(0).normal(0.0, 0.3, (num, 3)))
     return replace(at, range_m=predicted_ranges(at, RangeState(similarity, SITE_M, bias_m)))
 
@@ -174,12 +148,12 @@ def test_the_cost_of_a_translation_is_the_mean_error_of_the_ranges_each_up_to_th
     off_m: float,
 ) -> None:
     """Around the middle of six anchors, ranges that err alike fit the linear equation, but not the distances."""
-    alike = problem_of(np.zeros((6, 3)), 4.0 * AXES, np.full(6, 4.0 + off_m))
+    alike = range_problem(np.zeros((6, 3)), 4.0 * AXES, np.full(6, 4.0 + off_m))
     translations, costs = starts._translations(alike, 1.0, np.eye(3)[None])
     np.testing.assert_allclose(translations, 0.0, atol=1e-6)
     np.testing.assert_allclose(costs, 0.2, rtol=1e-6)
     # One of thirteen is 5 m too long, and counts as 0.6 m.
-    one_wrong = problem_of(np.zeros((13, 3)), 4.0 * np.concatenate([AXES, AXES, AXES[:1]]))
+    one_wrong = range_problem(np.zeros((13, 3)), 4.0 * np.concatenate([AXES, AXES, AXES[:1]]))
     range_m = np.where(np.arange(13) == 12, 9.0, 4.0 + off_m)
     translations, costs = starts._translations(replace(one_wrong, range_m=range_m), 1.0, np.eye(3)[None])
     np.testing.assert_allclose(translations, 0.0, atol=0.02)
@@ -188,7 +162,7 @@ def test_the_cost_of_a_translation_is_the_mean_error_of_the_ranges_each_up_to_th
 
 def test_a_tag_near_an_anchor_has_a_translation_too() -> None:
     place = SITE_M[0] + [0.0, 0.03, 0.04]
-    touching = problem_of(np.zeros((10, 3)), SITE_M, np.tile(np.linalg.norm(SITE_M - place, axis=1), 2))
+    touching = range_problem(np.zeros((10, 3)), SITE_M, np.tile(np.linalg.norm(SITE_M - place, axis=1), 2))
     translations, costs = starts._translations(touching, 1.0, np.eye(3)[None])
     np.testing.assert_allclose(translations[0], place, atol=0.04)
     assert costs[0] < 0.04
@@ -197,7 +171,7 @@ def test_a_tag_near_an_anchor_has_a_translation_too() -> None:
 def test_scales_to_try_begin_at_three_tenths_of_the_least_scale_that_explains_the_ranges() -> None:
     """A path straight away from an anchor at 2 m per unit, and 80 scales in even steps up to 200 times the first."""
     away = np.linspace(0.0, 3.0, 10)[:, None] * [1.0, 0.0, 0.0]
-    scales = scale_candidates(problem_of(away, np.full((1, 3), np.nan), 1.0 + 2.0 * away[:, 0]))
+    scales = scale_candidates(range_problem(away, np.full((1, 3), np.nan), 1.0 + 2.0 * away[:, 0]))
     assert len(scales) == 80
     assert scales[0] == pytest.approx(0.6)
     np.testing.assert_allclose(scales[1:] / scales[:-1], 200 ** (1 / 79))
@@ -207,14 +181,14 @@ def test_only_steps_of_more_than_half_of_the_path_bound_the_scale_and_their_uppe
     # Steps of 10, 5.5 and 4.5 units: the first two change the range by 1 and 2 m per unit, and the quartile between
     # them is 1.75. With the third one it would be 1.5, and without the second one 1.
     centers = np.array([0.0, 4.5, 10.0])[:, None] * [0.0, 0.6, 0.8]
-    least = scale_candidates(problem_of(centers, np.full((1, 3), np.nan), np.array([20.0, 21.0, 10.0])))[0] / 0.3
+    least = scale_candidates(range_problem(centers, np.full((1, 3), np.nan), np.array([20.0, 21.0, 10.0])))[0] / 0.3
     assert least == pytest.approx(1.75)
 
 
 def test_each_anchor_has_a_say_in_the_scales_to_try_but_only_in_its_own_ranges() -> None:
     """One anchor's ranges change by 3 m per unit and another's by 1; the quartile is between. A third is not heard."""
     centers = np.array([0.0, 0.0, 1.0, 1.0])[:, None] * [1.0, 0.0, 0.0]
-    two = problem_of(centers, np.full((2, 3), np.nan), np.array([50.0, 7.0, 53.0, 6.0]))
+    two = range_problem(centers, np.full((2, 3), np.nan), np.array([50.0, 7.0, 53.0, 6.0]))
     unheard = replace(two, anchor_mean_m=np.full((3, 3), np.nan), anchor_stddev_m=np.full(3, np.inf))
     for each in (two, unheard):
         assert scale_candidates(each)[0] / 0.3 == pytest.approx(2.5)
@@ -225,7 +199,7 @@ def test_each_anchor_has_a_say_in_the_scales_to_try_but_only_in_its_own_ranges()
 )
 def test_without_motion_or_change_of_any_range_no_scale_is_tried(length: float, change_m: float, is_told: bool) -> None:
     """Differences that rounding alone may make are none."""
-    moved = problem_of(
+    moved = range_problem(
         np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]]), np.full((1, 3), np.nan), np.array([5.0, 5.0 + change_m])
     )
     if is_told:
@@ -247,7 +221,7 @@ def test_anchors_are_located_at_the_true_scale_and_cost_more_at_others() -> None
 def test_costs_of_located_anchors_are_means_over_all_ranges_with_residuals_in_three_standard_deviations() -> None:
     """Anchors in the middle of a sphere: its linear equation fits at any scale, and distances are off by the radius."""
     sphere = np.concatenate([AXES, AXES[[0, 2, 1, 4, 3, 5]]])
-    middle = problem_of(np.concatenate([sphere, AXES]), np.full((2, 3), np.nan), bias_m=np.array([0.0, 0.5]))
+    middle = range_problem(np.concatenate([sphere, AXES]), np.full((2, 3), np.nan), bias_mean_m=np.array([0.0, 0.5]))
     index = np.repeat([0, 1], [12, 6])
     # Half of the ranges have a stddev of 0.1 m, and some have a larger one: the median is in force.
     stddev_m = np.where(np.arange(18) < 5, 7.0, 0.1)

@@ -26,7 +26,7 @@ class TestsOfLines:
     Attributes:
         statements: of each file, by its path in the package.
         runs: names of the tests that run a line, by path and line.
-        seconds: that a test takes, by its name.
+        every: names of all tests. seconds: that a test takes, by its name.
     """
 
     def __init__(self, checkout: Path, folder: Path) -> None:
@@ -43,6 +43,7 @@ class TestsOfLines:
             by_line = data.contexts_by_lineno(name)
             # A context is the name of a test with "|run" or, for fixtures, "|setup"; at the import it is empty.
             self.runs[path] = {line: {each.rsplit("|", 1)[0] for each in by_line[line] if each} for line in by_line}
+        self.every = set().union(*(tests for by_line in self.runs.values() for tests in by_line.values()))
         self.seconds = dict(_seconds(folder / "tests.xml"))
 
     @classmethod
@@ -65,8 +66,7 @@ class TestsOfLines:
         running = self._running(path, line)
         mirrored = f"tests/{path.parent.as_posix()}/"
         files = {name for name in (test.split("::")[0] for test in running) if name.startswith(mirrored)}
-        every = set().union(*(tests for by_line in self.runs.values() for tests in by_line.values()))
-        others = {test for test in every if test.split("::")[0] in files} - running
+        others = {test for test in self.every if test.split("::")[0] in files} - running
         ordered = [*self._quick_first(running), *self._quick_first(others)]
         ends = np.cumsum([self.seconds.get(test, 0.0) for test in ordered])
         within = ordered[: int(np.searchsorted(ends, MAX_SECONDS))]

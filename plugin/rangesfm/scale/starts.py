@@ -198,11 +198,10 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
         if not math.isclose(fits[0].cost, fits[1].cost, rel_tol=SAME_COST, abs_tol=SAME_COST):
             fits.sort(key=lambda fit: fit.cost)
         anchors[k], others[k] = (fit.state.anchors_m[0] for fit in fits)
-        between = [
-            0.5 * (first + second) for first, second in zip(*((f.state.anchors_m, f.state.bias_m) for f in fits))
-        ]
-        ridge = solve(alone, RangeState(IDENTITY, *between), max_num_evaluations=1).cost
-        if ridge > max(fit.cost for fit in fits):
+        first, second = (fit.state for fit in fits)
+        middle = 0.5 * (first.anchors_m + second.anchors_m), 0.5 * (first.bias_m + second.bias_m)
+        # Both starts may lead to one place, up to the tolerance; then the cost has no ridge between the two.
+        if solve(alone, RangeState(IDENTITY, *middle), max_num_evaluations=1).cost > max(fit.cost for fit in fits):
             rise[k] = fits[1].cost - fits[0].cost
     return replace(state, anchors_m=anchors), others, rise
 
