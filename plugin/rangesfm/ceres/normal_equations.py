@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
 from rangesfm.ceres.linear_solver import normal_matrix, resized
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import both
@@ -21,8 +22,6 @@ from rangesfm.processes.threads import both
 # A motion of the whole world changes no residual if its effect is below this share of the effects of its parts alone:
 # rounding leaves some 1e-15, a single weak range some 1e-5.
 _FREE_MOTION = 1e-9
-# Share of a point's best determined direction below which another direction is not determined.
-_UNDETERMINED = 1e-12
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ class NormalEquations:
         others are as certain as before.
         """
         is_pose = np.repeat([kind == "pose" for kind in self.columns.kinds], np.diff(self.columns.starts))
-        held = diags_array(_UNDETERMINED * is_pose * self.of_photos.diagonal())
+        held = diags_array(ROUNDING * is_pose * self.of_photos.diagonal())
         return replace(self, of_photos=self.of_photos + held)
 
     @property
@@ -223,7 +222,7 @@ def _whitener(points: csc_array) -> bsr_array:
     strengths, directions = np.linalg.eigh(blocks)
     # A point near the horizon has no determined depth. All others stay as they are: what held them, too, would hold the
     # whole map a little, and results would depend on the choice of the coordinates that fix it.
-    strengths = np.maximum(strengths, np.maximum(_UNDETERMINED * strengths[:, 2:], 1e-300))
+    strengths = np.maximum(strengths, np.maximum(ROUNDING * strengths[:, 2:], 1e-300))
     whitener = directions / np.sqrt(strengths)[:, None, :]
     indices = np.arange(num_points)
     return bsr_array((whitener, indices, np.arange(num_points + 1)), shape=(3 * num_points, 3 * num_points))

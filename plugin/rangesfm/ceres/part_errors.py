@@ -11,6 +11,7 @@ from scipy.sparse import csc_array, diags_array
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.map_errors import Kind, MapErrors, PartErrors
+from rangesfm.geometry.numerics import ROUNDING
 
 # Largest number of modes, which take 7 kB for each keyframe. What they leave counts as independent from keyframe to
 # keyframe. On a field of 500 keyframes (the study of growth), standard deviations between two of them are 0.95 to 1.34
@@ -18,8 +19,6 @@ from rangesfm.geometry.map_errors import Kind, MapErrors, PartErrors
 MAX_NUM_MODES = 300
 # Products by which the subspace of the largest modes is found.
 _NUM_PRODUCTS = 2
-# Share of the largest variance that may be rounding: a mode with a smaller one is made smaller still.
-_ROUNDING = 1e-10
 
 
 class PartSteps(NamedTuple):
@@ -117,7 +116,7 @@ def _largest_modes(product: Callable[[Array], Array], size: int) -> Array:
     image = product(basis)
     small = basis.T @ image
     values, vectors = linalg.eigh((small + small.T) / 2)
-    least = _ROUNDING * values.max(initial=0.0) + 1e-300
+    least = ROUNDING * values.max(initial=0.0) + 1e-300
     modes: Array = image @ (vectors / np.sqrt(np.maximum(values, least)))
     return modes
 

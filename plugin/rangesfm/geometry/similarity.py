@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.rotations import cross_matrices
 
 
@@ -39,9 +40,6 @@ def overflow_raised() -> np.errstate:
 
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
-# Rounding error that some operations in double precision may leave, as a fraction of the coordinates or, where they are
-# smaller, of their unit.
-_ROUNDING = 1e-12
 # A camera counts as being at the origin up to this fraction of the path's extent. Rounding stays below it even if the
 # world in which the path was computed was far from its own origin.
 _AT_ORIGIN = 1e-6
@@ -51,7 +49,7 @@ _OF_SOME_SIZE = 0.3
 
 def rounding_of(coordinates: Array) -> float:
     """Return the largest length that may be mere rounding of coordinates (n, 3), in their unit."""
-    return _ROUNDING * (1.0 + float(np.abs(coordinates).max(initial=0.0)))
+    return ROUNDING * (1.0 + float(np.abs(coordinates).max(initial=0.0)))
 
 
 def are_apart(points: Array) -> bool:
@@ -106,7 +104,7 @@ def similarity_between(source: Array, target: Array) -> Similarity | None:
         return None
     found = align_points(source, target)
     extents = [float(np.linalg.norm(points.std(axis=0))) for points in (source, target)]
-    return found if found.scale * extents[0] > _ROUNDING * extents[1] else None
+    return found if found.scale * extents[0] > ROUNDING * extents[1] else None
 
 
 def rmse(differences: Array) -> float:

@@ -18,6 +18,7 @@ from rangesfm.ceres.linear_solver import dense_is_faster, inverse_is_affordable,
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.errors import SolverError
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.noise import robust_stddev
@@ -26,8 +27,6 @@ from rangesfm.refine.vision_information import model_poses
 # Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it changes slowly and seems converged.
 # 1e8 does the same to the bending of a path of 2000 keyframes.
 _INITIAL_TRUST_REGION_RADIUS = 1e10
-# Relative decrease of the cost: no more than rounding, because convergence is judged by the keyframes, not the cost.
-_FUNCTION_TOLERANCE = 1e-12
 # One thread is used for any number of residuals. Several threads would add them in the order in which they finish, so
 # that the same command gives other last digits each time; with a million residuals they save hardly any time.
 _MIN_NUM_RESIDUALS_FOR_THREADS = 2**31 - 1
@@ -292,7 +291,7 @@ def _bundle_adjuster(
     ba.refine_focal_length = ba.refine_extra_params = any(refines)
     solver = ba.ceres.solver_options
     solver.initial_trust_region_radius = _INITIAL_TRUST_REGION_RADIUS
-    solver.function_tolerance = _FUNCTION_TOLERANCE
+    solver.function_tolerance = ROUNDING  # convergence is judged by the keyframes, not by the cost
     # These tolerances compare steps with all parameters, and points near the horizon may be millions of metres away.
     solver.gradient_tolerance = solver.parameter_tolerance = 0.0
     solver.max_num_iterations = options.max_num_iterations

@@ -18,6 +18,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres.linear_solver import factor, normal_matrix, resized
 from rangesfm.ceres.nested_dissection import NestedFactor, SingularError
 from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.geometry.trajectory import Trajectory
@@ -29,8 +30,7 @@ from rangesfm.refine.bundle_adjustment import farthest, still_to_come
 from rangesfm.refine.radio import Antennas
 from rangesfm.refine.vision_information import Poses, VisionInformation, relative_poses
 
-_MAX_NUM_STEPS = 60
-_INITIAL_DAMPING, _LEAST_DAMPING = 1e-8, 1e-12
+_INITIAL_DAMPING = 1e-8
 _MAX_DAMPING = 1e6
 # Number of random vectors for the estimated trace (number of parameters that the ranges determine).
 _NUM_PROBES = 12
@@ -115,7 +115,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
     state, damping = start, _INITIAL_DAMPING
     terms = solved = _Terms.at(graph, layout, state)
     factored, used, step_count, movement = None, damping, 0, 0.0
-    while step_count < _MAX_NUM_STEPS and damping < _MAX_DAMPING:
+    while step_count < MAX_NUM_ROUNDS and damping < _MAX_DAMPING:
         step_count += 1
         solved, used, factored = terms, damping, _factor(terms.hessian_of_free, damping, layout.blocks)
         step = factored.solve(-terms.gradient[layout.free])
@@ -125,7 +125,7 @@ def solve_graph(graph: KeyframeGraph, start: GraphState, *, tolerance_m: float) 
             damping *= 10
             continue
         last, movement = movement, farthest(trial.poses.centers, state.poses.centers)
-        state, terms, damping = trial, trial_terms, max(damping / 10, _LEAST_DAMPING)
+        state, terms, damping = trial, trial_terms, max(damping / 10, ROUNDING)
         if min(movement, still_to_come(movement, last)) < tolerance_m:
             break
     if factored is None or used > _INITIAL_DAMPING:  # more would hide what the ranges determine
@@ -379,7 +379,7 @@ def _factor(hessian: Array | sparse.csr_array, damping: float, blocks: tuple[Ind
     """
     diagonal = hessian.diagonal()
     # The floor keeps a pose without constraints in place.
-    damped = hessian + sparse.diags_array(damping * diagonal + 1e-12 * diagonal.max())
+    damped = hessian + sparse.diags_array(damping * diagonal + ROUNDING * diagonal.max())
     try:
         return factor(damped, *blocks)
     except SingularError:

@@ -14,6 +14,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import ResidualErrors
 from rangesfm.colmap.calibrated_cameras import cameras_as_given
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.components import BENDS
@@ -171,7 +172,7 @@ def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) ->
 
     shifts_px = np.linalg.norm(approx_fprime(camera.params, image_of_edge, 1e-6), axis=0)
     of_focal_lengths = np.linalg.norm(shifts_px[list(camera.focal_length_idxs())])
-    smallest = 1e-12 * of_focal_lengths  # a parameter without any effect gets a very large stddev
+    smallest = ROUNDING * of_focal_lengths  # a parameter without any effect gets a very large stddev
     stddevs: Array = focal_length_stddev_px * of_focal_lengths / np.maximum(shifts_px, smallest)
     stddevs[list(camera.focal_length_idxs())] = focal_length_stddev_px
     return stddevs

@@ -19,6 +19,7 @@ from scipy import sparse
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.point_observations import seen_in
 from rangesfm.errors import SolverError
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import side_by_side
@@ -272,7 +273,7 @@ def steps_of_points(observations: Observations, to_point: Array, residuals: Arra
 
 def _regular(information: Array) -> Array:
     """Return (n, 3, 3) information on points with what rounding needs to invert it where a depth is open."""
-    ridge = 1e-12 * np.trace(information, axis1=1, axis2=2) + 1e-200
+    ridge = ROUNDING * np.trace(information, axis1=1, axis2=2) + 1e-200
     return np.asarray(information + ridge[:, None, None] * np.eye(3))
 
 

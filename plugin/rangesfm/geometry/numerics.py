@@ -1,0 +1,15 @@
+"""What counts as rounding, as undetermined, as significant and as too long an iteration, for all estimators."""
+
+from typing import Final
+
+ROUNDING: Final = 1e-12
+"""Share of numbers that some hundred operations in double precision may leave where the exact result is zero."""
+
+UNDETERMINED: Final = 1e-7
+"""Relative singular value below which nothing determines a direction: in normal equations its square is rounding."""
+
+MAX_NUM_ROUNDS: Final = 60
+"""Cap of iterations that end by themselves, so that one that never settles ends too."""
+
+SIGNIFICANT_STDDEVS: Final = 3.0
+"""Deviation, in standard deviations, that is hardly ever chance: once in 370 times where errors are normal."""
