@@ -261,10 +261,10 @@ def test_there_are_at_most_300_modes() -> None:
 
 
 def test_modes_that_may_be_rounding_are_made_smaller() -> None:
-    variances = np.array([4.0, 4.4e-10, 3.6e-10, 4e-12, -1e-16, 0.0])
+    variances = np.array([4.0, 4.4e-12, 3.6e-12, 4e-14, -1e-18, 0.0])
     found = part_errors._largest_modes(lambda right: variances[:, None] * right, 6)
-    # Below 1e-10 of the largest variance, the mode is the variance over the root of that.
-    expected = [4.0, 4.4e-10, 3.6e-10**2 / 4e-10, 4e-12**2 / 4e-10, 0.0, 0.0]
+    # Below 1e-12 of the largest variance, the mode is the variance over the root of that.
+    expected = [4.0, 4.4e-12, 3.6e-12**2 / 4e-12, 4e-14**2 / 4e-12, 0.0, 0.0]
     np.testing.assert_allclose(np.diag(found @ found.T), expected, rtol=1e-9, atol=1e-20)
 
 

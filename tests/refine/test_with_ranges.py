@@ -170,7 +170,7 @@ def make_survey(
 
 
 def presolve_with_known_errors(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Presolved:
-    return Presolved(errors, 0.0, presolve_again(problem, rays, errors, problem.radio.anchors), 0.0, 0)
+    return presolve_again(problem, rays, errors, problem.radio.anchors)
 
 
 def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:

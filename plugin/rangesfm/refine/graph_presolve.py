@@ -72,9 +72,7 @@ class Presolved:
     num_steps: int
 
 
-def presolve(
-    problem: RefinementProblem, rays: Observations, errors: RangeErrors, loops: LoopPoses | None = None
-) -> Presolved:
+def presolve(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Presolved:
     """Solve the keyframe graph and move the model accordingly, in place.
 
     The errors are estimated again with every solution. While the drift is large, the residuals and their standard
@@ -84,36 +82,49 @@ def presolve(
 
     Args:
         rays: all observations of the photos. errors: of the ranges that take part.
-        loops: by indices in ``problem.frame_ids``; None without any.
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Presolved(errors, 0.0, problem.radio.anchors, 0.0, 0)
     graph = _graph(problem, rays, errors, problem.radio.anchors)
+    fit, errors = _solve_with_own_errors(graph)
+    return _moved(problem, rays, graph, fit, errors)
+
+
+def presolve_again(
+    problem: RefinementProblem,
+    rays: Observations,
+    errors: RangeErrors,
+    anchors: tuple[AnchorEstimate, ...],
+    loops: LoopPoses | None = None,
+) -> Presolved:
+    """Solve the keyframe graph again from a model that was refined, with known errors, and move the model, in place.
+
+    New errors turn the whole map slightly. That is one step here, but tens of rejected steps in the full problem, whose
+    points follow a turn along straight lines.
+
+    Args:
+        rays: all observations of the photos. errors: of the ranges that take part. anchors: as they are now.
+        loops: by indices in ``problem.frame_ids``; None without any.
+    """
+    graph = _graph(replace(problem, is_refined=True), rays, errors, anchors)
     if loops is not None:
         graph = replace(graph, vision=graph.vision.with_loops(loops))
-    fit, errors = _solve_with_own_errors(graph)
+    fit = solve_graph(graph, graph.start(), tolerance_m=_tolerance_m(errors))
+    return _moved(problem, rays, graph, fit, errors)
+
+
+def _moved(
+    problem: RefinementProblem, rays: Observations, graph: KeyframeGraph, fit: GraphSolution, errors: RangeErrors
+) -> Presolved:
+    """Move the model to a solution of its graph, in place, and return the result."""
     _move(problem, rays, graph.vision, fit.state.poses, errors)
     return Presolved(
         errors=errors,
         num_absorbed=fit.num_absorbed,
-        anchors=moved_anchors(problem.radio.anchors, fit.state.anchors_m, fit.state.biases_m),
+        anchors=moved_anchors(graph.anchors, fit.state.anchors_m, fit.state.biases_m),
         bend_m=_bend(graph.vision.origin.centers, fit.state.poses.centers),
         num_steps=fit.num_steps,
     )
-
-
-def presolve_again(
-    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
-) -> tuple[AnchorEstimate, ...]:
-    """Solve the keyframe graph again from the current model, with known errors; return the moved anchors.
-
-    New errors turn the whole map slightly. That is one step here, but tens of rejected steps in the full problem, whose
-    points follow a turn along straight lines.
-    """
-    graph = _graph(replace(problem, is_refined=True), rays, errors, anchors)
-    state = solve_graph(graph, graph.start(), tolerance_m=_tolerance_m(errors)).state
-    _move(problem, rays, graph.vision, state.poses, errors)
-    return moved_anchors(anchors, state.anchors_m, state.biases_m)
 
 
 def _graph(

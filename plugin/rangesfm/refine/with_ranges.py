@@ -42,9 +42,11 @@ from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import (
     LoopPoses,
     Observations,
+    Poses,
     misplaced_points,
     model_observations,
     model_poses,
+    project,
 )
 
 # Largest number of solutions of the full problem, between which the errors of ranges and pixels are estimated again.
@@ -225,8 +227,9 @@ def refine_with_ranges(
         metric_from_sfm: from the world of ``observations`` to that of ``reconstruction``.
         anchors: in the order of the log, in the metric world. Prior standard deviation 0 fixes an anchor, a finite one
             adds a prior, an infinite one leaves it free.
-        errors: of all ranges of the log, from the scale stage. Unless the noise is given, it is estimated again for
-            each anchor, together with shares and inflation.
+        errors: of all ranges of the log, from the scale stage, or from the refinement before where loops are to be
+            closed. Unless the noise is given, it is estimated again for each anchor, together with shares and
+            inflation.
         tag_in_cam_m: (3,) antenna in the camera (rig) frame; or (num_tags, 3), in the order of the log's tags.
         first_pose_is_fixed: the gauge: True in the first camera's frame, False where surveyed anchors determine the
             frame.
@@ -236,7 +239,7 @@ def refine_with_ranges(
         shared_errors_m: (n, k) errors that the log's ranges share, for k independent standard deviations, which all
             other measurements may correct; None without any.
         learn: estimates the ranges' errors at the refined map, for its covariance; None: those in ``errors`` are used.
-        closing: loops to be closed before; None without any.
+        closing: loops of a refined map, to be closed before; None without any.
         is_refined: whether the model was refined with these ranges before, as one whose loops
             are closed was. It stays where it is if nothing is new.
 
@@ -271,11 +274,15 @@ def refine_with_ranges(
         is_refined or closing is not None,
     )
     with at_most(num_threads):
-        to_begin_with = _errors_to_begin_with(problem, errors, metric_from_sfm.scale)
-        if closing is not None:
-            problem = _with_closed_loops(problem, to_begin_with, closing)
+        if closing is None:
+            errors, closed = _errors_to_begin_with(problem, errors, metric_from_sfm.scale), None
+        else:
+            errors = errors.subset(ranges.rows)
+            closed = _close_loops(problem, errors, closing)
         with _markers_in_map(problem) as with_markers:
-            summary = _refine(with_markers, to_begin_with, learn)
+            with_markers, bundle, rays = _without_misplaced(with_markers)
+            start = closed or presolve(with_markers, rays, errors)
+            summary = _adjust(with_markers, bundle, start, learn)
     return metric, summary
 
 
@@ -313,12 +320,6 @@ def _between_anchors(
     )
 
 
-def _refine(problem: RefinementProblem, errors: RangeErrors, learn: Learn | None) -> RefineSummary:
-    """Remove drift from the map, then solve the full problem, both without the misplaced points."""
-    problem, bundle, rays = _without_misplaced(problem)
-    return _adjust(problem, bundle, presolve(problem, rays, errors), learn)
-
-
 def _without_misplaced(problem: RefinementProblem) -> tuple[RefinementProblem, BundleAdjustment, Observations]:
     """Return the problem without the misplaced points, its bundle adjustment, and the observations of all points."""
     frame_ids = problem.frame_ids
@@ -329,31 +330,46 @@ def _without_misplaced(problem: RefinementProblem) -> tuple[RefinementProblem, B
     return problem, bundle, rays.with_pixel_stddev(bundle.pixel_stddev)
 
 
-def _with_closed_loops(problem: RefinementProblem, errors: RangeErrors, closing: LoopClosing) -> RefinementProblem:
-    """Move the model so that its loops close, merge its tracks, and return the problem with the anchors moved along."""
+def _close_loops(problem: RefinementProblem, errors: RangeErrors, closing: LoopClosing) -> Presolved:
+    """Move a refined model so that its loops close, and merge its tracks, in place.
+
+    Loops that contradict the ranges are not closed. So the errors that the ranges show in the map with open loops are
+    right for the map with closed ones, too, and no robust start is needed.
+    """
     place = {frame_id: k for k, frame_id in enumerate(problem.frame_ids.tolist())}
     reference, frame = (
         np.array([place[frame_id] for frame_id in ids.tolist()], dtype=np.int64)
         for ids in (closing.loops.reference, closing.loops.frame)
     )
     seen, _, rays = _without_misplaced(problem)
-    moved = presolve(seen, rays, errors, replace(closing.loops, reference=reference, frame=frame))
-    problem = replace(problem, radio=replace(problem.radio, anchors=moved.anchors))
+    loops = replace(closing.loops, reference=reference, frame=frame)
+    moved = presolve_again(seen, rays, errors, problem.radio.anchors, loops)
     closing.merge_tracks(problem.metric)
+    if moved.bend_m < _just_visible_m(rays, model_poses(problem.metric, problem.frame_ids)):
+        return moved
     # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do
     # so only when those that have merged have straightened it.
-    problem = _settled(problem, errors)
+    anchors = _settled(problem, errors, moved.anchors)
     closing.merge_tracks(problem.metric)
-    return problem
+    return replace(moved, anchors=anchors)
 
 
-def _settled(problem: RefinementProblem, errors: RangeErrors) -> RefinementProblem:
-    """Solve the full problem once, with known errors."""
+def _just_visible_m(rays: Observations, poses: Poses) -> float:
+    """Return the movement of a camera that moves a feature at median depth by its standard deviation."""
+    _, in_cam, _ = project(rays, poses, rays.points)
+    return float(np.median(np.abs(in_cam[:, 2]) / rays.root_information))
+
+
+def _settled(
+    problem: RefinementProblem, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
+) -> tuple[AnchorEstimate, ...]:
+    """Solve the full problem once, with known errors, and return the moved anchors."""
+    radio = replace(problem.radio, anchors=anchors)
     with _markers_in_map(problem) as with_markers:
         with_markers, bundle, _ = _without_misplaced(with_markers)
-        added = with_markers.add_to(bundle, errors, problem.radio)
+        added = with_markers.add_to(bundle, errors, radio)
         solve_bundle_adjustment(bundle, _tolerance_m(problem, errors))
-        return replace(problem, radio=added.estimate(problem.radio))
+        return added.estimate(radio).anchors
 
 
 @dataclass(frozen=True)
@@ -377,8 +393,8 @@ def _adjust(
             before = _Round(replace(problem.radio, anchors=start.anchors), (), problem.options.max_num_iterations)
         else:
             rays = model_observations(problem.metric, problem.frame_ids).with_pixel_stddev(bundle.pixel_stddev)
-            anchors = presolve_again(problem, rays, errors, before.radio.anchors)
-            before = replace(before, radio=replace(before.radio, anchors=anchors))
+            moved = presolve_again(problem, rays, errors, before.radio.anchors)
+            before = replace(before, radio=replace(before.radio, anchors=moved.anchors))
             bundle = problem.of_photos(before.num_left)
         added = problem.add_to(bundle, errors, before.radio)
         solution = solve_bundle_adjustment(bundle, _tolerance_m(problem, errors))
