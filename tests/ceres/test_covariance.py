@@ -754,8 +754,8 @@ def similarity_by_steps(centers: Array) -> Array:
     return by_pose
 
 
-@pytest.mark.parametrize(("share", "has_turn"), [(0.8e-10, False), (1.25e-10, True)])
-def test_a_path_is_straight_below_a_ten_billionth_of_its_squared_extent(share: float, *, has_turn: bool) -> None:
+@pytest.mark.parametrize(("share", "has_turn"), [(0.8e-14, False), (1.25e-14, True)])
+def test_a_path_is_straight_below_a_ten_millionth_of_its_extent(share: float, *, has_turn: bool) -> None:
     """Then the turn about it is left out, and all other motions are as they were."""
     aside = np.sqrt(share / 3.0)  # of the squares, the sum is 6 aside**2, of which the length has 2
     gradients = similarity_by_steps(5.0 + 7.0 * np.array([[-1.0, aside, 0], [0, -2 * aside, 0], [1, aside, 0]]))

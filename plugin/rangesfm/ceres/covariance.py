@@ -16,13 +16,12 @@ from rangesfm.ceres.normal_equations import BlockColumns, NormalEquations, addre
 from rangesfm.ceres.part_errors import PartSteps, map_errors
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.map_errors import MapErrors
+from rangesfm.geometry.numerics import UNDETERMINED
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import similarity_motions
 
 # Smallest pivot of the normal equations, with their diagonal scaled to 1, for a direction to count as determined.
 _MIN_PIVOT = 1e-13
-# Share of the squared extent of a path below which it is straight: then the turn about it is not determined.
-_NO_TURN = 1e-10
 
 
 @dataclass(frozen=True)
@@ -307,7 +306,8 @@ def _similarity_gradients(columns: BlockColumns, num_rows: int) -> Array:
     size = float(np.linalg.norm(centers - centers.mean(axis=0)) / np.sqrt(len(centers))) or 1.0
     unit = np.array([size] * 4 + [1.0] * 3)
     in_lengths = np.einsum("nik,nij->kj", motions, motions) / np.outer(unit, unit)
-    to_similarity = np.linalg.pinv(in_lengths, rcond=_NO_TURN, hermitian=True) / np.outer(unit, unit)
+    # The turn about a straight path is not determined.
+    to_similarity = np.linalg.pinv(in_lengths, rcond=UNDETERMINED**2, hermitian=True) / np.outer(unit, unit)
     gradients = np.zeros((num_rows, 7))
     for pose, motion in zip(columns.poses, motions, strict=True):
         index = columns.index_of.get(address(pose))

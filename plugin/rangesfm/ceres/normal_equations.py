@@ -14,14 +14,10 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres import num_columns, tangent_jacobian
 from rangesfm.ceres.linear_solver import normal_matrix, resized
-from rangesfm.geometry.numerics import ROUNDING
+from rangesfm.geometry.numerics import ROUNDING, UNDETERMINED
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import both
-
-# A motion of the whole world changes no residual if its effect is below this share of the effects of its parts alone:
-# rounding leaves some 1e-15, a single weak range some 1e-5.
-_FREE_MOTION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -259,13 +255,15 @@ def _world_motions(columns: BlockColumns) -> Array:
 def _free_motions(motions: Array, effects: Array) -> Array:
     """Return a basis (num_columns, k) of the motions of the world that change no residual.
 
+    Of the effects of a motion's parts alone, rounding leaves a share of some 1e-15, a single weak range some 1e-5.
+
     Args:
         effects: (2, n, 7) changes of n residuals by the motions, and sums of the sizes of those by their parts.
     """
     alone = np.sqrt(np.square(effects[1]).sum(axis=0))
-    moves = alone > _FREE_MOTION * alone.max(initial=0.0)
+    moves = alone > UNDETERMINED * alone.max(initial=0.0)
     _, strengths, directions = np.linalg.svd(effects[0][:, moves] / alone[moves], full_matrices=False)
-    return np.asarray(motions[:, moves] / alone[moves] @ directions[strengths < _FREE_MOTION].T)
+    return np.asarray(motions[:, moves] / alone[moves] @ directions[strengths < UNDETERMINED].T)
 
 
 def _size_m(columns: BlockColumns) -> float:

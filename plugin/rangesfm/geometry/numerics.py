@@ -13,3 +13,6 @@ MAX_NUM_ROUNDS: Final = 60
 
 SIGNIFICANT_STDDEVS: Final = 3.0
 """Deviation, in standard deviations, that is hardly ever chance: once in 370 times where errors are normal."""
+
+NEGLIGIBLE_STDDEVS: Final = 0.05
+"""Change, in standard deviations of what changes, that nobody notices: it adds 0.1 % to them."""

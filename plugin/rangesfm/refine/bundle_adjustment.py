@@ -18,7 +18,7 @@ from rangesfm.ceres.linear_solver import dense_is_faster, inverse_is_affordable,
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.errors import SolverError
-from rangesfm.geometry.numerics import ROUNDING
+from rangesfm.geometry.numerics import NEGLIGIBLE_STDDEVS, ROUNDING
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.noise import robust_stddev
@@ -29,15 +29,15 @@ from rangesfm.refine.vision_information import model_poses
 _INITIAL_TRUST_REGION_RADIUS = 1e10
 # One thread is used for any number of residuals. Several threads would add them in the order in which they finish, so
 # that the same command gives other last digits each time; with a million residuals they save hardly any time.
-_MIN_NUM_RESIDUALS_FOR_THREADS = 2**31 - 1
+_MIN_NUM_RESIDUALS_FOR_THREADS = np.iinfo(np.int32).max
 # No feature is located more precisely. With a smaller value, ranges would have no weight in a model without noise.
 _MIN_PIXEL_STDDEV = 0.05
 _MAX_NUM_TIE_POINTS = 500
 # A step with a trust region of at least this radius counts as free, that is not damped.
 _FREE_TRUST_REGION_RADIUS = 1e8
 # Expected decrease of half the sum of squares (in standard deviations) below which the minimum is reached: then no
-# quantity of the map differs by more than 0.05 of its standard deviation from its value there.
-_MAX_GAIN_LEFT = 0.5 * 0.05**2
+# quantity of the map differs noticeably from its value there.
+_MAX_GAIN_LEFT = NEGLIGIBLE_STDDEVS**2 / 2
 # In the same unit: decrease that a free step promised and that no step achieved.
 _MAX_PROMISE_LEFT = 0.5
 # Largest relative decrease of the cost by the last step; with more, the cost is still falling by orders of magnitude.
@@ -297,7 +297,7 @@ def _bundle_adjuster(
     solver.max_num_iterations = options.max_num_iterations
     solver.num_threads = num_threads
     ba.ceres.solver_options = solver
-    ba.ceres.min_num_residuals_for_cpu_multi_threading = _MIN_NUM_RESIDUALS_FOR_THREADS
+    ba.ceres.min_num_residuals_for_cpu_multi_threading = int(_MIN_NUM_RESIDUALS_FOR_THREADS)
     num = metric.num_reg_images()
     if num > ba.ceres.max_num_images_direct_dense_cpu_solver:
         overlaps, limit = overlaps_in(metric), ba.ceres.max_num_images_direct_sparse_cpu_solver

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.transform import transform
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
 from rangesfm.geometry.similarity import Similarity, align_points, are_apart, rmse
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
@@ -40,18 +41,11 @@ from rangesfm.refine.vision_information import (
     vision_information,
 )
 
-_MAX_NUM_ROUNDS = 12
 # Relative change of the errors that ends the iteration: with some hundred ranges the noise is not known better.
 SAME_ERRORS = 0.05
 # Movement of a keyframe, in standard deviations of a range, at which the solver stops. A turn of the whole world by
 # centimetres costs the full problem tens of iterations, since all points have to follow; here it costs one step.
 _TOLERANCE = 0.001
-# Bending, in the same unit, below which the map is moved as a whole. The full problem has the same difficulty with a
-# part of the map that turns about a weak link.
-_MIN_BEND = 0.05
-# Tolerance, in the same unit, from which on the residuals show the same errors.
-_ROUGH_TOLERANCE = 0.05
-_NUM_TRIANGULATIONS = 5
 
 
 @dataclass(frozen=True)
@@ -154,10 +148,13 @@ def _graph(
 def _move(
     problem: RefinementProblem, rays: Observations, vision: VisionInformation, after: Poses, errors: RangeErrors
 ) -> None:
-    """Move the model: as a whole, which photos do not notice, or keyframe by keyframe if it bends."""
+    """Move the model: as a whole, which photos do not notice, or keyframe by keyframe if it bends.
+
+    The full problem has the same difficulty with a part of the map that turns about a weak link as with the whole map.
+    """
     metric, before = problem.metric, vision.origin
     whole = _as_a_whole(before, after, problem.held_frame)
-    if rmse(after.centers - whole.apply(before.centers)) > _MIN_BEND * float(np.median(errors.stddev_m)):
+    if rmse(after.centers - whole.apply(before.centers)) > NEGLIGIBLE_STDDEVS * float(np.median(errors.stddev_m)):
         carry_model(metric, problem.frame_ids, rays, before, after, local_scales(vision, after))
         return
     first = pose_of(metric.frame(problem.first_frame_id)).params
@@ -206,7 +203,9 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
     def fit(errors: RangeErrors, before: GraphSolution | None) -> GraphSolution:
         nonlocal num_steps
         state = start if before is None else before.state
-        solution = solve_graph(replace(graph, errors=errors), state, tolerance_m=_tolerance_m(errors, _ROUGH_TOLERANCE))
+        solution = solve_graph(
+            replace(graph, errors=errors), state, tolerance_m=_tolerance_m(errors, NEGLIGIBLE_STDDEVS)
+        )
         num_steps += solution.num_steps
         return solution
 
@@ -214,7 +213,7 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
         fit,
         lambda errors, found: errors.seen_by_bending_map(graph.residuals_m(found.state), found.num_absorbed),
         errors,
-        max_num_rounds=_MAX_NUM_ROUNDS,
+        max_num_rounds=MAX_NUM_ROUNDS,
         is_last=lambda used, shown, _: used.change(shown) < SAME_ERRORS,
     )
     return replace(solution, num_steps=num_steps), seen
@@ -270,7 +269,7 @@ def _carried(observations: Observations, before: Poses, after: Poses, local_scal
 def _triangulated(observations: Observations, poses: Poses, start: Array) -> Array:
     """Return the (p, 3) points that fit the rays best, by Gauss-Newton steps that are kept where they help."""
     points, cost = start, costs_of_points(observations, poses, start)
-    for _ in range(_NUM_TRIANGULATIONS):
+    for _ in range(MAX_NUM_ROUNDS):
         _, in_cam, derivative = project(observations, poses, points)
         residuals = np.nan_to_num(ray_residuals(observations, in_cam), posinf=0.0)
         root = robust_root_weights(residuals)[:, None]
@@ -278,6 +277,10 @@ def _triangulated(observations: Observations, poses: Poses, start: Array) -> Arr
         to_point = to_rig @ np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
         trial = points + steps_of_points(observations, root[:, :, None] * to_point, root * residuals)
         trial_cost = costs_of_points(observations, poses, trial)
-        points = np.where((trial_cost < cost)[:, None], trial, points)
-        cost = np.fmin(trial_cost, cost)  # a point without any cost keeps its place
+        is_better = trial_cost < cost  # false for a point without any cost, which keeps its place
+        points = np.where(is_better[:, None], trial, points)
+        gain = float(np.sum(cost[is_better] - trial_cost[is_better]))
+        cost[is_better] = trial_cost[is_better]
+        if gain < NEGLIGIBLE_STDDEVS**2 * len(points):  # some points near the horizon move on forever
+            break
     return points

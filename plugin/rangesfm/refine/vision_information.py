@@ -27,7 +27,7 @@ from rangesfm.ranging.errors.robust_loss import RobustLoss
 
 # A long track is cut into overlapping pieces of this length; distant keyframes are linked through those in between.
 _MAX_PIECE = 8
-_PIECE_STEP = 4
+_PIECE_STEP = _MAX_PIECE // 2
 # More pieces per keyframe tell nothing new about its neighbours, so an evenly thinned share with more weight is used.
 # Up to _ENOUGH_PIECES in all none are dropped, and more than _MAX_NUM_PIECES are never used.
 _NUM_PIECES_OF_KEYFRAME = 40
