@@ -16,7 +16,7 @@ from scipy import special
 from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array
-from rangesfm.ranging.errors.learned import ROUNDING
+from rangesfm.geometry.numerics import ROUNDING, UNDETERMINED
 from rangesfm.scale.range_equation import Columns
 
 FALSE_ALARM_RATE = 0.02
@@ -27,8 +27,6 @@ NUM_SUSPECTS = 3
 _ALPHA, _BETA = 0.001, 0.2
 NOTHING_LEFT = 1e-7
 """Squared share of an effect below which what the unknowns leave of it is only rounding."""
-# Relative singular value of the design below which nothing determines a direction of the unknowns.
-_UNDETERMINED = 1e-7
 
 
 @dataclass(frozen=True)
@@ -122,9 +120,9 @@ class Solved:
         whitened = self.whitened(design, prior_design)
         lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-100)
         basis, values, turns = np.linalg.svd(whitened / lengths, full_matrices=False)
-        determined, root = np.maximum(values, _UNDETERMINED), turns.T / lengths[:, None]
+        determined, root = np.maximum(values, UNDETERMINED), turns.T / lengths[:, None]
         self.covariance = root / determined**2 @ root.T
-        self._basis, self._gains = basis[:, values > _UNDETERMINED], root * (values / determined**2) @ basis.T
+        self._basis, self._gains = basis[:, values > UNDETERMINED], root * (values / determined**2) @ basis.T
         self._whole = self.whitened(residual_m[:, None], prior_residual[:, None])
         self.residual = self.left(self._whole)[:, 0]
 

@@ -22,10 +22,11 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.rotations import left_jacobian
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.errors.noise import bias_whitening
-from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
+from rangesfm.ranging.errors.robust_loss import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.placement_prior import PlacementPrior
 
@@ -246,22 +247,13 @@ def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
     return range_gradient(problem, state).distance_m + state.bias_m[problem.anchor_index]
 
 
-# Tolerance for solutions that are kept; candidates to choose among need not be at the very minimum.
-_TIGHT = 1e-12
-# Expected decrease of the cost by a step (squared standard deviations of the parameters): below _NO_GAIN the step is
-# only rounding; above _NEAR_BOTTOM the solver has not converged, and its result is left as it is.
-_NO_GAIN, _NEAR_BOTTOM = 1e-24, 1e-6
-# Most Newton steps; they converge in two or three.
-_MAX_NUM_SETTLING = 20
-
-
 def solve(
     problem: RangeProblem,
     start: RangeState,
     *,
     others: Sequence[RangeProblem] = (),
     loss: RobustLoss = CAUCHY,
-    tolerance: float = 1e-12,
+    tolerance: float = ROUNDING,
     max_num_evaluations: int = 100,
 ) -> RangeFit:
     """Solve by robust least squares, with scipy's trust region solver and an analytic Jacobian.
@@ -271,7 +263,8 @@ def solve(
             and all priors are taken from the first problem.
         start: initial values; an anchor without a position must have no ranges.
         loss: robust loss of the ranges.
-        tolerance: relative change of cost and of parameters at which the solver stops.
+        tolerance: relative change of cost and of parameters at which the solver stops. Candidates to choose among need
+            not be at the very minimum.
     """
     columns = columns_of((problem, *others))
     system = _System((problem, *others), columns, start, loss)
@@ -287,7 +280,7 @@ def solve(
         gtol=None,
         max_nfev=max_num_evaluations,
     )
-    x = _settled(system, result.x) if tolerance <= _TIGHT else result.x
+    x = _settled(system, result.x) if tolerance <= ROUNDING else result.x
     return system.fit(state_after(columns, start, x), float(result.cost))
 
 
@@ -304,13 +297,15 @@ def _settled(system: _System, x: Array) -> Array:
     """Move to the exact minimum by Newton steps that use the gradient alone.
 
     The trust region stops where rounding hides the decrease of the cost, some 1e-9 from the minimum. On which side it
-    stops depends on the last digit of the input.
+    stops depends on the last digit of the input. A step is measured by the decrease of the cost that is expected of it,
+    which is squared standard deviations of the parameters. Where a step promises more than the solver's tolerance, the
+    solver has not converged, and its result is left as it is.
     """
-    for _ in range(_MAX_NUM_SETTLING):
+    for _ in range(MAX_NUM_ROUNDS):
         gradient, curvature = system.slope(state_after(system.columns, system.start, x))
-        step = np.linalg.lstsq(curvature, gradient, rcond=1e-12)[0]
+        step = np.linalg.lstsq(curvature, gradient, rcond=ROUNDING)[0]
         gain = float(gradient @ step)
-        if not _NO_GAIN < gain < _NEAR_BOTTOM:
+        if not ROUNDING**2 < gain < SAME_COST:
             break
         x = x - step
     return x

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.similarity import off_origin
-
-# A discriminant below this share of the squared distance from the anchor (in model units) may be a rounding error of 0.
-_ONE_ROOT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def two_candidate(centers: Array, tag_from_center: Array, anchor_m: Array, range
     with np.errstate(divide="ignore", invalid="ignore"):
         center, discriminant = -b / a, (b / a) ** 2 - c / a
         # Where its ray is nearest to the anchor, a camera has one candidate; rounding must not make it none.
-        has_one = np.abs(discriminant) < _ONE_ROOT * np.sum(offset**2, axis=1) / a
+        has_one = np.abs(discriminant) < ROUNDING * np.sum(offset**2, axis=1) / a
     discriminant[has_one] = 0.0
     rows = np.flatnonzero(off_origin(centers) & (discriminant >= 0))
     if len(rows) < 2:
