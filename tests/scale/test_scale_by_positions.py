@@ -335,7 +335,7 @@ def test_three_positions_off_a_line_determine_a_similarity() -> None:
     assert not _determine(positions, np.array([True, False, False, True]))
     assert not _determine(positions, np.array([True, True, True, False]))
     # The extents across and along are 1 / sqrt(3) and sqrt(2 / 3) of the lengths in a lean triangle.
-    for across, is_enough in ((1.8e-6, True), (1.6e-6, False)):
+    for across, is_enough in ((1.8e-7, True), (1.6e-7, False)):
         lean = replace(positions, places=places + across * np.array([[0.0], [1.0], [0.0], [0.0]]) * [0.0, 1.0, 0.0])
         assert _determine(lean, np.array([True, True, True, False])) is is_enough
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, UNDETERMINED
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions
@@ -26,6 +27,7 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.bending import BendingOfBins, ErrorPart, MapBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.learned import ErrorParts
+from rangesfm.ranging.errors.noise import MIN_STDDEV_M
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import is_line
@@ -48,16 +50,13 @@ from rangesfm.scale.uncertainty import KnownMap
 
 MIN_NUM_POSITIONS = 3
 """Fewest positions, not on one line, that determine a similarity."""
-# Median length of a vector of three normally distributed numbers, in their standard deviation.
-_MEDIAN_LENGTH = 1.538
-# Most triples for a start, and most reweighted steps from there.
-_MAX_NUM_TRIPLES, _NUM_ROUNDS = 300, 30
+# Most triples for a start.
+_MAX_NUM_TRIPLES = 300
 # Standard deviation of the logarithm of what a system says of its own errors, and of what is guessed of them; and the
 # share of the noise that lasts, before anything is known.
 _SPREAD_GIVEN, _SPREAD_GUESSED, _LASTING_SHARE = 0.5, 1.0, 0.3
-# Extent of positions across their line, as a share of that along it, below which it is only rounding; and the largest
-# standard deviation of a turn of the map, radians, for which its effect is linear.
-_ON_LINE, _MAX_TURN_STDDEV = 1e-6, 0.3
+# Largest standard deviation of a turn of the map, radians, for which its effect is linear.
+_MAX_TURN_STDDEV = 0.3
 
 
 @dataclass(frozen=True)
@@ -141,7 +140,7 @@ def _determine(known: KnownPositions, used: Mask) -> bool:
     if used.sum() < MIN_NUM_POSITIONS:
         return False
     stddevs = path_shape(known.places[used]).stddevs
-    return bool(stddevs[1] > _ON_LINE * stddevs[0])
+    return bool(stddevs[1] > UNDETERMINED * stddevs[0])
 
 
 @with_one_blas_thread
@@ -245,7 +244,7 @@ class _Problem:
         """Return the similarity, (k,) weights and (k,) standard deviations, by iteratively reweighted least squares."""
         known = self.known
         similarity = self.refined or start or _of_triples(known, np.flatnonzero(used))
-        for _ in range(_NUM_ROUNDS):
+        for _ in range(MAX_NUM_ROUNDS):
             off_m = known.misclosures_m(similarity)
             stddev_m = self._stddevs_m(off_m, used)
             away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
@@ -254,7 +253,7 @@ class _Problem:
                 break
             step = self._step(similarity, off_m, weights / stddev_m**2)
             similarity = moved_similarity(similarity, step, self.path)
-            if np.abs(step).max() < _SMALL_STEP:
+            if np.abs(step).max() < ROUNDING:
                 break
         return similarity, weights, stddev_m
 
@@ -262,7 +261,7 @@ class _Problem:
         root = np.repeat(np.sqrt(weights), 3)
         off, by = root * off_m.ravel(), root[:, None] * self._design(similarity)
         prior_off, prior_design = self._priors(similarity)
-        step = np.linalg.lstsq(np.vstack([by, prior_design]), -np.append(off, prior_off), rcond=1e-12)[0]
+        step = np.linalg.lstsq(np.vstack([by, prior_design]), -np.append(off, prior_off), rcond=ROUNDING)[0]
         return np.asarray(step)
 
     def _priors(self, similarity: Similarity) -> tuple[Array, Array]:
@@ -284,12 +283,14 @@ class _Problem:
         known, stddevs = self.known, np.ones(len(self.known))
         given = _stddev_of(known.covariance_m2)
         freedom = np.sqrt(3 * used.sum() / max(3 * used.sum() - 7, 1))
+        # Half of all vectors of three normally distributed numbers are shorter than this.
+        median_length = np.sqrt(special.chdtri(3, 0.5))
         for of_kind in (known.is_mark, ~known.is_mark):
             if (rows := used & of_kind).any():
                 is_given = bool(np.isfinite(given[of_kind]).all())
                 ratio = given if is_given else np.ones(len(known))
-                shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / _MEDIAN_LENGTH
-                stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else _LEAST_STDDEV_M)
+                shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / median_length
+                stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else MIN_STDDEV_M)
         return stddevs
 
     def _linear(self, similarity: Similarity, grouping: csr_array, bending: BendingOfBins) -> LinearMap:
@@ -419,12 +420,6 @@ def expected_positions(
     problem.require_enough()
     used = ~known.is_check
     return problem.equations(used, *problem.robust(used, None))[0]
-
-
-# Steps of the similarity (relative, radians, metres) below this are rounding.
-_SMALL_STEP = 1e-10
-# Standard deviation of positions without errors, metres.
-_LEAST_STDDEV_M = 1e-9
 
 
 def moved_similarity(similarity: Similarity, step: Array, path: Trajectory) -> Similarity:
