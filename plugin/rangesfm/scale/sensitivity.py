@@ -5,16 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.ranging.errors.range_bins import RangeBins
+from rangesfm.ranging.readers.units import UNITS_PER_METRE
 from rangesfm.scale.range_equation import predicted_ranges, range_gradient
 from rangesfm.scale.scale_estimate import ScaleSensitivity
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.uncertainty import KnownMap
-
-_CM = 0.01
-# Ranges must be shorter than the median by this factor to count as the shorter half: rounding spreads equal ranges.
-_SHORTER = 1 - 1e-9
 
 
 def scale_sensitivity(solution: Solution, posed: ScaleProblem, known: KnownMap, bins: RangeBins) -> ScaleSensitivity:
@@ -31,17 +29,18 @@ def scale_sensitivity(solution: Solution, posed: ScaleProblem, known: KnownMap, 
         # The scale is half-way between that with the robust weights and that with the best weights.
         return 50 * float(robust @ range_error_m + known.best_by_bins @ bins.mean(range_error_m))
 
-    distance = predicted_ranges(problem, state)
+    distance, centimetre = predicted_ranges(problem, state), 1 / UNITS_PER_METRE["cm"]
     world_from_cam = state.metric_from_model.rotation @ posed.model_from_cam
     along_x, along_y, along_z = range_gradient(problem, state).by_tag_in_cam(world_from_cam).T
     return ScaleSensitivity(
-        common_bias_per_cm=percent(np.full(len(distance), _CM)),
-        short_range_per_cm=percent(np.where(distance < _SHORTER * np.median(distance), _CM, 0.0)),
+        common_bias_per_cm=percent(np.full(len(distance), centimetre)),
+        # Rounding spreads ranges of one length, of which none is a shorter one.
+        short_range_per_cm=percent(np.where(distance < (1 - ROUNDING) * np.median(distance), centimetre, 0.0)),
         anchor_bias_per_cm={
-            anchor_id: percent(np.where(problem.anchor_index == k, _CM, 0.0))
+            anchor_id: percent(np.where(problem.anchor_index == k, centimetre, 0.0))
             for k, anchor_id in enumerate(posed.observations.log.anchor_ids)
         },
         range_slope_per_percent=percent(0.01 * distance),
         # A tag further out than assumed lengthens the measured ranges, which then stretch the map.
-        lever_arm_per_cm=(percent(_CM * along_x), percent(_CM * along_y), percent(_CM * along_z)),
+        lever_arm_per_cm=(percent(centimetre * along_x), percent(centimetre * along_y), percent(centimetre * along_z)),
     )
