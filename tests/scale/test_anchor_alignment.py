@@ -218,15 +218,3 @@ def test_motions_that_put_the_path_within_a_tenth_of_its_extent_are_one(
     found = anchor_alignment._distinct(paired(anchors("ABC"), anchors("ABC")), PATH_M)
     assert len(found) == num
     assert found[0].target_from_source is IDENTITY
-
-
-@pytest.mark.parametrize(("gap", "num"), [(49.0, 2), (51.0, 1)])
-def test_a_motion_that_costs_far_more_than_the_best_one_is_discarded(
-    monkeypatch: pytest.MonkeyPatch, gap: float, num: int
-) -> None:
-    """One anchor that is off by so much that its cost is the gap."""
-    off_stddevs = 2.385 * np.sqrt(np.expm1(gap / (0.5 * 2.385**2)))
-    off = AnchorAlignment(MOTION, {}, np.array([off_stddevs**2]), {})
-    best = AnchorAlignment(IDENTITY, {}, np.zeros(1), {})
-    monkeypatch.setattr(anchor_alignment, "_distinct", lambda pairs, path_m: [best, off])
-    assert align_by_anchors(anchors("ABC"), anchors("ABCD"), PATH_M) == [best, off][:num]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, align_points, path_shape, rmse
 from rangesfm.ranging.errors.robust_loss import CAUCHY
@@ -19,10 +20,8 @@ from rangesfm.scale.starts import each_once
 
 # Triples are tried among this many anchors, the best placed ones. More make it slower without a better result.
 _MAX_NUM_TRIED = 8
-# Most Gauss-Newton steps of a motion, and the number of motions by triples that are refined.
-_NUM_ROUNDS, _NUM_BEST = 30, 6
-# A motion whose robust cost exceeds the best one's by more than this is discarded.
-_MAX_COST_GAP = 50.0
+# Number of motions by triples that are refined.
+_NUM_BEST = 6
 SAME_SHARE = 0.1
 """Two placements of a path are one if its places are no further apart than this, in extents of the path."""
 # An anchor this many standard deviations from its place in the other frame is reported as standing elsewhere.
@@ -134,8 +133,7 @@ def align_by_anchors(
     """
     pairs = {id_: _Pair(target[id_], source[id_]) for id_ in sorted(set(target) & set(source))}
     _refuse_too_few(pairs)
-    fits = _distinct(pairs, source_path_m)
-    return [fit for fit in fits if fit.cost - fits[0].cost < _MAX_COST_GAP]
+    return _distinct(pairs, source_path_m)
 
 
 def _refuse_too_few(pairs: Mapping[str, _Pair]) -> None:
@@ -177,9 +175,9 @@ def _triple_motions(pairs: Iterable[_Pair]) -> Iterator[Similarity]:
 
 def _refined(pairs: Mapping[str, _Pair], fit: AnchorAlignment) -> AnchorAlignment:
     """Refine a motion by reweighted Gauss-Newton steps, each anchor at the places that fit better."""
-    for _ in range(_NUM_ROUNDS):
+    for _ in range(MAX_NUM_ROUNDS):
         middle = np.mean([fit.target_from_source.apply(pair.source.places_m[0]) for pair in pairs.values()], axis=0)
-        normal, right = 1e-12 * np.eye(6), np.zeros(6)
+        normal, right = ROUNDING * np.eye(6), np.zeros(6)
         weights = CAUCHY.rho(fit.squared)[1]
         for (id_, pair), weight in zip(pairs.items(), weights, strict=True):
             side = fit.sides[id_]
