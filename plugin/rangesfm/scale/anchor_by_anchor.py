@@ -12,10 +12,8 @@ from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, MIN_COST_GAP
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 from rangesfm.scale.scale_problem import MIN_RANGES
 from rangesfm.scale.solution import Solution
-from rangesfm.scale.starts import choose_sides, spread_subset
+from rangesfm.scale.starts import choose_sides
 
-# Most ranges with which an anchor is solved alone.
-_MAX_RANGES_ALONE = 3000
 # An anchor gives no scale of its own if the standard deviation of the scale's logarithm is larger than this.
 _MAX_LOG_SCALE_STDDEV = 0.5
 
@@ -31,9 +29,9 @@ def scale_per_anchor(solution: Solution, anchor_ids: tuple[str, ...]) -> dict[st
     placed = replace(state.metric_from_model, translation=state.metric_from_model.apply(middle))
     for k, anchor_id in enumerate(anchor_ids):
         part = problem.of_anchor(k)
-        alone = spread_subset(replace(part, centers=part.centers - middle), _MAX_RANGES_ALONE)
-        if len(alone.range_m) < MIN_RANGES:
+        if len(part.range_m) < MIN_RANGES:
             continue
+        alone = replace(part, centers=part.centers - middle)
         start = RangeState(placed, state.anchors_m[k : k + 1], state.bias_m[k : k + 1])
         fit = solve(alone, start, loss=GEMAN_MCCLURE)
         if fit.log_scale_stddev * solution.errors.inflation < _MAX_LOG_SCALE_STDDEV:
@@ -86,7 +84,7 @@ def _common_bias(problem: RangeProblem, state: RangeState) -> float:
 def _mirror_places(solution: Solution) -> dict[int, Array]:
     """Return the mirror places, by index, of unknown anchors that may stand on either side of the path's plane."""
     found_m = solution.fit.state.anchors_m
-    chosen, others_m, rise = choose_sides(spread_subset(solution.problem, _MAX_RANGES_ALONE), solution.fit.state)
+    chosen, others_m, rise = choose_sides(solution.problem, solution.fit.state)
     sides_m = np.stack([chosen.anchors_m, others_m])
     is_open = rise / solution.errors.inflation**2 < MIN_COST_GAP
     farther = np.argmax(np.linalg.norm(sides_m - found_m, axis=2), axis=0)
