@@ -588,8 +588,8 @@ def test_only_the_uncertainty_of_lengths_has_the_maps_bending() -> None:
     np.testing.assert_allclose(posed.ranges.distances.stddev_m, [0.5 * measured])
 
 
-@pytest.mark.parametrize(("learnt", "share"), [(0.2, 0.0225), (0.02, 1.0), (5.0, 1e-4)])
+@pytest.mark.parametrize(("learnt", "share"), [(0.2, 0.0225), (0.02, 1.0), (np.inf, 1e-12)])
 def test_ranges_are_weighed_by_their_formal_over_their_learnt_variance(learnt: float, share: float) -> None:
-    """The formal standard deviation of 0.01 is inflated three times; the learnt one is of a scale of 2."""
+    """The formal standard deviation of 0.01 is inflated three times; the learnt one is of a scale of 2, or unknown."""
     alone: Any = SimpleNamespace(fit=SimpleNamespace(log_scale_stddev=0.01), errors=SimpleNamespace(inflation=3.0))
     assert initialize._range_share(alone, ScaleByKind(2.0, 2.0 * learnt)) == pytest.approx(share)

@@ -10,6 +10,7 @@ import numpy as np
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import RangeModelOptions, ScaleOptions
@@ -31,9 +32,6 @@ from rangesfm.scale.sensitivity import scale_sensitivity
 from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import known_map, learned_errors, shared_errors_m
-
-# Smallest factor on the weights of ranges beside other measurements, below which they would have no effect.
-_LEAST_SHARE = 1e-4
 
 
 @with_one_blas_thread
@@ -243,9 +241,13 @@ def _by_kind(lengths: LengthScale | None, positions: PositionScale | None) -> di
 
 
 def _range_share(alone: Solution, ranges: ScaleByKind) -> float:
-    """Return the formal over the learnt variance of the scale by ranges alone, at most 1."""
+    """Return the formal over the learnt variance of the scale by ranges alone, at most 1.
+
+    Where ranges alone say nothing of the scale, they keep a share that has no effect: with none at all, nothing would
+    place the anchors.
+    """
     formal = alone.fit.log_scale_stddev * alone.errors.inflation
-    return float(np.clip((formal * ranges.value / ranges.stddev) ** 2, _LEAST_SHARE, 1.0))
+    return float(np.clip((formal * ranges.value / ranges.stddev) ** 2, ROUNDING, 1.0))
 
 
 def _with_share(solution: Solution, range_share: float) -> Solution:
