@@ -65,8 +65,8 @@ def test_points_without_the_coordinate_system_of_the_anchors_are_refused(
         site.local(FAR[None], of_points)
 
 
-@pytest.mark.parametrize(("distance_m", "offset_m"), [(999.0, 0.0), (1001.0, 1001.0)])
-def test_a_site_is_moved_if_its_middle_is_farther_than_a_kilometre(distance_m: float, offset_m: float) -> None:
+@pytest.mark.parametrize(("distance_m", "offset_m"), [(499.0, 0.0), (501.0, 501.0)])
+def test_a_site_is_moved_if_its_middle_is_farther_than_half_a_kilometre(distance_m: float, offset_m: float) -> None:
     across = np.array([0.0, 400.0, 0.0])
     coordinates = np.array([distance_m, 0.0, 0.0]) + np.stack([across, np.full(3, np.nan), -across])
     site, local = site_of(coordinates, None)

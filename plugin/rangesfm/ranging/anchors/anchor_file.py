@@ -15,6 +15,7 @@ from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, rea
 from rangesfm.option_model import Bounds
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import LOCAL_M
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.guess import by_id_rather_than_index, is_named_time, is_range
 from rangesfm.ranging.readers.layout import MISSING, ColumnSample, Layout, find_layout
@@ -28,13 +29,11 @@ _CANONICAL = {
     quantity: quantity if quantity == "anchor_id" else f"{quantity}_m" for quantity in QUANTITIES
 }  # names in the canonical CSV
 _REQUIRED = tuple(_CANONICAL[quantity] for quantity in ("anchor_id", *_AXES))
-_OPTIONAL = tuple(_CANONICAL[quantity] for quantity in QUANTITIES[4:])
+_OPTIONAL = tuple(name for name in _CANONICAL.values() if name not in _REQUIRED)
 _ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
 _EXPECTED = f"expected a table with {','.join(_REQUIRED)}"
 # A table without names is taken for one of anchors only up to this number of rows.
 _MAX_NUM_UNNAMED = 64
-# Coordinates beyond this are those of a surveyed grid, in which north often comes before east.
-_LOCAL_M = 500.0
 _GEOGRAPHIC = "EPSG:4979"
 
 
@@ -234,7 +233,8 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
     east_first, north_first = _choice("if x is east and y is north", columns), _choice("if x is north", swapped)
     if not layout.has_names:
         largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in _AXES), default=0.0)
-        if largest > _LOCAL_M or len(order) > 4:
+        # In a surveyed grid, north often comes before east.
+        if largest > LOCAL_M or len(order) > 4:
             first = _choice("if the numbers are x, y, z or east, north, height", columns)
             second = _choice("if they are north, east, height (PNEZD)", swapped)
             yield "a table without names, in which either east or north may come first", [first, second]

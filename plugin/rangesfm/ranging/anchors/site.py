@@ -12,8 +12,8 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.georeference import Georeference, georeference_at
 from rangesfm.ranging.anchors.anchor import Anchor
 
-# Anchors farther from the origin than this are moved to it, because least squares lose digits with large coordinates.
-_FAR_M = 1000.0
+LOCAL_M = 500.0
+"""Distance from the origin, metres, beyond which coordinates are not local but those of a surveyed grid."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,9 @@ def site_of(coordinates: Array, crs: str | None, path: Path | None = None) -> tu
             raise InputError(str(error), path) from None
         return Site(np.zeros(3), georeference), local
     middle = coordinates[np.isfinite(coordinates).all(axis=1)].mean(axis=0)
-    # The offset is in whole metres, so that adding it again restores every digit.
-    offset = np.round(middle) if np.linalg.norm(middle) > _FAR_M else np.zeros(3)
+    # With large coordinates, least squares lose digits. The offset is in whole metres, so that adding it again restores
+    # every digit.
+    offset = np.round(middle) if np.linalg.norm(middle) > LOCAL_M else np.zeros(3)
     return Site(offset), coordinates - offset
 
 
