@@ -12,13 +12,10 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.ranging.errors.bending import ErrorPart
 from rangesfm.ranging.errors.learned import ComponentLikelihood, ErrorParts
+from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.linear_map import EstimatedMistake, LinearMap
-
-NUM_TIMES = 8
-"""Number of times of a group, over which its correlation with others is averaged."""
-# An antenna's positions are averaged to at most this many groups for the estimate of their errors.
-_MAX_NUM_GROUPS = 150
+from rangesfm.scale.scale_by_lengths import NUM_WITHIN
 
 
 @dataclass(frozen=True)
@@ -75,14 +72,17 @@ def at_point(known: KnownPositions, row: int) -> Array:
 
 
 def grouped_by_time(known: KnownPositions, weights: Array) -> csr_array:
-    """Return the (3 g, 3 k) weights of positions in groups: marks alone, an antenna's averaged in the order of time."""
+    """Return the (3 g, 3 k) weights of positions in groups: marks alone, an antenna's averaged in the order of time.
+
+    The groups of an antenna have no more coordinates than ranges have bins, whose errors are learnt in the same way.
+    """
     marks = np.flatnonzero(known.is_mark)
     others = np.flatnonzero(~known.is_mark & (weights >= OUTLIER_BELOW))
     order = (
         others[np.argsort(known.time_s[others], kind="stable")] if np.isfinite(known.time_s[others]).all() else others
     )
     groups = [np.array([row]) for row in marks]
-    groups += [part for part in np.array_split(order, min(len(order), _MAX_NUM_GROUPS) or 1) if len(part)]
+    groups += [part for part in np.array_split(order, min(len(order), MAX_NUM_BINS // 3) or 1) if len(part)]
     shares = [np.ones(1) if known.is_mark[rows[0]] else weights[rows] / weights[rows].sum() for rows in groups]
     lines = np.repeat(np.arange(len(groups)), [len(rows) for rows in groups])
     shape = (len(groups), len(known))
@@ -97,15 +97,15 @@ def covariance_of_groups(grouping: csr_array, covariances: Array, rows: Mask) ->
 
 
 def times_of_groups(grouping: csr_array, known: KnownPositions, size_m: Array, rows: Indices) -> tuple[Array, Array]:
-    """Return (g,) mean standard deviations of the antenna's positions in each group (0: marks), and (g, 8) times."""
+    """Return (g,) mean standard deviations of the antenna's positions in each group (0: marks), and (g, t) times."""
     of_groups = grouping[::3, ::3]
     is_timed = np.zeros(len(known))
     is_timed[rows] = 1.0
-    times = np.zeros((of_groups.shape[0], NUM_TIMES))
+    times = np.zeros((of_groups.shape[0], NUM_WITHIN))
     for group in range(of_groups.shape[0]):
         members = of_groups.indices[of_groups.indptr[group] : of_groups.indptr[group + 1]]
         if is_timed[members].all():
-            times[group] = np.quantile(known.time_s[members], np.linspace(0, 1, NUM_TIMES))
+            times[group] = np.quantile(known.time_s[members], np.linspace(0, 1, NUM_WITHIN))
     return of_groups @ (is_timed * size_m), times
 
 

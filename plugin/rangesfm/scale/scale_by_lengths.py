@@ -19,6 +19,7 @@ from scipy.optimize import brentq
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS
 
@@ -27,8 +28,10 @@ from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS
 # 5 m against the truth in a room mapped with a hand-held camera.
 BENDING = 0.008
 _BENDING_SPREAD, _ALIKE_WITHIN = 0.6, 0.25
-# Numbers of sizes of the bending that are tried, of places along a length, and of fits, as the scale changes errors.
-_NUM_TRIED, _NUM_PLACES, _NUM_ROUNDS = 21, 8, 2
+# Number of sizes of the bending that are tried.
+_NUM_TRIED = 21
+NUM_WITHIN = 8
+"""Number of places along a length, or of times of a group, over which its correlation with others is averaged."""
 
 
 @dataclass(frozen=True)
@@ -195,11 +198,11 @@ class _Lengths:
         if not np.all(model > 1e-9 * extent):
             raise GeometryError("a measured length has both its ends in one place of the map")
         alone = ~(printed[:, None] & printed) & ~np.eye(len(rows), dtype=bool)
-        shares = np.linspace(0, 1, _NUM_PLACES)[:, None, None]
+        shares = np.linspace(0, 1, NUM_WITHIN)[:, None, None]
         start, end = np.swapaxes(distances.ends[rows], 0, 1)
         places = np.swapaxes(start + shares * (end - start), 0, 1).reshape(-1, 3)
         squared = np.sum((places[:, None] - places) ** 2, axis=2) / (_ALIKE_WITHIN * extent) ** 2
-        alike = np.exp(-0.5 * squared).reshape(len(rows), _NUM_PLACES, len(rows), _NUM_PLACES).mean(axis=(1, 3))
+        alike = np.exp(-0.5 * squared).reshape(len(rows), NUM_WITHIN, len(rows), NUM_WITHIN).mean(axis=(1, 3))
         # Lengths at unknown places are taken as independent: each has a scale of its own.
         alike = np.where(np.isfinite(alike), alike, np.eye(len(rows)))
         bends = ~distances.is_everywhere[rows]
@@ -250,12 +253,13 @@ class _Lengths:
         """Fit the scale by generalised least squares.
 
         The size of the bending is the root of its mean square under its restricted likelihood. The most likely size
-        would be too small with few lengths.
+        would be too small with few lengths. The errors of marks and of the bending are in the model's unit, and change
+        with the scale, so that it is fitted until it stays.
         """
         model, metric = self.model[chosen], self.metric[chosen]
         scale, bending = float(np.median(metric / model)), BENDING
         logs = np.linspace(-4 * _BENDING_SPREAD, 6 * _BENDING_SPREAD, _NUM_TRIED)
-        for _ in range(_NUM_ROUNDS):
+        for _ in range(MAX_NUM_ROUNDS):
             of_sizes = [self._parts(chosen, scale, BENDING * np.exp(each)) for each in logs]
             unlikeliness = np.array([_unlikeliness(_total(p), model, metric) for p in of_sizes])
             weights = np.exp(-(unlikeliness - unlikeliness.min()) - 0.5 * (logs / _BENDING_SPREAD) ** 2)
@@ -264,7 +268,9 @@ class _Lengths:
             parts = self._parts(chosen, scale, bending)
             by_model = np.linalg.solve(_total(parts), model)
             gains = by_model / (model @ by_model)
-            scale = float(gains @ metric)
+            before, scale = scale, float(gains @ metric)
+            if abs(scale - before) <= ROUNDING * before:
+                break
         return _Fit(scale, bending, BENDING * np.exp(logs) / bending, probabilities, parts, gains)
 
     def test(self, kept: Mask, k: int, fit: _Fit | None = None) -> _Test:

@@ -34,7 +34,6 @@ from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, LinearMap
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.position_equations import (
-    NUM_TIMES,
     PositionEquations,
     at_point,
     covariance_of_groups,
@@ -44,7 +43,7 @@ from rangesfm.scale.position_equations import (
     times_of_groups,
 )
 from rangesfm.scale.range_equation import Columns
-from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind
+from rangesfm.scale.scale_by_lengths import NUM_WITHIN, LengthScale, ScaleByKind
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.uncertainty import KnownMap
 
@@ -329,7 +328,7 @@ class _Problem:
             of_groups, times_s = times_of_groups(grouping, known, size_m, rows)
             for lasting_s in self.lasting_s:
                 apart = np.exp(-np.abs(times_s.reshape(-1, 1) - times_s.ravel()) / lasting_s)
-                alike = apart.reshape(len(times_s), NUM_TIMES, -1, NUM_TIMES).mean(axis=(1, 3))
+                alike = apart.reshape(len(times_s), NUM_WITHIN, -1, NUM_WITHIN).mean(axis=(1, 3))
                 own = np.kron(alike * np.outer(of_groups, of_groups), np.eye(3))
                 yield ErrorPart(f"positions_{lasting_s:g}s", own, _LASTING_SHARE, _SPREAD_GUESSED)
 
