@@ -14,10 +14,9 @@ from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState
 _COPLANAR = 0.1
 # Anchors are on a line if their second largest extent is at most this share of the largest.
 _COLLINEAR = 0.02
-# Angle of a line from the vertical, degrees, below which gravity does not fix the turn about it.
-_MIN_OFF_VERTICAL_DEG = 20.0
-# Angle from the vertical, degrees. With a steeper normal, "above" and "below" have no meaning.
-_MAX_TILT_DEG = 60.0
+# Angle from the vertical, degrees, below which a line or a plane stands upright. Gravity does not fix the turn about
+# such a line, and nothing is above or below such a plane.
+_UPRIGHT_DEG = 20.0
 # Share of the path's places that must lie on one side for the path to count as on that side.
 _ON_ONE_SIDE = 0.9
 # Share of the path's length. Places nearer to the plane than this count as in it: ranges cannot tell their side.
@@ -53,7 +52,7 @@ def is_line(anchors: PathShape) -> bool:
 
 def is_steep(anchors: PathShape) -> bool:
     """Return True if the positions' line is so near the vertical that gravity does not fix the turn about it."""
-    return bool(abs(anchors.axes[:, 0] @ UP_IN_SITE) > np.cos(np.deg2rad(_MIN_OFF_VERTICAL_DEG)))
+    return bool(abs(anchors.axes[:, 0] @ UP_IN_SITE) > np.cos(np.deg2rad(_UPRIGHT_DEG)))
 
 
 def mirrored_map(problem: RangeProblem, state: RangeState) -> RangeState | None:
@@ -84,7 +83,7 @@ def camera_side_of(problem: RangeProblem, state: RangeState) -> str | None:
     if plane is None:
         return None
     point, normal = plane
-    if np.rad2deg(np.arccos(normal @ UP_IN_SITE)) > _MAX_TILT_DEG:
+    if normal @ UP_IN_SITE < np.sin(np.deg2rad(_UPRIGHT_DEG)):
         raise GeometryError("the anchors stand in an upright plane, so that nothing is above or below it: camera_side")
     heights = (state.metric_from_model.apply(problem.centers) - point) @ normal
     length = state.metric_from_model.scale * path_shape(problem.centers).stddevs[0]
