@@ -174,7 +174,7 @@ class TestFit:
         variance = 1.4826**2
         for num, freedom in ((10, 6), (5, 1), (4, 0), (3, 0)):
             expected = np.sqrt((variance * num + 2) / (freedom + 2))
-            assert _noise_of(np.resize([1.0, -1.0], num)) == pytest.approx(expected)
+            assert _noise_of(np.resize([1.0, -1.0], num), 4) == pytest.approx(expected)
 
     def started(self, monkeypatch: pytest.MonkeyPatch, noise: float = 1.0) -> list[Array]:
         """Start at the point, as the search for a start takes most of the time; return the units it was asked with."""
@@ -246,9 +246,9 @@ class TestStart:
         np.testing.assert_allclose(distances(starts[:20, :3], flat.mean(axis=0)), np.median(distances(flat)))
         np.testing.assert_allclose(starts[20:, :3], [[3.0, -2.0, 1.5], [3.0, -2.0, 0.5]], atol=1e-6)
 
-    def test_of_points_within_a_centimetre_the_first_is_kept(self) -> None:
+    def test_of_points_within_the_noise_the_first_is_kept(self) -> None:
         points = [np.zeros(4), np.array([0.0, 0.009, 0.0, 0.0]), np.array([0.0, 0.011, 0.0, 0.0]), np.zeros(4)]
-        kept = _distinct(points)
+        kept = _distinct(points, 0.01)
         assert [id(x) for x in kept] == [id(points[0]), id(points[2])]
 
     def test_the_likeliest_of_all_minima_is_chosen_with_its_noise(self, monkeypatch: pytest.MonkeyPatch) -> None:

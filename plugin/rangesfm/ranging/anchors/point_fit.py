@@ -15,11 +15,12 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.errors.learned import learn_errors
 from rangesfm.ranging.errors.noise import MIN_ORDINARY, START_STDDEV_M, inlier_noise, robust_stddevs
 from rangesfm.ranging.errors.range_bins import noisiness, range_bins
-from rangesfm.ranging.errors.robust_loss import CAUCHY, RobustLoss
+from rangesfm.ranging.errors.robust_loss import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 
 # Rounds of reweighting in the linear solution.
@@ -27,19 +28,14 @@ _NUM_ROUNDS = 12
 # Added to the diagonal of normal equations, whose columns have length 1 before weighting. It keeps them regular where
 # outliers have lost all their weight.
 _RIDGE = 1e-16
-# Relative tolerance of a solver at which a fit has converged.
-_CONVERGED = 1e-13
-# The search for a start uses at most this many ranges, this many directions of starting points around the tag, losses
-# of these widths (in units of the noise) and this tolerance. Points at least _DISTINCT_M apart are different minima.
-_MAX_NUM_RANGES = 300
+ENOUGH_TO_SEARCH = 300
+"""Ranges, spread over all of them, with which the place of a point is searched as well as with more."""
+ENOUGH_TO_JUDGE = 2000
+"""Ranges of a point, spread over all of them, that tell places apart and show errors as well as more would."""
+# The search for a start uses this many directions of starting points around the tag, and losses of these widths (in
+# units of the noise).
 _NUM_DIRECTIONS = 20
-_WIDTHS = (30.0, 10.0, 3.0, 1.0, 0.3)
-_NEARLY_CONVERGED = 1e-5
-_DISTINCT_M = 0.01
-# Unknowns of a point: three coordinates and the bias.
-_NUM_UNKNOWNS = 4
-# Rounds in which the noise and the fit are made consistent.
-_NUM_NOISE_ROUNDS = 4
+_WIDTHS = np.geomspace(30.0, 0.3, 5)
 # Number of ranges that the usual noise counts as.
 _USUAL_NOISE_COUNTS = 2.0
 # Error components that are not learnt here, because each anchor's bias is estimated with a prior of its own.
@@ -169,7 +165,7 @@ class PointFit:
 
 
 def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
-    """Fit a point and estimate the noise from its residuals; given noise is a lower bound.
+    """Fit a point and estimate the noise from its residuals, until both agree; given noise is a lower bound.
 
     Args:
         problem: the problem; of its standard deviations only the shared ones are used.
@@ -178,28 +174,31 @@ def fit_with_own_noise(problem: PointProblem, given_m: Array) -> PointFit:
     is_given = np.isfinite(given_m)
     unit = np.where(is_given, given_m, np.median(given_m[is_given]) if is_given.any() else START_STDDEV_M)
     x, noise = _best_start(problem, unit)
-    for _ in range(_NUM_NOISE_ROUNDS):
-        noise = max(noise, 1.0) if is_given.all() else noise
+    least = 1.0 if is_given.all() else 0.0
+    noise = max(noise, least)
+    for _ in range(MAX_NUM_ROUNDS):
         now = replace(problem, stddev_m=np.hypot(noise * unit, problem.shared_stddev_m))
         fit = PointFit(now, improve(now, x), noise * unit)
         x = fit.x
         ordinary = problem.shared_stddev_m < noise * unit
         rows = ordinary if np.mean(ordinary) > MIN_ORDINARY else np.ones(len(unit), dtype=np.bool_)
-        noise = _noise_of(fit.residuals_m[rows] / unit[rows])
+        before, noise = noise, max(_noise_of(fit.residuals_m[rows] / unit[rows], len(x)), least)
+        if abs(noise - before) <= SAME_COST * before:
+            break
     return fit
 
 
-def _noise_of(scaled: Array) -> float:
+def _noise_of(scaled: Array, num_unknowns: int) -> float:
     """Return the standard deviation of scaled residuals, with a prior that counts where there are few.
 
-    The degrees of freedom are reduced by the four unknowns of the fit.
+    The degrees of freedom are reduced by the unknowns of the fit.
     """
-    freedom = max(len(scaled) - _NUM_UNKNOWNS, 0)
+    freedom = max(len(scaled) - num_unknowns, 0)
     found = inlier_noise(scaled).stddev ** 2 * len(scaled)
     return float(np.sqrt((found + _USUAL_NOISE_COUNTS) / (freedom + _USUAL_NOISE_COUNTS)))
 
 
-def improve(problem: PointProblem, x: Array, tolerance: float = _CONVERGED) -> Array:
+def improve(problem: PointProblem, x: Array, tolerance: float = ROUNDING) -> Array:
     """Return the minimum (4,) of the cost near ``x``, with a Cauchy loss on the ranges and none on the prior."""
     num = len(problem.range_m)
 
@@ -226,22 +225,23 @@ def _best_start(problem: PointProblem, unit_m: Array) -> tuple[Array, float]:
     Args:
         unit_m: (n,) noise of the ranges relative to each other.
     """
-    rows = np.linspace(0, len(unit_m) - 1, min(len(unit_m), _MAX_NUM_RANGES)).astype(np.int64)
+    rows = np.linspace(0, len(unit_m) - 1, min(len(unit_m), ENOUGH_TO_SEARCH)).astype(np.int64)
     part, unit_m = problem.subset(rows), unit_m[rows]
     now, passed = _starts(part), []
     for width in _WIDTHS:
         narrowed = replace(part, stddev_m=np.hypot(width * unit_m, part.shared_stddev_m))
-        now = _distinct([improve(narrowed, x, _NEARLY_CONVERGED) for x in now])
+        now = _distinct([improve(narrowed, x, SAME_COST) for x in now], float(unit_m.min()))
         passed += now
     noises = [inlier_noise(part.residuals_m(x) / np.hypot(unit_m, part.shared_stddev_m)) for x in passed]
     best = int(np.argmax([noise.log_likelihood for noise in noises]))
     return passed[best], noises[best].stddev
 
 
-def _distinct(points: list[Array]) -> list[Array]:
+def _distinct(points: list[Array], noise_m: float) -> list[Array]:
+    """Return the first of each group of points that ranges with this noise do not tell apart."""
     kept: list[Array] = []
     for x in points:
-        if all(np.linalg.norm(x - other) > _DISTINCT_M for other in kept):
+        if all(np.linalg.norm(x - other) > noise_m for other in kept):
             kept.append(x)
     return kept
 

@@ -15,10 +15,12 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import PathShape, oriented, path_shape
+from rangesfm.geometry.numerics import UNDETERMINED
+from rangesfm.geometry.similarity import NEARLY_STRAIGHT, PathShape, oriented, path_shape
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.point_fit import (
+    ENOUGH_TO_JUDGE,
     FitErrors,
     PointFit,
     PointProblem,
@@ -26,7 +28,7 @@ from rangesfm.ranging.anchors.point_fit import (
     fit_with_own_noise,
     improve,
 )
-from rangesfm.ranging.errors.noise import short_range_stddev
+from rangesfm.ranging.errors.noise import MIN_STDDEV_M, short_range_stddev
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, MIN_COST_GAP, SAME_COST
 from rangesfm.ranging.range_log import RangeLog
 
@@ -36,20 +38,8 @@ MIN_NUM_RANGES = 4
 _NONLINEAR = 0.05
 # Distances at which the cost is then evaluated, metres.
 _PROFILE_STEPS_M = np.geomspace(0.01, 100.0, 41)
-# Weight, relative to all ranges, of the prior that holds a point at such a distance.
-_HOLD = 100.0
-# Largest number of ranges in that computation.
-_MAX_RANGES_OF_PROFILE = 2000
-# Width over length below which the tag's positions count as lying on a line.
-_NEARLY_STRAIGHT = 0.1
-# Cosine of the angle to the normal of the tag's plane above which a direction counts as across that plane.
-_ACROSS = 0.9
-# A direction counts as along a plane if the sine of the angle between both is below this, which is mere rounding.
-_ALONG_PLANE = 1e-6
 # Standard deviation of a known height.
 _HEIGHT_STDDEV_M = 0.01
-# A known bias is held by a prior that is far stronger than any ranges.
-_KNOWN_BIAS_STDDEV_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -127,11 +117,10 @@ class AnchorRanges:
 
     @property
     def times_s(self) -> Array:
-        """Times of the ranges (n,), seconds; if there are none, those of a tag that moves at 1 m/s."""
+        """Times of the ranges (n,), seconds; if there are none, those of a tag that somebody carries."""
         if self.timestamp_s is not None:
             return self.timestamp_s
-        steps_m = np.linalg.norm(np.diff(self.tag_positions_m, axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps_m)])
+        return walking_times_s(self.tag_positions_m)
 
     @property
     def tags(self) -> Indices:
@@ -149,7 +138,8 @@ class AnchorRanges:
         num = len(self.range_m)
         middle = self.tag_positions_m.mean(axis=0)
         mean = np.array([0.0, 0.0, 0.0, options.range_bias_m])
-        prior = np.array([[0.0, 0.0, 0.0, 1 / max(options.range_bias_stddev_m, _KNOWN_BIAS_STDDEV_M)]])
+        # A known bias is held by a prior that is far stronger than any ranges.
+        prior = np.array([[0.0, 0.0, 0.0, 1 / max(options.range_bias_stddev_m, MIN_STDDEV_M)]])
         if self.height_m is not None:
             mean[2] = self.height_m - middle[2]
             prior = np.vstack([prior, [0.0, 0.0, 1 / _HEIGHT_STDDEV_M, 0.0]])
@@ -157,6 +147,11 @@ class AnchorRanges:
         problem = PointProblem(self.tag_positions_m - middle, self.range_m, np.ones(num), shared, mean, prior)
         given = np.full(num, np.nan) if self.range_stddev_m is None else self.range_stddev_m
         return fit_with_own_noise(problem, np.where(np.isfinite(given), given, options.range_stddev_m or np.nan))
+
+
+def walking_times_s(places_m: Array) -> Array:
+    """Return (n,) times, seconds, at which somebody who walks a metre a second is at (n, 3) places, from 0."""
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places_m, axis=0), axis=1)))
 
 
 @dataclass(frozen=True)
@@ -387,9 +382,9 @@ def _profile_stddev(found: _Found, along: Array, inflation: float) -> float:
     The other unknowns are estimated anew at each distance.
     """
     num = len(found.fit.problem.range_m)
-    rows = np.linspace(0, num - 1, min(num, _MAX_RANGES_OF_PROFILE)).astype(np.int64)
+    rows = np.linspace(0, num - 1, min(num, ENOUGH_TO_JUDGE)).astype(np.int64)
     part = found.judged_by(inflation).subset(rows)
-    hold = np.vstack([part.prior, _HOLD * np.sqrt(np.sum(part.stddev_m**-2)) * along])
+    hold = np.vstack([part.prior, along / MIN_STDDEV_M])  # as a known bias is held
     best = improve(part, found.fit.x)
     allowed = part.cost(best) + 0.5 * len(rows) / num
 
@@ -410,9 +405,9 @@ def _refuse_uncertain(covariance: Array, shape: PathShape, options: Trilateratio
     length, width = shape.stddevs[:2]
     if length <= options.max_position_stddev_m / 10:
         why = f"the tag's positions lie within {length:.3g} m of each other"
-    elif width < _NEARLY_STRAIGHT * length:
+    elif width < NEARLY_STRAIGHT * length:
         why = "the tag's positions lie on a line, and the anchor may be anywhere on a circle around that line"
-    elif abs(axes[:, 2] @ shape.axes[:, 2]) > _ACROSS:
+    elif np.argmax(np.abs(axes[:, 2] @ shape.axes)) == 2:  # the plane's normal is the nearest of the axes
         why = "the anchor is near the plane of the tag's positions, and its distance from the plane is not determined"
     else:
         why = f"the tag's positions extend over {length:.3g} by {width:.3g} m only, or are too far away"
@@ -446,5 +441,6 @@ def _gap(found: _Found, mirror: Array) -> float:
 
 def _unless_along_plane(direction: Array, across: Array) -> Array | None:
     """Return the direction if it selects one of two mirror images, or None if it is along the plane between them."""
-    least = _ALONG_PLANE * float(np.linalg.norm(direction) * np.linalg.norm(across))
+    # A plane between two positions that are each as exact as a solver is has a normal with as many digits.
+    least = UNDETERMINED * float(np.linalg.norm(direction) * np.linalg.norm(across))
     return direction if abs(direction @ across) > least else None
