@@ -162,7 +162,7 @@ def test_anchors_that_noise_moves_are_not_called_elsewhere_and_all_ranges_count_
     joined = rough.join("unknown")
     assert joined.notes == ()
     # Places are searched for with a part of the ranges.
-    monkeypatch.setattr("rangesfm.scale.model_placement.SUBSET_PER_ANCHOR", 6)
+    monkeypatch.setattr("rangesfm.scale.model_placement.ENOUGH_TO_SEARCH", 6)
     pairs = zip(rough.parts, joined.verdicts, strict=True)
     models = [
         ScaledModel(part.trajectory, known(verdict.estimate), is_in_anchor_frame=False) for part, verdict in pairs

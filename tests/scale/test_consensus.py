@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 STDDEV_M = 0.1
-TOLERANCE_M = 2.5 * STDDEV_M
+TOLERANCE_M = 3.0 * STDDEV_M
 
 
 def known_anchors(survey: Survey, range_m: Array | None = None) -> RangeProblem:

@@ -380,5 +380,5 @@ def test_intervals_of_scales_that_agree_are_the_hand_computed_ones(
 
 def test_lowest_minima_of_a_sweep_come_lowest_first_ends_and_ties_included() -> None:
     assert starts._lowest_minima(np.array([2.0, 3.0, 1.0, 5.0, 4.0])) == [2, 0, 4]
-    assert starts._lowest_minima(np.array([9.0, 1.0, 9.0, 3.0, 9.0, 2.0, 9.0, 5.0, 9.0, 4.0])) == [1, 5, 3, 9]
+    assert starts._lowest_minima(np.array([9.0, 1.0, 9.0, 3.0, 9.0, 2.0, 9.0, 5.0, 9.0, 4.0])) == [1, 5, 3, 9, 7]
     assert starts._lowest_minima(np.array([1.0, 1.0, 2.0])) == [0, 1]

@@ -16,12 +16,10 @@ from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, align_points, path_shape, rmse
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
-from rangesfm.scale.starts import each_once
+from rangesfm.scale.starts import MAX_NUM_STARTS, each_once
 
 # Triples are tried among this many anchors, the best placed ones. More make it slower without a better result.
 _MAX_NUM_TRIED = 8
-# Number of motions by triples that are refined.
-_NUM_BEST = 6
 SAME_SHARE = 0.1
 """Two placements of a path are one if its places are no further apart than this, in extents of the path."""
 # An anchor this many standard deviations from its place in the other frame is reported as standing elsewhere.
@@ -154,13 +152,13 @@ def _distinct(pairs: Mapping[str, _Pair], path_m: Array) -> list[AnchorAlignment
     tolerance = SAME_SHARE * float(np.linalg.norm(path_shape(path_m).stddevs))
 
     def best(fits: Iterable[AnchorAlignment]) -> list[AnchorAlignment]:
-        return each_once(sorted(fits, key=lambda fit: fit.cost), are_same, 2 * _NUM_BEST)
+        return each_once(sorted(fits, key=lambda fit: fit.cost), are_same, MAX_NUM_STARTS)
 
     def are_same(first: AnchorAlignment, second: AnchorAlignment) -> bool:
         return rmse(first.target_from_source.apply(path_m) - second.target_from_source.apply(path_m)) <= tolerance
 
     begun = best(AnchorAlignment.of(pairs, motion) for motion in _triple_motions(pairs.values()))
-    return best(_refined(pairs, fit) for fit in begun[:_NUM_BEST])
+    return best(_refined(pairs, fit) for fit in begun)
 
 
 def _triple_motions(pairs: Iterable[_Pair]) -> Iterator[Similarity]:

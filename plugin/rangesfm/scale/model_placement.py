@@ -13,11 +13,11 @@ from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, path_shape, rmse
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.anchors.point_fit import ENOUGH_TO_SEARCH
 from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP, wider
 from rangesfm.scale.anchor_alignment import SAME_SHARE, PlacedAnchor, align_by_anchors
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
 from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.scale.solution import SUBSET_PER_ANCHOR
 from rangesfm.scale.starts import spread_subset
 
 # Smallest standard deviation of an anchor's position: antennas err by as much, whatever the ranges say.
@@ -133,7 +133,7 @@ class _World:
     def _best(self, k: int, starts: Sequence[tuple[Similarity, Mapping[str, Array]]]) -> RangeFit:
         """Choose among possible places of a model by the ranges of all; raise GeometryError if they cannot decide."""
         members = [*self.metric_from_sfm, k]
-        group = _Group([self._models[j] for j in members], SUBSET_PER_ANCHOR)
+        group = _Group([self._models[j] for j in members], ENOUGH_TO_SEARCH)
         fits = sorted(
             (group.solve([*self.metric_from_sfm.values(), metric], at) for metric, at in starts),
             key=lambda fit: fit.cost,

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.scale.starts import TOLERANCE_STDDEVS, agreeing_intervals
+from rangesfm.scale.starts import agreeing_intervals
 from rangesfm.scale.two_candidate import two_candidate
 
 NUM_CURVE_POINTS = 601
@@ -51,7 +52,7 @@ def scale_diagnostics(estimate: ScaleEstimate, trajectory: Trajectory) -> ScaleD
     # The path is stretched about a fixed point: its middle in a site, otherwise the first camera.
     centers, anchor_m = about(trajectory.centers.mean(axis=0) if estimate.frame == "site" else trajectory.centers[0])
     bias = np.array([anchor.range_bias_m for anchor in estimate.anchors])[log.anchor_index[rows]]
-    tolerance = TOLERANCE_STDDEVS * estimate.errors.stddev_m[rows]
+    tolerance = SIGNIFICANT_STDDEVS * estimate.errors.stddev_m[rows]
     starts, ends = agreeing_intervals(centers, tags - anchor_m, range_m - bias, tolerance)
     scales = placed.scale * np.geomspace(1 / CURVE_FACTOR, CURVE_FACTOR, NUM_CURVE_POINTS)
     num_begun = np.searchsorted(np.sort(starts), scales, side="right")

@@ -16,6 +16,7 @@ from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.trilateration import MIN_NUM_RANGES, walking_times_s
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
@@ -27,10 +28,6 @@ MIN_RANGES = 8
 """Fewest ranges that determine a scale: there are seven unknowns, and one more checks the fit."""
 # Fewest keyframes with ranges: three lie in one plane with any anchor.
 _MIN_KEYFRAMES = 4
-# A position has three unknowns; two more ranges check the fit.
-_MIN_RANGES_OF_UNKNOWN = 5
-# Assumed walking speed where ranges have no times.
-_WALKING_M_PER_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -96,13 +93,12 @@ class ScaleProblem:
         return self.observations.nearest[self.rows]
 
     def times_s(self, metres_per_unit: float) -> Array:
-        """Return (k,) times of the ranges in seconds; where the log names photos, from the distance walked."""
+        """Return (k,) times of the ranges in seconds; where the log names photos, as of somebody who walks."""
         if self.observations.log.timestamp_s is not None:
             return self.observations.log.timestamp_s[self.rows]
         before = self.observations.before[self.rows]
         _, first, of_range = np.unique(before, return_index=True, return_inverse=True)
-        steps_m = metres_per_unit * np.linalg.norm(np.diff(self.ranges.centers[first], axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps_m)])[of_range] / _WALKING_M_PER_S
+        return walking_times_s(metres_per_unit * self.ranges.centers[first])[of_range]
 
     def placing_stddev_m(self, metres_per_unit: float) -> Array:
         """Return the (k,) standard deviation of each coordinate of the antennas, metres, in a map of this scale."""
@@ -214,7 +210,7 @@ def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indice
     rows = observations.placed_rows
     index = observations.log.anchor_index
     counts = np.bincount(index[rows], minlength=len(given))
-    heard = counts >= np.where(given, 1, _MIN_RANGES_OF_UNKNOWN)
+    heard = counts >= np.where(given, 1, MIN_NUM_RANGES)
     rows = rows[heard[index[rows]]]
     keyframes = np.union1d(observations.before[rows], observations.after[rows])
     if len(rows) < MIN_RANGES or len(keyframes) < _MIN_KEYFRAMES:

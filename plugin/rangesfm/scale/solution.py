@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
+from rangesfm.ranging.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
 from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
@@ -36,10 +37,8 @@ from rangesfm.scale.starts import (
     unknown_anchor_starts,
 )
 
-SUBSET_PER_ANCHOR = 300
-"""Ranges per anchor, spread over all of them, with which candidates for a map are searched."""
-# This many ranges per anchor, spread over all of them, tell maps apart and show the errors as well as more would.
-_ENOUGH_OF_ANCHOR, _NUM_ROUNDS = 1000, 2
+# Number of fits, each with the errors that the one before shows.
+_NUM_ROUNDS = 2
 # Number of different maps that are compared. Two maps are the same if the logarithms of their scales, their rotations
 # (degrees) and the places of the path's middle (extents of the path) are no further apart than this.
 _NUM_ALTERNATIVES = 4
@@ -144,7 +143,7 @@ def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) ->
 
     They are searched with few ranges per anchor and ranked with more.
     """
-    small = spread_subset(problem, SUBSET_PER_ANCHOR)
+    small = spread_subset(problem, ENOUGH_TO_SEARCH)
     if not anchors_are_known:
         starts = unknown_anchor_starts(problem)
     else:
@@ -163,7 +162,7 @@ def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) ->
     if not anchors_are_known:
         swapped = [solve(small, state, tolerance=1e-8) for state in sphere_swaps(small, distinct[0].state)]
         distinct = _each_once(small, distinct + swapped)
-    enough = spread_subset(problem, _ENOUGH_OF_ANCHOR)
+    enough = spread_subset(problem, ENOUGH_TO_JUDGE)
     return _each_once(enough, [solve(enough, fit.state, tolerance=1e-8) for fit in distinct])
 
 
@@ -200,7 +199,7 @@ def _are_same(problem: RangeProblem, first: RangeState, second: RangeState) -> b
 def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
     """Alternate between fitting and estimating the errors, from one start; the last fit uses all ranges."""
     given = posed.ranges
-    rows = spread_rows(given, _ENOUGH_OF_ANCHOR)
+    rows = spread_rows(given, ENOUGH_TO_JUDGE)
 
     def residuals_m(state: RangeState) -> Array:
         return predicted_ranges(given, state) - given.range_m

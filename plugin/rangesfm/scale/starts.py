@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS, UNDETERMINED
 from rangesfm.geometry.similarity import IDENTITY, Similarity, off_origin, path_shape, round_middle, rounding_of
 from rangesfm.processes.threads import side_by_side
-from rangesfm.ranging.anchors.point_fit import multilaterate
+from rangesfm.ranging.anchors.point_fit import ENOUGH_TO_SEARCH, multilaterate
 from rangesfm.ranging.errors.noise import robust_stddevs
 from rangesfm.ranging.errors.robust_loss import SAME_COST
 from rangesfm.scale.range_equation import RangeProblem, RangeState, antenna_positions, solve
@@ -30,19 +31,13 @@ _T = TypeVar("_T")
 _NUM_SCALES, _SCALE_SPAN = 80, 200.0
 # Numbers of rotations of a sweep, without and with a known vertical: the latter are 6 degrees apart.
 _NUM_ROTATIONS, _NUM_HEADINGS = 400, 60
-# Most ranges of each anchor in a sweep over scales, and of all anchors in one over rotations.
-_MAX_RANGES_PER_ANCHOR, _MAX_RANGES_FOR_ROTATIONS = 200, 240
-# Numbers of starts from a sweep over rotations, and of minima from each kind of residuals in one over scales.
-_NUM_STARTS, _NUM_MINIMA = 12, 4
+MAX_NUM_STARTS = 12
+"""Most candidates of a search that are refined: of a sweep by each kind of residuals, a consensus, or triples."""
 # Trials closer to each other than this, in the logarithm of the scale and in radians, converge to the same minimum.
 _BASIN_LOG_SCALE, _BASIN_ROTATION_RAD = 0.3, 0.6
-# In radii: an anchor this near to the centre of a sphere cannot exchange its distance from it with the radius.
-_IN_MIDDLE = 1e-6
-# A range agrees with a scale if it fits within this many standard deviations of noise and bias together.
-TOLERANCE_STDDEVS = 2.5
 # Maxima of the number of agreeing ranges are told apart on a logarithmic grid of the scale with this step. Maxima below
-# the given share of the highest one are dropped, and all but the highest few.
-_LOG_CELL, _MIN_SHARE_OF_BEST, _MAX_CANDIDATES = 0.02, 0.5, 12
+# the given share of the highest one are dropped.
+_LOG_CELL, _MIN_SHARE_OF_BEST = 0.02, 0.5
 
 
 def spread_subset(problem: RangeProblem, max_num_per_anchor: int) -> RangeProblem:
@@ -96,7 +91,7 @@ def first_camera_starts(problem: RangeProblem) -> list[RangeState]:
 
 def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
     """Return starts for unknown anchors: a sweep over the scale, in which each anchor is solved linearly."""
-    small = spread_subset(problem, _MAX_RANGES_PER_ANCHOR)
+    small = spread_subset(problem, ENOUGH_TO_SEARCH)
     scales = scale_candidates(problem)
     anchors, costs = multilaterate_all(small, scales)
     best = dict.fromkeys(i for kind in costs for i in _lowest_minima(kind))
@@ -105,10 +100,10 @@ def unknown_anchor_starts(problem: RangeProblem) -> list[RangeState]:
 
 
 def _lowest_minima(costs: Array) -> list[int]:
-    """Return indices of some local minima of a sweep's costs, lowest first."""
+    """Return indices of the lowest local minima of a sweep's costs, lowest first."""
     padded = np.concatenate([[np.inf], costs, [np.inf]])
     minima = np.flatnonzero((costs <= padded[:-2]) & (costs <= padded[2:]))
-    return [int(i) for i in minima[np.argsort(costs[minima], kind="stable")][:_NUM_MINIMA]]
+    return [int(i) for i in minima[np.argsort(costs[minima], kind="stable")][:MAX_NUM_STARTS]]
 
 
 def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
@@ -118,7 +113,7 @@ def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
     """
     known = np.flatnonzero(np.isfinite(problem.anchor_stddev_m))
     rows = np.flatnonzero(np.isin(problem.anchor_index, known))
-    per_anchor = max(_MAX_RANGES_FOR_ROTATIONS // max(len(known), 1), 8)
+    per_anchor = max(ENOUGH_TO_SEARCH // max(len(known), 1), 8)
     small = spread_subset(problem.subset(rows), per_anchor)
     if problem.gravity is None:
         rotations = Rotation.random(_NUM_ROTATIONS, rng=np.random.default_rng(seed))
@@ -129,11 +124,11 @@ def site_starts(problem: RangeProblem, seed: int = 0) -> list[RangeState]:
     trials: list[tuple[float, Similarity]] = []
     placed = side_by_side(lambda scale: _translations(small, scale, turns), scales)
     for scale, (translations, costs) in zip(scales, placed, strict=True):
-        for i in np.argsort(costs)[:_NUM_STARTS]:
+        for i in np.argsort(costs)[:MAX_NUM_STARTS]:
             trials.append((float(costs[i]), Similarity(scale, turns[i], translations[i])))
     anchors = np.where(np.isfinite(problem.anchor_mean_m), problem.anchor_mean_m, 0.0)
     ranked = [trial for _, trial in sorted(trials, key=lambda trial: trial[0])]
-    found = each_once(ranked, _in_one_basin, _NUM_STARTS)
+    found = each_once(ranked, _in_one_basin, MAX_NUM_STARTS)
     return [RangeState(similarity, anchors.copy(), problem.bias_mean_m.copy()) for similarity in found]
 
 
@@ -164,7 +159,7 @@ def sphere_swaps(problem: RangeProblem, state: RangeState) -> list[RangeState]:
     from_middle = state.anchors_m - placed.apply(middle)
     swaps = []
     for growth in np.linalg.norm(from_middle[np.unique(problem.anchor_index)], axis=1) / (placed.scale * radius):
-        if growth > _IN_MIDDLE:
+        if growth > UNDETERMINED:  # an anchor in the centre has no direction from it in which it could move away
             grown = replace(placed, scale=float(placed.scale * growth))
             swaps.append(RangeState(grown, grown.apply(middle) + from_middle / growth, state.bias_m))
     return swaps
@@ -209,7 +204,7 @@ def choose_sides(problem: RangeProblem, state: RangeState) -> tuple[RangeState, 
 def complete_unknown_anchors(problem: RangeProblem, state: RangeState) -> RangeState:
     """Place the unknown anchors, given the place of the path."""
     anchors = state.anchors_m.copy()
-    small = spread_subset(problem, _MAX_RANGES_PER_ANCHOR)
+    small = spread_subset(problem, ENOUGH_TO_SEARCH)
     for k in np.flatnonzero(np.isinf(problem.anchor_stddev_m)):
         alone = anchor_alone(small, int(k), state.metric_from_model)
         if len(alone.range_m):
@@ -288,7 +283,8 @@ def consensus_scales(problem: RangeProblem) -> list[float]:
         GeometryError: no positive scale explains any range.
     """
     bias_stddev = np.where(np.isfinite(problem.bias_stddev_m), problem.bias_stddev_m, 0.0)[problem.anchor_index]
-    tolerance = TOLERANCE_STDDEVS * np.hypot(problem.stddev_m, bias_stddev)
+    # A range agrees with a scale if noise and bias together may well be the difference.
+    tolerance = SIGNIFICANT_STDDEVS * np.hypot(problem.stddev_m, bias_stddev)
     ranges = problem.range_m - problem.bias_mean_m[problem.anchor_index]
     offset = problem.tag_from_center - problem.anchor_mean_m[problem.anchor_index]
     starts, ends = agreeing_intervals(problem.centers, offset, ranges, tolerance)
@@ -307,7 +303,7 @@ def _hilltops(scales: Array, counts: Indices) -> list[float]:
     higher = np.concatenate([np.where(beside, best[1:], 0), [0]])
     # Of equal neighbouring cells the first counts as the maximum.
     tops = np.flatnonzero((best > lower) & (best >= higher) & (best >= _MIN_SHARE_OF_BEST * best.max()))
-    tops = tops[np.argsort(-best[tops], kind="stable")][:_MAX_CANDIDATES]
+    tops = tops[np.argsort(-best[tops], kind="stable")][:MAX_NUM_STARTS]
     ends = np.append(first[1:], len(scales))
     return [float(scales[first[top] + np.argmax(counts[first[top] : ends[top]])]) for top in tops]
 
