@@ -1,4 +1,4 @@
-"""What counts as rounding, as undetermined, as significant and as too long an iteration, for all estimators."""
+"""Shares of rounding, levels of significance and the longest iteration: one definition for all estimators."""
 
 from typing import Final
 
