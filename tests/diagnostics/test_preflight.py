@@ -221,8 +221,8 @@ def inputs_of(log: RangeLog, arms_m: npt.ArrayLike | None = None, **attributes: 
 PLACED = Survey().changed({"tag.tag_in_cam_m": (0.0, 0.0, 0.0)})
 
 
-@pytest.mark.parametrize(("longest_m", "told"), [(2.45, ()), (2.55, ("t9 is 2.55 m long",))])
-def test_a_lever_arm_longer_than_a_pole_is_told_with_its_tag(longest_m: float, told: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("longest_m", "told"), [(2.95, ()), (3.05, ("t9 is 3.05 m long",))])
+def test_a_lever_arm_longer_than_any_rig_is_told_with_its_tag(longest_m: float, told: tuple[str, ...]) -> None:
     log = log_of(["A", "B"], [1.0, 2.0], tag_id=["t1", "t9"])
     notes = list(notes_before_work(PLACED, inputs_of(log, [[0, 0, 2.0], [0, longest_m, 0]])))
     assert len(notes) == len(told)

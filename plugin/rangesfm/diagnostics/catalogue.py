@@ -34,8 +34,8 @@ _MOST_CLOCK_DRIFT = 2e-4
 # Largest errors proportional to the distance, for all ranges and for one anchor's, as shares. The first also limits the
 # scale of coordinates. Larger factors, as from feet or two-way ranges, are tried as alternatives.
 _MOST_SHARE, _MOST_SHARE_OF_ANCHOR = 0.5, 2.0
-# Largest distance between the lens and a tag on anything that is carried or driven.
 LARGEST_RIG_M = 3.0
+"""Largest distance between the lens and a tag on anything that is carried or driven, metres. A pole is 2 m long."""
 # Largest change of a radio's delay as it warms up, far more than was ever seen.
 _MOST_WARMING_M = 5.0
 # Largest excess of a range past the person with the camera: the way round the body, and a weak signal found late.

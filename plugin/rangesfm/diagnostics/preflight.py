@@ -12,26 +12,24 @@ from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
-from rangesfm.diagnostics.catalogue import SAME_HEIGHT_M
+from rangesfm.diagnostics.catalogue import LARGEST_RIG_M, SAME_HEIGHT_M
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import number_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import RangeKind, RangeLog
-from rangesfm.ranging.readers.units import FOOT_M
+from rangesfm.ranging.readers.units import UNITS_PER_METRE
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE
+from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 
-# No survey finds the same height for three anchors to within a millimetre, and no two anchors are in one place.
 SAME_PLACE_M = 0.01
-_MIN_ANCHORS_ALIKE = 3
+"""Two anchors that are nearer to each other than this, metres, are in one place, which cannot be."""
 # UWB radios reach some 200 m. The unit is doubted if this share of the ranges is longer than the limit.
 FAR_M, _FAR_SHARE = 300.0, 0.95
 # An anchor is stuck if one value makes up the first share of its ranges, while in the other anchors' ranges (median)
 # the commonest value stays below the second share. If the tag stands still, all anchors repeat their values.
 _STUCK_SHARE, _MOVING_SHARE, _MIN_RANGES = 0.5, 0.2, 20
-# Length of a lever arm, metres, above which it is doubted. A pole that somebody carries is 2 m long.
-LONG_ARM_M = 2.5
 # A gap between photos longer than this many median gaps is a pause between two walks.
 _PAUSE = 30.0
 # Clocks that count seconds since 1970 show more than this.
@@ -48,14 +46,8 @@ _MAX_ERROR_M, _MAX_ERROR_SHARE = 0.5, 0.1
 _MAX_SPOILT, _MIN_TRIANGLES = 0.3, 10
 # Most triangles that are checked, and most pairs or swaps that are named.
 _MAX_NUM_TRIANGLES, _MAX_NUM_NAMED = 20_000, 2
-_UNITS = {
-    "anchors are in millimetres": 1e-3,
-    "anchors are in centimetres": 1e-2,
-    "anchors are in feet": FOOT_M,
-    "ranges are in millimetres": 1e3,
-    "ranges are in centimetres": 1e2,
-    "ranges are in feet": 1 / FOOT_M,
-}
+# Units that are taken for metres.
+_UNITS = {"mm": "millimetres", "cm": "centimetres", "ft": "feet"}
 
 
 def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
@@ -66,7 +58,7 @@ def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
             "its distance from there; measure from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
         )
     for tag_id, arm_m in zip(inputs.log.tag_ids, np.linalg.norm(inputs.tag_in_cam_m, axis=1), strict=True):
-        if arm_m > LONG_ARM_M:
+        if arm_m > LARGEST_RIG_M:
             yield (
                 f"the lever arm of {tag_id or 'the tag'} is {arm_m:.3g} m long, more than a camera carries: give it in "
                 "metres from lens to antenna, right, down and forward (--tag_in_cam X,Y,Z)"
@@ -103,7 +95,8 @@ def _on_taped_anchors(tape: Tape, anchors: Sequence[Anchor]) -> Iterator[str]:
 
 def _on_positions(positions_m: Mapping[str, Array], *, is_site: bool) -> Iterator[str]:
     heights_m = np.array([at[2] for at in positions_m.values()])
-    if is_site and len(heights_m) >= _MIN_ANCHORS_ALIKE and np.ptp(heights_m) < SAME_HEIGHT_M:
+    # A map gets its height and its tilt from three anchors or more.
+    if is_site and len(heights_m) >= MIN_NUM_POSITIONS and np.ptp(heights_m) < SAME_HEIGHT_M:
         yield (
             f"all {len(heights_m)} anchors have one height, {heights_m[0]:g} m: if nobody measured it, the map's "
             "height and tilt rest on a guess, and the ranges cannot show it; measure the heights of the antennas"
@@ -258,7 +251,10 @@ def _causes(triangles: _Triangles, ids: Sequence[str], positions_m: Array, bad: 
     if in_pairs.max() == bad.sum():
         ends = [ids[k] for k in np.flatnonzero(in_pairs == bad.sum()).tolist()]
         yield f"anchor {' or '.join(ends)} stands elsewhere"
-    yield from (name for name, factor in _UNITS.items() if not triangles.bad_pairs(factor * positions_m).any())
+    for what, of_metre in (("anchors", -1), ("ranges", 1)):  # ranges in another unit are as if the anchors' were one
+        for unit, words in _UNITS.items():
+            if not triangles.bad_pairs(UNITS_PER_METRE[unit] ** of_metre * positions_m).any():
+                yield f"{what} are in {words}"
     swaps = []
     for i, k in combinations(range(len(ids)), 2):
         order = np.arange(len(ids))

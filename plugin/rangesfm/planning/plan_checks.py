@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.catalogue import LARGEST_RIG_M
-from rangesfm.diagnostics.preflight import FAR_M, LONG_ARM_M, SAME_PLACE_M
+from rangesfm.diagnostics.preflight import FAR_M, SAME_PLACE_M
 from rangesfm.errors import OptionError
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.walls import are_outside, lead_through
@@ -75,9 +75,6 @@ def oddities(
     Args:
         walls_m: corners (k, 2) of the walls for anchors.
     """
-    if (length_m := float(np.linalg.norm(planned.tag_in_cam_m))) > LONG_ARM_M:
-        found = f"[tag] tag_in_cam_m is {length_m:.3g} m long, more than a camera carries, expected metres"
-        yield OptionError(found, "tag", "tag_in_cam_m")
     if not planned.anchors:
         return
     is_inside = not are_outside(planned.trajectory.centers[:, :2], walls_m).any()
