@@ -178,8 +178,8 @@ def test_photos_in_reverse_have_the_times_of_one_another() -> None:
     np.testing.assert_allclose(timed.time_s + found.correction.time_shift_s, timed.time_s[::-1])
 
 
-@pytest.mark.parametrize(("num_fitting", "is_told"), [(NUM_PLACES // 2, False), (NUM_PLACES // 2 - 1, True)])
-def test_an_anchor_that_most_ranges_do_not_fit_is_elsewhere(num_fitting: int, is_told: bool) -> None:
+@pytest.mark.parametrize(("num_fitting", "is_told"), [(16, False), (15, True)])  # of 40
+def test_an_anchor_that_less_than_two_ranges_of_five_fit_is_elsewhere(num_fitting: int, is_told: bool) -> None:
     """Its coordinates are 3 m too far along x and 4 m too low; the ranges tell where it is."""
     made = on_map()
     weights = np.where(made.problem.anchor_index == 1, 0.09, 0.11)

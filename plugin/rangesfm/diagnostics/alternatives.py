@@ -11,43 +11,40 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import MEASURE_AGAIN, Correction, corrected, in_axes, where_ranges_meet
 from rangesfm.diagnostics.linearized import RangesOnMap
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.ranging.readers.units import FOOT_M
-from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, solve
+from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, solve
 from rangesfm.scale.starts import multilaterate_all, spread_rows
 
-# Ranges of each anchor in a refit, and most evaluations of it: alternatives are only compared.
-_NUM_PER_ANCHOR, _NUM_EVALUATIONS = 25, 25
-# Share of an anchor's ranges that fit if it is about where it is said to be.
-_MOST_FIT = 0.5
+# Ranges of each anchor in a refit: alternatives are only compared.
+_NUM_PER_ANCHOR = 25
+LEAST_USED = 0.4
+"""Least share of an anchor's ranges that fit a map on which it is about where it is said to be."""
 _UNITS_M = {
     "the anchors' coordinates are in feet": FOOT_M,
     "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / FOOT_M,
     "the ranges are of both ways, there and back": 2.0,
 }
-# Factors on the scale of the map that are tried, as with ranges in feet or of both ways.
-_SCALE_FACTORS = np.geomspace(1 / 4, 4, 7)
+# Directions of the three given coordinates, as _turned reads them.
 _AXES_OF_ANCHORS = {
-    "x and y are swapped": np.eye(3)[[1, 0, 2]],
-    "y and z are swapped": np.eye(3)[[0, 2, 1]],
-    "x has the wrong sign": np.diag([-1.0, 1, 1]),
-    "heights have the wrong sign (they are depths)": np.diag([1.0, 1, -1]),
+    "x and y are swapped": "y x z",
+    "y and z are swapped": "x z y",
+    "x has the wrong sign": "-x y z",
+    "heights have the wrong sign (they are depths)": "x y -z",
 }
 _AXES_OF_LEVER_ARM = {
-    "has the wrong sign (from the tag to the camera, not from the camera to the tag)": -np.eye(3),
-    "is given along x forward, y left, z up, not x right, y down, z forward": np.array(
-        [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]
-    ),
-    "is given along x right, y up, z back, not x right, y down, z forward": np.diag([1.0, -1, -1]),
-    "is given along x right, y forward, z up, not x right, y down, z forward": np.array(
-        [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]
-    ),
-    "is given along x forward, y right, z down, not x right, y down, z forward": np.array(
-        [[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]
-    ),
+    "has the wrong sign (from the tag to the camera, not from the camera to the tag)": "left up back",
+    "is given along x forward, y left, z up, not x right, y down, z forward": "forward left up",
+    "is given along x right, y up, z back, not x right, y down, z forward": "right up back",
+    "is given along x right, y forward, z up, not x right, y down, z forward": "right forward up",
+    "is given along x forward, y right, z down, not x right, y down, z forward": "forward right down",
 }
+# Directions along the axes that are meant, and against them: of the site, and of a camera.
+_IN_SITE = "x y z", "-x -y -z"
+_IN_CAMERA = "right down forward", "left up back"
 
 
 @dataclass(frozen=True)
@@ -83,7 +80,8 @@ def alternatives(on_map: RangesOnMap) -> Iterator[Alternative]:
 def lever_arms_in_other_axes(on_map: RangesOnMap) -> Iterator[Alternative]:
     """Yield other readings of the lever arms: with the wrong sign, or along other axes."""
     arms = _lever_arms_m(on_map)
-    for words, axes in _AXES_OF_LEVER_ARM.items():
+    for words, given in _AXES_OF_LEVER_ARM.items():
+        axes = _turned(given, *_IN_CAMERA)
         moves = {tag: axes @ arm - arm for tag, arm in arms.items()}
         if max(np.linalg.norm(move) for move in moves.values()) > 1e-3:
             remedy = "give the tag's place in the camera, x to the right, y down, z forward (--tag_in_cam)"
@@ -107,8 +105,8 @@ def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Alt
 def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Alternative]:
     """Yield other axes of the anchors' coordinates, coordinates in feet, and ranges of the way there and back."""
     remedy = "compare the anchors' file with a sketch of the site"
-    for axes_words, axes in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
-        words = f"in the anchors' coordinates {axes_words}"
+    for axes_words, directions in _AXES_OF_ANCHORS.items() if len(given) > 2 else ():
+        words, axes = f"in the anchors' coordinates {axes_words}", _turned(directions, *_IN_SITE)
         turned = Correction({name: axes @ at for name, at in given.items()})
         yield Alternative("anchors' axes", "", words, remedy, turned)
     if len(given) < 2:
@@ -120,6 +118,17 @@ def _of_coordinates(given: Mapping[str, Array]) -> Iterator[Alternative]:
         yield Alternative("anchors' unit", "", words, remedy, grown)
 
 
+def _turned(given: str, along: str, against: str) -> Array:
+    """Return the rotation or reflection (3, 3) of coordinates in given directions into those that are meant.
+
+    Args:
+        given: directions in which the three coordinates were given.
+        along, against: directions of the three axes that are meant, and the opposite ones.
+    """
+    axes = dict(zip((*along.split(), *against.split()), np.vstack([np.eye(3), -np.eye(3)]), strict=True))
+    return np.column_stack([axes[direction] for direction in given.split()])
+
+
 def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Alternative]:
     """Yield for each anchor that hardly any range fits: it is far from its coordinates, as without a sign or a point.
 
@@ -127,7 +136,7 @@ def _of_places(on_map: RangesOnMap, given: Mapping[str, Array]) -> Iterator[Alte
     """
     for name, at in given.items():
         k = on_map.anchor_ids.index(name)
-        if np.mean(on_map.weights[on_map.problem.anchor_index == k] >= OUTLIER_BELOW) < _MOST_FIT:
+        if np.mean(on_map.weights[on_map.problem.anchor_index == k] >= OUTLIER_BELOW) < LEAST_USED:
             off_m = where_ranges_meet(on_map, k) - at
             words = (
                 f"anchor {name} is about {np.linalg.norm(off_m):.2f} m from where its coordinates say "
@@ -164,9 +173,7 @@ class Refits:
 
     def of(self, start: RangesOnMap) -> tuple[float, RangesOnMap]:
         """Return the cost of the best fit of the thinned ranges, and the map at that fit."""
-        fit = solve(
-            self._thinned(start), start.state, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS
-        )
+        fit = _roughly_solved(self._thinned(start), start.state)
         return fit.cost, replace(start, state=fit.state)
 
     def _starts(
@@ -194,6 +201,10 @@ def _cost(problem: RangeProblem, state: RangeState) -> float:
     return float(CAUCHY.rho(off**2)[0].sum())
 
 
+def _roughly_solved(problem: RangeProblem, start: RangeState) -> RangeFit:
+    return solve(problem, start, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=MAX_NUM_ROUNDS)
+
+
 def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
     """Estimate how the map lies and where it sees the anchors (m, 3) if nothing is known of them beforehand."""
     unknown = replace(
@@ -203,11 +214,14 @@ def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
         frame_is_free=False,
         gravity=None,
     )
-    anchors_m, (_, costs) = multilaterate_all(unknown, _SCALE_FACTORS)
+    # The map has another scale if its anchors or its ranges have another unit.
+    units = np.array([*_UNITS_M.values()])
+    scales = np.unique([*units, 1.0, *1 / units])
+    anchors_m, (_, costs) = multilaterate_all(unknown, scales)
     best = int(np.argmin(costs))
     heard = np.where(np.isinf(unknown.anchor_stddev_m)[:, None], anchors_m[best], np.nan)
-    start = RangeState(replace(IDENTITY, scale=float(_SCALE_FACTORS[best])), heard, unknown.bias_mean_m)
-    state = solve(unknown, start, loss=CAUCHY, tolerance=1e-4, max_num_evaluations=_NUM_EVALUATIONS).state
+    start = RangeState(replace(IDENTITY, scale=float(scales[best])), heard, unknown.bias_mean_m)
+    state = _roughly_solved(unknown, start).state
     return state.metric_from_model, state.anchors_m
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Indices
+from rangesfm.diagnostics.alternatives import LEAST_USED
 from rangesfm.diagnostics.bent_path import drifts
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, Test, row_of
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
@@ -23,8 +24,8 @@ _MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
 # Addition to both limits per metre of distance: a radio over 70 m is noisier than in a room.
 _NOISE_BY_DISTANCE = 0.005
 _LASTING = ("time", "place", "view")
-# Least share of an anchor's ranges that fit the map, and largest share that is far from those right before and after.
-_LEAST_USED, _MOST_OUTLYING = 0.4, 0.35
+# Largest share of an anchor's ranges that is far from those right before and after.
+_MOST_OUTLYING = 0.35
 # Share of an anchor's outliers that must fit one other anchor to be taken for its ranges, and the fewest outliers.
 _MOST_OF_OTHER, _MIN_NUM_OUTLYING = 0.5, 10
 _FEW_OBSTRUCTED = "place the anchors where nothing stands between them and the path"
@@ -153,7 +154,7 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
         num = int(np.count_nonzero(is_of))
         words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
         remedy = "look whether it is the anchor that it is taken for, and where it stands"
-        yield _seen("anchor hardly used", name, unused, 1 - _LEAST_USED, words, remedy)
+        yield _seen("anchor hardly used", name, unused, 1 - LEAST_USED, words, remedy)
         rows = np.flatnonzero(is_of & (bins.robust_weight < DOWN_WEIGHTED_BELOW))
         if len(rows) >= _MIN_NUM_OUTLYING and len(on_map.anchor_ids) > 1:
             yield _mixed_up(problem, k, rows)
