@@ -130,10 +130,11 @@ def test_a_burst_of_ranges_with_large_errors_has_the_statistic_of_its_error(of_s
     assert burst.statistic == pytest.approx(solved.mistake(column).statistic)
 
 
-def test_bins_of_a_burst_that_is_left_out_are_off_by_ten_metres(of_small: Linearized) -> None:
+def test_bins_of_a_burst_that_is_left_out_are_off_by_as_much_as_a_range_can(of_small: Linearized) -> None:
     first = without(of_small, Burst(np.array([3, 4]), 0.0, 0.0))
     both = without(first, Burst(np.array([4, 7]), 0.0, 0.0))
-    for problem, expected in ((first, {3: 100.0, 4: 100.0}), (both, {3: 100.0, 4: 200.0, 7: 100.0})):
+    of_one = float(np.max(of_small.on_map.problem.range_m)) ** 2
+    for problem, expected in ((first, {3: of_one, 4: of_one}), (both, {3: of_one, 4: 2 * of_one, 7: of_one})):
         variances = np.array([expected.get(k, 0.0) for k in range(60)])
         np.testing.assert_allclose(problem.expected.known["bursts"], np.diag(variances))
         assert set(problem.expected.known) == {"bursts", *of_small.expected.known}

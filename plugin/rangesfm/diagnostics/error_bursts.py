@@ -13,14 +13,13 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Indices
+from rangesfm.diagnostics.hypothesis import longest_m
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE
 
 # Longest burst, seconds: the correlation time of errors that last for seconds. What lasts longer is a mistake.
 _LONGEST_S = 3.0
-# Standard deviation, metres, of the bins of a burst: they say nothing any more.
-_NOTHING_SAID_M = 10.0
 _NAME = "bursts"
 
 
@@ -52,9 +51,9 @@ def likeliest_burst(solved: Factorization) -> Burst:
 
 
 def without(problem: Linearized, burst: Burst) -> Linearized:
-    """Return the problem with the ranges of a burst left out."""
+    """Return the problem with the ranges of a burst left out: they may err by as much as a range can."""
     known, num = problem.expected.known, len(problem.bins)
-    variances_m2 = np.bincount(burst.bins, np.full(len(burst.bins), _NOTHING_SAID_M**2), num)
+    variances_m2 = np.bincount(burst.bins, np.full(len(burst.bins), longest_m(problem) ** 2), num)
     known = {**known, _NAME: known.get(_NAME, np.zeros((num, num))) + np.diag(variances_m2)}
     return replace(problem, expected=replace(problem.expected, known=known))
 

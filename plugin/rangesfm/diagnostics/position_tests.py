@@ -12,6 +12,7 @@ from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import in_axes
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, row_of_mistake
 from rangesfm.diagnostics.length_tests import against_other
+from rangesfm.options import LEVER_ARM_M
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE
 from rangesfm.scale.position_equations import at_point
@@ -22,25 +23,21 @@ LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of an
 _COMPARE = "calibrate the radio (rangesfm ranges calibrate), and look at the units of both"
 _POINT, _CHECK_POINT = "control point", "check point"
 _ARM, _CLOCK, _DATUM = "antenna's lever arm", "antenna's clock", "datum shift"
-# Words, remedy, largest possible size and unit of the mistakes of an antenna's positions. No camera carries its antenna
-# farther than 20 m; clocks that differ by more than seconds do not show as a shift of the positions alone.
+# Words, remedy and unit of the mistakes of an antenna's positions.
 _OF_ANTENNA = {
     _ARM: (
         "the antenna sits elsewhere on the camera, by {} (right, down, forward)",
         "measure from lens to antenna again ([positions] antenna_in_cam_m)",
-        20.0,
         "m",
     ),
     _CLOCK: (
         "the times of the positions are {} LATE",
         "look for leap seconds, or let the offset be searched for ([positions] time_offset)",
-        20.0,
         "s",
     ),
     _DATUM: (
         "the positions and the control points have frames that are shifted by {}",
         "look which coordinate system and which height each of them has",
-        np.inf,
         "m",
     ),
 }
@@ -119,12 +116,14 @@ def _of_antenna(positions: PositionScale) -> Iterator[MistakeTest]:
         columns[_CLOCK] = np.where(shown, moves[:, :, None], 0.0)
     if (known.is_mark & positions.is_used).sum() >= MIN_NUM_POSITIONS:
         columns[_DATUM] = np.where(shown, np.eye(3), 0.0)
+    # Clocks that differ by more than the positions last have no moment in common.
+    most = {_ARM: LEVER_ARM_M.most, _CLOCK: float(np.ptp(known.time_s[is_antenna]))}
     for name, of_all in columns.items():
         by = of_all.reshape(3 * len(known), -1)
         found = positions.equations.with_mistake_learnt(by).of_mistake(by)
         threshold = float(special.chdtri(max(found.num, 1), FALSE_ALARM_RATE / len(columns)))
-        words, remedy, most, unit = _OF_ANTENNA[name]
-        if np.linalg.norm(found.sizes) > most:
+        words, remedy, unit = _OF_ANTENNA[name]
+        if np.linalg.norm(found.sizes) > most.get(name, np.inf):
             found = replace(found, statistic=0.0)
         said = words.format(in_axes(found.sizes) if len(found.sizes) == 3 else f"{abs(found.sizes[0]):.2f} s")
         if name == _CLOCK:

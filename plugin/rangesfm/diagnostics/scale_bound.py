@@ -34,9 +34,8 @@ CHECKED_KINDS = (
     "lengths against positions",
 )
 """Mistakes in what was given: coordinates and ranges of each anchor, lever arm of each tag, measured lengths."""
-# Mistakes that move a test by this many standard deviations beyond its threshold are found for certain. Sizes up to
-# there are tried, so many of them.
-_CERTAINLY_FOUND, _NUM_SIZES = 6.0, 80
+# Number of sizes of a mistake that are tried.
+_NUM_SIZES = 80
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,8 @@ class HiddenMistake:
         """Possible changes of the scale's logarithm (k,), and the probabilities (k,) that the test misses them."""
         if not np.isfinite(self.slope):
             return np.array([self.most]), np.ones(1)
-        farthest = np.sqrt(self.threshold) + _CERTAINLY_FOUND
+        # A mistake that moves the test farther beyond its threshold is missed with a smaller probability than the risk.
+        farthest = np.sqrt(self.threshold) - special.ndtri(RISK)
         if self.slope > 0:
             farthest = min(farthest, self.most / self.slope)
         moves = np.linspace(0.0, farthest, _NUM_SIZES)
