@@ -10,17 +10,19 @@ from operator import attrgetter
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.diagnostics.preflight import SAME_PLACE_M
 from rangesfm.distances.tape import CONTROL
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_shape
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import PointOptions
 from rangesfm.planning.expected import Expected, expect_roughly
 from rangesfm.planning.paths import NUM_WAVES, way_along
-from rangesfm.planning.placement import spread_places
+from rangesfm.planning.placement import LEAST_GAIN, spread_places
 from rangesfm.planning.plan_checks import coordinates_text
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
-from rangesfm.planning.walls import lead_through
+from rangesfm.planning.walls import AT_WALL_M, lead_through
 from rangesfm.positions.control_points import ControlPoint
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import COMPONENTS
@@ -39,25 +41,16 @@ _LEARNT_CURVE_M = 0.02
 _TAPED_M = (5.0, 0.005)
 # Standard deviation of the coordinates of surveyed anchors, metres.
 _SURVEYED_M = 0.02
-# Smallest distance between a wall and the camera of somebody who walks along it, metres.
-_CLEARANCE_M = 0.3
-# Smallest distance of a new anchor from the others, metres; a nearer one adds almost no information.
-_NEAR_M = 1.0
-# Standard deviation of each coordinate of a control point, metres; fewest photos that show one, so that marks in some
-# may fail; number of places that are tried.
-_POINT_STDDEV_M, _MIN_NUM_SHOWING, _NUM_TRIED_POINTS = 0.01, 3, 24
+# Fewest photos that show a control point, so that marks in some may fail; number of places that are tried for one.
+_MIN_NUM_SHOWING, _NUM_TRIED_POINTS = 3, 24
 # With few ranges, ranging so many times as often is worth trying, and so is walking the path so many times.
 _MORE_OFTEN, _NUM_AGAIN = (10, 50), 5
 # Number of changes that a result recommends.
 _NUM_BEST = 3
 # Number of places, of all allowed ones, that are tried for an anchor.
 _NUM_PLACES = 8
-# Number of places to which each anchor may be moved: those where one more anchor would gain most.
-_NUM_PLACES_TO_MOVE_TO = 2
-# Smallest relative reduction of a standard deviation for which a change is reported.
-_LEAST_GAIN = 0.02
-# The same in the warnings after a survey: the standard deviation is divided by 1.2 or more.
-_WORTH_SAYING = 1 - 1 / 1.2
+# How many times as certain a change must make a result for a warning after a survey to tell it.
+_WORTH_SAYING = 1.2
 
 
 @dataclass(frozen=True)
@@ -103,16 +96,8 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
                 with suppress(GeometryError):  # a run will find too few ranges
                     yield _advice(change, expect_roughly(change[3], expected.vision), before, expected)
 
-    more = list(tried(_with_one_more(planned)))
-    found = [*more, *tried(_moved(planned, _best_places(more))), *tried(_changes(planned))]
-    return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > _LEAST_GAIN)
-
-
-def _best_places(more: Sequence[Advice]) -> list[Array]:
-    """Return the places, each once, where one more anchor gains most for the scale and for the position."""
-    gains = attrgetter("scale_gain"), attrgetter("place_gain")
-    best = [each for gain in gains for each in sorted(more, key=gain, reverse=True)[:_NUM_PLACES_TO_MOVE_TO]]
-    return list({id(each): each.planned.anchors_m[-1] for each in best}.values())
+    found = tried([*_with_one_more(planned), *_moved(planned), *_changes(planned)])
+    return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > LEAST_GAIN)
 
 
 def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
@@ -121,15 +106,15 @@ def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) ->
     for what, is_wanted in (("scale", for_scale), ("place", for_place)):
         gain = attrgetter(f"{what}_gain")
         for each in ranked(advice, gain)[:_NUM_BEST] if is_wanted else ():
-            if gain(each) > _WORTH_SAYING:
-                said = f"the {what} would be {1 / (1 - gain(each)):.2g} times as certain"
+            if (times := 1 / (1 - gain(each))) > _WORTH_SAYING:
+                said = f"the {what} would be {times:.2g} times as certain"
                 gains.setdefault(each.words, []).append(said)
     return [f"{words}: {', '.join(gained)}" for words, gained in gains.items()]
 
 
 def ranked(advice: Sequence[Advice], gain: Callable[[Advice], float]) -> list[Advice]:
     """Return the best change of each kind and subject, the largest gain first, without changes that hardly gain."""
-    worthwhile = sorted((each for each in advice if gain(each) > _LEAST_GAIN), key=gain, reverse=True)
+    worthwhile = sorted((each for each in advice if gain(each) > LEAST_GAIN), key=gain, reverse=True)
     best: dict[tuple[str, str], Advice] = {}
     for each in worthwhile:
         best.setdefault((each.kind, each.subject), each)
@@ -200,7 +185,7 @@ def _leads_through_walls(before: PlannedSurvey, after: PlannedSurvey) -> bool:
     start = before.trajectory.centers[:, :2]
     end = after.trajectory.centers[: len(start), :2]  # a path that is walked again begins with itself
     moved_m = np.linalg.norm(end - start, axis=1, keepdims=True)
-    end = end + _CLEARANCE_M * (end - start) / np.maximum(moved_m, _CLEARANCE_M)
+    end = end + AT_WALL_M * (end - start) / np.maximum(moved_m, AT_WALL_M)
     num = min(len(before.anchors), len(after.anchors))  # a new anchor moves nowhere
     start = np.vstack([start, before.anchors_m[:num, :2]])
     end = np.vstack([end, after.anchors_m[:num, :2]])
@@ -236,10 +221,10 @@ def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
                 yield "anchor height", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
-def _moved(planned: PlannedSurvey, places: Sequence[Array]) -> Iterator[_Change]:
+def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
     """Yield the plan with each anchor moved to each of some allowed places."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
-        for place in places:
+        for place in _free_places(planned):
             words = f"move anchor {anchor.anchor_id} to {coordinates_text(place)}"
             yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
@@ -273,16 +258,17 @@ def _with_control_points(planned: PlannedSurvey) -> Iterator[_Change]:
     names = [name for name in (f"C{k}" for k in range(1, len(taken) + MIN_NUM_POSITIONS + 1)) if name not in taken]
     outermost_first = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1), kind="stable")
     spread = spread_places(MIN_NUM_POSITIONS, places[outermost_first])
-    more = tuple(ControlPoint(name, at, _POINT_STDDEV_M, CONTROL, 0) for name, at in zip(names, spread, strict=False))
+    stddev_m = PointOptions().stddev_m
+    more = tuple(ControlPoint(name, at, stddev_m, CONTROL, 0) for name, at in zip(names, spread, strict=False))
     where = "; ".join(map(coordinates_text, spread))
-    words = f"survey three control points that the photos show, such as {where}, to {_POINT_STDDEV_M:g} m"
+    words = f"survey three control points that the photos show, such as {where}, to {stddev_m:g} m"
     anchor_frame = "site" if planned.anchor_frame == "site" else "unknown"
     with_points = replace(planned, points=(*planned.points, *more), anchor_frame=anchor_frame)
     yield "control points", "", words, with_points
 
 
 def _free_places(planned: PlannedSurvey) -> list[Array]:
-    """Return places for an anchor that are not near another one.
+    """Return places for an anchor where no other one is.
 
     They are the allowed places farthest apart. If none are given, they are eight points on the outline of the box
     around path and anchors, at the anchors' median height.
@@ -294,7 +280,7 @@ def _free_places(planned: PlannedSurvey) -> list[Array]:
         height_m = float(np.median(planned.anchors_m[:, 2]))
         grid = [low + (high - low) * [x / 2, y / 2, 0.0] for x, y in np.ndindex(3, 3) if (x, y) != (1, 1)]
         spread = np.array(grid) * [1.0, 1.0, 0.0] + [0.0, 0.0, height_m]
-    return [place for place in spread if np.linalg.norm(planned.anchors_m - place, axis=1).min() > _NEAR_M]
+    return [place for place in spread if np.linalg.norm(planned.anchors_m - place, axis=1).min() > SAME_PLACE_M]
 
 
 def _up_and_down(path: Trajectory) -> Trajectory:

@@ -20,7 +20,7 @@ from rangesfm.distances.tape import CHECK
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import in_first_camera
-from rangesfm.options import ScaleOptions
+from rangesfm.options import LENGTH_M, ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.errors.bending import ErrorPart, MapBending, WalkBending, averaged
 from rangesfm.ranging.errors.components import BENDS
@@ -46,8 +46,6 @@ _NUM_COMPARED_RANGES, _NUM_COMPARED_BINS, _NUM_COMPARED_KEYFRAMES = 600, 120, 15
 _NUM_KEYFRAMES = 40
 # Components of the errors that a simple estimate weights by: what differs from observation to observation.
 _NOISE = ("white", "points", "marks", "positions")
-# Shortest simulated range, metres.
-_LEAST_RANGE_M = 0.05
 OPEN = 1e3
 """Standard deviation, in metres or radians, from which on a number counts as not determined."""
 
@@ -166,7 +164,7 @@ class Expected:
         range_m = observations.log.range_m.copy()
         range_m[self.ranges.posed.rows] += of_bins[learned.of_range]
         range_m[self.ranges.posed.rows] += white_m * rng.standard_normal(len(learned.of_range))
-        return replace(observations, log=replace(observations.log, range_m=np.maximum(range_m, _LEAST_RANGE_M)))
+        return replace(observations, log=replace(observations.log, range_m=np.maximum(range_m, LENGTH_M.least)))
 
     @property
     def placement(self) -> Array | None:

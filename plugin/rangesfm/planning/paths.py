@@ -9,6 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
+from rangesfm.geometry.numerics import UNDETERMINED
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
@@ -20,10 +21,6 @@ _LOOP_SHARE = 2 / 3
 _LOOP_STEP_M = 0.25
 NUM_WAVES = 3
 """Number of the waves of a path that goes up and down."""
-# Below this ratio of its horizontal part to its length a direction counts as vertical.
-_STEEP = 1e-6
-# Times at which a turn is sampled, relative to its middle and its duration.
-_DURING_TURN = (np.arange(128) + 0.5) / 128 - 0.5
 
 
 def path_through(
@@ -58,10 +55,32 @@ def path_through(
     times = np.arange(num) / photo_rate_hz
     headings = _headings(np.diff(corners, axis=0))
     turn_s = np.rad2deg(np.abs(np.diff(headings)).max(initial=0.0)) / turn_deg_per_s
-    during = speed_m_per_s * (times[:, None] + turn_s * _DURING_TURN)
-    leg = np.clip(np.searchsorted(way, during, side="right") - 1, 0, len(corners) - 2)
-    centers = places_on_way(during.ravel(), way, corners).reshape(num, -1, 3).mean(axis=1)
-    return _trajectory(times, centers, _looking(headings[leg].mean(axis=1)))
+    # A mean over a much shorter part of the way would be a difference of nearly equal numbers.
+    half_m = max(speed_m_per_s * turn_s / 2, UNDETERMINED * float(way[-1]))
+    centers, heading = _means_on_way(speed_m_per_s * times, half_m, way, corners, headings)
+    return _trajectory(times, centers, _looking(heading))
+
+
+def _means_on_way(at: Array, half_m: float, way: Array, corners: Array, headings: Array) -> tuple[Array, Array]:
+    """Return the mean places (k, 3) and headings (k,) over parts of a way, standing still before and after it.
+
+    Args:
+        at: (k,) middles of the parts. half_m: half their length. way, corners, headings: (n,), (n, 3), (n - 1,).
+    """
+    way = np.concatenate([way[:1] - half_m, way, way[-1:] + half_m])
+    # Relative to the first one, what does not change is exact.
+    first, facing = corners[0], headings[0]
+    corners = np.vstack([corners[:1], corners, corners[-1:]]) - first
+    headings = np.concatenate([headings[:1], headings, headings[-1:]]) - facing
+    # Integrals from the beginning: the place is linear between corners, and the heading is constant.
+    legs = np.diff(way)[:, None] * np.column_stack([(corners[:-1] + corners[1:]) / 2, headings])
+    to_corner = np.vstack([np.zeros(4), np.cumsum(legs, axis=0)])
+    ends = np.concatenate([at - half_m, at + half_m])
+    leg = np.clip(np.searchsorted(way, ends, side="right") - 1, 0, len(legs) - 1)
+    middles = (corners[leg] + places_on_way(ends, way, corners)) / 2
+    to_end = to_corner[leg] + (ends - way[leg])[:, None] * np.column_stack([middles, headings[leg]])
+    means = (to_end[len(at) :] - to_end[: len(at)]) / (2 * half_m)
+    return first + means[:, :3], facing + means[:, 3]
 
 
 def way_along(corners: Array) -> Array:
@@ -138,7 +157,7 @@ def _headings(legs: Array) -> Array:
 
     A vertical line is walked with the heading of the line before it, or of the first that is not vertical.
     """
-    is_level = np.linalg.norm(legs[:, :2], axis=1) > _STEEP * np.linalg.norm(legs, axis=1)
+    is_level = np.linalg.norm(legs[:, :2], axis=1) > UNDETERMINED * np.linalg.norm(legs, axis=1)
     before = np.maximum.accumulate(np.where(is_level, np.arange(len(legs)), int(np.argmax(is_level))))
     return np.asarray(np.unwrap(np.arctan2(legs[before, 1], legs[before, 0])))
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.planning.expected import expect_roughly
 from rangesfm.planning.paths import places_on_way, way_along
 from rangesfm.planning.planned import PlannedSurvey
@@ -15,14 +16,10 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 
-# Numbers of places along x, y and z of a box.
+# Numbers of places along x, y and z of a box. As many are tried along all walls together, at two heights.
 _GRID = (4, 4, 2)
-# Number of places along all walls together, at each of two heights.
-_NUM_ALONG_WALLS = 16
-# Most rounds in which every anchor is tried at every place.
-_MAX_NUM_ROUNDS = 4
-# Smallest decrease of the sum of two logarithms for which an anchor is moved.
-_LEAST_GAIN = 0.01
+LEAST_GAIN = 0.02
+"""Smallest relative reduction of a standard deviation for which a change of a plan is worth the trouble."""
 
 
 def places_in_box(low_m: Sequence[float], high_m: Sequence[float]) -> Array:
@@ -44,7 +41,8 @@ def places_on_walls(walls_m: Sequence[Sequence[Sequence[float]]], heights_m: tup
     """
     walls = [np.array(wall, dtype=np.float64) for wall in walls_m]
     ways = [way_along(wall) for wall in walls]
-    step = sum(way[-1] for way in ways) / _NUM_ALONG_WALLS
+    along_x, along_y, _ = _GRID
+    step = sum(way[-1] for way in ways) / (along_x * along_y)
     spots = []
     for wall, way in zip(walls, ways, strict=True):
         at = np.linspace(0.0, way[-1], max(round(way[-1] / step), 1) + 1)
@@ -82,16 +80,16 @@ def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> P
     best = _badness(planned)
     progress.stage("placing anchors")
     num_anchors = len(planned.anchors)
-    for turn in range(_MAX_NUM_ROUNDS):
+    for turn in range(MAX_NUM_ROUNDS):
         before = best
         for k in range(num_anchors):
-            progress.update(turn * num_anchors + k, _MAX_NUM_ROUNDS * num_anchors)
+            progress.update(turn * num_anchors + k)
             for place in planned.allowed_m:
                 if np.linalg.norm(planned.anchors_m - place, axis=1).min() == 0:
                     continue
                 tried = planned.with_anchor_at(k, place)
                 badness = _badness(tried)
-                if badness < best - _LEAST_GAIN:
+                if badness < best - LEAST_GAIN:
                     planned, best = tried, badness
         if best == before:
             break

@@ -23,8 +23,8 @@ from rangesfm.ranging.errors.noise import NORMAL_95
 
 REFUSED, OPEN_PLACE = "refused", "open"
 """Verdicts of a plan: a run will refuse the scale; it will leave open where the map is."""
-# Largest numbers of changes that are advised for one purpose, of components that the terminal names, and of mistakes.
-_NUM_ADVISED, _NUM_COMPONENTS, _NUM_MISTAKES = 8, 5, 8
+# Most lines of a list, of changes that are advised for one purpose or of mistakes; most components in a line.
+_NUM_LINES, _NUM_COMPONENTS = 8, 5
 _MISTAKES = {
     "anchor place": "anchor {} is not where its coordinates say",
     "anchor bias": "ranges to anchor {} are too long",
@@ -124,12 +124,12 @@ class SurveyPlan:
     @property
     def advice_for_scale(self) -> list[Advice]:
         """Changes by their gain for the scale, the largest first."""
-        return ranked(self.advice, attrgetter("scale_gain"))[:_NUM_ADVISED]
+        return ranked(self.advice, attrgetter("scale_gain"))[:_NUM_LINES]
 
     @property
     def advice_for_place(self) -> list[Advice]:
         """Changes by their gain for the position of the least certain keyframe, the largest first."""
-        return ranked(self.advice, attrgetter("place_gain"))[:_NUM_ADVISED]
+        return ranked(self.advice, attrgetter("place_gain"))[:_NUM_LINES]
 
     @property
     def without_advice(self) -> str:
@@ -148,7 +148,7 @@ class SurveyPlan:
         of_kind: dict[str, MistakeTest] = {}
         for mistake in self.mistakes:
             of_kind.setdefault(mistake.name, mistake)
-        return list(of_kind.values())[:_NUM_MISTAKES]
+        return list(of_kind.values())[:_NUM_LINES]
 
     @property
     def lines(self) -> list[str]:

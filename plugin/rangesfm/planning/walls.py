@@ -9,8 +9,8 @@ import numpy as np
 
 from rangesfm.arrays import Array, Mask
 
-# Distance within which two corners, or a place and a wall, are one, metres.
-_AT_WALL_M = 0.3
+AT_WALL_M = 0.3
+"""Distance, metres, within which two corners are one, or a place is at a wall, where nobody walks with a camera."""
 
 
 def lead_through(start: Array, end: Array, walls_m: Sequence[Array]) -> Mask:
@@ -25,7 +25,7 @@ def lead_through(start: Array, end: Array, walls_m: Sequence[Array]) -> Mask:
 
 def are_outside(places: Array, walls_m: Sequence[Array]) -> Mask:
     """Return which places (n, 2) are in none of the rooms that walls enclose, nor at a wall; none without a room."""
-    rooms = [wall for wall in walls_m if len(wall) > 3 and np.linalg.norm(wall[0] - wall[-1]) < _AT_WALL_M]
+    rooms = [wall for wall in walls_m if len(wall) > 3 and np.linalg.norm(wall[0] - wall[-1]) < AT_WALL_M]
     outside = np.full(len(places), bool(rooms))
     for room in rooms:
         # A line to the right crosses the walls around a place an odd number of times.
@@ -37,7 +37,7 @@ def are_outside(places: Array, walls_m: Sequence[Array]) -> Mask:
     for from_, to in _sides(walls_m):
         along = to - from_
         share = np.clip((places - from_) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
-        outside &= np.linalg.norm(places - from_ - share[:, None] * along, axis=1) > _AT_WALL_M
+        outside &= np.linalg.norm(places - from_ - share[:, None] * along, axis=1) > AT_WALL_M
     return outside
 
 
