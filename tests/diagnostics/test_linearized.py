@@ -316,7 +316,7 @@ class TestSteps:
 
     @pytest.mark.parametrize(
         ("largest_share", "taken"),
-        [(2.0, 1.0), (1.0, 1.0), (0.3, 0.25), (1 / 64, 1 / 64), (1 / 100, None)],
+        [(2.0, 1.0), (1.0, 1.0), (0.3, 0.25), (1 / 64, 1 / 64), (0.0, None)],
     )
     def test_a_step_is_halved_until_the_ranges_are_as_likely(
         self, monkeypatch: pytest.MonkeyPatch, largest_share: float, taken: float | None

@@ -136,7 +136,7 @@ def test_mistakes_that_the_interval_allows_for_are_not_hidden_ones() -> None:
 
 
 def test_sizes_of_a_hidden_mistake_go_to_where_it_is_found_for_certain() -> None:
-    """At 4 stddevs, the root of the threshold, half of them are missed, and at 7.72 as few as bounds may fail."""
+    """Half of those of 4 stddevs, the root of the threshold, are missed, and of those of 7.72 as few as bounds fail."""
     changes, missed = HiddenMistake("a step", 0.005, 16.0, 1, np.inf).sizes
     np.testing.assert_allclose(changes[[0, -1]], [0.0, 0.005 * (4 + stats.norm.isf(1e-4))])
     np.testing.assert_allclose(missed, stats.ncx2.cdf(16.0, 1, (changes / 0.005) ** 2), atol=1e-12)

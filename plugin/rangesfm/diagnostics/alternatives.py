@@ -28,6 +28,8 @@ _UNITS_M = {
     "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / FOOT_M,
     "the ranges are of both ways, there and back": 2.0,
 }
+# Factors on the scale of the map that are tried, as with ranges in feet or of both ways.
+_SCALE_FACTORS = np.geomspace(1 / 4, 4, 7)
 # Directions of the three given coordinates, as _turned reads them.
 _AXES_OF_ANCHORS = {
     "x and y are swapped": "y x z",
@@ -214,13 +216,10 @@ def _anchors_by_map(problem: RangeProblem) -> tuple[Similarity, Array]:
         frame_is_free=False,
         gravity=None,
     )
-    # The map has another scale if its anchors or its ranges have another unit.
-    units = np.array([*_UNITS_M.values()])
-    scales = np.unique([*units, 1.0, *1 / units])
-    anchors_m, (_, costs) = multilaterate_all(unknown, scales)
+    anchors_m, (_, costs) = multilaterate_all(unknown, _SCALE_FACTORS)
     best = int(np.argmin(costs))
     heard = np.where(np.isinf(unknown.anchor_stddev_m)[:, None], anchors_m[best], np.nan)
-    start = RangeState(replace(IDENTITY, scale=float(scales[best])), heard, unknown.bias_mean_m)
+    start = RangeState(replace(IDENTITY, scale=float(_SCALE_FACTORS[best])), heard, unknown.bias_mean_m)
     state = _roughly_solved(unknown, start).state
     return state.metric_from_model, state.anchors_m
 

@@ -10,15 +10,10 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, after_step, at_state, linearized
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.scale.range_equation import RangeState, antenna_positions
-
-# Smallest gain in twice the log-likelihood that rules out the other side.
-_MIN_GAIN = 2 * MIN_COST_GAP
-# Gauss-Newton steps to the likeliest state; the map and an anchor's mirror image are near it.
-_NUM_STEPS = 5
 
 
 @dataclass(frozen=True)
@@ -81,7 +76,8 @@ def _likelier_sides(on_map: RangesOnMap, unknown: Sequence[int]) -> AnchorSides:
             other = other.with_learnt_errors()
             gain = Factorization(problem).deviance() - Factorization(other).deviance()
         likelier, less_likely = (other, problem) if gain > 0 else (problem, other)
-        mirrors_m[on_map.anchor_ids[k]] = _place_m(less_likely, k) if abs(gain) < _MIN_GAIN else None
+        is_open = abs(gain) < SIGNIFICANT_STDDEVS**2
+        mirrors_m[on_map.anchor_ids[k]] = _place_m(less_likely, k) if is_open else None
         problem, has_crossed = likelier, has_crossed or gain > 0
     return AnchorSides(problem.on_map if has_crossed else on_map, has_crossed, mirrors_m)
 
@@ -103,8 +99,11 @@ def _on_other_side(problem: Linearized, k: int) -> Linearized:
 def _settled(problem: Linearized, state: RangeState) -> Linearized:
     """Return the problem at the likeliest state near another one."""
     problem = at_state(problem, replace(problem.on_map, state=state))
-    for _ in range(_NUM_STEPS):
-        problem = after_step(problem)
+    for _ in range(MAX_NUM_ROUNDS):
+        before, problem = problem, after_step(problem)
+        moved_m = problem.on_map.from_anchor_m - before.on_map.from_anchor_m
+        if np.sqrt(np.mean(moved_m**2)) < NEGLIGIBLE_STDDEVS * problem.scatter_m:
+            break
     return problem
 
 

@@ -19,11 +19,11 @@ from rangesfm.diagnostics.linearized import (
     linearized,
     slopes_by_poses,
 )
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import rmse
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.errors.bending import WalkBending, averaged
 from rangesfm.ranging.errors.components import BENDS
-from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_observations import status_by_weight
 from rangesfm.scale.linear_map import regular
 from rangesfm.scale.range_equation import RangeState, state_after
@@ -32,13 +32,9 @@ from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import judge
 from rangesfm.scale.uncertainty import KnownMap, bias_covariance
 
-# Most Gauss-Newton steps, and the number of them after which the bins are kept: with bins and outliers chosen anew each
-# time, a map may swing to and fro for ever.
-_MAX_NUM_ROUNDS, _NUM_BINNED_ANEW = 8, 3
-# Iteration stops when a round moves the distances by less than this share of the scatter of single ranges.
-_STILL = 0.1
-# Smallest gain in twice the log-likelihood for which another place of the map is taken than that of a rigid path.
-_MIN_GAIN = 2 * MIN_COST_GAP
+# Number of Gauss-Newton steps after which the bins are kept: with bins and outliers chosen anew each time, a map may
+# swing to and fro for ever.
+_NUM_BINNED_ANEW = 3
 
 
 def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> RangesOnMap:
@@ -63,7 +59,7 @@ def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> Ra
 
     def likelier(best: tuple[float, RangesOnMap], start: RangesOnMap) -> tuple[float, RangesOnMap]:
         other = with_deviance(_bent(start))
-        return other if other[0] < best[0] - _MIN_GAIN else best
+        return other if other[0] < best[0] - SIGNIFICANT_STDDEVS**2 else best
 
     best = reduce(likelier, (replace(on_map, state=state) for state in rivals), with_deviance(bent))
     # The place of the bent path is a better start than that of a path of one piece.
@@ -72,13 +68,13 @@ def bent_to_ranges(on_map: RangesOnMap, rivals: Sequence[RangeState] = ()) -> Ra
 
 def _bent(on_map: RangesOnMap) -> RangesOnMap:
     problem = linearized(on_map).with_learnt_errors()
-    for num in range(_MAX_NUM_ROUNDS):
+    for num in range(MAX_NUM_ROUNDS):
         if num:
             again = linearized(on_map) if num < _NUM_BINNED_ANEW else at_other_map(problem, on_map)
             problem = again.with_learnt_errors(near=problem.errors)
         before, on_map = on_map, _bent_once(problem)
         moved_m = on_map.from_anchor_m - before.from_anchor_m
-        if float(np.sqrt(np.mean(moved_m**2))) < _STILL * problem.scatter_m:
+        if float(np.sqrt(np.mean(moved_m**2))) < NEGLIGIBLE_STDDEVS * problem.scatter_m:
             break
     return on_map
 

@@ -9,12 +9,13 @@ import numpy as np
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap
+from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.ranging.anchors.point_fit import multilaterate
 from rangesfm.scale.range_equation import antenna_positions
 
-# Step, in the unit of a hypothesis, of the difference quotient for its effect.
-_SMALL = 1e-4
-
+# Step, in the unit of a hypothesis, of the difference quotient for its effect: then rounding and curvature spoil it by
+# about the same.
+_SMALL = np.sqrt(ROUNDING)
 
 MEASURE_AGAIN = "measure it again, or run with it unknown (leave its coordinates in the anchors' file empty)"
 """Remedy for an anchor that is not where its coordinates say."""

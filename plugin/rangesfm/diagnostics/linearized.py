@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
 from rangesfm.ranging.errors.components import PLACES
@@ -33,24 +34,15 @@ from rangesfm.scale.uncertainty import ruled_out
 
 # Fewer bins than for an interval, because the tests learn the errors many times.
 _MAX_NUM_BINS = 160
-# Most halvings of a step.
-_MAX_NUM_HALVES = 6
 # Number of consecutive ranges of an anchor whose median they are compared with.
 _NUM_NEIGHBOURS = 8
-# A range farther than this many standard deviations from the median of its neighbours is an outlier among them. For
-# this the noise counts as _LEAST_SCATTER_M or more: a radio may repeat itself to a centimetre and still err by ten from
-# one place to the next.
-_OUTLYING = 3.0
+# Least noise that counts where a range is compared with the median of its neighbours, to see whether it is an outlier
+# among them: a radio may repeat itself to a centimetre and still err by ten from one place to the next.
 _LEAST_SCATTER_M = 0.08
-# Weight of such an outlier in its bin.
-_NO_WEIGHT = 1e-6
 # Standard deviation and correlation time of a slow wandering of the ranges, for each anchor and for all, as hands and
 # bodies move. It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where
 # steps may explain it. It is too slow to be confused with a step.
 _WANDERING_M, _WANDERING_S = 0.025, 60.0
-# Limit on learnt errors of a radio, in standard deviations of their spread over radios: more is a mistake and must not
-# pass for noise.
-_MOST_UNUSUAL = 3.0
 
 
 @dataclass(frozen=True)
@@ -183,7 +175,8 @@ class Linearized(LinearMap):
             design=np.hstack([self.design, columns]),
             prior_design=np.hstack([self.prior_design, priors]),
             noise_m=self.scatter_m,
-            most_unusual=_MOST_UNUSUAL,
+            # A radio that errs by significantly more than others was mistaken, which must not pass for noise.
+            most_unusual=SIGNIFICANT_STDDEVS,
             near=None if near is None else near.stddev_of_component,
         )
         return replace(self, errors=learnt)
@@ -235,7 +228,7 @@ def after_step(problem: Linearized) -> Linearized:
         return float(np.sum(solved.whitened(of.residual_m[:, None], of.prior_residual[:, None]) ** 2))
 
     step, before = solved.step, cost(problem)
-    for share in 0.5 ** np.arange(_MAX_NUM_HALVES + 1):
+    for share in 0.5 ** np.arange(MAX_NUM_ROUNDS):
         state = state_after((problem.columns,), problem.on_map.state, share * step)
         moved = at_state(problem, replace(problem.on_map, state=state))
         if cost(moved) <= before:
@@ -306,7 +299,7 @@ def _bins(on_map: RangesOnMap) -> tuple[RangeBins, float]:
         on_map.time_s,
         on_map.from_anchor_m,
         np.swapaxes(on_map.world_from_cam, 1, 2),
-        np.where(is_near, 1.0, _NO_WEIGHT),
+        is_near.astype(np.float64),
         noisiness(index[order], off_m, on_map.problem.num_anchors),
         _MAX_NUM_BINS,
     )
@@ -315,7 +308,7 @@ def _bins(on_map: RangesOnMap) -> tuple[RangeBins, float]:
 
 def near_m(scatter_m: float) -> float:
     """Return how far from its neighbours a range with this scatter may be, in metres."""
-    return _OUTLYING * max(scatter_m, _LEAST_SCATTER_M)
+    return SIGNIFICANT_STDDEVS * max(scatter_m, _LEAST_SCATTER_M)
 
 
 def _off_neighbours(values: Array, anchor_index: Indices) -> tuple[Array, float]:

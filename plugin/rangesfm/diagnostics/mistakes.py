@@ -17,6 +17,7 @@ from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_other_map, at_state, linearized
 from rangesfm.diagnostics.scale_bound import HiddenMistake, hidden_among
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.scale.range_equation import RangeState, state_after
 
@@ -34,14 +35,10 @@ _AS_LIKELY = 6.0
 _BEYOND_CHANCE = 2 * float(np.log(100))
 # Overlap of two hypotheses from which on nothing tells them apart, and most causes that are named beside the likeliest.
 _SAME, _MAX_NUM_RIVALS = 0.95, 2
-# Most steps to the likeliest state with a mistake, and relative change of its size at which they stop.
-_NUM_SETTLING, _SETTLED = 6, 0.05
-# Consecutive growing steps that count as divergence. One may be too short at first, with a large mistake.
-_NUM_LONGER = 2
+# Relative change of a mistake's size at which the steps to the likeliest state stop.
+_SETTLED = 0.05
 # Most bursts that are left out. More of them are no exception, and are seen as noise.
 _MAX_NUM_BURSTS = 8
-# Largest number of steps for a nonlinear hypothesis.
-_NUM_STEPS = 10
 
 
 @dataclass(frozen=True)
@@ -200,10 +197,8 @@ def _settled_test(problem: Linearized, hypothesis: Hypothesis) -> tuple[Test, fl
     found = (_linear_settled if hypothesis.is_linear else _settled_in_steps)(problem, hypothesis)
     factorized = Factorization(_learnt(found.at, [found.hypothesis]))
     [test] = factorized.estimates([found.hypothesis])
-    # The next step's gain is only counted if the steps have converged.
-    sizes = found.sizes + test.sizes if found.is_settled else found.sizes
-    deviance = np.inf if found.diverges else factorized.deviance(test if found.is_settled else None)
-    return replace(test, hypothesis=hypothesis, sizes=sizes), deviance, found.at.on_map.state
+    deviance = np.inf if found.diverges else factorized.deviance(test)
+    return replace(test, hypothesis=hypothesis, sizes=found.sizes + test.sizes), deviance, found.at.on_map.state
 
 
 @dataclass(frozen=True)
@@ -213,62 +208,45 @@ class _Settled:
     Attributes:
         at: the problem with the ranges corrected by ``sizes``, at the state that is then likeliest.
         hypothesis: linearised there. sizes: (k,) by which the ranges are corrected.
-        is_settled: whether the next step is short.
-        diverges: whether steps grow, or lead to impossible sizes.
+        diverges: whether the steps never become short, or lead to impossible sizes.
     """
 
     at: Linearized
     hypothesis: Hypothesis
     sizes: Array
-    is_settled: bool
-    diverges: bool = False
-
-
-class _Steps:
-    """Detection of steps that do not shrink."""
-
-    def __init__(self) -> None:
-        self._last, self._num_longer = np.inf, 0
-
-    def grow(self, step: float) -> bool:
-        """Add a step of this length, and return True if the last ``_NUM_LONGER`` steps each were longer than before."""
-        self._num_longer = self._num_longer + 1 if step > self._last or not np.isfinite(step) else 0
-        self._last = step
-        return self._num_longer >= _NUM_LONGER
+    diverges: bool
 
 
 def _linear_settled(problem: Linearized, hypothesis: Hypothesis) -> _Settled:
     """Find the likeliest state with a linear mistake, whose size is left free."""
-    at, before, nothing, steps = problem, np.zeros(hypothesis.num), np.zeros(hypothesis.num), _Steps()
-    for _ in range(_NUM_SETTLING):
+    at, before, nothing = problem, np.zeros(hypothesis.num), np.zeros(hypothesis.num)
+    for _ in range(MAX_NUM_ROUNDS):
         factorized = Factorization(at)
         [test] = factorized.estimates([hypothesis])
-        change = float(np.linalg.norm(test.sizes - before))
-        if change < _SETTLED * np.linalg.norm(test.sizes):
+        if np.linalg.norm(test.sizes - before) <= _SETTLED * np.linalg.norm(test.sizes):
+            return _Settled(at, hypothesis, nothing, diverges=False)
+        if not test.is_possible:
             break
-        if steps.grow(change) or not test.is_possible:
-            return _Settled(at, hypothesis, nothing, is_settled=True, diverges=True)
         at, before = at_state(at, _stepped(at, factorized, hypothesis, test.sizes)), test.sizes
-    return _Settled(at, hypothesis, nothing, is_settled=True)
+    return _Settled(at, hypothesis, nothing, diverges=True)
 
 
 def _settled_in_steps(problem: Linearized, original: Hypothesis) -> _Settled:
     """Find the likeliest size of a mistake by repeated correction; the steps may diverge if the data hardly fix it."""
-    at, hypothesis, sizes, steps = problem, original, np.zeros(original.num), _Steps()
-    for _ in range(_NUM_STEPS):
+    at, hypothesis, sizes = problem, original, np.zeros(original.num)
+    for _ in range(MAX_NUM_ROUNDS):
         factorized = Factorization(at)
         [test] = factorized.estimates([hypothesis])
-        step, size = (float(np.linalg.norm(each)) for each in (test.sizes, sizes + test.sizes))
-        if steps.grow(step) or not original.can_be(sizes + test.sizes):
-            return _Settled(at, hypothesis, sizes, is_settled=False, diverges=True)
-        if step < _SETTLED * size:
-            return _Settled(at, hypothesis, sizes, is_settled=True)
+        if not original.can_be(sizes + test.sizes):
+            break
+        if np.linalg.norm(test.sizes) <= _SETTLED * np.linalg.norm(sizes + test.sizes):
+            return _Settled(at, hypothesis, sizes, diverges=False)
         sizes = sizes + test.sizes
         moved = replace(problem.on_map, state=_stepped(at, factorized, hypothesis, test.sizes).state)
         at = at_state(at, corrected(moved, original.correction(sizes)))
         found = (each for of_kind in STANDING for h in of_kind(at) for each in (h, *h.sub_hypotheses))
         hypothesis = next((each for each in found if each.key == original.key), None) or original.at_size(at, sizes)
-    return _Settled(at, hypothesis, sizes, is_settled=False)
+    return _Settled(at, hypothesis, sizes, diverges=True)
 
 
 def _stepped(at: Linearized, factorized: Factorization, hypothesis: Hypothesis, sizes: Array) -> RangesOnMap:

@@ -96,8 +96,15 @@ def advise(expected: Expected) -> tuple[Advice, ...]:
                 with suppress(GeometryError):  # a run will find too few ranges
                     yield _advice(change, expect_roughly(change[3], expected.vision), before, expected)
 
-    found = tried([*_with_one_more(planned), *_moved(planned), *_changes(planned)])
+    more = list(tried(_with_one_more(planned)))
+    found = [*more, *tried(_moved(planned, _best_places(more))), *tried(_changes(planned))]
     return tuple(advice for advice in found if max(advice.scale_gain, advice.place_gain) > LEAST_GAIN)
+
+
+def _best_places(more: Sequence[Advice]) -> list[Array]:
+    """Return the place where one more anchor gains most for the scale, and that for the position if it is another."""
+    best = [max(more, key=attrgetter(gain)) for gain in ("scale_gain", "place_gain") if more]
+    return list({id(each): each.planned.anchors_m[-1] for each in best}.values())
 
 
 def best_words(advice: Sequence[Advice], *, for_scale: bool, for_place: bool) -> list[str]:
@@ -221,10 +228,10 @@ def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
                 yield "anchor height", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
-def _moved(planned: PlannedSurvey) -> Iterator[_Change]:
+def _moved(planned: PlannedSurvey, places: Sequence[Array]) -> Iterator[_Change]:
     """Yield the plan with each anchor moved to each of some allowed places."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
-        for place in _free_places(planned):
+        for place in places:
             words = f"move anchor {anchor.anchor_id} to {coordinates_text(place)}"
             yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
