@@ -552,7 +552,7 @@ def test_a_mistake_is_a_cause_if_it_is_likelier_than_its_numbers_cost(monkeypatc
 
 def test_a_mistake_that_no_test_shows_must_be_likelier_than_all_that_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     of = OfCauses(monkeypatch)
-    least = ONE_NUMBER + 2 * np.log(50) + 2 * np.log(50)
+    least = ONE_NUMBER + 2 * np.log(50) + 2 * np.log(100)
     assert of.found({"bias": least + 0.01}, is_sure=False) == ["bias"]
     assert of.found({"bias~": least - 0.01}, is_sure=False) == []
     of.more = [replace(cause_of(2 * np.log(50) + gain), name=f"{gain}") for gain in (0.01, -0.01)]
