@@ -114,11 +114,11 @@ def stub_of_adjuster(residuals: list[float], num_parameters: int) -> Any:
 @pytest.mark.parametrize(
     ("num_parameters", "expected"),
     [
-        (0, 0.3 * 1.4826),
-        (9, 0.3 * 1.4826 * np.sqrt(12 / 3)),
-        (11, 0.3 * 1.4826 * np.sqrt(12)),
-        (12, 0.3 * 1.4826 * np.sqrt(12)),
-        (50, 0.3 * 1.4826 * np.sqrt(12)),
+        (0, 0.3 * 1.4826022),
+        (9, 0.3 * 1.4826022 * np.sqrt(12 / 3)),
+        (11, 0.3 * 1.4826022 * np.sqrt(12)),
+        (12, 0.3 * 1.4826022 * np.sqrt(12)),
+        (50, 0.3 * 1.4826022 * np.sqrt(12)),
     ],
 )
 def test_parameters_that_absorb_residuals_make_the_noise_of_pixels_larger(num_parameters: int, expected: float) -> None:
@@ -128,7 +128,7 @@ def test_parameters_that_absorb_residuals_make_the_noise_of_pixels_larger(num_pa
     assert found == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize(("residual_px", "expected"), [(0.0, 0.05), (0.03, 0.05), (0.04, 0.04 * 1.4826)])
+@pytest.mark.parametrize(("residual_px", "expected"), [(0.0, 0.05), (0.03, 0.05), (0.04, 0.04 * 1.4826022)])
 def test_no_feature_is_located_more_precisely_than_to_a_twentieth_of_a_pixel(
     residual_px: float, expected: float
 ) -> None:

@@ -16,3 +16,6 @@ SIGNIFICANT_STDDEVS: Final = 3.0
 
 NEGLIGIBLE_STDDEVS: Final = 0.05
 """Change, in standard deviations of what changes, that nobody notices: it adds 0.1 % to them."""
+
+NUM_REWEIGHTINGS: Final = 6
+"""Rounds of a robust fit whose scale is estimated anew in each: after these it changes by less than it is known."""

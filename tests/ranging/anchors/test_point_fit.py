@@ -171,7 +171,7 @@ class TestFit:
 
     def test_the_noise_of_few_residuals_is_drawn_to_the_usual_one(self) -> None:
         """Four unknowns take their share, and the usual noise counts as two ranges."""
-        variance = 1.4826**2
+        variance = 1.4826022**2
         for num, freedom in ((10, 6), (5, 1), (4, 0), (3, 0)):
             expected = np.sqrt((variance * num + 2) / (freedom + 2))
             assert _noise_of(np.resize([1.0, -1.0], num), 4) == pytest.approx(expected)

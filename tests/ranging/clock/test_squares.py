@@ -46,7 +46,7 @@ def refitted(points: Array, range_m: Array, anchor: Indices, width: float) -> tu
         roots = np.sqrt(weights)
         unknowns = np.linalg.lstsq(roots[:, None] * columns, roots * values, rcond=None)[0]
         residuals = values - columns @ unknowns
-        size = 1.4826 * np.median(np.abs(residuals))
+        size = 1.4826022 * np.median(np.abs(residuals))
         weights = 1 / (1 + (residuals / (width * size)) ** 2)
     return residuals, weights, float(np.sqrt(unknowns[0]))
 
@@ -225,4 +225,4 @@ def test_a_camera_in_one_place_has_neither_scale_nor_slopes_and_residuals_from_t
 
 def test_residuals_below_a_millimetre_count_as_a_millimetre() -> None:
     assert residual_stddev(np.array([1e-5, -1e-5])) == pytest.approx(1e-3)
-    assert residual_stddev(np.array([0.1, -0.1])) == pytest.approx(0.14826)
+    assert residual_stddev(np.array([0.1, -0.1])) == pytest.approx(0.14826022)

@@ -71,7 +71,7 @@ def test_nothing_is_told_of_no_ranges() -> None:
 
 def test_twenty_residuals_of_more_than_three_stddevs_are_told() -> None:
     def told(num: int, typical: float) -> tuple[Misfit, ...]:
-        return misfits(apart(num, 0.1), alternating(num, 0.0, 0.1 * typical / 1.4826), np.arange(float(num)))
+        return misfits(apart(num, 0.1), alternating(num, 0.0, 0.1 * typical / 1.4826022), np.arange(float(num)))
 
     assert told(20, 3.06) == (Misfit("range residuals are typically 3.1 times their stddev"),)
     assert told(20, 2.95) == told(19, 3.06) == ()
@@ -104,14 +104,14 @@ def of_one_anchor(num: int) -> RangeErrors:
 
 
 def test_residuals_five_times_as_large_as_their_scatter_are_told_of_twenty_steps() -> None:
-    """Steps of twice 0.1 m are a scatter of 0.1 m times the root of two, besides 1.4826 for both."""
+    """Steps of twice 0.1 m are a scatter of 0.1 m times the root of two, besides 1.4826022 for both."""
     limit = 5 * 0.1 * np.sqrt(2)
 
     def told(num: int, size_m: float) -> tuple[Misfit, ...]:
         return misfits(of_one_anchor(num), alternating(num, size_m - 0.1, 0.1), np.arange(float(num)))
 
     (misfit,) = told(21, 1.02 * limit)
-    scatter_m = 1.4826 * 0.1 * np.sqrt(2)
+    scatter_m = 1.4826022 * 0.1 * np.sqrt(2)
     assert misfit == Misfit(
         f"range residuals ({5 * 1.02 * scatter_m:.2f} m) are far larger than the ranges' scatter ({scatter_m:.2f} m)"
     )

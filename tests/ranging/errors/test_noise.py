@@ -36,14 +36,14 @@ def test_a_stretch_is_as_long_as_asked() -> None:
     np.testing.assert_array_equal(np.bincount(labels), np.full(20, 20))
 
 
-def test_a_short_log_has_eight_all_the_same() -> None:
-    labels = stretch_labels(np.linspace(0.0, 16.0, 161), 10.0)
-    np.testing.assert_array_equal(np.unique(labels), np.arange(9))
-    np.testing.assert_array_equal(np.bincount(labels)[:8], np.full(8, 20))
+def test_a_short_log_has_a_dozen_all_the_same() -> None:
+    labels = stretch_labels(np.linspace(0.0, 24.0, 241), 10.0)
+    np.testing.assert_array_equal(np.unique(labels), np.arange(13))
+    np.testing.assert_array_equal(np.bincount(labels)[:12], np.full(12, 20))
 
 
-def test_a_log_of_less_than_a_second_has_eight_too() -> None:
-    np.testing.assert_array_equal(stretch_labels(np.array([0.0, 0.1, 0.31, 0.79]), 10.0), [0, 1, 3, 8])
+def test_a_log_of_less_than_a_second_has_a_dozen_too() -> None:
+    np.testing.assert_array_equal(stretch_labels(np.array([0.0, 0.1, 0.31, 0.79]), 10.0), [0, 1, 4, 12])
 
 
 def test_ranges_of_one_moment_are_one_stretch() -> None:
@@ -63,8 +63,8 @@ def test_one_stretch_says_nothing_of_what_the_errors_of_one_have_in_common() -> 
 
 
 def test_the_robust_stddev_is_that_of_a_normal_distribution_with_the_same_median_size() -> None:
-    assert robust_stddev([-1.0, 2.0, 30.0]) == pytest.approx(2.0 * 1.4826)
-    np.testing.assert_allclose(robust_stddevs(np.array([[1.0, -3.0], [0.0, 0.0]])), [[2 * 1.4826], [1e-9]])
+    assert robust_stddev([-1.0, 2.0, 30.0]) == pytest.approx(2.0 * 1.4826022)
+    np.testing.assert_allclose(robust_stddevs(np.array([[1.0, -3.0], [0.0, 0.0]])), [[2 * 1.4826022], [1e-9]])
     assert robust_stddev([]) == robust_stddev([0.0]) == 1e-9
 
 
@@ -95,13 +95,11 @@ def test_what_a_stretch_has_in_common_counts_with_the_weights_and_the_shares() -
     assert correlation_inflation(np.ones(16), np.ones(16), groups, shares) == pytest.approx(np.sqrt(14.0))
 
 
-def test_errors_that_cancel_within_a_stretch_do_not_narrow_and_none_widens_by_more_than_thirty() -> None:
+def test_errors_that_cancel_within_a_stretch_do_not_narrow_and_those_alike_count_as_one() -> None:
     alternating = np.tile([1.0, -1.0], 20)
     assert correlation_inflation(alternating, np.ones(40), np.repeat([0, 1], 20)) == 1.0
-    for num, expected in ((800, np.sqrt(800)), (1000, 30.0)):
-        assert correlation_inflation(np.ones(2 * num), np.ones(2 * num), np.repeat([0, 1], num)) == pytest.approx(
-            expected
-        )
+    found = correlation_inflation(np.ones(2000), np.ones(2000), np.repeat([0, 1], 1000))
+    assert found == pytest.approx(np.sqrt(1000))
 
 
 @pytest.mark.parametrize("share", [1.0, 0.25])
@@ -190,7 +188,7 @@ def test_of_many_windows_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> Non
         seen.append(len(times))
         return _misses_of_parabola(times, ranges)
 
-    monkeypatch.setattr(noise, "_MAX_NUM_WINDOWS", 10)
+    monkeypatch.setattr(noise, "_MAX_NUM_SAMPLES", 10)
     monkeypatch.setattr(noise, "_misses_of_parabola", count)
     for num_windows in (20, 21, 30):
         estimate_noise_m(np.arange(num_windows + 10.0), np.ones(num_windows + 10))

@@ -9,14 +9,15 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.clock.search import CostCurve, TimedRanges
-from rangesfm.ranging.clock.squares import MIN_RESIDUAL_M, fit_squares
+from rangesfm.ranging.clock.squares import fit_squares
+from rangesfm.ranging.errors.noise import MIN_NOISE_M
 
-# A pause of this fraction of the median time between photos ends a burst. The burst of a photo is at most this fraction
-# away from it.
-_PAUSE_SHARE = 0.25
-_REACH_SHARE = 0.25
+# Times that are no further apart than this fraction of the median time between photos belong together: ranges to a
+# burst, and a burst to a photo.
+_TOGETHER_SHARE = 0.25
 # A burst with fewer ranges than this fraction of the median number is ignored.
 _MIN_SIZE_SHARE = 0.25
 # With fewer bursts than this fraction of the photos, the log is not one of bursts.
@@ -28,8 +29,6 @@ _MIN_PAIRED_SHARE = 0.75
 _LOSS_SCALE = 5.0
 # Smallest number of medians beyond the unknowns for a pairing to be tested.
 _MIN_NUM_SPARE = 4.0
-# Largest probability that a pairing explains the medians by chance.
-_MAX_CHANCE = 1e-3
 
 
 class Bursts(NamedTuple):
@@ -75,7 +74,7 @@ class BurstPairing:
 
     def explains(self) -> bool:
         """Return whether there are enough medians, and the path explains them better than no motion at all."""
-        return self.num_spare >= _MIN_NUM_SPARE and self.chance < _MAX_CHANCE
+        return self.num_spare >= _MIN_NUM_SPARE and self.chance < special.ndtr(-SIGNIFICANT_STDDEVS)
 
     def log_odds(self, rival: BurstPairing) -> float:
         """Return the logarithm of the likelihood ratio to a rival; infinite if the rival has too few medians."""
@@ -87,7 +86,7 @@ class BurstPairing:
 def find_bursts(ranges: TimedRanges, photo_times_s: Array) -> Bursts | None:
     """Cut the log at its pauses into bursts; None if it does not pause between photos."""
     ranges = ranges.take(np.argsort(ranges.times_s, kind="stable"))
-    pause_s = _PAUSE_SHARE * float(np.median(np.diff(photo_times_s)))
+    pause_s = _TOGETHER_SHARE * float(np.median(np.diff(photo_times_s)))
     starts = np.flatnonzero(np.diff(ranges.times_s, prepend=-np.inf) > pause_s)
     ends = np.append(starts[1:], len(ranges.times_s))
     kept = ends - starts >= _MIN_SIZE_SHARE * np.median(ends - starts)
@@ -112,7 +111,7 @@ def pair_bursts(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array) ->
     """
     photo_times = trajectory.timestamps_s
     assert photo_times is not None, "a path in time needs times"
-    reach_s = _REACH_SHARE * float(np.median(np.diff(photo_times)))
+    reach_s = _TOGETHER_SHARE * float(np.median(np.diff(photo_times)))
     pairings = []
     for offset_s in _offsets(bursts.middle_s, photo_times, reach_s):
         times = bursts.middle_s + offset_s
@@ -174,7 +173,7 @@ def _fit(bursts: Bursts, trajectory: Trajectory, tags_in_cam_m: Array, burst: In
     squares = fit_squares(centers + tag_from_center / without_lever.scale, range_m, anchor, _LOSS_SCALE)
     num_spare = max(float(squares.weights.sum()) - squares.num_unknowns, 1e-3)
     squared_m2 = float(np.sum(squares.weighted_residuals**2))
-    variance = max(squared_m2 / max(num_spare, 1.0), MIN_RESIDUAL_M**2)
+    variance = max(squared_m2 / max(num_spare, 1.0), MIN_NOISE_M**2)
     num_of_anchor = np.bincount(anchor)
     means = np.bincount(anchor, range_m) / np.maximum(num_of_anchor, 1)
     num_varying = max(len(range_m) - int(np.count_nonzero(num_of_anchor)), 1)

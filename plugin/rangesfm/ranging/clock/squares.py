@@ -13,14 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, rows_by_key
-from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
+from rangesfm.ranging.errors.noise import MIN_NOISE_M, START_STDDEV_M, robust_stddev
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 
-# Shorter ranges get the weight of a range of this length, because the derivative of their square is near 0.
-MIN_RANGE_M = 0.3
-# Smallest size of residuals, because radios resolve only about a centimetre.
-MIN_RESIDUAL_M = 1e-3
-_NUM_REWEIGHTINGS = 6
+# Shorter ranges get the weight of a range of this length, because the derivative of their square is near 0. They are no
+# longer than their errors may be.
+MIN_RANGE_M = SIGNIFICANT_STDDEVS * START_STDDEV_M
 # The column |p|^2 must be significant by this many standard deviations for the scale to be used.
 _MIN_CURVATURE_STDDEVS = 5.0
 
@@ -82,7 +81,7 @@ def fit_squares(points: Array, range_m: Array, anchor: Indices, loss_scale: floa
     # Division by the derivative of rho^2 converts residuals back to metres.
     metres = 1 / (2 * np.maximum(range_m, MIN_RANGE_M))
     residuals_m = np.zeros(len(points))
-    for _ in range(_NUM_REWEIGHTINGS + 1):
+    for _ in range(NUM_REWEIGHTINGS + 1):
         weights = 1 / (1 + (residuals_m / (loss_scale * residual_stddev(residuals_m))) ** 2)
         columns = _LinearColumns(design, metres * np.sqrt(weights), groups)
         alpha_squared, coefficients, residuals = columns.solve(range_m**2)
@@ -145,5 +144,5 @@ class _LinearColumns:
 
 
 def residual_stddev(residuals_m: Array) -> float:
-    """Return a robust standard deviation of residuals, at least MIN_RESIDUAL_M."""
-    return max(robust_stddev(residuals_m), MIN_RESIDUAL_M)
+    """Return a robust standard deviation of residuals, at least the smallest noise."""
+    return max(robust_stddev(residuals_m), MIN_NOISE_M)

@@ -16,15 +16,13 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import Similarity, align_points, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.components import BENDS, Component
-from rangesfm.ranging.errors.range_bins import RangeBins
+from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 
 # Weight of turns against shifts in the fit of a similarity. Turns only matter for a turn about a straight path, which
 # nothing else shows; elsewhere this weight is too small to have an effect.
 _TURNS_COUNT = 1e-3
-# Largest number of steps of a random walk; the bins of ranges do not resolve more.
-_MAX_NUM_STEPS = 100
 # Random drift from the start to the end of a path: relative change of the scale, turn in radians, and shift as a share
 # of the path's length (medians over maps of poses alone); _SPREAD is the standard deviation of their logarithms.
 # Source: tests.studies.drifting_maps. From its first to its last third the real path (ORB-SLAM, fr2_desk) changes by
@@ -33,7 +31,8 @@ _MAX_NUM_STEPS = 100
 # magnitude.
 _OF_PATH = {"scale_drift": 0.004, "heading_drift": 0.002, "bending": 0.0005}
 _SPREAD = 1.0
-_OF_STEP = {"scale_drift": slice(0, 1), "heading_drift": slice(1, 4), "bending": slice(4, 7)}
+# What each of the numbers of a step belongs to: the logarithm of the scale, three of the turn and three of the shift.
+_OF_STEP = np.array(["scale_drift", "heading_drift", "heading_drift", "heading_drift", "bending", "bending", "bending"])
 
 LearnedSizes = Mapping[str, float]
 
@@ -207,9 +206,9 @@ class WalkBending:
         factors = self.factors(by_pose, frame_is_free=frame_is_free)
         shift_m = np.zeros(num) if self.steps is None else -np.einsum("csi,si->c", factors, self.steps)
         found = []
-        for name, which in _OF_STEP.items():
-            own = factors[:, :, which].reshape(num, -1)
-            found.append(bending_part(name, own @ own.T, _OF_PATH[name], _SPREAD))
+        for name, median in _OF_PATH.items():
+            own = factors[:, :, name == _OF_STEP].reshape(num, -1)
+            found.append(bending_part(name, own @ own.T, median, _SPREAD))
         return BendingOfBins(tuple(each for each in found if each is not None), np.zeros((num, num)), shift_m)
 
     def factors(self, by_pose: Array, *, frame_is_free: bool) -> Array:
@@ -228,15 +227,16 @@ class WalkBending:
             sizes: learnt sizes of the parts, in medians, by name.
         """
         steps = -self.factors(pull[None], frame_is_free=frame_is_free)[0]
-        for name, which in _OF_STEP.items():
-            steps[:, which] *= (sizes.get(name, 0.0) * _OF_PATH[name]) ** 2
+        for name, median in _OF_PATH.items():
+            steps[:, name == _OF_STEP] *= (sizes.get(name, 0.0) * median) ** 2
         return WalkBending(self.given, steps, frame_is_free)
 
     @cached_property
     def _steps_of_path(self) -> tuple[Indices, Array]:
         """Indices (s,) of the poses with a step, and (s, 7) standard deviations for a walk of 1 from start to end."""
         steps = np.linalg.norm(np.diff(self.given.centers, axis=0), axis=1)
-        starts = np.unique(np.linspace(0, len(steps), min(len(steps), _MAX_NUM_STEPS) + 1).astype(np.int64))[:-1]
+        # The bins of ranges do not resolve more steps than there may be bins.
+        starts = np.unique(np.linspace(0, len(steps), min(len(steps), MAX_NUM_BINS) + 1).astype(np.int64))[:-1]
         length = float(steps.sum())
         share = np.add.reduceat(steps, starts) / length if length > 0 else np.zeros(len(starts))
         return starts, np.sqrt(share)[:, None] * np.repeat([1.0, length], [4, 3])

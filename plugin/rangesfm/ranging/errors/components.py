@@ -25,11 +25,8 @@ _DRIFT_S = 60.0
 # Correlation lengths: of errors by the tag's position (metres), as for echoes; of errors by direction in the camera (1
 # minus the cosine), as for the lobes of antennas.
 _PLACE_M, _LOBE = 0.5, 0.1
-# Angular width, radians, of the delay of an anchor's antenna away from the direction it faces.
-_OFF_AXIS_RAD = 1.0
-# Correlation length of the error curve in the logarithm of the distance.
-_SMOOTH = 1.0
-_MIN_DISTANCE_M = 0.05
+MIN_DISTANCE_M = 0.05
+"""Distance, metres, below which a tag is at the anchor: its logarithm has no meaning there."""
 # Standard deviations in metres (slope: share of the distance), learnt against the true distances, with one start for
 # all, by ``python -m tests.studies.shown_errors``. A dash stands where a log has one tag, whose bias is then the common
 # bias. The logs are described in ``examples/radios.md``.
@@ -52,7 +49,8 @@ off_axis    0.080     0.051            0.040      0.040         0.042         0.
 tag_antenna 0.033     0.029            0.021      0.023         0.018         0.036    0.008  0.021
 """
 _NOT_SHOWN = "-"
-LOGS = tuple(_SHOWN.split()[1:9])
+(_, *_LOGS), (_, *_RADIOS), *_ROWS = (line.split() for line in _SHOWN.strip().splitlines())
+LOGS = tuple(_LOGS)
 # Smallest standard deviation of the logarithms: eight logs do not show how similar other radios are.
 _LEAST_SPREAD = 0.5
 
@@ -94,13 +92,16 @@ def _fading(values: Array, within: float) -> Array:
     return np.exp(-np.abs(values[:, None] - values) / within)
 
 
-def _smooth(values: Array, within: float) -> Array:
-    """Return the (c, c) covariance of a smooth random function of (c,) values (squared exponential)."""
-    return np.exp(-0.5 * (np.abs(values[:, None] - values) / within) ** 2)
+def _smooth(values: Array) -> Array:
+    """Return the (c, c) covariance of a smooth random function that changes over a unit of its (c,) values.
+
+    It is a squared exponential. Delays of antennas change over a radian, error curves over an e-fold of the distance.
+    """
+    return np.exp(-0.5 * (values[:, None] - values) ** 2)
 
 
 def _log_distance(bins: RangeBins) -> Array:
-    return np.log(np.maximum(bins.distance_m, _MIN_DISTANCE_M))
+    return np.log(np.maximum(bins.distance_m, MIN_DISTANCE_M))
 
 
 def _in_place(bins: RangeBins) -> Array:
@@ -124,7 +125,7 @@ def _off_axis(bins: RangeBins) -> Array:
     same = _same(bins.anchor_index)
     facing = same @ bins.from_anchor
     cosine = np.sum(bins.from_anchor * facing, axis=1) / np.maximum(np.linalg.norm(facing, axis=1), 1e-9)
-    return _smooth(np.arccos(np.clip(cosine, -1.0, 1.0)), _OFF_AXIS_RAD)
+    return _smooth(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, ...]:
@@ -159,7 +160,7 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
         of("tag_bias", "each tag's own bias", lambda c: _same(c.tag_index)),
         of("common_bias", "the bias of all ranges", lambda c: np.ones((len(c), len(c))), calibrated_median=0.04),
         of("short", "short ranges", _short, calibrated_median=0.08),
-        of("curve", "the radio's error curve", lambda c: _smooth(_log_distance(c), _SMOOTH), calibrated_median=0.02),
+        of("curve", "the radio's error curve", lambda c: _smooth(_log_distance(c)), calibrated_median=0.02),
         of("slope", "ranges long by a share", lambda c: np.outer(c.distance_m, c.distance_m), calibrated_median=0.003),
         of_anchor(
             "antenna",
@@ -173,8 +174,7 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
 
 def stddevs_in(log: str) -> dict[str, float]:
     """Return the standard deviation of each component, by name, in one of LOGS."""
-    _, _, *components = (line.split() for line in _SHOWN.strip().splitlines())
-    of_log = {name: sizes[LOGS.index(log)] for name, *sizes in components}
+    of_log = {name: sizes[LOGS.index(log)] for name, *sizes in _ROWS}
     return {name: float(size) for name, size in of_log.items() if size != _NOT_SHOWN}
 
 
@@ -184,12 +184,11 @@ def population(without: str | None = None) -> dict[str, tuple[float, float]]:
     Args:
         without: a log; all logs of its radio are left out.
     """
-    logs, radios, *components = (line.split() for line in _SHOWN.strip().splitlines())
-    left_out = None if without is None else radios[logs.index(without)]
-    kept = [i for i, radio in enumerate(radios) if i > 0 and radio != left_out]
+    left_out = None if without is None else _RADIOS[LOGS.index(without)]
+    kept = [i for i, radio in enumerate(_RADIOS) if radio != left_out]
     of_components = {}
-    for name, *sizes in components:
-        shown = np.log([float(sizes[i - 1]) for i in kept if sizes[i - 1] != _NOT_SHOWN])
+    for name, *sizes in _ROWS:
+        shown = np.log([float(sizes[i]) for i in kept if sizes[i] != _NOT_SHOWN])
         spread = float(shown.std(ddof=1)) if len(shown) > 1 else 0.0
         of_components[name] = float(np.exp(shown.mean())), max(spread, _LEAST_SPREAD)
     return of_components

@@ -12,6 +12,7 @@ from scipy.linalg import lapack
 from scipy.optimize import minimize
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.numerics import ROUNDING, UNDETERMINED
 from rangesfm.ranging.errors.bending import BendingOfBins
 from rangesfm.ranging.errors.components import BENDS, COMPONENTS, LEARNT_CURVE, Component
 from rangesfm.ranging.errors.noise import START_STDDEV_M
@@ -23,10 +24,6 @@ _WIDENING_POWER = 1.5
 # Bounds of the logarithms of standard deviations, relative to the median. Farther below, the likelihood is flat. Above,
 # a path without loops may drift by some hundred times the median.
 _FARTHEST_BELOW, _FARTHEST_ABOVE = 5.0, 8.0
-# Relative singular value below which a combination of unknowns has no effect.
-_DEPENDENT = 1e-7
-# Share of a covariance's trace that is added to its diagonal, as rounding may leave it singular.
-ROUNDING = 1e-12
 
 _Parts = TypeVar("_Parts", bound="ErrorParts")
 
@@ -336,6 +333,7 @@ class _Half:
     def of(cls, components: Array, known: Array) -> _Half:
         num = len(known)
         places = np.flatnonzero(np.triu(np.ones((num, num))))
+        # Rounding may leave a covariance singular, without this share of its trace on the diagonal.
         on_diagonal = places % (num + 1) == 0
         stacked = np.concatenate([components, known[None]])
         of_all = np.take(stacked.reshape(len(stacked), -1), places, axis=1)
@@ -365,5 +363,5 @@ def independent_unknowns(design: Array, prior_design: Array) -> tuple[Array, Arr
     stacked = np.vstack([design, prior_design])
     lengths = np.linalg.norm(stacked, axis=0)
     basis, strengths, _ = np.linalg.svd(stacked[:, lengths > 0] / lengths[lengths > 0], full_matrices=False)
-    independent = basis[:, strengths > _DEPENDENT * strengths.max(initial=0.0)]
+    independent = basis[:, strengths > UNDETERMINED * strengths.max(initial=0.0)]
     return independent[: len(design)], independent[len(design) :]

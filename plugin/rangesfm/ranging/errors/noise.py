@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import special
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NUM_REWEIGHTINGS, ROUNDING, SIGNIFICANT_STDDEVS
 from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.range_log import RangeLog
 
@@ -31,27 +33,21 @@ MIN_ORDINARY = 0.3
 """Smallest share of ranges without a large common error for which the noise is estimated from these alone."""
 MIN_STDDEV_M = 1e-9
 """Smallest standard deviation, metres; what is divided by is at least as large."""
-# Ratio of standard deviation to median absolute value of a normal distribution.
-_STDDEV_PER_MAD = 1.4826
+MIN_NOISE_M = 1e-3
+"""Smallest noise of a range, metres: radios resolve only about a centimetre."""
 # Root mean square of residuals, in standard deviations, below which they are only rounding and the solver's tolerance.
 NO_ERROR = 1e-3
-MAX_INFLATION = 30.0
 STRETCH_S = 10.0
 """Length of stretches of time, seconds, in which errors may be correlated; where a log names photos, each is one."""
-# Smallest number of stretches of time for an estimate of the correlation.
-_MIN_NUM_STRETCHES = 8
-# Largest number of residuals to which the mixture of noise and outliers is fitted.
-_MAX_MIXED = 4000
-_NUM_MIXTURE_ROUNDS = 60
-# The smallest tenth of Gaussian residuals lies within this many stddevs of zero.
-_FIRST_SHARE, _FIRST_QUANTILE = 0.1, 0.1257
-# Mean error of outliers, in standard deviations of the noise, at least; smaller errors would be noise.
-_MIN_OUTLIER_STDDEVS = 3.0
+MIN_NUM_STRETCHES = 12
+"""Smallest number of stretches of time for an estimate of the correlation."""
+# Largest number of residuals, or of windows of a log, from which noise is estimated: two percent is close enough.
+_MAX_NUM_SAMPLES = 4000
+# The noise is first taken from this share of the residuals, the smallest, as most of the others may be outliers.
+_FIRST_SHARE = 0.1
 # For the estimate from the log alone.
 _WINDOW = 11
-_MAX_NUM_WINDOWS = 20_000
 _MAX_STRETCH = 3.0  # a window longer than this many typical ones has a gap in it
-_NUM_PARABOLA_ROUNDS = 8
 _STEPS_M = (0.1, 0.01)
 _ROUNDING = np.finfo(np.float32).eps  # of a log with 32-bit numbers, relative
 
@@ -63,8 +59,13 @@ def robust_stddev(residuals: npt.ArrayLike) -> float:
 
 def robust_stddevs(residuals: Array) -> Array:
     """Return the (..., 1) robust standard deviations of the rows of (..., n) residuals."""
-    stddevs: Array = _STDDEV_PER_MAD * np.median(np.abs(residuals), axis=-1, keepdims=True)
+    stddevs: Array = np.median(np.abs(residuals), axis=-1, keepdims=True) / _stddevs_within(1 / 2)
     return np.maximum(stddevs, MIN_STDDEV_M)
+
+
+def _stddevs_within(share: float) -> float:
+    """Return the distance from the mean, in standard deviations, within which a share of a normal distribution is."""
+    return float(special.ndtri((1 + share) / 2))
 
 
 def short_range_stddev(range_m: Array) -> Array:
@@ -88,9 +89,9 @@ def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
 
 
 def stretch_labels(times_s: Array, length_s: float) -> Indices:
-    """Return (n,) labels of stretches of time in which errors may be correlated; there are at least eight."""
+    """Return (n,) labels of stretches of time in which errors may be correlated; there are at least a dozen."""
     since = times_s - times_s.min()
-    length_s = max(min(length_s, float(since.max()) / _MIN_NUM_STRETCHES), 1e-9)
+    length_s = max(min(length_s, float(since.max()) / MIN_NUM_STRETCHES), 1e-9)
     return np.asarray(np.floor(since / length_s).astype(np.int64))
 
 
@@ -113,7 +114,7 @@ def correlation_inflation(
     squares = float(np.sum(shares * influence**2))
     if squares <= NO_ERROR**2 * np.sum(shares) or len(sums) < 2:
         return 1.0
-    return float(np.clip(np.sqrt(np.sum(sums**2) / squares), 1.0, MAX_INFLATION))
+    return max(float(np.sqrt(np.sum(sums**2) / squares)), 1.0)
 
 
 @dataclass(frozen=True)
@@ -142,19 +143,27 @@ def inlier_noise(residuals: Array) -> InlierNoise:
         return _gaussian(residuals)
     # Sorted, so that thinning keeps the distribution and the result does not depend on the order.
     sizes = np.abs(residuals)
-    thinned = np.sort(residuals)[np.linspace(0, len(residuals) - 1, min(len(residuals), _MAX_MIXED)).astype(np.int64)]
-    stddev = max(float(np.quantile(sizes, _FIRST_SHARE)) / _FIRST_QUANTILE, MIN_STDDEV_M)
+    thinned = np.sort(residuals)[
+        np.linspace(0, len(residuals) - 1, min(len(residuals), _MAX_NUM_SAMPLES)).astype(np.int64)
+    ]
+    stddev = max(float(np.quantile(sizes, _FIRST_SHARE)) / _stddevs_within(_FIRST_SHARE), MIN_STDDEV_M)
     means = np.maximum([_mean_or_zero(sizes[residuals > 0]), _mean_or_zero(sizes[residuals < 0])], stddev)
     shares = np.array([0.5, 0.25, 0.25])
-    for _ in range(_NUM_MIXTURE_ROUNDS):
-        means = np.maximum(means, _MIN_OUTLIER_STDDEVS * stddev)
+    before = np.zeros(6)
+    for _ in range(MAX_NUM_ROUNDS):
+        # Smaller errors than significant ones would be noise.
+        means = np.maximum(means, SIGNIFICANT_STDDEVS * stddev)
         densities = _densities(thinned, stddev, means, shares)
         belongs = densities / np.maximum(densities.sum(axis=0), 1e-300)
         counts = np.maximum(belongs.sum(axis=1), 1e-9)
         shares = counts / counts.sum()
         stddev = max(float(np.sqrt(belongs[0] @ thinned**2 / counts[0])), MIN_STDDEV_M)
         means = (belongs[1:] @ np.abs(thinned)) / counts[1:]
-    means = np.maximum(means, _MIN_OUTLIER_STDDEVS * stddev)
+        now = np.array([stddev, *means, *shares])
+        if np.all(np.abs(now - before) <= ROUNDING * now):
+            break
+        before = now
+    means = np.maximum(means, SIGNIFICANT_STDDEVS * stddev)
     densities = np.maximum(_densities(thinned, stddev, means, shares).sum(axis=0), 1e-300)
     return InlierNoise(stddev, float(shares[0]) * len(residuals), float(np.mean(np.log(densities))) * len(residuals))
 
@@ -199,7 +208,7 @@ def estimate_noise_m(timestamp_s: Array, range_m: Array) -> float | None:
     ranges = np.lib.stride_tricks.sliding_window_view(range_m[order], _WINDOW)
     span = times[:, -1] - times[:, 0]
     whole = np.flatnonzero(span <= _MAX_STRETCH * np.median(span))
-    chosen = whole[:: -(-len(whole) // _MAX_NUM_WINDOWS)]
+    chosen = whole[:: -(-len(whole) // _MAX_NUM_SAMPLES)]
     with np.errstate(over="ignore", invalid="ignore"):  # times or ranges that no radio gives
         misses = _misses_of_parabola(times[chosen], ranges[chosen])
         noise = robust_stddev(misses - np.median(misses))
@@ -214,7 +223,7 @@ def _misses_of_parabola(times: Array, ranges: Array) -> Array:
     powers = np.stack([np.ones_like(scaled), scaled, scaled**2], axis=2)
     weights = np.ones_like(ranges)
     offset = np.median(ranges, axis=1, keepdims=True)
-    for _ in range(_NUM_PARABOLA_ROUNDS):
+    for _ in range(NUM_REWEIGHTINGS):
         normal = np.einsum("mi,mij,mik->mjk", weights, powers, powers) + MIN_STDDEV_M * np.eye(3)
         right = np.einsum("mi,mij,mi->mj", weights, powers, ranges - offset)
         coefficients = np.linalg.solve(normal, right[..., np.newaxis])

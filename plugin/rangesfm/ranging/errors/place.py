@@ -5,15 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER, NO_ERROR
 from rangesfm.ranging.errors.robust_loss import RobustLoss
 
 # Edge of a place, metres: some wavelengths, the scale at which echoes that overlap the direct path change. On real logs
 # any value from 0.1 to 0.5 m gives scales within 0.7 % of each other.
 _PLACE_SIZE_M = 0.2
-# Offset of the grid, in cells: a path at a height of 1.6 m, or at the first camera's 0, lies on grid planes, where
-# rounding would choose the cell.
-_OFF_GRID = 1e-9
 
 
 def place_labels(tags_m: Array, anchor_index: Indices) -> Indices:
@@ -22,8 +20,9 @@ def place_labels(tags_m: Array, anchor_index: Indices) -> Indices:
     Args:
         tags_m: (n, 3) antenna positions in the metric world. anchor_index: (n,).
     """
-    labels = anchor_index
-    for axis in np.floor(tags_m / _PLACE_SIZE_M + _OFF_GRID).astype(np.int64).T:
+    labels, in_cells = anchor_index, tags_m / _PLACE_SIZE_M
+    # A path at a height of 1.6 m, or at the first camera's 0, lies on grid planes: rounding would choose the cell.
+    for axis in np.floor(in_cells + rounding_of(in_cells)).astype(np.int64).T:
         # The axes are combined one after the other, since a single number for all would overflow at large sites.
         cells, row = np.unique(axis, return_inverse=True)
         labels = np.unique(labels * len(cells) + row, return_inverse=True)[1]

@@ -10,10 +10,12 @@ from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, ROUNDING
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.errors.components import MIN_DISTANCE_M
 from rangesfm.ranging.errors.error_curve import ErrorCurve
-from rangesfm.ranging.errors.learned import ROUNDING, ExpectedErrors
+from rangesfm.ranging.errors.learned import ExpectedErrors
 from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER, robust_stddev
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
 from rangesfm.ranging.errors.robust_loss import CAUCHY
@@ -23,14 +25,10 @@ from rangesfm.ranging.range_log import RangeLog
 _OF_CURVE = ("common_bias", "short", "curve", "slope")
 # Knots this far apart, in the logarithm of the distance, follow every curve that antennas and received power produce.
 _LOG_SPACING = 1 / 6
-# A tag nearer than this, metres, is at the anchor, where the logarithm of the distance has no meaning.
-_AT_ANCHOR_M = 1e-3
-# Share of the ranges beyond each end of the curve.
-_EDGE_SHARE = 0.001
 # With fewer ranges there is no curve.
 _MIN_RANGES = 100
-# Rounds of robust weights, and bins of ranges in each; with more, neither changes the curve by a millimetre.
-_NUM_ROUNDS, _NUM_BINS = 4, 200
+# Bins of ranges in each round of robust weights; with more, the curve does not change by a millimetre.
+_NUM_BINS = 200
 
 
 @dataclass(frozen=True)
@@ -75,14 +73,14 @@ def calibrate_ranges(log: RangeLog, tags_m: Array, anchors: Sequence[Anchor]) ->
     """
     from_anchor_m = tags_m - _positions(log, anchors)[log.anchor_index]
     distance = np.linalg.norm(from_anchor_m, axis=1)
-    used = np.flatnonzero(distance > _AT_ANCHOR_M)
+    used = np.flatnonzero(distance > MIN_DISTANCE_M)
     if len(used) < _MIN_RANGES:
         raise GeometryError(f"{len(used)} ranges of known length, expected {_MIN_RANGES} or more to learn from")
     distance, error, index = distance[used], (log.range_m - distance)[used], log.anchor_index[used]
     knots, num_anchors = _knots(distance), len(log.anchor_ids)
     times = np.unique(np.array(log.image_name), return_inverse=True)[1] if log.timestamp_s is None else log.timestamp_s
     off, axes = error - np.median(error), np.tile(np.eye(3), (len(used), 1, 1))
-    for _ in range(_NUM_ROUNDS):
+    for _ in range(NUM_REWEIGHTINGS):
         noise_m = robust_stddev(off)
         weights = CAUCHY.weights(off / noise_m)
         bins = range_bins(
@@ -120,8 +118,8 @@ def _positions(log: RangeLog, anchors: Sequence[Anchor]) -> Array:
 
 
 def _knots(distance: Array) -> Array:
-    """Return (k,) distances with even spacing of their logarithms, over all but the few shortest and longest ranges."""
-    ends = np.quantile(distance, [_EDGE_SHARE, 1 - _EDGE_SHARE])
+    """Return (k,) distances with even spacing of their logarithms, from the shortest range to the longest."""
+    ends = distance.min(), distance.max()
     low, high = np.log(ends)
     if not high - low > 2 * _LOG_SPACING:
         raise GeometryError(

@@ -10,9 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices, Mask, rows_by_key
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, SIGNIFICANT_STDDEVS
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import (
+    MIN_NOISE_M,
     MIN_NUM_OF_SCATTER,
     MIN_ORDINARY,
     START_STDDEV_M,
@@ -31,14 +33,9 @@ from rangesfm.ranging.range_observations import RangeObservations
 _Errors = TypeVar("_Errors")
 _Fit = TypeVar("_Fit")
 
-_MIN_STDDEV_M = 1e-3
-# An anchor gets its own noise only if it differs from that of all by this many standard deviations.
-_SIGNIFICANT = 3.0
-_NUM_MEAN_ROUNDS = 10
-# A median residual of a stretch above this many standard deviations is not noise.
-_MAX_BLOCK_STDDEVS = 3.0
+# Smallest number of ranges in a stretch whose median shows whether it is off as a whole.
 _MIN_BLOCK = 5
-# Share of such stretches that is no reason for doubt: somebody stands between for some seconds.
+# Share of stretches that may be off without a reason for doubt: somebody stands between for some seconds.
 _FEW_BLOCKS = 0.02
 # Errors of real radios last for seconds, which makes residuals twice as large as their scatter, but not this many
 # times.
@@ -162,13 +159,13 @@ class RangeErrors:
 
     def without_shared(self) -> RangeErrors:
         """Return the errors for a map that estimates the common error of short ranges as a parameter."""
-        stddev = np.sqrt(np.maximum(self.stddev_m**2 - self.shared_m**2, _MIN_STDDEV_M**2))
+        stddev = np.sqrt(np.maximum(self.stddev_m**2 - self.shared_m**2, MIN_NOISE_M**2))
         return replace(self, stddev_m=stddev, shared_m=np.zeros_like(self.shared_m))
 
     def for_bending_map(self, loss: RobustLoss) -> RangeErrors:
         """Return the errors to start with on a map that may bend, under another loss; their noise is an upper limit."""
         beyond = (self.stddev_m**2 - self.shared_m**2 - self.placing_m**2)[self.is_estimated]
-        noise_m = float(np.sqrt(max(np.median(beyond), _MIN_STDDEV_M**2))) if len(beyond) else np.inf
+        noise_m = float(np.sqrt(max(np.median(beyond), MIN_NOISE_M**2))) if len(beyond) else np.inf
         return replace(self, loss=loss, noise_m=noise_m, log_likelihood=-np.inf)
 
     def noise_of_all(self, residuals_m: Array) -> InlierNoise:
@@ -234,7 +231,7 @@ class RangeErrors:
         """Return the errors with a given noise (n,) of the residuals, and with the correlation that remains."""
         n = len(residuals_m)
         widening = np.sqrt(n / max(n - num_absorbed, 0.1 * n))
-        noise_m = np.maximum(widening * noise_m, _MIN_STDDEV_M)
+        noise_m = np.maximum(widening * noise_m, MIN_NOISE_M)
         stddev = np.where(self.is_estimated, np.hypot(noise_m, np.hypot(self.shared_m, self.placing_m)), self.stddev_m)
         share = shares_by_residuals(self.place, residuals_m / stddev, self.loss)
         return replace(self, stddev_m=stddev, share=share).inflated(residuals_m)
@@ -264,14 +261,17 @@ class RangeErrors:
             # The variance of the mixture's noise estimate is some 2.7 times that of an ordinary standard deviation.
             chance = self.inflation * np.sqrt(2.7 / (2 * max(alone.num, 1.0)))
             ratio = alone.stddev / together.stddev
-            ratios[k] = ratio if abs(np.log(ratio)) > _SIGNIFICANT * chance else 1.0
+            ratios[k] = ratio if abs(np.log(ratio)) > SIGNIFICANT_STDDEVS * chance else 1.0
         return ratios
 
     def _bulk_mean(self, residuals_m: Array, noise_m: float) -> float:
         """Return the mean of the residuals that fit, iterating from zero."""
         mean = 0.0
-        for _ in range(_NUM_MEAN_ROUNDS if len(residuals_m) else 0):
+        for _ in range(MAX_NUM_ROUNDS if len(residuals_m) else 0):
+            before = mean
             mean = float(np.average(residuals_m, weights=self.loss.weights((residuals_m - mean) / noise_m)))
+            if abs(mean - before) <= ROUNDING * noise_m:
+                break
         return mean
 
     def change(self, other: RangeErrors) -> float:
@@ -327,10 +327,10 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
     reasons = []
     stated = residuals_m / errors.stddev_m
     typical = robust_stddev(stated)
-    if len(stated) >= MIN_NUM_OF_SCATTER and typical > _MAX_BLOCK_STDDEVS:
+    if len(stated) >= MIN_NUM_OF_SCATTER and typical > SIGNIFICANT_STDDEVS:
         reasons.append(Misfit(f"range residuals are typically {typical:.1f} times their stddev"))
     off = [np.median(stated[rows]) for rows in rows_by_key(errors.group) if len(rows) >= _MIN_BLOCK]
-    num_off = int(np.sum(np.abs(off) > _MAX_BLOCK_STDDEVS))
+    num_off = int(np.sum(np.abs(off) > SIGNIFICANT_STDDEVS))
     if num_off > _FEW_BLOCKS * len(off):
         told = f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole"
         reasons.append(Misfit(told))

@@ -7,11 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS
 
 # Relative difference of costs below which two fits are equal: rounding and the solver's tolerance.
 SAME_COST = 1e-6
-# Difference of costs from which the worse of two fits is ruled out: half the square of 3 standard deviations.
-MIN_COST_GAP = 4.5
+
+
+def cost_of_deviation(num_stddevs: float) -> float:
+    """Return the cost, a negative log-likelihood, of one deviation of so many standard deviations."""
+    return num_stddevs**2 / 2
+
+
+# Difference of costs from which the worse of two fits is ruled out.
+MIN_COST_GAP = cost_of_deviation(SIGNIFICANT_STDDEVS)
 
 
 @dataclass(frozen=True)
