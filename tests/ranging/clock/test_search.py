@@ -46,14 +46,14 @@ def test_peaks_are_the_highest_within_a_separation_the_best_first() -> None:
 def test_a_curve_for_the_report_has_all_offsets_near_the_best_and_the_best_of_each_interval() -> None:
     offsets = 0.05 * np.arange(2000, dtype=np.float64)
     costs = 1 + np.abs(np.sin(offsets)) + (offsets - 40) ** 2
-    shown = OffsetCurve(offsets, costs, -costs).around(40.0, 2.0)
-    assert set(offsets[np.abs(offsets - 40) < 1.99]) <= set(shown.offsets_s)
-    assert 160 < len(shown.offsets_s) < 260
+    shown = OffsetCurve(offsets, costs, -costs).around(40.0)
+    assert set(offsets[np.abs(offsets - 40) < 4.99]) <= set(shown.offsets_s)
+    assert 300 < len(shown.offsets_s) <= 400
     assert np.all(np.diff(shown.offsets_s) > 0)
     np.testing.assert_array_equal(shown.costs_m, costs[np.searchsorted(offsets, shown.offsets_s)])
-    far = shown.offsets_s[shown.offsets_s < 38]
-    # 160 intervals of 12.5 offsets: each shows where its cost is the least, here at its end that is nearer to 40 s.
-    assert np.abs(np.diff(far) - 12.5 * 0.05).max() < 0.51
+    far = shown.offsets_s[shown.offsets_s < 34]
+    # 200 intervals of 10 offsets: each shows where its cost is the least, here at its end that is nearer to 40 s.
+    assert np.abs(np.diff(far) - 10 * 0.05).max() < 0.51
 
 
 def test_a_tag_is_between_the_samples_where_both_are_known() -> None:
@@ -76,19 +76,19 @@ def on_a_line(times: Array, turn_rad_s: float = 0.0) -> Trajectory:
     return Trajectory(np.arange(len(times)), names, times, np.outer(times - times[0], [2.0, 0, 1.0]), turns)
 
 
-def test_a_path_is_sampled_every_fortieth_of_a_second_between_photos_that_are_not_too_far_apart() -> None:
+def test_a_path_is_sampled_every_twentieth_of_a_second_between_photos_that_are_not_too_far_apart() -> None:
     """Its lever arms turn with the camera; nothing is known across the long gap."""
-    times = np.array([100.0, 101.0, 102.0, 105.01, 106.0, 107.01])
+    times = np.array([100.0, 101.0, 102.0, 105.01, 106.0, 107.02])
     arms = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.1]])
     path = moving_path(on_a_line(times, 0.5), arms, AssociationOptions(max_interpolation_gap_s=2.0))
-    assert (path.start_s, path.step_s) == (100.0, 0.025)
-    assert len(path) == 281
-    assert path.tag_from_center.shape == (2, 281, 3)
-    since = 0.025 * np.arange(281)
+    assert (path.start_s, path.step_s) == (100.0, 0.05)
+    assert len(path) == 141
+    assert path.tag_from_center.shape == (2, 141, 3)
+    since = 0.05 * np.arange(141)
     off = (since > 2.0 + 1e-6) & (since < 5.01)
     np.testing.assert_array_equal(path.is_known, ~off)
     np.testing.assert_allclose(path.centers, np.where(off[:, None], 0.0, np.outer(since, [2, 0, 1])), atol=1e-3)
-    turned = np.column_stack([0.3 * np.cos(0.5 * since), 0.3 * np.sin(0.5 * since), np.full(281, 0.1)])
+    turned = np.column_stack([0.3 * np.cos(0.5 * since), 0.3 * np.sin(0.5 * since), np.full(141, 0.1)])
     np.testing.assert_allclose(path.tag_from_center[1], np.where(off[:, None], 0.0, turned), atol=1e-3)
     np.testing.assert_array_equal(path.tag_from_center[0], 0.0)
 
@@ -97,19 +97,19 @@ def test_a_lone_photo_next_to_which_nothing_is_interpolated_is_no_part_of_the_pa
     """Ranges near it would need a camera that stands still."""
     times = np.array([0.0, 1.0, 4.0, 7.01, 8.0])
     path = moving_path(on_a_line(times), np.zeros((1, 3)), AssociationOptions(max_interpolation_gap_s=2.0))
-    since = 0.025 * np.arange(len(path))
+    since = 0.05 * np.arange(len(path))
     np.testing.assert_array_equal(path.is_known, (since <= 1.0 + 1e-9) | (since > 7.01))
 
 
 def test_a_longer_path_than_can_be_sampled_so_densely_is_sampled_more_coarsely(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(search, "_MAX_NUM_SAMPLES", 64)
+    monkeypatch.setattr(search, "_MAX_NUM_STEPS", 32)
     path = moving_path(on_a_line(np.array([10.0, 11.0, 12.0])), np.zeros((1, 3)), AssociationOptions())
-    assert path.step_s == 2 / 64
-    assert len(path) == 65
+    assert path.step_s == 2 / 32
+    assert len(path) == 33
     short = moving_path(on_a_line(np.array([10.0, 10.5, 11.0])), np.zeros((1, 3)), AssociationOptions())
-    assert short.step_s == 0.025
+    assert short.step_s == 0.05
 
 
 def winding(num: int, is_known: Mask | None = None, step_s: float = 0.05, start_s: float = 0.0) -> PathSamples:

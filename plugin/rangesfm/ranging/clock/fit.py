@@ -11,42 +11,22 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, rows_by_key
-from rangesfm.ranging.clock.search import PathSamples, TimedRanges
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS, UNDETERMINED
+from rangesfm.ranging.clock.search import MIN_COVERAGE, PathSamples, TimedRanges
 from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev
-from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.ranging.errors.noise import MIN_NUM_STRETCHES, NORMAL_95, STRETCH_S
 
 # Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
 _CELL_S = 1.0
-# Numbers of Gauss-Newton steps, largest step, and step at which the offset has converged.
-_MIN_NUM_STEPS, _MAX_NUM_STEPS = 2, 12
-_MAX_STEP_S = 1.0
-_CONVERGED_STEP_S = 1e-4
-# A descent is given up if its residuals are at least twice a rival's, and the logarithm of the odds exceeds this.
-_FAR_BEHIND, _HOPELESS = float(np.log(2)), 30.0
-# A descent ends if a smaller fraction of its ranges stays on the path.
-_MIN_KEPT_SHARE = 0.5
-# If the other unknowns explain the ranges' rates of change up to this fraction, the rest is rounding error.
-_MIN_OWN_RATE = 1e-3
-# Residuals of real radios are correlated over seconds. Blocks of this length count as independent.
-_BLOCK_S = 10.0
-_MIN_NUM_BLOCKS = 12
-# The correlation time is not known. The variance is therefore the mean of the variances with these numbers of blocks.
-_JACKKNIFE_NUM_BLOCKS = (6, 12, 24)
-# In longer logs the numbers of blocks grow, so that the blocks have 40, 20 and 10 s.
-_LONG_LOG_S = 240.0
-# Smallest eigenvalue of the curvature without one block, for columns of length one. Below it the other blocks do not
-# determine all unknowns.
-_MIN_LEFT_CURVATURE = 1e-6
+SEPARATION_S = 0.5
+"""Offsets that are nearer to each other are one, and no step of a descent is longer."""
 # Standard deviation of the bias that all ranges share because of the tag's delay.
 _RANGE_BIAS_STDDEV_M = 0.05
 # The path explains the ranges if their gain in likelihood is this many standard deviations above 0, with blocks of time
 # as independent samples. For a log of another walk, the best of some hundred offsets reaches 6, by Student's
 # distribution with a dozen blocks.
 _MIN_GAIN_STDDEVS = 7.0
-# A drift of fewer standard deviations may be chance and is not corrected.
-_MIN_STDDEVS = 3.0
-# Largest number of corrections of the drift, and size of a correction (in standard deviations) at which it converged.
-_MAX_NUM_DRIFTS = 6
+# Size of a correction of the offset or the drift, in standard deviations, at which it has converged.
 _CONVERGED_STDDEVS = 0.05
 
 
@@ -124,11 +104,6 @@ class OffsetFit:
         least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.ranges.times_s))
         return bool(self.score > least)
 
-    def is_hopeless_beside(self, rival: OffsetFit) -> bool:
-        """Return whether its residuals are so much larger than a rival's that further descent makes no difference."""
-        behind = rival.score - self.score
-        return behind > _FAR_BEHIND and behind * min(self.num_independent, rival.num_independent) > _HOPELESS
-
     def timing(self) -> Timing:
         """Return the drift, and standard deviations that account for residuals correlated within blocks of time."""
         times = self.ranges.times_s - self.ranges.times_s.mean()
@@ -143,35 +118,34 @@ class OffsetFit:
 
     def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
         """Return the variances (k,) of unknowns with columns ``own`` (n, k), from noise and a bias of all ranges."""
-        span_s = float(np.ptp(times))
-        num_blocks = [max(num, round(num * span_s / _LONG_LOG_S)) for num in _JACKKNIFE_NUM_BLOCKS]
-        by_chance = _jackknife_variances(own, residuals, self.squares, [_blocks(times, num) for num in num_blocks])
+        # The correlation time is not known. The variance is therefore the mean of the variances with blocks of one, two
+        # and four stretches; short logs have the smallest number of blocks, half of it, and twice as many.
+        usual = max(MIN_NUM_STRETCHES, float(np.ptp(times)) / (2 * STRETCH_S))
+        blocks = [_blocks(times, round(num)) for num in (usual / 2, usual, 2 * usual)]
+        by_chance = _jackknife_variances(own, residuals, self.squares, blocks)
         by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.squares.weights), rcond=None)[0]
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 
-def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, rival: OffsetFit | None = None) -> OffsetFit:
+def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float) -> OffsetFit:
     """Refine an offset by Gauss-Newton steps to the nearest one that fits the ranges best.
 
     Args:
         ranges: ranges that are (nearly) all on the path at the given offset.
         path: the path.
         offset_s: the offset to start from.
-        rival: the refinement stops early if it is far behind this fit; None: there is none.
     """
-    found = fit_at_offset(ranges, path, offset_s)
-    for num_steps in range(_MAX_NUM_STEPS):
-        if rival is not None and num_steps >= _MIN_NUM_STEPS and found.is_hopeless_beside(rival):
-            break
+    # The lever arm comes in only after the scale has been estimated.
+    found = fit_at_offset(ranges, path, offset_s, fit_at_offset(ranges, path, offset_s).squares.scale)
+    for _ in range(MAX_NUM_ROUNDS):
         own = found.squares.unexplained(found.rates[:, None])[:, 0]
         if not _is_determined(own, found.rates):
             break
         step_s = float(own @ found.squares.weighted_residuals / (own @ own))
-        # The first steps are always done, because the lever arm comes in only after the scale has been estimated.
-        if abs(step_s) < _CONVERGED_STEP_S and num_steps >= _MIN_NUM_STEPS:
+        if abs(step_s) * np.linalg.norm(own) < _CONVERGED_STDDEVS * found.residual_stddev_m:
             break
-        offset_s = found.offset_s + float(np.clip(step_s, -_MAX_STEP_S, _MAX_STEP_S))
-        if np.mean(path.knows(ranges.times_s + offset_s)) < _MIN_KEPT_SHARE:
+        offset_s = found.offset_s + float(np.clip(step_s, -SEPARATION_S, SEPARATION_S))
+        if np.mean(path.knows(ranges.times_s + offset_s)) < MIN_COVERAGE:
             break
         found = fit_at_offset(ranges, path, offset_s, found.squares.scale)
     return found
@@ -208,13 +182,13 @@ def _losses(errors_m: Array) -> Array:
 
 def _variance_of_mean(values: Array, times: Array) -> float:
     """Return the variance of the mean of n values that are correlated within blocks of time."""
-    sums = np.bincount(_blocks(times, max(_MIN_NUM_BLOCKS, int(np.ptp(times) / _BLOCK_S))), values - values.mean())
+    sums = np.bincount(_blocks(times, max(MIN_NUM_STRETCHES, int(np.ptp(times) / STRETCH_S))), values - values.mean())
     return float(sums @ sums) / len(values) ** 2 * len(sums) / max(len(sums) - 1, 1)
 
 
 def _is_determined(own: Array, rates: Array) -> bool:
     """Return whether the offset changes the ranges in a way that the other unknowns cannot explain."""
-    return bool(own @ own > _MIN_OWN_RATE**2 * (rates @ rates))
+    return bool(own @ own > UNDETERMINED**2 * (rates @ rates))
 
 
 def _blocks(times: Array, num_blocks: int) -> Indices:
@@ -247,7 +221,7 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, bloc
         for rows in np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1]):
             some = columns[rows]
             left = curvature - some.T @ (curving[rows] * some)
-            if np.linalg.eigvalsh(left)[0] < _MIN_LEFT_CURVATURE:
+            if np.linalg.eigvalsh(left)[0] < UNDETERMINED**2:  # the other blocks do not determine all unknowns
                 return np.full(len(sizes), np.inf)
             changes.append(np.linalg.solve(left, some.T @ residuals[rows])[-len(sizes) :] / sizes)
         num = len(changes)
@@ -267,8 +241,8 @@ def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple
     """
     reference_s = float(ranges.times_s.mean())
     fit = refine_offset(ranges, path, offset_s)
-    timing, followed, least_stddevs = fit.timing(), 0.0, _MIN_STDDEVS
-    for _ in range(_MAX_NUM_DRIFTS):
+    timing, followed, least_stddevs = fit.timing(), 0.0, SIGNIFICANT_STDDEVS
+    for _ in range(MAX_NUM_ROUNDS):
         if not abs(timing.drift) > least_stddevs * timing.drift_stddev:
             break
         followed, least_stddevs = followed + timing.drift, _CONVERGED_STDDEVS

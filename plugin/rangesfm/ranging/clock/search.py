@@ -8,6 +8,7 @@ pass.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
@@ -24,22 +25,15 @@ from rangesfm.ranging.clock.squares import MIN_RANGE_M
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 
-# Time between samples of the path. Linear interpolation between them is off by less than a millimetre, even at an
-# acceleration of 10 m/s^2.
-_SAMPLE_STEP_S = 0.025
-# Largest number of samples; a path of more than seven hours is sampled more coarsely.
-_MAX_NUM_SAMPLES = 1 << 20
-# An offset that puts fewer ranges on the path than this fraction of the largest possible number is not tried.
-_MIN_COVERAGE = 0.5
-# Step between offsets, a twentieth of the time in which a walker's motion changes. It is larger for logs of more than
-# seven hours.
+# Time between samples of the path, and between offsets: a twentieth of the time in which a walker's motion changes.
+# Linear interpolation between samples is off by less than a millimetre at an acceleration of 3 m/s^2.
 _STEP_S = 0.05
-_MAX_NUM_STEPS = 1 << 19
-# Numbers of offsets in the curve for the report: of all offsets, and near the best one.
-_NUM_COARSE, _MAX_NUM_FINE = 160, 200
-# Columns of the linear fit: |c|^2, c and 1.
-_NUM_COLUMNS = 5
-_PAIRS = [(i, j) for i in range(_NUM_COLUMNS) for j in range(i, _NUM_COLUMNS)]
+# Largest number of samples, and of offsets; if path and log together last more than seven hours, the step is longer.
+_MAX_NUM_STEPS = 500_000
+MIN_COVERAGE = 0.5
+"""Fraction of the largest possible number of ranges on the path; an offset that puts fewer there is not tried."""
+# Number of offsets in the curve for the report that are taken from all, and of those nearest to the best one.
+_NUM_SHOWN = 200
 
 
 class TimedRanges(NamedTuple):
@@ -110,7 +104,7 @@ def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: Associati
     assert trajectory.timestamps_s is not None, "a path in time needs times"
     start_s = float(trajectory.timestamps_s[0])
     span_s = float(trajectory.timestamps_s[-1]) - start_s
-    step_s = max(_SAMPLE_STEP_S, span_s / _MAX_NUM_SAMPLES)
+    step_s = max(_STEP_S, span_s / _MAX_NUM_STEPS)
     times = start_s + step_s * np.arange(int(span_s / step_s) + 1)
     probe = RangeLog.from_arrays(["probe"] * len(times), np.ones(len(times)), timestamp_s=times)
     # With a negative tolerance, a sample next to a keyframe is interpolated like all others.
@@ -153,17 +147,10 @@ class OffsetCurve(CostCurve):
 
     scores: Array
 
-    def around(self, best_s: float, reach_s: float) -> CostCurve:
-        """Return a curve for the report: the best offset of each interval, and all offsets near the best one.
-
-        Args:
-            best_s: the best offset.
-            reach_s: distance from it up to which all offsets are kept.
-        """
-        from_best_s = np.abs(self.offsets_s - best_s)
-        near = np.flatnonzero(from_best_s < reach_s)
-        fine = near[np.argsort(from_best_s[near])[:_MAX_NUM_FINE]]
-        stretches = np.array_split(np.arange(len(from_best_s)), min(_NUM_COARSE, len(from_best_s)))
+    def around(self, best_s: float) -> CostCurve:
+        """Return a curve for the report: the best offset of each interval, and those nearest to the best one of all."""
+        fine = np.argsort(np.abs(self.offsets_s - best_s))[:_NUM_SHOWN]
+        stretches = np.array_split(np.arange(len(self.offsets_s)), min(_NUM_SHOWN, len(self.offsets_s)))
         coarse = [rows[np.argmin(self.costs_m[rows])] for rows in stretches]
         shown = np.unique(np.concatenate([fine, coarse]))
         return CostCurve(self.offsets_s[shown], self.costs_m[shown])
@@ -193,12 +180,12 @@ def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None =
     scanned: list[tuple[Array, Array, Array, Array]] = []
     most = 0.0
     for rows in sorted(_parts(ranges.times_s, len(path) * path.step_s), key=len, reverse=True):
-        if len(rows) < _MIN_COVERAGE * most:
+        if len(rows) < MIN_COVERAGE * most:
             break
         scanned.append(_scan(ranges.take(rows), weights[rows], path))
         most = max(most, float(scanned[-1][0].max()))
     num_on_path, offsets, scores, costs = (np.concatenate(column) for column in zip(*scanned))
-    tried = np.flatnonzero(num_on_path >= max(1.0, _MIN_COVERAGE * most))
+    tried = np.flatnonzero(num_on_path >= max(1.0, MIN_COVERAGE * most))
     order = tried[np.argsort(offsets[tried], kind="stable")]
     return OffsetCurve(offsets[order], costs[order], scores[order])
 
@@ -216,12 +203,13 @@ def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> tuple[Array
     """Return sums of weights on the path, offsets, scores and costs, (m,) each, of one part of the log."""
     first_s, last_s = float(ranges.times_s.min()), float(ranges.times_s.max())
     span_s = len(path) * path.step_s + last_s - first_s
-    stride = max(1, round(max(_STEP_S, span_s / _MAX_NUM_STEPS) / path.step_s))
+    stride = max(1, round(span_s / (_MAX_NUM_STEPS * path.step_s)))
     step_s = stride * path.step_s
     columns = _columns(path, stride)
     cell = np.rint((ranges.times_s - first_s) / step_s).astype(np.int64)
     correlate = _Correlation(len(columns), int(cell.max()) + 1)
-    products = {(i, j): correlate.transform(columns[:, i] * columns[:, j]) for i, j in _PAIRS}
+    pairs = combinations_with_replacement(range(columns.shape[1]), 2)
+    products = {(i, j): correlate.transform(columns[:, i] * columns[:, j]) for i, j in pairs}
 
     sums = np.zeros((5, correlate.num_offsets))
     for rows in rows_by_key(ranges.anchor):
@@ -289,20 +277,21 @@ def _sums_of_anchor(
         return correlate.transform(np.bincount(cell, values, minlength=correlate.num_cells).astype(np.float64))
 
     own_weights, weighted = cells(weight), cells(weight * squared)
-    normal = np.empty((correlate.num_offsets, _NUM_COLUMNS, _NUM_COLUMNS))
-    for i, j in _PAIRS:
-        normal[:, i, j] = normal[:, j, i] = correlate(products[i, j], own_weights)
-    right = np.stack([correlate(products[i, 4], weighted) for i in range(_NUM_COLUMNS)], axis=1)
-    total = correlate(products[4, 4], cells(weight * squared**2))
-    num = correlate(products[4, 4], cells(weights))
+    ones = max(products)[0]  # the last of the columns, from 0
+    normal = np.empty((correlate.num_offsets, ones + 1, ones + 1))
+    for (i, j), product in products.items():
+        normal[:, i, j] = normal[:, j, i] = correlate(product, own_weights)
+    right = np.stack([correlate(products[i, ones], weighted) for i in range(ones + 1)], axis=1)
+    total = correlate(products[ones, ones], cells(weight * squared**2))
+    num = correlate(products[ones, ones], cells(weights))
 
     # The anchor's own unknowns are eliminated, and the unexplained parts are summed over the anchors.
-    own = normal[:, 1:, 1:] + (1e-6 * normal[:, 4, 4] + 1e-9 * weight.sum())[:, None, None] * np.eye(4)
+    own = normal[:, 1:, 1:] + (1e-6 * normal[:, ones, ones] + 1e-9 * weight.sum())[:, None, None] * np.eye(ones)
     solved = np.linalg.solve(own, np.stack([normal[:, 1:, 0], right[:, 1:]], axis=2))
     return np.stack(
         [
             num,
-            np.maximum(total - right[:, 4] ** 2 / own[:, 3, 3], 0.0),
+            np.maximum(total - right[:, ones] ** 2 / own[:, -1, -1], 0.0),
             total - np.einsum("mi,mi->m", right[:, 1:], solved[:, :, 1]),
             normal[:, 0, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 0]),
             right[:, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 1]),

@@ -11,13 +11,14 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
-from rangesfm.ranging.clock.fit import OffsetFit, drift_note, fit_clocks, refine_offset
+from rangesfm.ranging.clock.fit import SEPARATION_S, OffsetFit, drift_note, fit_clocks, refine_offset
 from rangesfm.ranging.clock.search import (
     CostCurve,
     PathSamples,
@@ -27,17 +28,13 @@ from rangesfm.ranging.clock.search import (
     scan_offsets,
 )
 from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 
 REMEDY = "give the time offset (--ranges_time_offset)"
-# Offsets with a lower probability are discarded.
-_MIN_PROBABILITY = 0.01
 # With more likely offsets than this the estimate fails.
 _MAX_NUM_LIKELY = 3
-# Two descents have found the same offset if they end this close, or within this many standard deviations.
-_SAME_OFFSET_S = 0.25
-_SAME_OFFSET_STDDEVS = 5.0
 # Log and photos usually cover the same time. An offset that puts fewer ranges on the path than this fraction of the
 # best offset's number gets this prior probability, relative to the others.
 _COVERING_SHARE = 0.7
@@ -45,16 +42,13 @@ _PRIOR_OF_THE_OTHERS = 0.05
 # Two offsets with a smaller fraction of ranges in common are compared by all ranges that each puts on the path.
 _MIN_SHARED = 0.5
 _MIN_NUM_KEYFRAMES = 4
-# Largest number of candidates from the scan, and their smallest distance from each other.
+# Largest number of candidates from the scan.
 _MAX_NUM_CANDIDATES = 12
-_CANDIDATE_SEPARATION_S = 0.5
 # Numbers of ranges that suffice to compare candidates, and for the final estimate.
 _NUM_RANGES_PER_CANDIDATE = 3000
 _NUM_RANGES_OF_FINAL = 40000
 # The offset does not matter if this fraction of the ranges in bursts stays at the same photos.
 _MIN_SAME_SHARE = 0.95
-# Near the best offset the curve has all offsets, up to the larger of this distance and this many standard deviations.
-_FINE_REACH_S, _FINE_REACH_STDDEVS = 1.0, 6.0
 # An offset with a larger standard deviation is refused.
 _MOST_UNCERTAIN_S = 0.5
 # To find the offset, poses are also interpolated across gaps up to this many times the median gap between photos.
@@ -177,14 +171,13 @@ def _offset_of_motion(
     scanned = scan_offsets(ranges, path)
     # All offsets use ranges in the same random order, so that different offsets are compared by the same ranges.
     ranges = ranges.take(np.random.default_rng(seed).permutation(len(ranges.times_s)))
-    candidates = scanned.peaks(_CANDIDATE_SEPARATION_S, _MAX_NUM_CANDIDATES)
+    candidates = scanned.peaks(SEPARATION_S, _MAX_NUM_CANDIDATES)
     fits: list[OffsetFit] = []
     for num_done, offset_s in enumerate(candidates):
         progress.update(num_done, len(candidates))
         near = ranges_at_offset(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE)
         if len(near.range_m):
-            best = max((fit for fit in fits if fit.is_testable), key=lambda fit: fit.score, default=None)
-            fits.append(refine_offset(near, path, offset_s, best))
+            fits.append(refine_offset(near, path, offset_s))
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
         raise GeometryError(f"too few ranges along the camera's path to find the time offset: {REMEDY}")
@@ -207,7 +200,7 @@ def _offset_of_motion(
     return TimeOffset(
         value_s=final.offset_s,
         stddev_s=timing.stddev_s,
-        curve=weighed.around(final.offset_s, max(_FINE_REACH_S, _FINE_REACH_STDDEVS * timing.stddev_s)),
+        curve=weighed.around(final.offset_s),
         drift=drift or timing.drift,
         drift_stddev=timing.drift_stddev,
         drift_is_followed=drift != 0,
@@ -269,8 +262,8 @@ def likely_offsets(offsets_s: Sequence[float], log_likelihoods: Sequence[float])
     Raises:
         GeometryError: there are too many of them.
     """
-    weights = np.exp(np.asarray(log_likelihoods) - np.max(log_likelihoods))
-    likely = np.flatnonzero(weights > _MIN_PROBABILITY * weights.sum())
+    behind = np.max(log_likelihoods) - np.asarray(log_likelihoods)
+    weights, likely = np.exp(-behind), np.flatnonzero(behind < MIN_COST_GAP)
     likely = likely[np.argsort(-weights[likely], kind="stable")]
     probabilities = weights[likely] / weights[likely].sum()
     if len(likely) > _MAX_NUM_LIKELY:
@@ -292,7 +285,7 @@ def _likely_fits(fits: list[OffsetFit], ranges: TimedRanges, path: PathSamples) 
     num_on_path = np.array([np.count_nonzero(path.knows(ranges.times_s + fit.offset_s)) for fit in fits])
     order = [k for k in np.argsort([-fit.score for fit in fits] * num_on_path) if fits[k].is_testable]
     best, most = fits[order[0]], num_on_path[order[0]]
-    same_s = max(_SAME_OFFSET_S, _SAME_OFFSET_STDDEVS * min(best.timing().stddev_s, 1.0))
+    same_s = max(SEPARATION_S, SIGNIFICANT_STDDEVS * min(best.timing().stddev_s, 1.0))
     distinct: list[OffsetFit] = []
     log_likelihoods: list[float] = []
     for number in order:
