@@ -14,7 +14,7 @@ from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS, UNDETERMINED
 from rangesfm.ranging.clock.search import MIN_COVERAGE, PathSamples, TimedRanges
 from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev
-from rangesfm.ranging.errors.noise import MIN_NUM_STRETCHES, NORMAL_95, STRETCH_S
+from rangesfm.ranging.errors.noise import NORMAL_95, STRETCH_S
 
 # Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
 _CELL_S = 1.0
@@ -22,6 +22,8 @@ SEPARATION_S = 0.5
 """Offsets that are nearer to each other are one, and no step of a descent is longer."""
 # Standard deviation of the bias that all ranges share because of the tag's delay.
 _RANGE_BIAS_STDDEV_M = 0.05
+# Smallest number of blocks of time whose errors count as independent.
+_MIN_NUM_BLOCKS = 12
 # The path explains the ranges if their gain in likelihood is this many standard deviations above 0, with blocks of time
 # as independent samples. For a log of another walk, the best of some hundred offsets reaches 6, by Student's
 # distribution with a dozen blocks.
@@ -120,7 +122,7 @@ class OffsetFit:
         """Return the variances (k,) of unknowns with columns ``own`` (n, k), from noise and a bias of all ranges."""
         # The correlation time is not known. The variance is therefore the mean of the variances with blocks of one, two
         # and four stretches; short logs have the smallest number of blocks, half of it, and twice as many.
-        usual = max(MIN_NUM_STRETCHES, float(np.ptp(times)) / (2 * STRETCH_S))
+        usual = max(_MIN_NUM_BLOCKS, float(np.ptp(times)) / (2 * STRETCH_S))
         blocks = [_blocks(times, round(num)) for num in (usual / 2, usual, 2 * usual)]
         by_chance = _jackknife_variances(own, residuals, self.squares, blocks)
         by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.squares.weights), rcond=None)[0]
@@ -182,7 +184,7 @@ def _losses(errors_m: Array) -> Array:
 
 def _variance_of_mean(values: Array, times: Array) -> float:
     """Return the variance of the mean of n values that are correlated within blocks of time."""
-    sums = np.bincount(_blocks(times, max(MIN_NUM_STRETCHES, int(np.ptp(times) / STRETCH_S))), values - values.mean())
+    sums = np.bincount(_blocks(times, max(_MIN_NUM_BLOCKS, int(np.ptp(times) / STRETCH_S))), values - values.mean())
     return float(sums @ sums) / len(values) ** 2 * len(sums) / max(len(sums) - 1, 1)
 
 

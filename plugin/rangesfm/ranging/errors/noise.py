@@ -39,8 +39,8 @@ MIN_NOISE_M = 1e-3
 NO_ERROR = 1e-3
 STRETCH_S = 10.0
 """Length of stretches of time, seconds, in which errors may be correlated; where a log names photos, each is one."""
-MIN_NUM_STRETCHES = 12
-"""Smallest number of stretches of time for an estimate of the correlation."""
+# Smallest number of stretches of time for an estimate of the correlation.
+_MIN_NUM_STRETCHES = 8
 # Largest number of residuals, or of windows of a log, from which noise is estimated: two percent is close enough.
 _MAX_NUM_SAMPLES = 4000
 # The noise is first taken from this share of the residuals, the smallest, as most of the others may be outliers.
@@ -89,9 +89,9 @@ def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
 
 
 def stretch_labels(times_s: Array, length_s: float) -> Indices:
-    """Return (n,) labels of stretches of time in which errors may be correlated; there are at least a dozen."""
+    """Return (n,) labels of stretches of time in which errors may be correlated; there are at least eight."""
     since = times_s - times_s.min()
-    length_s = max(min(length_s, float(since.max()) / MIN_NUM_STRETCHES), 1e-9)
+    length_s = max(min(length_s, float(since.max()) / _MIN_NUM_STRETCHES), 1e-9)
     return np.asarray(np.floor(since / length_s).astype(np.int64))
 
 
