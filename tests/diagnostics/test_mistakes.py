@@ -555,7 +555,7 @@ def test_a_mistake_that_no_test_shows_must_be_likelier_than_all_that_is_tried(mo
     least = ONE_NUMBER + 2 * np.log(50) + 2 * np.log(100)
     assert of.found({"bias": least + 0.01}, is_sure=False) == ["bias"]
     assert of.found({"bias~": least - 0.01}, is_sure=False) == []
-    of.more = [replace(cause_of(2 * np.log(50) + gain), name=f"{gain}") for gain in (0.01, -0.01)]
+    of.more = [replace(cause_of(2 * np.log(100) + gain), name=f"{gain}") for gain in (0.01, -0.01)]
     assert of.found({"bias": 0.0}, is_sure=False) == ["0.01"]
 
 
