@@ -16,11 +16,7 @@ from scipy import special
 from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array
-<<<<<<< HEAD
 from rangesfm.geometry.numerics import ROUNDING, UNDETERMINED
-=======
-from rangesfm.geometry.numerics import ROUNDING
->>>>>>> 2164cd67 (Say once in the models of range errors what is significant, rounding and the smallest noise)
 from rangesfm.scale.range_equation import Columns
 
 FALSE_ALARM_RATE = 0.02

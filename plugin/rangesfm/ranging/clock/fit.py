@@ -11,7 +11,7 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, rows_by_key
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS, UNDETERMINED
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS, UNDETERMINED
 from rangesfm.ranging.clock.search import MIN_COVERAGE, PathSamples, TimedRanges
 from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev
 from rangesfm.ranging.errors.noise import NORMAL_95, STRETCH_S
@@ -28,8 +28,6 @@ _MIN_NUM_BLOCKS = 12
 # as independent samples. For a log of another walk, the best of some hundred offsets reaches 6, by Student's
 # distribution with a dozen blocks.
 _MIN_GAIN_STDDEVS = 7.0
-# Size of a correction of the offset or the drift, in standard deviations, at which it has converged.
-_CONVERGED_STDDEVS = 0.05
 
 
 class Timing(NamedTuple):
@@ -144,7 +142,7 @@ def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float) -> Of
         if not _is_determined(own, found.rates):
             break
         step_s = float(own @ found.squares.weighted_residuals / (own @ own))
-        if abs(step_s) * np.linalg.norm(own) < _CONVERGED_STDDEVS * found.residual_stddev_m:
+        if abs(step_s) * np.linalg.norm(own) < NEGLIGIBLE_STDDEVS * found.residual_stddev_m:
             break
         offset_s = found.offset_s + float(np.clip(step_s, -SEPARATION_S, SEPARATION_S))
         if np.mean(path.knows(ranges.times_s + offset_s)) < MIN_COVERAGE:
@@ -247,7 +245,7 @@ def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple
     for _ in range(MAX_NUM_ROUNDS):
         if not abs(timing.drift) > least_stddevs * timing.drift_stddev:
             break
-        followed, least_stddevs = followed + timing.drift, _CONVERGED_STDDEVS
+        followed, least_stddevs = followed + timing.drift, NEGLIGIBLE_STDDEVS
         # The times become those of a radio clock that runs at the rate of the camera's.
         times_s = ranges.times_s + followed * (ranges.times_s - reference_s)
         fit = refine_offset(ranges._replace(times_s=times_s), path, fit.offset_s)
