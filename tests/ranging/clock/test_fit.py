@@ -48,6 +48,17 @@ def test_a_descent_finds_the_offset_to_a_twentieth_of_its_stddev_from_wherever_i
     np.testing.assert_allclose([fit.offset_s for fit in found], found[0].offset_s, rtol=0, atol=0.1 * stddev_s)
 
 
+def test_descents_end_soon_where_they_are_far_behind_and_go_on_where_they_are_not(path: PathSamples) -> None:
+    ranges = ranges_at(path, 0.0, 0.02)
+    best = refine_offset(ranges, path, 0.3)
+    alone, behind = refine_offset(ranges, path, -20.0), refine_offset(ranges, path, -20.0, best)
+    assert behind.is_hopeless_beside(best)
+    assert not best.is_hopeless_beside(behind)
+    assert behind.offset_s == -20.0 != alone.offset_s  # it stopped at once
+    again = refine_offset(ranges, path, 0.3, behind)
+    assert again.offset_s == best.offset_s
+
+
 def test_even_motion_on_a_line_tells_nothing_of_the_clocks() -> None:
     """Another offset fits equally well with another place of the anchor."""
     times_s = STEP_S * np.arange(NUM_SAMPLES)

@@ -20,6 +20,8 @@ from rangesfm.ranging.errors.noise import NORMAL_95, STRETCH_S
 _CELL_S = 1.0
 SEPARATION_S = 0.5
 """Offsets that are nearer to each other are one, and no step of a descent is longer."""
+# A descent is given up if its residuals are at least twice a rival's, and the logarithm of the odds exceeds this.
+_FAR_BEHIND, _HOPELESS = float(np.log(2)), 30.0
 # Standard deviation of the bias that all ranges share because of the tag's delay.
 _RANGE_BIAS_STDDEV_M = 0.05
 # Smallest number of blocks of time whose errors count as independent.
@@ -104,6 +106,11 @@ class OffsetFit:
         least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.ranges.times_s))
         return bool(self.score > least)
 
+    def is_hopeless_beside(self, rival: OffsetFit) -> bool:
+        """Return whether its residuals are so much larger than a rival's that further descent makes no difference."""
+        behind = rival.score - self.score
+        return behind > _FAR_BEHIND and behind * min(self.num_independent, rival.num_independent) > _HOPELESS
+
     def timing(self) -> Timing:
         """Return the drift, and standard deviations that account for residuals correlated within blocks of time."""
         times = self.ranges.times_s - self.ranges.times_s.mean()
@@ -127,17 +134,20 @@ class OffsetFit:
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
 
 
-def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float) -> OffsetFit:
+def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, rival: OffsetFit | None = None) -> OffsetFit:
     """Refine an offset by Gauss-Newton steps to the nearest one that fits the ranges best.
 
     Args:
         ranges: ranges that are (nearly) all on the path at the given offset.
         path: the path.
         offset_s: the offset to start from.
+        rival: the refinement stops early if it is far behind this fit; None: there is none.
     """
     # The lever arm comes in only after the scale has been estimated.
     found = fit_at_offset(ranges, path, offset_s, fit_at_offset(ranges, path, offset_s).squares.scale)
     for _ in range(MAX_NUM_ROUNDS):
+        if rival is not None and found.is_hopeless_beside(rival):
+            break
         own = found.squares.unexplained(found.rates[:, None])[:, 0]
         if not _is_determined(own, found.rates):
             break

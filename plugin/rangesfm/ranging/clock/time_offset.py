@@ -177,7 +177,8 @@ def _offset_of_motion(
         progress.update(num_done, len(candidates))
         near = ranges_at_offset(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE)
         if len(near.range_m):
-            fits.append(refine_offset(near, path, offset_s))
+            best = max((fit for fit in fits if fit.is_testable), key=lambda fit: fit.score, default=None)
+            fits.append(refine_offset(near, path, offset_s, best))
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
         raise GeometryError(f"too few ranges along the camera's path to find the time offset: {REMEDY}")
