@@ -16,6 +16,7 @@ from PIL import Image, ImageOps
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.processes.threads import side_by_side
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.packing import pack
@@ -327,7 +328,8 @@ def thumbnails(folder: Path | None, image_names: Sequence[str]) -> dict[str, str
     if not image_names:
         return {}
     chosen = np.unique(np.linspace(0, len(image_names) - 1, MAX_NUM_THUMBNAILS).round().astype(int))
-    photos = {image_names[i]: _small_copy(folder / image_names[i]) for i in chosen}
+    names = [image_names[i] for i in chosen]
+    photos = dict(zip(names, side_by_side(_small_copy, [folder / name for name in names]), strict=True))
     made: dict[str, str] = {}
     for width in _WIDTHS_PX:
         made, num_bytes = {}, 0
