@@ -18,9 +18,9 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
 from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
-# Largest standard deviations, metres, of noise and of lasting errors. Real radios show 0.03 to 0.15 m beside outliers,
+# Largest standard deviation, metres, of noise, and of lasting errors. Real radios show 0.03 to 0.15 m beside outliers,
 # old ones 0.2 m; more has another cause.
-_MOST_NOISE_M, _MOST_LASTING_M = 0.25, 0.25
+_MOST_ERROR_M = 0.25
 # Addition to both limits per metre of distance: a radio over 70 m is noisier than in a room.
 _NOISE_BY_DISTANCE = 0.005
 _LASTING = ("time", "place", "view")
@@ -139,8 +139,8 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
     """Yield faults that are no mistake of one size: noise and lasting errors of all ranges, faults of each anchor."""
     far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
     for kind, what, stddev_m, most_m in (
-        ("range noise", "scatter by", problem.scatter_m, _MOST_NOISE_M + far),
-        ("lasting errors", "have errors that last for seconds, of", _lasting_m(problem), _MOST_LASTING_M + far),
+        ("range noise", "scatter by", problem.scatter_m, _MOST_ERROR_M + far),
+        ("lasting errors", "have errors that last for seconds, of", _lasting_m(problem), _MOST_ERROR_M + far),
     ):
         words = f"the ranges {what} {stddev_m:.2f} m; radios in the open reach {most_m:.2f} m at most"
         yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")

@@ -16,10 +16,9 @@ from rangesfm.arrays import Indices
 from rangesfm.diagnostics.hypothesis import longest_m
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.ranging.errors.components import LASTING_S
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE
 
-# Longest burst, seconds: the correlation time of errors that last for seconds. What lasts longer is a mistake.
-_LONGEST_S = 3.0
 _NAME = "bursts"
 
 
@@ -65,7 +64,8 @@ def _windows(problem: Linearized) -> list[Indices]:
     link, time_s = np.stack([bins.anchor_index, bins.tag_index])[:, order], bins.time_s[order]
     for first in range(len(order)):
         for end in range(first + 1, len(order) + 1):
-            if np.any(link[:, end - 1] != link[:, first]) or time_s[end - 1] - time_s[first] > _LONGEST_S:
+            # What lasts longer than errors do that last for seconds is a mistake.
+            if np.any(link[:, end - 1] != link[:, first]) or time_s[end - 1] - time_s[first] > LASTING_S:
                 break
             found.append(order[first:end])
     return found

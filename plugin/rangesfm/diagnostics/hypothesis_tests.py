@@ -12,7 +12,8 @@ from scipy.linalg import solve_triangular
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NOTHING_LEFT, EstimatedMistake, Solved, noncentrality
+from rangesfm.geometry.numerics import UNDETERMINED
+from rangesfm.scale.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
 
 # Random surveys from which the thresholds come: 20 of them exceed one.
 _NUM_DRAWS = 1000
@@ -165,7 +166,7 @@ def _redundancy(left: Array, seen: Array) -> float:
     """
     of_left, of_seen = left.T @ left, seen.T @ seen
     values, vectors = np.linalg.eigh(of_seen)
-    if values[0] <= NOTHING_LEFT * values[-1]:
+    if values[0] <= UNDETERMINED * values[-1]:
         return 0.0
     root = vectors / np.sqrt(values)
     return float(np.clip(np.linalg.eigvalsh(root.T @ of_left @ root)[0], 0.0, 1.0))

@@ -11,7 +11,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
-from rangesfm.ranging.errors.components import PLACES
+from rangesfm.ranging.errors.components import DRIFT_S, PLACES
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
@@ -39,10 +39,10 @@ _NUM_NEIGHBOURS = 8
 # Least noise that counts where a range is compared with the median of its neighbours, to see whether it is an outlier
 # among them: a radio may repeat itself to a centimetre and still err by ten from one place to the next.
 _LEAST_SCATTER_M = 0.08
-# Standard deviation and correlation time of a slow wandering of the ranges, for each anchor and for all, as hands and
-# bodies move. It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where
-# steps may explain it. It is too slow to be confused with a step.
-_WANDERING_M, _WANDERING_S = 0.025, 60.0
+# Standard deviation of a slow wandering of the ranges, metres, for each anchor and for all, as hands and bodies move.
+# It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where steps may explain
+# it. It is too slow to be confused with a step.
+_WANDERING_M = 0.025
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ def slopes_by_poses(on_map: RangesOnMap) -> csr_array:
 
 def _wandering(bins_of_ranges: RangeBins) -> dict[str, Array]:
     index, time_s = bins_of_ranges.anchor_index, bins_of_ranges.time_s
-    together = np.exp(-np.abs(time_s[:, None] - time_s) / _WANDERING_S)
+    together = np.exp(-np.abs(time_s[:, None] - time_s) / DRIFT_S)
     return {"wandering": _WANDERING_M**2 * (1.0 + (index[:, None] == index)) * together}
 
 

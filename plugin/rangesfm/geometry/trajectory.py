@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 ROUNDING_S = 1e-6
 """Rounding error of the difference of two times in seconds since 1970."""
+MIN_NUM_KEYFRAMES = 4
+"""Fewest keyframes whose ranges tell anything of a map: three lie in one plane with any anchor."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,6 @@ NUM_SUSPECTS = 3
 """Number of measurements for which it is tried what the others say without them, the most deviating first."""
 # Baarda's significance level of a single test, and the probability that it misses a mistake of the smallest size.
 _ALPHA, _BETA = 0.001, 0.2
-NOTHING_LEFT = 1e-7
-"""Squared share of an effect below which what the unknowns leave of it is only rounding."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,8 @@ class Solved:
         """Estimate a mistake, given its whitened effect (c + r, k), what is left of it, and the change by it."""
         lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-12)
         basis, values, turns = np.linalg.svd(left / lengths, full_matrices=False)
-        shown = values**2 > NOTHING_LEFT
+        # Of an effect with a smaller squared share the unknowns leave only rounding.
+        shown = values**2 > UNDETERMINED
         basis, root = basis[:, shown], turns[shown].T / values[shown] / lengths[:, None]
         pulls, smallest, effect = basis.T @ self.residual, np.inf, np.inf
         if shown.all():

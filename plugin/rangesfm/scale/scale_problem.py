@@ -13,7 +13,7 @@ from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_rad
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.trilateration import MIN_NUM_RANGES, walking_times_s
@@ -26,8 +26,6 @@ from rangesfm.scale.range_equation import RangeProblem
 
 MIN_RANGES = 8
 """Fewest ranges that determine a scale: there are seven unknowns, and one more checks the fit."""
-# Fewest keyframes with ranges: three lie in one plane with any anchor.
-_MIN_KEYFRAMES = 4
 
 
 @dataclass(frozen=True)
@@ -213,10 +211,10 @@ def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indice
     heard = counts >= np.where(given, 1, MIN_NUM_RANGES)
     rows = rows[heard[index[rows]]]
     keyframes = np.union1d(observations.before[rows], observations.after[rows])
-    if len(rows) < MIN_RANGES or len(keyframes) < _MIN_KEYFRAMES:
+    if len(rows) < MIN_RANGES or len(keyframes) < MIN_NUM_KEYFRAMES:
         raise GeometryError(
             f"the scale is not determined: {len(rows)} of {len(observations.log)} ranges lie on the path, near "
-            f"{len(keyframes)} keyframes; {MIN_RANGES} near {_MIN_KEYFRAMES} are needed (do the clocks agree?)"
+            f"{len(keyframes)} keyframes; {MIN_RANGES} near {MIN_NUM_KEYFRAMES} are needed (do the clocks agree?)"
         )
     return rows, heard
 

@@ -17,7 +17,7 @@ from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import LOCAL_M
 from rangesfm.ranging.readers import vocabulary as terms
-from rangesfm.ranging.readers.guess import by_id_rather_than_index, is_named_time, is_range
+from rangesfm.ranging.readers.guess import MAX_NUM_IDS, by_id_rather_than_index, is_named_time, is_range
 from rangesfm.ranging.readers.layout import MISSING, ColumnSample, Layout, find_layout
 from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns, columns_flag, read_list
 from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
@@ -32,8 +32,6 @@ _REQUIRED = tuple(_CANONICAL[quantity] for quantity in ("anchor_id", *_AXES))
 _OPTIONAL = tuple(name for name in _CANONICAL.values() if name not in _REQUIRED)
 _ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
 _EXPECTED = f"expected a table with {','.join(_REQUIRED)}"
-# A table without names is taken for one of anchors only up to this number of rows.
-_MAX_NUM_UNNAMED = 64
 _GEOGRAPHIC = "EPSG:4979"
 
 
@@ -197,7 +195,7 @@ def _by_values(layout: Layout) -> dict[str, list[ColumnSample]]:
     first, *others = layout.columns
     numbers = [column for column in others if column.kind == "numbers"]
     is_id = first.num_distinct == len(first.cells) and (first.kind == "text" or first.is_whole)
-    is_short = len(first.cells) <= _MAX_NUM_UNNAMED and len(layout.columns) <= 5
+    is_short = len(first.cells) <= MAX_NUM_IDS and len(layout.columns) <= 5
     if is_id and is_short and len(numbers) == 3 and numbers == others[:3]:
         found["anchor_id"] = [first]
         found |= {axis: [column] for axis, column in zip(_AXES, numbers)}

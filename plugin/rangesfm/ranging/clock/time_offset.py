@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.progress import Progress, SilentProgress
@@ -41,7 +41,6 @@ _COVERING_SHARE = 0.7
 _PRIOR_OF_THE_OTHERS = 0.05
 # Two offsets with a smaller fraction of ranges in common are compared by all ranges that each puts on the path.
 _MIN_SHARED = 0.5
-_MIN_NUM_KEYFRAMES = 4
 # Largest number of candidates from the scan.
 _MAX_NUM_CANDIDATES = 12
 # Numbers of ranges that suffice to compare candidates, and for the final estimate.
@@ -136,7 +135,7 @@ def estimate_time_offset(
         raise InputError("the log has no timestamps, so that no time offset can be found", log.source)
     if trajectory.timestamps_s is None:
         raise InputError("the photos have no times, so that no time offset can be found: give image times")
-    if len(trajectory) < _MIN_NUM_KEYFRAMES or not len(log):
+    if len(trajectory) < MIN_NUM_KEYFRAMES or not len(log):
         raise GeometryError(
             f"{len(trajectory)} photos and {len(log)} ranges are too few to find the time offset: {REMEDY}"
         )

@@ -18,10 +18,10 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M
 from rangesfm.ranging.errors.range_bins import RangeBins
 
-# Correlation time of errors that last for seconds.
-_TIME_S = 3.0
-# Correlation time of the slow drift, seconds, as of a warming radio.
-_DRIFT_S = 60.0
+LASTING_S = 3.0
+"""Correlation time of errors that last for seconds."""
+DRIFT_S = 60.0
+"""Correlation time of slow drift, seconds, as of a warming radio or of moving hands and bodies."""
 # Correlation lengths: of errors by the tag's position (metres), as for echoes; of errors by direction in the camera (1
 # minus the cosine), as for the lobes of antennas.
 _PLACE_M, _LOBE = 0.5, 0.1
@@ -144,11 +144,11 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
     of_anchor = functools.partial(of, is_of_anchor=True)
     return (
         of_anchor("white", "noise of single ranges", lambda c: np.diag(1 / np.maximum(c.worth, 1e-6))),
-        of_anchor("time", "errors that last for seconds", lambda c: _fading(c.time_s, _TIME_S) * _same_link(c)),
+        of_anchor("time", "errors that last for seconds", lambda c: _fading(c.time_s, LASTING_S) * _same_link(c)),
         of(
             "drift",
             "slow drift of the radio, alike to all anchors",
-            lambda c: _fading(c.time_s, _DRIFT_S) * _same(c.tag_index),
+            lambda c: _fading(c.time_s, DRIFT_S) * _same(c.tag_index),
         ),
         of_anchor("place", "errors that belong to a place: echoes", _in_place),
         of_anchor(

@@ -18,7 +18,8 @@ from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.layout import ColumnSample, Layout
 from rangesfm.ranging.readers.reader import EndpointRoles
 
-_MAX_NUM_IDS = 64
+MAX_NUM_IDS = 64
+"""Largest number of tags and anchors of a survey, where a table does not say what it holds."""
 _SAME_SPOT_M = 1.5  # largest distance between tags on one rig, and so largest difference of their ranges to an anchor
 
 
@@ -367,7 +368,7 @@ def _is_positive(column: ColumnSample) -> bool:
 def _is_id(column: ColumnSample) -> bool:
     # A word without digits that is the same in each row, such as "range:" or "m", is not an id.
     is_word = column.num_distinct == 1 and not any(map(str.isdigit, column.cells[0]))
-    few = column.num_distinct <= min(_MAX_NUM_IDS, max(2, len(column.cells) // 4))
+    few = column.num_distinct <= min(MAX_NUM_IDS, max(2, len(column.cells) // 4))
     return few and not is_word and (column.kind == "text" or (column.is_whole and bool(np.all(column.numbers >= 0))))
 
 
