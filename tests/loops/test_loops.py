@@ -51,8 +51,8 @@ def test_closed_loops_tie_the_laps_together(closed: Closed, laps: LoopedSurvey) 
 def test_a_map_that_was_bent_to_its_ranges_is_not_bent_again() -> None:
     laps = two_laps(100, size_m=(24.0, 16.0), num_observations=40, pixel_stddev=1.0)
     scaled = ScaledMap.of(laps.survey, laps.chain(), range_log(laps.survey, 1))
-    refined, summary = scaled.refined()
-    again, _ = scaled.refined((refined, summary))
+    refined, _ = scaled.refined()
+    again, _ = scaled.refined(refined)
     scaled_m, refined_m, again_m = (
         trajectory_from_reconstruction(model, laps.survey.model.timestamps_s).centers
         for model in (scaled.scaled, refined, again)

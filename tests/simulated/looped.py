@@ -172,25 +172,23 @@ class ScaledMap:
         return cls(survey, rescale(sfm, estimate.metric_from_sfm), trajectory, estimate)
 
     def refined(
-        self, before: tuple[pycolmap.Reconstruction, RefineSummary] | None = None, closing: LoopClosing | None = None
+        self, start: pycolmap.Reconstruction | None = None, closing: LoopClosing | None = None
     ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-        """Refine the scaled map, or one that was refined before, metres."""
+        """Refine the scaled map, or another map in metres."""
         estimate = self.estimate
-        start = self.scaled if before is None else before[0]
-        errors = estimate.errors if before is None or closing is None else before[1].errors
         return refine_with_ranges(
-            start,
+            self.scaled if start is None else start,
             self.trajectory,
             estimate.observations,
             estimate.metric_from_sfm,
             estimate.anchors,
-            errors,
+            estimate.errors,
             tag_in_cam_m=TAG_IN_CAM_M,
             first_pose_is_fixed=self.survey.is_in_first_camera,
             camera=CameraOptions(refine_intrinsics=False),
             learn=lambda rest: Learnt(None, 1.0),  # the simulated ranges have no errors but noise
             closing=closing,
-            is_refined=before is not None,
+            is_refined=start is not None,
             num_threads=1,
         )
 
@@ -233,8 +231,9 @@ class SimulatedMap:
         path = self.database_path
         path.unlink(missing_ok=True)
         write_matches(path, self.model, self.looped.neighbours | self.matches_of(sorted(tried.closed)))
-        closing = LoopClosing(self.finder.relative_poses(loops), lambda model: merge_tracks(model, path, seed=0))
-        model, summary = self.scaled.refined((self.model, self.summary), closing)
+        closed = self.finder.relative_poses(loops)
+        closing = LoopClosing(closed, self.summary.errors, lambda model: merge_tracks(model, path, seed=0))
+        model, summary = self.scaled.refined(self.model, closing)
         return replace(self, model=model, summary=summary)
 
 

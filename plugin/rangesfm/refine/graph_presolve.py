@@ -66,7 +66,9 @@ class Presolved:
     num_steps: int
 
 
-def presolve(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Presolved:
+def presolve(
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, loops: LoopPoses | None = None
+) -> Presolved:
     """Solve the keyframe graph and move the model accordingly, in place.
 
     The errors are estimated again with every solution. While the drift is large, the residuals and their standard
@@ -76,20 +78,16 @@ def presolve(problem: RefinementProblem, rays: Observations, errors: RangeErrors
 
     Args:
         rays: all observations of the photos. errors: of the ranges that take part.
+        loops: by indices in ``problem.frame_ids``; None without any.
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Presolved(errors, 0.0, problem.radio.anchors, 0.0, 0)
-    graph = _graph(problem, rays, errors, problem.radio.anchors)
-    fit, errors = _solve_with_own_errors(graph)
-    return _moved(problem, rays, graph, fit, errors)
+    graph = _graph(problem, rays, errors, problem.radio.anchors, loops)
+    return _moved(problem, rays, graph, *_solve_with_own_errors(graph))
 
 
 def presolve_again(
-    problem: RefinementProblem,
-    rays: Observations,
-    errors: RangeErrors,
-    anchors: tuple[AnchorEstimate, ...],
-    loops: LoopPoses | None = None,
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
 ) -> Presolved:
     """Solve the keyframe graph again from a model that was refined, with known errors, and move the model, in place.
 
@@ -98,12 +96,29 @@ def presolve_again(
 
     Args:
         rays: all observations of the photos. errors: of the ranges that take part. anchors: as they are now.
-        loops: by indices in ``problem.frame_ids``; None without any.
     """
     graph = _graph(replace(problem, is_refined=True), rays, errors, anchors)
-    if loops is not None:
-        graph = replace(graph, vision=graph.vision.with_loops(loops))
-    fit = solve_graph(graph, graph.start(), tolerance_m=_tolerance_m(errors))
+    return _moved(problem, rays, graph, _solve_precisely(graph, graph.start()), errors)
+
+
+def presolve_nearby(
+    problem: RefinementProblem, rays: Observations, errors: RangeErrors, loops: LoopPoses, most_bend_m: float
+) -> Presolved | None:
+    """Close loops of a model that was refined, with known errors, if that bends it by no more than ``most_bend_m``.
+
+    A map that bends far leaves its ranges on the way, and would lose them as outliers.
+
+    Args:
+        rays: all observations of the photos. errors: of the ranges that take part.
+        loops: by indices in ``problem.frame_ids``.
+
+    Returns:
+        None where the map would bend further; then the model stays as it is.
+    """
+    graph = _graph(problem, rays, errors, problem.radio.anchors, loops)
+    fit = _solve_precisely(graph, graph.start())
+    if _bend(graph.vision.origin.centers, fit.state.poses.centers) > most_bend_m:
+        return None
     return _moved(problem, rays, graph, fit, errors)
 
 
@@ -122,7 +137,11 @@ def _moved(
 
 
 def _graph(
-    problem: RefinementProblem, rays: Observations, errors: RangeErrors, anchors: tuple[AnchorEstimate, ...]
+    problem: RefinementProblem,
+    rays: Observations,
+    errors: RangeErrors,
+    anchors: tuple[AnchorEstimate, ...],
+    loops: LoopPoses | None = None,
 ) -> KeyframeGraph:
     """Set up the keyframe graph of the current model.
 
@@ -134,8 +153,10 @@ def _graph(
     takes_part = ~np.isin(rays.point_ids, list(problem.left_out_ids))[rays.point]
     seen, poses = rays.subset(np.flatnonzero(takes_part)), model_poses(problem.metric, problem.frame_ids)
     vision = vision_information(seen, poses)
+    if problem.is_refined:
+        vision = with_gradient(vision, photo_gradient(seen, poses))
     return KeyframeGraph(
-        vision=with_gradient(vision, photo_gradient(seen, poses)) if problem.is_refined else vision,
+        vision=vision if loops is None else vision.with_loops(loops),
         antennas=ranges.antennas.subset(ranges.rows),
         range_m=ranges.observations.log.range_m[ranges.rows],
         errors=errors,
@@ -192,7 +213,7 @@ def _solve_with_own_errors(graph: KeyframeGraph) -> tuple[GraphSolution, RangeEr
     state = wide.state if reached >= seen else start
     errors = replace(shown, loss=errors.loss).seen_by_bending_map(graph.residuals_m(state), wide.num_absorbed)
     bounded, errors = _alternate(graph, errors, state)
-    settled = solve_graph(replace(graph, errors=errors), bounded.state, tolerance_m=_tolerance_m(errors))
+    settled = _solve_precisely(replace(graph, errors=errors), bounded.state)
     return replace(settled, num_steps=wide.num_steps + bounded.num_steps + settled.num_steps), errors
 
 
@@ -217,6 +238,10 @@ def _alternate(graph: KeyframeGraph, errors: RangeErrors, start: GraphState) -> 
         is_last=lambda used, shown, _: used.change(shown) < SAME_ERRORS,
     )
     return replace(solution, num_steps=num_steps), seen
+
+
+def _solve_precisely(graph: KeyframeGraph, start: GraphState) -> GraphSolution:
+    return solve_graph(graph, start, tolerance_m=_tolerance_m(graph.errors))
 
 
 def _tolerance_m(errors: RangeErrors, share: float = _TOLERANCE) -> float:

@@ -35,7 +35,7 @@ from rangesfm.refine.bundle_adjustment import (
     solve_until_still,
 )
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
-from rangesfm.refine.graph_presolve import SAME_ERRORS, Presolved, presolve, presolve_again
+from rangesfm.refine.graph_presolve import SAME_ERRORS, Presolved, presolve, presolve_again, presolve_nearby
 from rangesfm.refine.positions import HeldPositions
 from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
 from rangesfm.refine.refinement_problem import RefinementProblem
@@ -188,10 +188,12 @@ class LoopClosing:
 
     Attributes:
         loops: measured relative poses, by ids of frames in place of indices.
+        errors: of all ranges of the log, as the map was refined with.
         merge_tracks: merges the points that are one, in place, once the poses have moved.
     """
 
     loops: LoopPoses
+    errors: RangeErrors
     merge_tracks: Callable[[pycolmap.Reconstruction], None]
 
 
@@ -227,9 +229,8 @@ def refine_with_ranges(
         metric_from_sfm: from the world of ``observations`` to that of ``reconstruction``.
         anchors: in the order of the log, in the metric world. Prior standard deviation 0 fixes an anchor, a finite one
             adds a prior, an infinite one leaves it free.
-        errors: of all ranges of the log, from the scale stage, or from the refinement before where loops are to be
-            closed. Unless the noise is given, it is estimated again for each anchor, together with shares and
-            inflation.
+        errors: of all ranges of the log, from the scale stage. Unless the noise is given, it is estimated again for
+            each anchor, together with shares and inflation.
         tag_in_cam_m: (3,) antenna in the camera (rig) frame; or (num_tags, 3), in the order of the log's tags.
         first_pose_is_fixed: the gauge: True in the first camera's frame, False where surveyed anchors determine the
             frame.
@@ -274,15 +275,12 @@ def refine_with_ranges(
         is_refined or closing is not None,
     )
     with at_most(num_threads):
-        if closing is None:
-            errors, closed = _errors_to_begin_with(problem, errors, metric_from_sfm.scale), None
-        else:
-            errors = errors.subset(ranges.rows)
-            closed = _close_loops(problem, errors, closing)
+        errors, start = _errors_to_begin_with(problem, errors, metric_from_sfm.scale), None
+        if closing is not None:
+            problem, start = _close_loops(problem, errors, closing)
         with _markers_in_map(problem) as with_markers:
             with_markers, bundle, rays = _without_misplaced(with_markers)
-            start = closed or presolve(with_markers, rays, errors)
-            summary = _adjust(with_markers, bundle, start, learn)
+            summary = _adjust(with_markers, bundle, start or presolve(with_markers, rays, errors), learn)
     return metric, summary
 
 
@@ -330,28 +328,37 @@ def _without_misplaced(problem: RefinementProblem) -> tuple[RefinementProblem, B
     return problem, bundle, rays.with_pixel_stddev(bundle.pixel_stddev)
 
 
-def _close_loops(problem: RefinementProblem, errors: RangeErrors, closing: LoopClosing) -> Presolved:
+def _close_loops(
+    problem: RefinementProblem, errors: RangeErrors, closing: LoopClosing
+) -> tuple[RefinementProblem, Presolved | None]:
     """Move a refined model so that its loops close, and merge its tracks, in place.
 
-    Loops that contradict the ranges are not closed. So the errors that the ranges show in the map with open loops are
-    right for the map with closed ones, too, and no robust start is needed.
+    Args:
+        errors: of the ranges that take part, to begin with.
+
+    Returns:
+        The problem with its anchors moved along, and the start of the full problem; None where the map had to bend
+        visibly, so that its drift has to be removed again.
     """
     place = {frame_id: k for k, frame_id in enumerate(problem.frame_ids.tolist())}
     reference, frame = (
         np.array([place[frame_id] for frame_id in ids.tolist()], dtype=np.int64)
         for ids in (closing.loops.reference, closing.loops.frame)
     )
-    seen, _, rays = _without_misplaced(problem)
     loops = replace(closing.loops, reference=reference, frame=frame)
-    moved = presolve_again(seen, rays, errors, problem.radio.anchors, loops)
+    seen, _, rays = _without_misplaced(problem)
+    visible_m = _just_visible_m(rays, model_poses(problem.metric, problem.frame_ids))
+    near = presolve_nearby(seen, rays, closing.errors.subset(problem.ranges.rows), loops, visible_m)
+    if near is not None:
+        closing.merge_tracks(problem.metric)
+        return problem, near
+    moved = presolve(seen, rays, errors, loops)
     closing.merge_tracks(problem.metric)
-    if moved.bend_m < _just_visible_m(rays, model_poses(problem.metric, problem.frame_ids)):
-        return moved
     # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do
     # so only when those that have merged have straightened it.
     anchors = _settled(problem, errors, moved.anchors)
     closing.merge_tracks(problem.metric)
-    return replace(moved, anchors=anchors)
+    return replace(problem, radio=replace(problem.radio, anchors=anchors)), None
 
 
 def _just_visible_m(rays: Observations, poses: Poses) -> float:

@@ -74,13 +74,15 @@ class _RefinedMap:
         self.keep(tried)
         finder, database = self._finder, self.matching.database
         assert finder is not None, "it has found the loops"
+        assert self.metric.kept_refinement is not None, "its map is refined"
 
         def merge(model: pycolmap.Reconstruction) -> None:
             with colmap_log(database.log):
                 merge_tracks(model, database.path, seed=finder.seed)
 
         with self.run.journal.stage("refinement"):
-            refined = self.refine(self.metric, LoopClosing(finder.relative_poses(loops), merge))
+            closing = LoopClosing(finder.relative_poses(loops), self.metric.kept_refinement.errors, merge)
+            refined = self.refine(self.metric, closing)
         if refined.why_broken:
             self.run.journal.warn(f"loops are left open, because the map broke: {'; '.join(refined.why_broken)}")
             return None

@@ -352,7 +352,7 @@ def _refined(
         estimate.observations,
         estimate.metric_from_sfm,
         metric.anchors,
-        estimate.errors if closing is None or metric.refinement is None else metric.refinement.errors,
+        estimate.errors,
         tag_in_cam_m=run.inputs.tag_in_cam_m,
         first_pose_is_fixed=estimate.frame != "site",
         gravity=gravity_of(survey.scale.up_in_first_camera),
