@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pycolmap
 import pytest
@@ -11,6 +15,8 @@ from tests.studies.simulated_survey import range_log
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.loops.loop_finder import LoopFinder
+from rangesfm.refine import with_ranges
+from rangesfm.refine.graph_presolve import Presolved, presolve
 
 
 def error_m(survey: LoopedSurvey, model: pycolmap.Reconstruction) -> float:
@@ -46,6 +52,26 @@ def test_closed_loops_tie_the_laps_together(closed: Closed, laps: LoopedSurvey) 
         for point in closed.after.model.points3D.values()
     )
     assert longest > 20
+
+
+@pytest.mark.parametrize("is_far", [False, True])
+def test_a_robust_start_is_made_only_where_closing_bends_the_map_visibly(
+    closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_far: bool
+) -> None:
+    started, visible_m = [], with_ranges._just_visible_m
+
+    def robust_start(*given: Any) -> Presolved:
+        started.append(given)
+        return presolve(*given)
+
+    monkeypatch.setattr(with_ranges, "presolve", robust_start)
+    monkeypatch.setattr(with_ranges, "_just_visible_m", lambda *of: 0.0 if is_far else visible_m(*of))
+    before = replace(closed.after, database_path=tmp_path / "again.db")
+    loops, _ = before.finder.tested(before.matches_of(sorted(closed.tried.closed)))
+    again = before.with_closed(loops, closed.tried)
+    assert len(started) == (2 if is_far else 0)  # with the loops, and when more tracks have become one
+    movement_m = error_m(closed.after.looped, again.model) - error_m(closed.after.looped, closed.after.model)
+    assert abs(movement_m) < 0.01
 
 
 def test_a_map_that_was_bent_to_its_ranges_is_not_bent_again() -> None:
