@@ -16,7 +16,16 @@ from tests.simulated.path import orbit_path
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.refine import graph_presolve
-from rangesfm.refine.graph_presolve import _as_a_whole, _bend, _carried, _move, _tolerance_m, _triangulated, carry_model
+from rangesfm.refine.graph_presolve import (
+    _as_a_whole,
+    _bend,
+    _carried,
+    _move,
+    _tolerance_m,
+    _triangulated,
+    carry_model,
+    presolve_nearby,
+)
 from rangesfm.refine.vision_information import Observations, Poses, costs_of_points, model_observations, model_poses
 
 Array = npt.NDArray[np.float64]
@@ -190,3 +199,9 @@ def test_a_map_is_moved_as_a_whole_if_it_bends_less_than_a_twentieth_of_a_range(
     # Only the solver's own frame is put back, if it holds the gauge.
     is_same = np.array_equal(pose_of(metric.frame(2)).params, held)
     assert is_same == (is_bent or first_pose_is_fixed)
+
+
+def test_without_ranges_the_graph_closes_no_loop() -> None:
+    nothing: Any = SimpleNamespace(ranges=SimpleNamespace(rows=np.zeros(0, dtype=np.int64)))
+    unused: Any = None
+    assert presolve_nearby(nothing, unused, unused, unused, 1.0) is None

@@ -113,8 +113,10 @@ def presolve_nearby(
         loops: by indices in ``problem.frame_ids``.
 
     Returns:
-        None where the map would bend further; then the model stays as it is.
+        None where the map would bend further, or without ranges; then the model stays as it is.
     """
+    if not len(problem.ranges.rows):
+        return None
     graph = _graph(problem, rays, errors, problem.radio.anchors, loops)
     fit = _solve_precisely(graph, graph.start())
     if _bend(graph.vision.origin.centers, fit.state.poses.centers) > most_bend_m:
