@@ -23,9 +23,8 @@ from rangesfm.diagnostics.hypothesis import (
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.scale.range_equation import antenna_positions
 
-# Number of times that are tried. Ranges between the true time of a step and the tried time fit neither way, so the best
-# time is refined afterwards by as many between its neighbours.
-_NUM_TIMES = 32
+# Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.
+_NUM_TIMES, _NUM_FINER = 32, 17
 # Share of the survey that must be before and after a change; otherwise it is as good as a lasting mistake.
 _LEAST_SHARE = 1 / 12
 # Shares of the survey that a stretch may last.
@@ -242,7 +241,7 @@ def _changes(
     times = np.unique(np.quantile(problem.on_map.time_s[of_ranges], np.linspace(*ends, _NUM_TIMES)))
     if around is not None:
         at = int(np.searchsorted(times, around))
-        times = np.linspace(times[max(at - 1, 0)], times[min(at + 1, len(times) - 1)], _NUM_TIMES)
+        times = np.linspace(times[max(at - 1, 0)], times[min(at + 1, len(times) - 1)], _NUM_FINER)
     is_of = _is_of(problem.bins.anchor_index, anchor)
     for time, share in zip(times.tolist(), _shares_after(problem, times), strict=True):
         after = np.where(is_of, share, 0.0)

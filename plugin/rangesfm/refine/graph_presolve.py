@@ -46,6 +46,8 @@ SAME_ERRORS = 0.05
 # Movement of a keyframe, in standard deviations of a range, at which the solver stops. A turn of the whole world by
 # centimetres costs the full problem tens of iterations, since all points have to follow; here it costs one step.
 _TOLERANCE = 0.001
+# With many more steps, points follow a camera that is out of its place, which then stays there.
+_NUM_TRIANGULATIONS = 5
 
 
 @dataclass(frozen=True)
@@ -296,7 +298,7 @@ def _carried(observations: Observations, before: Poses, after: Poses, local_scal
 def _triangulated(observations: Observations, poses: Poses, start: Array) -> Array:
     """Return the (p, 3) points that fit the rays best, by Gauss-Newton steps that are kept where they help."""
     points, cost = start, costs_of_points(observations, poses, start)
-    for _ in range(MAX_NUM_ROUNDS):
+    for _ in range(_NUM_TRIANGULATIONS):
         _, in_cam, derivative = project(observations, poses, points)
         residuals = np.nan_to_num(ray_residuals(observations, in_cam), posinf=0.0)
         root = robust_root_weights(residuals)[:, None]
@@ -304,10 +306,6 @@ def _triangulated(observations: Observations, poses: Poses, start: Array) -> Arr
         to_point = to_rig @ np.swapaxes(poses.world_from_rig[observations.frame], 1, 2)
         trial = points + steps_of_points(observations, root[:, :, None] * to_point, root * residuals)
         trial_cost = costs_of_points(observations, poses, trial)
-        is_better = trial_cost < cost  # false for a point without any cost, which keeps its place
-        points = np.where(is_better[:, None], trial, points)
-        gain = float(np.sum(cost[is_better] - trial_cost[is_better]))
-        cost[is_better] = trial_cost[is_better]
-        if gain < NEGLIGIBLE_STDDEVS**2 * len(points):  # some points near the horizon move on forever
-            break
+        points = np.where((trial_cost < cost)[:, None], trial, points)
+        cost = np.fmin(trial_cost, cost)  # a point without any cost keeps its place
     return points

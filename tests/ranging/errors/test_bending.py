@@ -22,7 +22,7 @@ from rangesfm.ranging.errors.bending import (
     by_poses,
     without_similarity,
 )
-from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, range_bins
+from rangesfm.ranging.errors.range_bins import RangeBins, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 
@@ -186,15 +186,13 @@ def test_poses_after_the_last_range_have_no_effect_on_a_bin(path: Trajectory) ->
     assert not found[:, 12:].any()
 
 
-def test_steps_of_a_long_path_are_as_many_as_bins_may_be_and_their_variance_is_by_their_length(
-    path: Trajectory,
-) -> None:
+def test_steps_of_a_long_path_are_a_hundred_and_their_variance_is_by_their_length(path: Trajectory) -> None:
     starts, unit = WalkBending(path)._steps_of_path
     np.testing.assert_array_equal(starts, np.arange(NUM_POSES - 1))
     lengths = np.linalg.norm(np.diff(path.centers, axis=0), axis=1)
     np.testing.assert_allclose(unit[:, :4] ** 2, np.tile(lengths[:, None] / lengths.sum(), 4))
     np.testing.assert_allclose(unit[:, 4:], np.tile(unit[:, :1], 3) * lengths.sum())
-    num = 2 * MAX_NUM_BINS + 1
+    num = 251
     along = np.arange(float(num))
     long = Trajectory(
         np.arange(num),
@@ -204,8 +202,9 @@ def test_steps_of_a_long_path_are_as_many_as_bins_may_be_and_their_variance_is_b
         np.tile(np.eye(3), (num, 1, 1)),
     )
     starts, unit = WalkBending(long)._steps_of_path
-    np.testing.assert_array_equal(starts, 2 * np.arange(MAX_NUM_BINS))
-    np.testing.assert_allclose(np.sum(unit**2, axis=0), [1.0] * 4 + [(num - 1.0) ** 2] * 3)
+    assert len(starts) == 100
+    assert (starts[0], starts[1], starts[-1]) == (0, 2, 247)
+    np.testing.assert_allclose(np.sum(unit**2, axis=0), [1.0] * 4 + [250.0**2] * 3)
 
 
 @pytest.mark.parametrize("frame_is_free", [True, False])

@@ -16,13 +16,15 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.similarity import Similarity, align_points, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.components import BENDS, Component
-from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins
+from rangesfm.ranging.errors.range_bins import RangeBins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 
 # Weight of turns against shifts in the fit of a similarity. Turns only matter for a turn about a straight path, which
 # nothing else shows; elsewhere this weight is too small to have an effect.
 _TURNS_COUNT = 1e-3
+# Largest number of steps of a random walk: with more, the walk follows what errors that jump do.
+_MAX_NUM_STEPS = 100
 # Random drift from the start to the end of a path: relative change of the scale, turn in radians, and shift as a share
 # of the path's length (medians over maps of poses alone); _SPREAD is the standard deviation of their logarithms.
 # Source: tests.studies.drifting_maps. From its first to its last third the real path (ORB-SLAM, fr2_desk) changes by
@@ -235,8 +237,7 @@ class WalkBending:
     def _steps_of_path(self) -> tuple[Indices, Array]:
         """Indices (s,) of the poses with a step, and (s, 7) standard deviations for a walk of 1 from start to end."""
         steps = np.linalg.norm(np.diff(self.given.centers, axis=0), axis=1)
-        # The bins of ranges do not resolve more steps than there may be bins.
-        starts = np.unique(np.linspace(0, len(steps), min(len(steps), MAX_NUM_BINS) + 1).astype(np.int64))[:-1]
+        starts = np.unique(np.linspace(0, len(steps), min(len(steps), _MAX_NUM_STEPS) + 1).astype(np.int64))[:-1]
         length = float(steps.sum())
         share = np.add.reduceat(steps, starts) / length if length > 0 else np.zeros(len(starts))
         return starts, np.sqrt(share)[:, None] * np.repeat([1.0, length], [4, 3])
