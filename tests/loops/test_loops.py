@@ -15,8 +15,8 @@ from tests.studies.simulated_survey import range_log
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.loops.loop_finder import LoopFinder
-from rangesfm.refine import with_ranges
-from rangesfm.refine.graph_presolve import Presolved, presolve
+from rangesfm.refine import graph_presolve, with_ranges
+from rangesfm.refine.graph_presolve import _solve_with_own_errors
 
 
 def error_m(survey: LoopedSurvey, model: pycolmap.Reconstruction) -> float:
@@ -60,11 +60,11 @@ def test_a_robust_start_is_made_only_where_closing_bends_the_map_visibly(
 ) -> None:
     started, visible_m = [], with_ranges._just_visible_m
 
-    def robust_start(*given: Any) -> Presolved:
+    def robust_start(*given: Any) -> Any:
         started.append(given)
-        return presolve(*given)
+        return _solve_with_own_errors(*given)
 
-    monkeypatch.setattr(with_ranges, "presolve", robust_start)
+    monkeypatch.setattr(graph_presolve, "_solve_with_own_errors", robust_start)
     monkeypatch.setattr(with_ranges, "_just_visible_m", lambda *of: 0.0 if is_far else visible_m(*of))
     before = replace(closed.after, database_path=tmp_path / "again.db")
     loops, _ = before.finder.tested(before.matches_of(sorted(closed.tried.closed)))

@@ -24,7 +24,7 @@ from rangesfm.refine.graph_presolve import (
     _tolerance_m,
     _triangulated,
     carry_model,
-    presolve_nearby,
+    presolve_with_loops,
 )
 from rangesfm.refine.vision_information import Observations, Poses, costs_of_points, model_observations, model_poses
 
@@ -202,6 +202,8 @@ def test_a_map_is_moved_as_a_whole_if_it_bends_less_than_a_twentieth_of_a_range(
 
 
 def test_without_ranges_the_graph_closes_no_loop() -> None:
-    nothing: Any = SimpleNamespace(ranges=SimpleNamespace(rows=np.zeros(0, dtype=np.int64)))
+    radio = SimpleNamespace(anchors=())
+    nothing: Any = SimpleNamespace(ranges=SimpleNamespace(rows=np.zeros(0, dtype=np.int64)), radio=radio)
     unused: Any = None
-    assert presolve_nearby(nothing, unused, unused, unused, 1.0) is None
+    found, is_near = presolve_with_loops(nothing, unused, unused, unused, unused, 1.0)
+    assert (found.bend_m, found.num_steps, is_near) == (0.0, 0, False)

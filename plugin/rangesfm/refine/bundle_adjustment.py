@@ -22,6 +22,7 @@ from rangesfm.geometry.numerics import NEGLIGIBLE_STDDEVS, ROUNDING
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.noise import robust_stddev
+from rangesfm.ranging.errors.robust_loss import cost_of_deviation
 from rangesfm.refine.vision_information import model_poses
 
 # Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it changes slowly and seems converged.
@@ -37,7 +38,7 @@ _MAX_NUM_TIE_POINTS = 500
 _FREE_TRUST_REGION_RADIUS = 1e8
 # Expected decrease of half the sum of squares (in standard deviations) below which the minimum is reached: then no
 # quantity of the map differs noticeably from its value there.
-_MAX_GAIN_LEFT = NEGLIGIBLE_STDDEVS**2 / 2
+_MAX_GAIN_LEFT = cost_of_deviation(NEGLIGIBLE_STDDEVS)
 # In the same unit: decrease that a free step promised and that no step achieved.
 _MAX_PROMISE_LEFT = 0.5
 # Largest relative decrease of the cost by the last step; with more, the cost is still falling by orders of magnitude.

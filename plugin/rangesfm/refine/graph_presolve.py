@@ -68,9 +68,7 @@ class Presolved:
     num_steps: int
 
 
-def presolve(
-    problem: RefinementProblem, rays: Observations, errors: RangeErrors, loops: LoopPoses | None = None
-) -> Presolved:
+def presolve(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Presolved:
     """Solve the keyframe graph and move the model accordingly, in place.
 
     The errors are estimated again with every solution. While the drift is large, the residuals and their standard
@@ -80,11 +78,10 @@ def presolve(
 
     Args:
         rays: all observations of the photos. errors: of the ranges that take part.
-        loops: by indices in ``problem.frame_ids``; None without any.
     """
     if not len(problem.ranges.rows):  # a few lengths bend no map
         return Presolved(errors, 0.0, problem.radio.anchors, 0.0, 0)
-    graph = _graph(problem, rays, errors, problem.radio.anchors, loops)
+    graph = _graph(problem, rays, errors, problem.radio.anchors)
     return _moved(problem, rays, graph, *_solve_with_own_errors(graph))
 
 
@@ -103,27 +100,32 @@ def presolve_again(
     return _moved(problem, rays, graph, _solve_precisely(graph, graph.start()), errors)
 
 
-def presolve_nearby(
-    problem: RefinementProblem, rays: Observations, errors: RangeErrors, loops: LoopPoses, most_bend_m: float
-) -> Presolved | None:
-    """Close loops of a model that was refined, with known errors, if that bends it by no more than ``most_bend_m``.
+def presolve_with_loops(
+    problem: RefinementProblem,
+    rays: Observations,
+    errors: RangeErrors,
+    known_errors: RangeErrors,
+    loops: LoopPoses,
+    most_bend_m: float,
+) -> tuple[Presolved, bool]:
+    """Close loops of a model that was refined, in place, and return the result and whether the model stays near.
 
-    A map that bends far leaves its ranges on the way, and would lose them as outliers.
+    A map that bends far leaves its ranges on the way, and would lose them as outliers. So known errors are kept only
+    where closing bends the map by no more than ``most_bend_m``. Elsewhere they are estimated as in ``presolve``.
 
     Args:
-        rays: all observations of the photos. errors: of the ranges that take part.
+        rays: all observations of the photos.
+        errors, known_errors: of the ranges that take part, to begin with, and as the model was refined with.
         loops: by indices in ``problem.frame_ids``.
-
-    Returns:
-        None where the map would bend further, or without ranges; then the model stays as it is.
     """
     if not len(problem.ranges.rows):
-        return None
-    graph = _graph(problem, rays, errors, problem.radio.anchors, loops)
+        return presolve(problem, rays, errors), False
+    graph = _graph(problem, rays, known_errors, problem.radio.anchors, loops)
     fit = _solve_precisely(graph, graph.start())
-    if _bend(graph.vision.origin.centers, fit.state.poses.centers) > most_bend_m:
-        return None
-    return _moved(problem, rays, graph, fit, errors)
+    if _bend(graph.vision.origin.centers, fit.state.poses.centers) <= most_bend_m:
+        return _moved(problem, rays, graph, fit, known_errors), True
+    graph = replace(graph, errors=errors)
+    return _moved(problem, rays, graph, *_solve_with_own_errors(graph)), False
 
 
 def _moved(

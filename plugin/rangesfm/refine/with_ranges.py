@@ -35,7 +35,7 @@ from rangesfm.refine.bundle_adjustment import (
     solve_until_still,
 )
 from rangesfm.refine.distances import MeasuredDistances, add_marker_points, remove_marker_points
-from rangesfm.refine.graph_presolve import SAME_ERRORS, Presolved, presolve, presolve_again, presolve_nearby
+from rangesfm.refine.graph_presolve import SAME_ERRORS, Presolved, presolve, presolve_again, presolve_with_loops
 from rangesfm.refine.positions import HeldPositions
 from rangesfm.refine.radio import AddedRadio, RadioEstimate, radio_as_given
 from rangesfm.refine.refinement_problem import RefinementProblem
@@ -348,12 +348,11 @@ def _close_loops(
     loops = replace(closing.loops, reference=reference, frame=frame)
     seen, _, rays = _without_misplaced(problem)
     visible_m = _just_visible_m(rays, model_poses(problem.metric, problem.frame_ids))
-    near = presolve_nearby(seen, rays, closing.errors.subset(problem.ranges.rows), loops, visible_m)
-    if near is not None:
-        closing.merge_tracks(problem.metric)
-        return problem, near
-    moved = presolve(seen, rays, errors, loops)
+    known_errors = closing.errors.subset(problem.ranges.rows)
+    moved, is_near = presolve_with_loops(seen, rays, errors, known_errors, loops, visible_m)
     closing.merge_tracks(problem.metric)
+    if is_near:
+        return problem, moved
     # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do
     # so only when those that have merged have straightened it.
     anchors = _settled(problem, errors, moved.anchors)
