@@ -9,8 +9,8 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Factorization
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, after_step, at_state, linearized
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
+from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, after_step, at_state, is_nearly_at, linearized
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.scale.range_equation import RangeState, antenna_positions
@@ -101,8 +101,7 @@ def _settled(problem: Linearized, state: RangeState) -> Linearized:
     problem = at_state(problem, replace(problem.on_map, state=state))
     for _ in range(MAX_NUM_ROUNDS):
         before, problem = problem, after_step(problem)
-        moved_m = problem.on_map.from_anchor_m - before.on_map.from_anchor_m
-        if np.sqrt(np.mean(moved_m**2)) < NEGLIGIBLE_STDDEVS * problem.scatter_m:
+        if is_nearly_at(problem.on_map, before.on_map, problem.scatter_m):
             break
     return problem
 

@@ -16,10 +16,11 @@ from rangesfm.diagnostics.linearized import (
     RangesOnMap,
     after_step,
     at_other_map,
+    is_nearly_at,
     linearized,
     slopes_by_poses,
 )
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import rmse
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.errors.bending import WalkBending, averaged
@@ -73,8 +74,7 @@ def _bent(on_map: RangesOnMap) -> RangesOnMap:
             again = linearized(on_map) if num < _NUM_BINNED_ANEW else at_other_map(problem, on_map)
             problem = again.with_learnt_errors(near=problem.errors)
         before, on_map = on_map, _bent_once(problem)
-        moved_m = on_map.from_anchor_m - before.from_anchor_m
-        if float(np.sqrt(np.mean(moved_m**2))) < NEGLIGIBLE_STDDEVS * problem.scatter_m:
+        if is_nearly_at(on_map, before, problem.scatter_m):
             break
     return on_map
 

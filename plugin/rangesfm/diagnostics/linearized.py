@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
 from rangesfm.ranging.errors.components import DRIFT_S, PLACES
@@ -214,6 +214,16 @@ def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
     """Linearise the problem at another state or for corrected ranges, with the same bins and errors."""
     return _linearized(on_map, problem.expected, problem.scatter_m, problem.errors)
+
+
+def is_nearly_at(now: RangesOnMap, before: RangesOnMap, scatter_m: float) -> bool:
+    """Return whether a round of an iteration has moved the tags, as seen from the anchors, by hardly anything.
+
+    Args:
+        scatter_m: of single ranges, metres.
+    """
+    moved_m = now.from_anchor_m - before.from_anchor_m
+    return bool(np.sqrt(np.mean(moved_m**2)) < NEGLIGIBLE_STDDEVS * scatter_m)
 
 
 def after_step(problem: Linearized) -> Linearized:
