@@ -745,11 +745,12 @@ def test_the_center_of_a_pose_moves_with_its_step() -> None:
     np.testing.assert_allclose(covariance._center_from_step(pose), expected, atol=1e-8)
 
 
-def similarity_by_steps(centers: Array) -> Array:
+def similarity_by_steps(centers: Array, is_firm: npt.NDArray[np.bool_] | None = None) -> Array:
     """Return the gradients of the similarity by steps of unturned poses at some centres."""
+    is_firm = np.ones(len(centers), dtype=bool) if is_firm is None else is_firm
     poses = [pose_with(center) for center in centers]
     columns = columns_of([("pose", pose, 6) for pose in poses], poses)
-    gradients = covariance._similarity_gradients(columns, 6 * len(poses))
+    gradients = covariance._similarity_gradients(columns, is_firm, 6 * len(poses))
     by_pose: Array = gradients.reshape(len(poses), 6, 7)
     return by_pose
 
@@ -764,6 +765,14 @@ def test_a_path_is_straight_below_a_ten_millionth_of_its_extent(share: float, *,
     np.testing.assert_allclose(gradients[:, 3, 0], np.array([1.0, 0, -1]) / 14.0, atol=1e-9)
     np.testing.assert_allclose(gradients[:, 4, 3], np.array([1.0, 0, -1]) / 14.0, atol=1e-9)
     np.testing.assert_allclose(gradients[:, 3, 4], -1.0 / 3.0, atol=1e-9)
+
+
+def test_the_similarity_is_that_of_the_firm_frames() -> None:
+    centers = np.random.default_rng(3).normal(size=(5, 3))
+    is_firm = np.array([True, True, False, True, True])
+    found = similarity_by_steps(centers, is_firm)
+    assert not found[2].any()
+    np.testing.assert_allclose(found[is_firm], similarity_by_steps(centers[is_firm]), atol=1e-12)
 
 
 def test_frames_in_one_place_have_a_shift_only() -> None:

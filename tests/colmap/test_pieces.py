@@ -9,7 +9,7 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import sequence_path
 from tests.simulated.pieces import leave_across, points_across
 
-from rangesfm.colmap.pieces import MIN_NUM_SHARED, loose_pieces
+from rangesfm.colmap.pieces import MIN_NUM_SHARED, frames_of_largest_part, loose_pieces
 
 NUM_PHOTOS = 30
 SECOND = tuple(f"frame_{k:05d}.jpg" for k in range(19, NUM_PHOTOS + 1))
@@ -54,3 +54,23 @@ def test_a_model_without_points_and_a_photo_that_sees_nothing_are_no_pieces(mode
     for point_id in [point_id for point_id, p in model.points3D.items() if p.track.elements[0].image_id == 1]:
         model.delete_point3D(point_id)
     assert loose_pieces(model) == ()
+
+
+@pytest.mark.parametrize("num_points", [0, 1, MIN_NUM_SHARED - 1, MIN_NUM_SHARED])
+def test_a_photo_that_shares_few_points_is_no_piece_and_hangs_loose(
+    model: pycolmap.Reconstruction, num_points: int
+) -> None:
+    leave_across(model, SECOND[-1:], num_points)
+    assert loose_pieces(model) == ()
+    is_held = num_points == MIN_NUM_SHARED
+    np.testing.assert_array_equal(frames_of_largest_part(model), np.arange(1, NUM_PHOTOS + is_held))
+
+
+def test_the_largest_part_of_a_map_of_few_points_is_the_whole_map(model: pycolmap.Reconstruction) -> None:
+    half = [image.name for image in model.images.values() if image.image_id > NUM_PHOTOS / 2]
+    leave_across(model, half, 0)
+    np.testing.assert_array_equal(frames_of_largest_part(model), np.arange(1, NUM_PHOTOS + 1))
+    for point_id in list(model.points3D):
+        model.delete_point3D(point_id)
+    np.testing.assert_array_equal(frames_of_largest_part(model), np.arange(1, NUM_PHOTOS + 1))
+    assert len(frames_of_largest_part(pycolmap.Reconstruction())) == 0

@@ -19,6 +19,7 @@ from rangesfm.demo.simulated_radio import Radio
 from rangesfm.diagnostics import finished_map
 from rangesfm.diagnostics.finished_map import Doubt, by_similarity, doubts_of_map, doubts_of_pieces, place_of_map
 from rangesfm.geometry.similarity import similarity_motions
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate
@@ -49,8 +50,9 @@ def estimate(walked: Survey) -> ScaleEstimate:
     return initialize_scale(walked.observations(), walked.trajectory, anchors, anchor_frame="site", options=OPTIONS)
 
 
-def path_in_site(walked: Survey, estimate: ScaleEstimate) -> Array:
-    return estimate.metric_from_sfm.apply(walked.trajectory.centers)
+def path_in_site(walked: Survey, estimate: ScaleEstimate) -> Trajectory:
+    moved = estimate.metric_from_sfm
+    return walked.trajectory.transformed(moved.scale, moved.rotation, moved.translation)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -60,7 +62,7 @@ def test_a_clean_map_is_doubted_of_nothing_and_its_place_is_good(make_survey: Ma
     assert list(doubts_of_map(None, GOOD_POINTS)) == []
     place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [], NOT_BENT))
     assert place.verdict == "good"
-    off_m = path_in_site(walked, estimate) - walked.centers_m
+    off_m = path_in_site(walked, estimate).centers - walked.centers_m
     assert np.all(np.abs(off_m.mean(axis=0)) < 4 * np.array(place.stddev_m))
     assert np.linalg.norm(off_m, axis=1).max() < 3 * place.worst_keyframe_stddev_m
 
@@ -101,7 +103,7 @@ def test_a_scaled_maps_place_errs_as_its_stddevs_say(make_survey: MakeSurvey) ->
         uncertainty = estimate.uncertainty
         widening = uncertainty.half_width_95 / (1.96 * uncertainty.formal)
         place = known(place_of_map(estimate, None, path_in_site(walked, estimate), [], NOT_BENT))
-        off_m = (path_in_site(walked, estimate) - walked.centers_m).mean(axis=0)
+        off_m = (path_in_site(walked, estimate).centers - walked.centers_m).mean(axis=0)
         squares.append((off_m / (np.array(place.stddev_m) / widening)) ** 2)
     # The mean of 18 chi-squares with one degree of freedom each is beyond this in one case of a thousand.
     assert 0.2 < np.mean(squares) < 2.5
@@ -336,6 +338,9 @@ def test_covariances_of_a_rigid_map_are_those_of_the_centres_that_it_moves() -> 
 
 
 CENTERS_M = np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0]])
+# Frames are numbered against the time.
+FRAME_IDS = np.array([3, 5, 7])
+PATH = Trajectory(FRAME_IDS[::-1], ("a", "b", "c"), None, CENTERS_M, np.array([np.eye(3)] * 3))
 
 
 def estimate_of(
@@ -347,7 +352,7 @@ def estimate_of(
 
 
 def place(estimate: Any, summary: Any = None, doubts: Sequence[str] = (), bent_by_m: Array = NOT_BENT) -> Any:
-    return known(place_of_map(estimate, summary, CENTERS_M, doubts, bent_by_m))
+    return known(place_of_map(estimate, summary, PATH, doubts, bent_by_m))
 
 
 def test_the_place_of_a_rigid_map_is_that_of_its_middle_and_of_its_least_certain_keyframe() -> None:
@@ -364,13 +369,17 @@ def test_a_map_that_is_bent_has_less_certain_keyframes() -> None:
     bent_by_m = np.array([0.3, 0.0, 0.06])
     found = place(estimate_of(0.03, 0.004), bent_by_m=bent_by_m)
     assert found.worst_keyframe_stddev_m == pytest.approx(np.hypot(0.03, 0.3))
-    refined = summary_of(covariance=SimpleNamespace(similarity=np.eye(7) * 0.01**2, centers=np.zeros((3, 3, 3))))
+    refined = summary_of(
+        covariance=SimpleNamespace(frame_ids=FRAME_IDS, similarity=np.eye(7) * 0.01**2, centers=np.zeros((3, 3, 3)))
+    )
     assert place(estimate_of(0.03), refined, bent_by_m=bent_by_m).worst_keyframe_stddev_m == 0.0
 
 
 def test_the_place_of_a_refined_map_is_that_of_its_own_covariance() -> None:
     centers_m2 = np.stack([np.diag([0.01, 0.02, 0.06]), np.zeros((3, 3)), np.eye(3) * 0.01])
-    covariance = SimpleNamespace(similarity=np.diag([0, 0, 0, 0.002, 0.01, 0.02, 0.03]) ** 2, centers=centers_m2)
+    covariance = SimpleNamespace(
+        frame_ids=FRAME_IDS, similarity=np.diag([0, 0, 0, 0.002, 0.01, 0.02, 0.03]) ** 2, centers=centers_m2
+    )
     found = place(estimate_of(0.5, 0.05), summary_of(covariance=covariance))
     assert found.stddev_m == pytest.approx((0.01, 0.02, 0.03))
     assert found.heading_stddev_deg == pytest.approx(np.degrees(0.002))
@@ -380,13 +389,28 @@ def test_the_place_of_a_refined_map_is_that_of_its_own_covariance() -> None:
 
 
 def test_known_positions_err_for_long_so_that_the_whole_map_is_no_more_certain_than_by_them() -> None:
-    covariance = SimpleNamespace(similarity=np.eye(7) * 1e-6, centers=np.zeros((3, 3, 3)))
+    covariance = SimpleNamespace(frame_ids=FRAME_IDS, similarity=np.eye(7) * 1e-6, centers=np.zeros((3, 3, 3)))
     found = place(estimate_of(0.05, 0.001, has_positions=True), summary_of(covariance=covariance))
     assert found.stddev_m == pytest.approx((0.0, np.hypot(0.05, 0.01), 0.0))
     assert found.worst_keyframe_stddev_m == pytest.approx(np.hypot(0.05, 0.02))
     covariance.centers[1] = np.eye(3) * 0.12
     found = place(estimate_of(0.05, 0.001, has_positions=True), summary_of(covariance=covariance))
     assert found.worst_keyframe_stddev_m == pytest.approx(0.6)
+
+
+def test_keyframes_that_hang_loose_are_named_beside_how_well_the_others_are_known() -> None:
+    def reasons_of(*stddevs_m: float, doubts: Sequence[str] = ()) -> Any:
+        centers = np.square(stddevs_m)[:, None, None] * np.eye(3) / 3
+        covariance = SimpleNamespace(frame_ids=FRAME_IDS, similarity=np.zeros((7, 7)), centers=centers)
+        return place(estimate_of(0.0), summary_of(covariance=covariance), doubts=doubts).reasons
+
+    one = "a hangs loose on the map; each other keyframe is known to 0.2 m or better (95 %)"
+    assert reasons_of(0.1, 0.05, 600.0, doubts=["it is broken"])[1:] == (one, "it is broken")
+    # None is far less certain than most, and one that is known well enough is no matter.
+    assert len(reasons_of(300.0, 150.0, 600.0)) == len(reasons_of(0.001, 0.001, 0.1)) == 1
+    several = Trajectory(np.arange(5), tuple("abcde"), None, np.zeros((5, 3)), np.array([np.eye(3)] * 5))
+    (said,) = finished_map._loose_ones(several, np.array([0.1, 5.0, 0.2, 7.0, 0.1]))
+    assert said == "d and 1 more hang loose on the map; each other keyframe is known to 0.39 m or better (95 %)"
 
 
 def test_the_size_of_the_site_is_that_of_path_and_surveyed_anchors() -> None:

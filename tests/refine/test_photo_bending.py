@@ -111,7 +111,7 @@ def stub_bending(photos: Any, *, is_at_optimum: bool = True) -> PhotoBending:
     turns = np.concatenate([np.eye(3)[None], Rotation.random(4, random_state=9).as_matrix()])
     centers = np.concatenate([np.zeros((1, 3)), rng.normal(size=(4, 3))])
     path = Trajectory(FRAME_IDS, ("a", "b", "c", "d", "e"), None, centers, turns)
-    return PhotoBending(photos, FRAME_IDS, path, TURN, 2.5, is_at_optimum)
+    return PhotoBending(photos, FRAME_IDS, path, TURN, 2.5, np.ones(5, dtype=bool), is_at_optimum)
 
 
 @pytest.mark.parametrize("is_at_optimum", [True, False])

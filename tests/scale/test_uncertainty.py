@@ -22,7 +22,7 @@ from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.linear_map import LinearMap
 from rangesfm.scale.range_equation import Columns
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
-from rangesfm.scale.uncertainty import KnownMap, known_map, shared_errors_m
+from rangesfm.scale.uncertainty import KnownMap, bias_covariance, known_map, linear_map, shared_errors_m
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -151,9 +151,13 @@ def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(
     for share in (1.0, 1e-6):
         told = replace(learned, covariances_m2=share * learned.covariances_m2)
         known = known_map(found.problem, found.solution, told)
-        stated, by_robust = known.uncertainty.components, known.by_own_weights[0, 0]
+        stated, weighted = known.uncertainty.components, found.solution
+        linear = linear_map(found.problem, weighted, told.bins)
+        by_range = weighted.errors.worth * weighted.fit.weights / weighted.errors.stddev_m**2
+        assumed_m2 = np.diag(1 / told.bins.total(by_range)) + bias_covariance(told.bins, found.problem.ranges)
+        by_robust, _ = linear.with_weights(assumed_m2, told.covariance_m2)
         best = np.array([stated[name] for name in stated if name != "reweighting"])
-        chance = np.sqrt(by_robust - np.sum(best**2))
+        chance = np.sqrt(by_robust[0, 0] - np.sum(best**2))
         assert stated["reweighting"] == abs(known.half_way[0]) <= 0.5 * chance * (1 + 1e-9)
     # With a covariance a millionth as large, the difference exceeds chance, and is limited to it.
     assert stated["reweighting"] == pytest.approx(0.5 * chance)

@@ -216,7 +216,10 @@ class Known:
         assert known is not None
         problem = photos_adjuster(self.truth, truth.reconstruction).problem
         photos = PhotosAlone(NormalEquations.of(problem, truth.reconstruction, problem.num_residuals()), pixel_stddev)
-        bending = PhotoBending(photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, True)
+        is_firm = np.ones(len(path), dtype=bool)
+        bending = PhotoBending(
+            photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, is_firm, True
+        )
         found = scale_by_positions(known, path, bending)
         parts = {part.name: part.alike for part in found.equations.parts}
         covariance = found.bending_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))

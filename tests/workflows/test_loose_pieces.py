@@ -1,9 +1,13 @@
-"""A model of two pieces that hardly any point holds together is named by the commands that scale it."""
+"""A model of pieces that hardly any point holds together is named by the commands that scale it.
+
+What hangs loose makes nothing else uncertain.
+"""
 
 from __future__ import annotations
 
 import json
 import re
+from typing import Any
 
 import pycolmap
 import pytest
@@ -32,3 +36,29 @@ def test_a_model_of_two_pieces_is_named_as_such_if_their_few_points_leave_the_sc
     scale = json.loads((own_survey.folder / "out" / "result.json").read_text(encoding="utf-8"))["scale"]
     assert scale["verdict"] == ("good" if is_held else "doubtful")
     assert is_held or any(expected.match(reason) for reason in scale["reasons"])
+
+
+@pytest.mark.parametrize("anchors", [("--anchors", "anchors.csv"), ()])
+@pytest.mark.parametrize("command", ["scale", "refine"])
+def test_a_photo_of_one_point_may_be_anywhere_and_the_rest_of_the_map_is_as_certain_as_without_it(
+    own_survey: WalkedSurvey, rangesfm_command: Command, command: str, anchors: tuple[str, ...]
+) -> None:
+    def entries(name: str) -> dict[str, Any]:
+        output = own_survey.folder / name
+        flags = (*own_survey.flags, *anchors, "--no_report", "--output_path", output.name)
+        rangesfm_command(command, *flags, cwd=own_survey.folder)
+        found: dict[str, Any] = json.loads((output / "result.json").read_text(encoding="utf-8"))
+        return found
+
+    before = entries("before")
+    folder = own_survey.folder / "sparse" / "0"
+    model = pycolmap.Reconstruction(folder)
+    last = max(image.name for image in model.images.values())
+    leave_across(model, {last}, 1)
+    model.write(folder)
+    after = entries("after")
+    for name in ("value", "interval_95"):
+        assert after["scale"][name] == pytest.approx(before["scale"][name], rel=0.01)
+    if anchors:
+        for name in ("stddev_m", "heading_stddev_deg"):
+            assert after["place"][name] == pytest.approx(before["place"][name], rel=0.1)

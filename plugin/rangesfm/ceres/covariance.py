@@ -9,7 +9,7 @@ import numpy as np
 from scipy import linalg
 from scipy.sparse import csr_array, diags_array
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres.linear_solver import factor
 from rangesfm.ceres.nested_dissection import NestedFactor, SingularError
 from rangesfm.ceres.normal_equations import BlockColumns, NormalEquations, address, rotation_of
@@ -54,7 +54,7 @@ class JointCovariance:
         anchors: (num_anchors, 3, 3) square metres.
         others: (k, k) of each other block, in its unit.
         similarity: (7, 7) of the map as a whole: logarithm of the scale, turn (rad) and shift (m) about the middle of
-            the centres, for the best similarity between true and estimated centres.
+            the firm frames' centres, for the best similarity between their true and estimated centres.
         num_free_directions: number of motions of the whole map that change no residual (7 without ranges and gauge).
             Along these, covariances are those of the map that moves least (inner constraints). Constant blocks have
             covariance 0.
@@ -85,6 +85,7 @@ def joint_covariance(
     errors: ResidualErrors | None = None,
     anchor_ids: Sequence[str] | None = None,
     refined_params: Mapping[int, Sequence[int]] | None = None,
+    firm_frame_ids: Indices | None = None,
 ) -> JointCovariance:
     """Compute covariances to first order: the inverse of the normal equations J^T J.
 
@@ -97,6 +98,7 @@ def joint_covariance(
         anchor_ids: names of the anchors in the map's errors; None: their indices.
         refined_params: indices of the adjusted parameters of each camera, by the camera's id; cameras that are missing
             here are adjusted as a whole or not at all.
+        firm_frame_ids: of the frames that are the map as a whole; None: all.
 
     Raises:
         GeometryError: a block is not determined by the residuals.
@@ -112,9 +114,10 @@ def joint_covariance(
     to_center = np.array([_center_from_step(pose) for pose in columns.poses]).reshape(-1, 3, 6)
     names = list(map(str, range(len(anchors)))) if anchor_ids is None else anchor_ids
     parts = [*_parts(equations, dict(zip(names, anchors, strict=True)), refined_params or {})]
-    by_similarity = _similarity_gradients(columns, size)
+    is_firm = np.ones(len(frames), dtype=bool) if firm_frame_ids is None else np.isin(frames, firm_frame_ids)
+    by_similarity = _similarity_gradients(columns, is_firm, size)
     similarity = np.full((7, 7), np.nan)
-    if len(frames) > 1:
+    if np.count_nonzero(is_firm) > 1:
         solution = inverse.solve(by_similarity)
         similarity = variance * solution.T @ spread.times(solution)
     return JointCovariance(
@@ -298,9 +301,10 @@ def _not_determined(columns: BlockColumns, column: int) -> GeometryError:
     return GeometryError(f"the residuals do not determine the problem's {columns.name(column)}: no covariance")
 
 
-def _similarity_gradients(columns: BlockColumns, num_rows: int) -> Array:
-    """Return (num_rows, 7) gradients of the similarity that fits the errors of all centres by least squares."""
-    centers = np.array([-rotation_of(pose).T @ pose[4:] for pose in columns.poses])
+def _similarity_gradients(columns: BlockColumns, is_firm: Mask, num_rows: int) -> Array:
+    """Return (num_rows, 7) gradients of the similarity that fits the errors of firm centres by least squares."""
+    poses = [pose for pose, counts in zip(columns.poses, is_firm, strict=True) if counts]
+    centers = np.array([-rotation_of(pose).T @ pose[4:] for pose in poses])
     motions = similarity_motions(centers - centers.mean(axis=0))
     # Lengths and angles get one unit. The turn about a straight path is not determined and is left out.
     size = float(np.linalg.norm(centers - centers.mean(axis=0)) / np.sqrt(len(centers))) or 1.0
@@ -309,7 +313,7 @@ def _similarity_gradients(columns: BlockColumns, num_rows: int) -> Array:
     # The turn about a straight path is not determined.
     to_similarity = np.linalg.pinv(in_lengths, rcond=UNDETERMINED**2, hermitian=True) / np.outer(unit, unit)
     gradients = np.zeros((num_rows, 7))
-    for pose, motion in zip(columns.poses, motions, strict=True):
+    for pose, motion in zip(poses, motions, strict=True):
         index = columns.index_of.get(address(pose))
         if index is not None:
             gradients[columns.span(index)] = _center_from_step(pose).T @ motion @ to_similarity

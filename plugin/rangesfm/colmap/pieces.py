@@ -35,19 +35,8 @@ def loose_pieces(model: pycolmap.Reconstruction) -> tuple[LoosePiece, ...]:
     Photos of one rig frame belong together. A single frame is no part, because it has no scale of its own. A model
     without points has no parts.
     """
-    frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
-    sees = _frames_see(model, frame_ids)
-    if not sees.shape[1]:
-        return ()
-    labels = np.arange(len(frame_ids))
-    while True:
-        num_before = int(labels.max()) + 1
-        num, merged = connected_components(_held_together(_shared_by_parts(sees, labels)), directed=False)
-        labels = merged[labels]
-        if num == num_before:
-            break
+    frame_ids, sees, labels = _parts(model)
     num_frames = np.bincount(labels)
-    largest = int(num_frames.argmax())
     names = _names_of_frames(model, frame_ids)
     return tuple(
         LoosePiece(
@@ -55,8 +44,37 @@ def loose_pieces(model: pycolmap.Reconstruction) -> tuple[LoosePiece, ...]:
             _shared_with_rest(sees, labels == part),
         )
         for part in np.flatnonzero(num_frames > 1).tolist()
-        if part != largest
+        if part != num_frames.argmax()
     )
+
+
+def frames_of_largest_part(model: pycolmap.Reconstruction) -> Indices:
+    """Return the ids of the frames that share enough points to be one part, without those that hang loose on it.
+
+    They are all frames where the largest part has no more than half of them: then the map is one of few points.
+    """
+    frame_ids, _, labels = _parts(model)
+    num_frames = np.bincount(labels, minlength=1)
+    is_most = 2 * num_frames.max() > len(frame_ids)
+    return frame_ids[labels == num_frames.argmax()] if is_most else frame_ids
+
+
+def _parts(model: pycolmap.Reconstruction) -> tuple[Indices, csr_array, Indices]:
+    """Return the ids (f,) of the frames, the matrix (f, p) of the points that they see, and the part (f,) of each.
+
+    Parts are merged as long as two of them share enough points. A model without points is one part.
+    """
+    frame_ids = np.array(sorted(model.reg_frame_ids()), dtype=np.int64)
+    sees = _frames_see(model, frame_ids)
+    if not sees.shape[1]:
+        return frame_ids, sees, np.zeros(len(frame_ids), dtype=np.int64)
+    labels = np.arange(len(frame_ids))
+    while True:
+        num_before = int(labels.max()) + 1
+        num, merged = connected_components(_held_together(_shared_by_parts(sees, labels)), directed=False)
+        labels = merged[labels]
+        if num == num_before:
+            return frame_ids, sees, labels
 
 
 def _frames_see(model: pycolmap.Reconstruction, frame_ids: Indices) -> csr_array:

@@ -30,6 +30,8 @@ _OF_MEDIANS = 1.5
 _LARGE, _MANY_MORE = 10.0, 0.05
 # Largest growth of the median distance of the points from the middle of the path.
 _MAX_POINTS_GROWTH = 2.0
+# A keyframe hangs loose on the map if it is this many times less certain than the median one.
+_LOOSE = 10.0
 # Largest growth of the median residual of the ranges, or of their standard deviation; a refinement should reduce it.
 _MAX_RESIDUAL_GROWTH = 2.0
 
@@ -96,7 +98,7 @@ def doubts_of_pieces(pieces: Sequence[LoosePiece], num_images: int) -> tuple[Dou
 def place_of_map(
     estimate: ScaleEstimate,
     summary: RefineSummary | None,
-    centers_m: Array,
+    path: Trajectory,
     doubts: Sequence[str],
     bent_by_m: Array,
 ) -> Place | None:
@@ -104,15 +106,16 @@ def place_of_map(
 
     Args:
         summary: of the refinement; None for a map that is only scaled.
-        centers_m: (n, 3) keyframe centres in the final map, the first in time first.
+        path: of the n keyframes in the final map, the first in time first.
         doubts: about the map, in words; with any of them its place is doubtful too.
         bent_by_m: (n,) how far the ranges would bend each keyframe of a map that is only scaled; (0,) if unknown.
     """
     if estimate.placement is None:
         return None
-    found = None if summary is None else summary.covariance
-    of_one_piece = by_similarity(estimate.placement, centers_m)
-    of_map, of_keyframes = of_one_piece if found is None else (found.similarity, found.centers)
+    found, centers_m = None if summary is None else summary.covariance, path.centers
+    of_map, of_keyframes = of_one_piece = by_similarity(estimate.placement, centers_m)
+    if found is not None:
+        of_map, of_keyframes = found.similarity, found.centers[np.searchsorted(found.frame_ids, path.frame_ids)]
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
     if estimate.positions is not None:
         # The refined problem has no errors of known positions that last, which shift or turn the map as a whole.
@@ -121,13 +124,26 @@ def place_of_map(
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))
     bent_m2 = np.square(bent_by_m) if found is None and len(bent_by_m) else 0.0
-    worst_m = float(np.sqrt((keyframes_m2 + bent_m2).max()))
+    keyframes_m = np.sqrt(keyframes_m2 + bent_m2)
+    worst_m = float(keyframes_m.max())
     surveyed = [a.prior_position_m for a in estimate.anchors if a.prior_position_m is not None]
     size_m = float(np.linalg.norm(np.ptp(np.vstack([centers_m, *surveyed]), axis=0)))
     in_words, is_wide = place_in_words(stddevs, worst_m, size_m)
-    reasons = (*((in_words,) if is_wide or not doubts else ()), *doubts)
+    loose = _loose_ones(path, keyframes_m) if is_wide else ()
+    reasons = (*((in_words,) if is_wide or not doubts else ()), *loose, *doubts)
     x_m, y_m, z_m = stddevs[4:].tolist()
     return Place("doubtful" if is_wide or doubts else "good", reasons, (x_m, y_m, z_m), heading_deg, worst_m)
+
+
+def _loose_ones(path: Trajectory, keyframes_m: Array) -> Iterator[str]:
+    """Yield which keyframes are far less certain than the others, as those that see next to nothing of them are."""
+    is_loose = keyframes_m > _LOOSE * np.median(keyframes_m)
+    if not is_loose.any():
+        return
+    least, more = int(keyframes_m.argmax()), np.count_nonzero(is_loose) - 1
+    hanging = f"{path.image_names[least]} " + (f"and {more} more hang" if more else "hangs")
+    others_m = NORMAL_95 * keyframes_m[~is_loose].max()
+    yield f"{hanging} loose on the map; each other keyframe is known to {others_m:.2g} m or better (95 %)"
 
 
 def place_in_words(stddevs: Array, worst_m: float, size_m: float) -> tuple[str, bool]:

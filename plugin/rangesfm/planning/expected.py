@@ -98,7 +98,7 @@ class Expected:
         """Return that a run will refuse the survey, and know nothing of its map."""
         none, is_placed = np.zeros(0, dtype=np.int64), planned.anchor_frame == "site"
         columns, open_ = Columns(0, 1 if is_placed else -1, none, none, 7), OPEN**4 * np.eye(7)
-        known = KnownMap(ScaleUncertainty(np.inf, {}), open_, columns, open_, np.zeros(7), np.zeros(0))
+        known = KnownMap(ScaleUncertainty(np.inf, {}), open_, columns, np.zeros(7), np.zeros(0))
         errors = ErrorParts((), np.zeros(0), np.zeros((0, 0, 0)))
         open_m = np.full(len(planned.trajectory), np.inf)
         return cls(replace(planned, photos=None), None, None, known, errors, open_m, 0, (), refusal)
@@ -333,7 +333,7 @@ class _BendingMap:
         # The estimates with different weights will differ by about one standard deviation.
         best = linear.solved(errors.covariance_m2)
         half_way = chance_differences(by_others, best.covariance) / 2
-        known = KnownMap.of(best, errors, formal, columns, by_others, half_way)
+        known = KnownMap.of(best, errors, formal, columns, half_way)
         whitened = cho_solve(cho_factor(regular(errors.covariance_m2)), np.hstack([bent_m2[:num, num:], design]))
         of_places, of_design = whitened[:, : bent_m2.shape[0] - num], whitened[:, bent_m2.shape[0] - num :]
         left = self._motions(columns) - bent_m2[num:, :num] @ of_design

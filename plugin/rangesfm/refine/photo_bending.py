@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres.covariance import PhotosAlone
 from rangesfm.ceres.normal_equations import NormalEquations
+from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import CameraOptions, RefineOptions
@@ -40,6 +41,7 @@ class PhotoBending:
         photos: linearised at the map as it is. frame_ids: of the path.
         path: in the model's world, which is the first camera's frame. world_from_model: rotation to the map's world.
         metres_per_unit: metres of the map's world per unit of the model.
+        is_firm: (k,) True for the poses of the path that the photos hold together; the map's size and place are theirs.
         is_at_optimum: whether the map is at the photos' own minimum.
     """
 
@@ -48,10 +50,11 @@ class PhotoBending:
     path: Trajectory
     world_from_model: Array
     metres_per_unit: float
+    is_firm: Mask
     is_at_optimum: bool
 
     def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
-        functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)
+        functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
         parts = functions.reshape(len(by_pose), len(self.path), 6)
         by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
         covariance, shift_m = self.photos.of_functions(self.frame_ids, parts[:, :, :3], by_center)
@@ -96,7 +99,8 @@ def bending_of_model(
         )
         if bundle.has_covariance:
             equations = NormalEquations.of(bundle.adjuster.problem, model, bundle.num_reprojections)
-            return by_photos(equations, bundle.pixel_stddev, trajectory, 1.0, is_at_optimum=True)
+            firm_ids = frames_of_largest_part(model)
+            return by_photos(equations, bundle.pixel_stddev, trajectory, 1.0, firm_ids, is_at_optimum=True)
     except (SolverError, GeometryError, InputError):
         pass
     return WalkBending(path)
@@ -107,6 +111,7 @@ def by_photos(
     pixel_stddev: float,
     trajectory: Trajectory,
     metres_per_unit: float,
+    firm_frame_ids: Indices,
     *,
     is_at_optimum: bool,
 ) -> PhotoBending:
@@ -116,6 +121,7 @@ def by_photos(
         pixel_stddev: standard deviation of a reprojection error's coordinate.
         trajectory: of the map, in its world.
         metres_per_unit: metres of that world per unit of the model to which the ranges refer.
+        firm_frame_ids: of the frames whose centres are the map's size and place.
 
     Raises:
         GeometryError: the photos do not determine the map up to a similarity.
@@ -126,5 +132,6 @@ def by_photos(
         in_first_camera(trajectory, metres_per_unit),
         trajectory.world_from_cam[0],
         metres_per_unit,
+        np.isin(trajectory.frame_ids, firm_frame_ids),
         is_at_optimum,
     )

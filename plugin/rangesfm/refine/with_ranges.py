@@ -14,6 +14,7 @@ import pycolmap
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import JointCovariance, joint_covariance
 from rangesfm.ceres.normal_equations import NormalEquations
+from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_radio
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
@@ -151,6 +152,7 @@ class AtRest:
         shared_m: (k,) by how much the map takes the ranges to be too long because of shared errors.
         metric: the map.
         equations: of photos and all other measurements; None if the photos are too many.
+        firm_frame_ids: of the frames that the photos hold together, which are the map as a whole.
         pixel_stddev: standard deviation of a reprojection error's coordinate.
     """
 
@@ -163,6 +165,7 @@ class AtRest:
     shared_m: Array
     metric: pycolmap.Reconstruction
     equations: NormalEquations | None
+    firm_frame_ids: Indices
     pixel_stddev: float
 
 
@@ -426,9 +429,9 @@ def _adjust(
     learnt = Learnt(errors.learned, 1.0) if learn is None else learn(rest)
     errors = replace(errors, learned=learnt.errors)
     covariance = None
-    if problem.options.covariance and equations is not None:
+    if problem.options.covariance:
         # Ranges that are too coarse to see any bending do not make it smaller than the noise of the features does.
-        covariance = _covariance(problem, bundle, added, errors, equations, max(learnt.bending_factor, 1.0))
+        covariance = _covariance(problem, bundle, added, errors, rest, max(learnt.bending_factor, 1.0))
     problem.metric.update_point_3d_errors()
     return _summary(problem, start, bundle, last, errors, covariance, learnt.bending_factor, is_still=is_still)
 
@@ -453,11 +456,23 @@ def _at_rest(
     ranges = problem.ranges
     path = ranges.trajectory.as_in(problem.metric)
     tags_m, centers_m = (places[ranges.rows] for places in ranges.places(path, radio))
-    scale = align_points(ranges.trajectory.centers, path.centers).scale
+    firm_ids = frames_of_largest_part(problem.metric)
+    is_firm = np.isin(path.frame_ids, firm_ids)
+    scale = align_points(ranges.trajectory.centers[is_firm], path.centers[is_firm]).scale
     shared_m = ranges.shared_m(radio)[ranges.rows]
     pixel_stddev = pixel_stddev_of(bundle.adjuster, bundle.num_reprojections)
     return AtRest(
-        path, scale, tags_m, centers_m, radio.anchors, errors, shared_m, problem.metric, equations, pixel_stddev
+        path,
+        scale,
+        tags_m,
+        centers_m,
+        radio.anchors,
+        errors,
+        shared_m,
+        problem.metric,
+        equations,
+        firm_ids,
+        pixel_stddev,
     )
 
 
@@ -471,18 +486,21 @@ def _covariance(
     bundle: BundleAdjustment,
     added: AddedRadio,
     errors: RangeErrors,
-    equations: NormalEquations,
+    rest: AtRest,
     bending_factor: float,
 ) -> JointCovariance | None:
+    if rest.equations is None:
+        return None
     try:
         return joint_covariance(
-            equations,
+            rest.equations,
             anchors=added.blocks.anchors,
             others=added.all_but_anchors,
             residual_stddev=bending_factor * bundle.pixel_stddev,
             errors=problem.residual_errors(added, errors, bending_factor),
             anchor_ids=problem.ranges.observations.log.anchor_ids,
             refined_params=bundle.refined_params,
+            firm_frame_ids=rest.firm_frame_ids,
         )
     except GeometryError as error:
         logging.getLogger(__name__).info("%s", error)

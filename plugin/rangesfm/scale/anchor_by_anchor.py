@@ -43,7 +43,7 @@ def anchor_estimates(solution: Solution, anchor_ids: tuple[str, ...], covariance
     """Return the estimates of all anchors of the log, mirror places included.
 
     Args:
-        covariance: (p, p) covariance of the map and its anchors, as in ``KnownMap.by_own_weights``.
+        covariance: (p, p) covariance of the map and its anchors, as in ``KnownMap``.
     """
     problem, state = solution.problem, solution.fit.state
     of_anchors = solution.fit.of_anchors(covariance)

@@ -181,7 +181,7 @@ class _Given:
         known = known_map(posed, solution, learned)
         uncertainty = known.uncertainty
         moved = known.moved(solution)
-        found = anchor_estimates(moved, observations.log.anchor_ids, known.by_own_weights)
+        found = anchor_estimates(moved, observations.log.anchor_ids, known.covariance)
         judged = judge(problem, solution, uncertainty, per_anchor, found, options)
         verdict, remarks = judged.verdict, (*open_place, *self.remarks)
         if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
@@ -212,7 +212,7 @@ class _Given:
             noise_stddev_m=solution.noise_stddev_m,
             problem=posed,
             solution=solution,
-            placement=known.columns.placement(known.by_own_weights),
+            placement=known.columns.placement(known.covariance),
             remarks=remarks,
             lengths=lengths,
             positions=by_positions,

@@ -139,7 +139,6 @@ class KnownMap:
     Attributes:
         uncertainty: of the scale.
         covariance: (p, p) of the scale's logarithm, the map's turn and shift, and the anchors, as in ``columns``.
-        by_own_weights: (p, p) the same for the estimate as it is weighted, without the best weights.
         half_way: (p,) step of the unknowns from where the map is to the middle between two estimates, to which
             everything else refers.
         best_by_bins: (c,) change of the scale's logarithm, with the best weights, per metre that each bin is longer.
@@ -148,14 +147,11 @@ class KnownMap:
     uncertainty: ScaleUncertainty
     covariance: Array
     columns: Columns
-    by_own_weights: Array
     half_way: Array
     best_by_bins: Array
 
     @classmethod
-    def of(
-        cls, best: Solved, learned: ErrorParts, formal: float, columns: Columns, by_others: Array, half_way: Array
-    ) -> KnownMap:
+    def of(cls, best: Solved, learned: ErrorParts, formal: float, columns: Columns, half_way: Array) -> KnownMap:
         """Return what is known at the middle between two estimates, which are twice ``half_way`` (p,) apart."""
         of_bins, of_priors = best.gains
         components = learned.stddev_of_bins(of_bins[0])
@@ -163,7 +159,7 @@ class KnownMap:
             components[GIVEN] = given
         components[REWEIGHTING] = abs(float(half_way[0]))
         covariance = best.covariance + np.outer(half_way, half_way)
-        return cls(ScaleUncertainty(formal, components), covariance, columns, by_others, half_way, of_bins[0])
+        return cls(ScaleUncertainty(formal, components), covariance, columns, half_way, of_bins[0])
 
     @classmethod
     def between(
@@ -193,7 +189,7 @@ class KnownMap:
         chance = chance_differences(by_others, best.covariance)[0]
         # The whole step is shortened, because a shorter one of the scale alone would not fit the anchors' places.
         share = min(1.0, chance / max(abs(float(change[0])), 1e-300))
-        return cls.of(best, learned, formal, linear.columns, by_others, share * change / 2)
+        return cls.of(best, learned, formal, linear.columns, share * change / 2)
 
     def moved(self, solution: Solution) -> Solution:
         """Return the solution from which this was computed, moved half-way, with the same robust weights."""
@@ -229,9 +225,9 @@ def known_map(
         formal = float(np.sqrt(linear.solved(alone + bent_m2).covariance[0, 0]))
     shared = np.zeros((len(bins), 0)) if shared_m is None else bins.mean(shared_m)
     assumed_m2 = weighed + bent_m2 + bias_covariance(bins, given) + shared @ shared.T
-    by_own_weights, _ = linear.with_weights(assumed_m2, learned.covariance_m2)
+    by_others, _ = linear.with_weights(assumed_m2, learned.covariance_m2)
     at_optimum = linear if bending is None else replace(linear, residual_m=linear.residual_m + bending.shift_m)
-    return KnownMap.between(at_optimum, learned, formal, by_own_weights)
+    return KnownMap.between(at_optimum, learned, formal, by_others)
 
 
 def linear_map(posed: ScaleProblem, solution: Solution, bins: RangeBins) -> LinearMap:

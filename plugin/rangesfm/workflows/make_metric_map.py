@@ -393,7 +393,14 @@ def _bending_at_rest(rest: AtRest, metres_per_unit: float) -> MapBending:
     """Return the bending of a refined map; ``metres_per_unit``: of the model to which the measurements refer."""
     if rest.equations is not None:
         try:
-            return by_photos(rest.equations, rest.pixel_stddev, rest.trajectory_m, metres_per_unit, is_at_optimum=False)
+            return by_photos(
+                rest.equations,
+                rest.pixel_stddev,
+                rest.trajectory_m,
+                metres_per_unit,
+                rest.firm_frame_ids,
+                is_at_optimum=False,
+            )
         except GeometryError:
             pass
     return WalkBending(in_first_camera(rest.trajectory_m, metres_per_unit))
@@ -429,9 +436,9 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     """
     survey, journal = run.survey, run.journal
     metric, on_map = _estimated(survey, metric)
-    centers_m = metric.trajectory.as_in(metric.final).centers
+    path = metric.trajectory.as_in(metric.final)
     bent_by_m = np.zeros(0) if on_map is None else bends_m(on_map)
-    of_positions = _diagnose_positions(metric, centers_m, bent_by_m)
+    of_positions = _diagnose_positions(metric, path.centers, bent_by_m)
     diagnosis, of_place = of_positions.with_more(diagnose_lengths(metric.estimate, metric.tape)), of_positions.reasons
     try:
         if (of_ranges := _diagnose(survey, on_map)) is not None:
@@ -452,7 +459,7 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     journal.warn(*(doubt.reason for doubt in doubts), *by_rivals)
     doubts += known_doubts
     against_place = (*of_place, *(doubt.reason for doubt in doubts))
-    place = place_of_map(metric.estimate, metric.kept_refinement, centers_m, against_place, bent_by_m)
+    place = place_of_map(metric.estimate, metric.kept_refinement, path, against_place, bent_by_m)
     judged = replace(metric, place=place, diagnosis=diagnosis).doubted(by_rivals)
     judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
     return judged.doubted(diagnosis.reasons)

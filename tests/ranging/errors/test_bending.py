@@ -110,13 +110,28 @@ def test_ranges_at_a_pose_grow_as_it_turns_in_its_own_frame() -> None:
 
 
 @pytest.mark.parametrize("frame_is_free", [True, False])
-def test_a_map_that_grows_turns_and_moves_as_a_whole_is_not_bent(path: Trajectory, frame_is_free: bool) -> None:
-    functions = without_similarity(slopes(path), path, frame_is_free=frame_is_free)
+@pytest.mark.parametrize("loose", [[], [NUM_POSES - 1], [3, 4]])
+def test_a_map_that_grows_turns_and_moves_as_a_whole_is_not_bent(
+    path: Trajectory, frame_is_free: bool, loose: list[int]
+) -> None:
+    is_firm = ~np.isin(np.arange(NUM_POSES), loose)
+    functions = without_similarity(slopes(path), path, frame_is_free=frame_is_free, is_firm=is_firm)
     turn, shift, growth = np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.4, -0.3]), 0.2
     moves = np.zeros((NUM_POSES, 6))
     moves[:, :3] = np.swapaxes(path.world_from_cam, 1, 2) @ turn
     moves[:, 3:] = growth * path.centers + np.cross(turn, path.centers) + shift
     assert np.abs(functions @ moves.ravel()).max() < 1e-9 * np.abs(slopes(path)).max()
+
+
+@pytest.mark.parametrize("frame_is_free", [True, False])
+def test_a_loose_pose_does_not_move_what_is_seen_from_the_others(path: Trajectory, frame_is_free: bool) -> None:
+    of_others = slopes(path).reshape(-1, NUM_POSES, 6)
+    of_others[:, 4] = 0.0
+    is_firm = np.arange(NUM_POSES) != 4
+    given = of_others.reshape(len(of_others), -1)
+    for firm, is_moved in ((is_firm, False), (None, True)):
+        found = without_similarity(given, path, frame_is_free=frame_is_free, is_firm=firm)
+        assert np.any(found.reshape(of_others.shape)[:, 4]) == is_moved
 
 
 def test_bins_grow_by_each_step_of_a_walk_as_its_factors_say(path: Trajectory) -> None:

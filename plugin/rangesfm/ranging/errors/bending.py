@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Indices
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.similarity import Similarity, align_points, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.components import BENDS, Component
@@ -152,17 +152,20 @@ def averaged(bins: RangeBins, by_range: csr_array, num_poses: int) -> Array:
     return np.pad(sums.toarray(), ((0, 0), (0, 6 * num_poses - sums.shape[1])))
 
 
-def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool) -> Array:
+def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool, is_firm: Mask | None = None) -> Array:
     """Return the (c, 6 k) derivatives of functions made independent of the map's scale and place.
 
-    The scale is that of the similarity that fits all centres best. The place is also that of the similarity if it is
+    The scale is that of the similarity that fits the centres best. The place is also that of the similarity if it is
     free; otherwise it is that of the first pose.
 
     Args:
-        path: the poses, in the model's world.
+        path: the k poses, in the model's world.
+        is_firm: (k,) True for the poses whose centres count; None: all. One that hangs loose on the others may be
+            anywhere, and would make size and place of the whole map as uncertain.
     """
     motions = _motions(path)
-    weights = np.tile(np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3), len(path))
+    counts = np.ones(len(path)) if is_firm is None else is_firm
+    weights = np.outer(counts, np.repeat([_size(path) * _TURNS_COUNT, 1.0], 3)).ravel()
     weighted = motions * weights[:, None]
     lengths = np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)  # in no unit, so that none is too small to count
     of_poses = np.linalg.pinv(weighted / lengths, rcond=1e-6) / lengths[:, None] * weights
