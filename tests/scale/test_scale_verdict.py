@@ -188,8 +188,13 @@ def survey_reasons(
     heard: int = 2,
     left_out: tuple[str, ...] = (),
     notes: tuple[str, ...] = (),
+    by_map: float = 0.0,
 ) -> list[str]:
-    """The faults of a survey whose ranges are to the first ``heard`` of its anchors."""
+    """The faults of a survey whose ranges are to the first ``heard`` of its anchors.
+
+    Args:
+        by_map: standard deviation of the scale that is due to the shape of the map.
+    """
     ranges = SimpleNamespace(
         centers=centers,
         anchor_index=np.arange(len(centers)) % heard,
@@ -198,7 +203,9 @@ def survey_reasons(
     )
     posed: Any = SimpleNamespace(notes=notes, left_out=left_out)
     solution: Any = SimpleNamespace(problem=ranges)
-    return [doubt.reason for doubt in scale_verdict._doubts_of_survey(posed, solution, half_width)]
+    others = float(np.sqrt((half_width / 1.96) ** 2 - by_map**2))
+    uncertainty = ScaleUncertainty(0.0, {"white": others, "bending": 0.6 * by_map, "scale_drift": 0.8 * by_map})
+    return [doubt.reason for doubt in scale_verdict._doubts_of_survey(posed, solution, uncertainty)]
 
 
 def test_a_round_path_among_unknown_anchors_is_why_a_wide_scale_is_open() -> None:
@@ -221,6 +228,26 @@ def test_ranges_that_tell_nothing_of_the_scale_do_not_show_a_motion() -> None:
     assert survey_reasons(ROOM, 1.97) == [moved]
     assert survey_reasons(ROOM, 1.95) == []
     assert survey_reasons(CIRCLE, 1.97, (0.1, 0.1)) == [moved]
+
+
+def test_a_map_whose_shape_its_photos_leave_open_is_said_to_be_one() -> None:
+    shape = "the photos leave the shape of the map open"
+    assert survey_reasons(ROOM, 2.5, by_map=1.01) == [shape]
+    assert survey_reasons(ROOM, 2.5, by_map=0.99) == ["the ranges do not show that the camera moved"]
+
+
+def test_a_scale_of_which_nothing_is_known_is_not_given_a_size() -> None:
+    def refused(half_width: float, reasons: tuple[str, ...]) -> str:
+        with pytest.raises(GeometryError) as caught:
+            refuse_unknown(half_width, reasons, ["walk on"], ScaleOptions(max_relative_stddev=0.1))
+        return str(caught.value)
+
+    assert refused(1e30, ("it stands still",)) == "the scale is not determined: it stands still; next time: walk on"
+    assert refused(1.97, ()) == "the scale is not determined; next time: walk on"
+    assert refused(1.95, ()) == (
+        "the scale is only known to 195.0 % (95 % interval), worse than the 19.6 % allowed (1.96 times "
+        "max_relative_stddev); next time: walk on"
+    )
 
 
 def test_anchors_that_are_left_out_are_counted_and_named() -> None:

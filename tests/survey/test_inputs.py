@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -113,3 +114,31 @@ def test_positions_of_anchors_in_another_unit_are_told_from_metres(survey: Surve
     assert f"the ranges to them 1 and 2 m: are the positions in {unit}? expected metres" in str(error)
     assert error.path == survey.anchors.path
     read_ranging_inputs(of_tag.changed({"anchors.frame": "unknown"}))
+
+
+@pytest.mark.parametrize("wrong", range(4))
+def test_one_position_that_is_far_off_is_no_unit(survey: Survey, tmp_path: Path, wrong: int) -> None:
+    """Four anchors are heard in turn. The positions are in centimetres if all of them are too far apart."""
+    rows = [f"{0.1 * k:.1f},{'ABCD'[k % 4]},{2 + k % 3},left\n" for k in range(40)]
+    (tmp_path / "uwb.csv").write_text("timestamp_s,anchor_id,range_m,tag_id\n" + "".join(rows))
+    of_tag = survey.changed({"tag.tag_id": "left"})
+    places = np.array([[0.0, 0, 0], [3, 0, 0], [3, 3, 1], [0, 3, 2]])
+
+    def write(places: np.ndarray) -> None:
+        assert survey.anchors.path is not None
+        lines = [f"{name},{x},{y},{z}\n" for name, (x, y, z) in zip("ABCD", places, strict=True)]
+        survey.anchors.path.write_text("anchor_id,x_m,y_m,z_m\n" + "".join(lines))
+
+    off = places.copy()
+    off[wrong] += 600.0
+    write(off)
+    assert len(read_ranging_inputs(of_tag).anchors) == 4
+    write(100.0 * places)
+    message = re.search(
+        r"anchors (.) and (.) are (.*) m apart here, and the ranges to them (.) and (.) m", str(refusal(of_tag))
+    )
+    assert message is not None
+    first, second = (places["ABCD".index(name)] for name in message.group(1, 2))
+    apart_m, *ranges_m = map(float, message.group(3, 4, 5))
+    assert apart_m == pytest.approx(100.0 * np.linalg.norm(first - second), rel=1e-5)
+    assert apart_m > 10 * sum(ranges_m)

@@ -238,11 +238,21 @@ def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:
 def _usable_positions(
     anchors: Sequence[Anchor], given: Mask, anchor_frame: str, gravity_is_known: bool
 ) -> tuple[Mask, list[str]]:
-    """Return a (m,) mask of anchors whose given positions can be used in this frame, and notes why others cannot."""
+    """Return a (m,) mask of anchors whose given positions can be used in this frame, and notes why others cannot.
+
+    Raises:
+        GeometryError: all have the same coordinates.
+    """
     num = int(given.sum())
+    positions_m = np.array([_position(a) for a, k in zip(anchors, given, strict=True) if k]).reshape(-1, 3)
+    if num > 1 and not np.ptp(positions_m, axis=0).any():
+        raise GeometryError(
+            f"all {num} anchors have the same coordinates, {', '.join(f'{at:g}' for at in positions_m[0])}: "
+            "measure them, or leave them empty"
+        )
     if anchor_frame != "site" or num == 0:
         return given, []
-    shape = path_shape(np.array([_position(a) for a, k in zip(anchors, given, strict=True) if k]))
+    shape = path_shape(positions_m)
     if num >= 2 and (not is_line(shape) or (gravity_is_known and not is_steep(shape))):
         return given, []
     if num == 1:

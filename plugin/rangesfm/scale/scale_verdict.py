@@ -13,6 +13,7 @@ from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
+from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.range_equation import RangeFit
@@ -67,7 +68,7 @@ def judge(
         GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
     """
     half_width = uncertainty.half_width_95
-    doubts = [*_doubts_of_survey(problem, solution, half_width), *_doubts_of_ranges(solution.fit, per_anchor)]
+    doubts = [*_doubts_of_survey(problem, solution, uncertainty), *_doubts_of_ranges(solution.fit, per_anchor)]
     return _verdict(doubts, _remarks(solution, anchors), half_width, options)
 
 
@@ -107,10 +108,14 @@ def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[s
     """
     if half_width > NORMAL_95 * options.max_relative_stddev:
         planned = "plan it first, which says what would narrow it (rangesfm plan)"
-        raise GeometryError(
+        known = (
             f"the scale is only known to {100 * half_width:.1f} % (95 % interval), worse than the "
             f"{100 * NORMAL_95 * options.max_relative_stddev:.3g} % allowed ({NORMAL_95} times max_relative_stddev)"
-            f"{''.join(f': {reason}' for reason in reasons[:1])}; next time: {next(iter(advice), planned)}"
+        )
+        if half_width > NORMAL_95 * NOTHING_KNOWN:
+            known = "the scale is not determined"
+        raise GeometryError(
+            f"{known}{''.join(f': {reason}' for reason in reasons[:1])}; next time: {next(iter(advice), planned)}"
         )
 
 
@@ -128,14 +133,17 @@ def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, opt
     return Verdict("doubtful", reasons, advice)
 
 
-def _doubts_of_survey(posed: ScaleProblem, solution: Solution, half_width: float) -> Iterator[_Doubt]:
+def _doubts_of_survey(posed: ScaleProblem, solution: Solution, uncertainty: ScaleUncertainty) -> Iterator[_Doubt]:
     """Return the faults of the path and of the anchors."""
-    problem = solution.problem
+    problem, half_width = solution.problem, uncertainty.half_width_95
     kind, heard = path_kind(problem.centers), np.unique(problem.anchor_index)
     is_round = kind in ("circular", "spherical") and not np.isfinite(problem.anchor_stddev_m[heard]).any()
     # On these paths the scale is uncertain because of their shape: a longer walk of the same shape would not help.
     if half_width > DOUBTFUL_ABOVE and is_round:
         yield _Doubt(*WHY_SCALE_IS_OPEN[kind])
+    elif np.linalg.norm([uncertainty.components.get(name, 0.0) for name in BENDS]) > NOTHING_KNOWN:
+        overlap = "take photos that overlap more, or match more pairs of them"
+        yield _Doubt("the photos leave the shape of the map open", overlap)
     elif half_width > NORMAL_95 * NOTHING_KNOWN:
         yield _Doubt("the ranges do not show that the camera moved", "walk a loop of several metres")
     for note in posed.notes:

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 # Distance between two anchors over the sum of the ranges to them. It is at most 1 where all are in metres; above each
 # of these numbers, the anchors are in that unit.
 _UNITS_OF_ANCHORS = (("millimetres", 100.0), ("centimetres", 10.0))
+# Share of neighbouring ranges that are to two other anchors than a given one: a third if three are heard in turn.
+_WITHOUT_ONE = 0.25
 # Times of a log in steps at least as coarse as this get a note.
 _COARSE_STEP_S = 0.1
 
@@ -269,6 +271,7 @@ def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path 
     """Check that the positions of anchors are in metres.
 
     The distance between two anchors is at most the sum of the ranges to them, if the camera hardly moves between these.
+    A wrong unit is seen between all of them, and one wrong position not between the others.
 
     Raises:
         InputError: the positions seem to be in millimetres or centimetres.
@@ -282,16 +285,17 @@ def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path 
     order = of_camera[np.argsort(log.timestamp_s[of_camera], kind="stable")]
     first, second = order[:-1], order[1:]
     apart_m = np.linalg.norm(position_m[log.anchor_index[first]] - position_m[log.anchor_index[second]], axis=1)
-    is_close = (log.timestamp_s[second] - log.timestamp_s[first] <= 1.0) & (apart_m > 0)
-    if not is_close.any():
+    close = np.flatnonzero((log.timestamp_s[second] - log.timestamp_s[first] <= 1.0) & (apart_m > 0))
+    if not len(close):
         return
-    share = apart_m[is_close] / (log.range_m[first] + log.range_m[second])[is_close]
-    unit = next((unit for unit, least in _UNITS_OF_ANCHORS if np.median(share) > least), None)
+    share = apart_m[close] / (log.range_m[first] + log.range_m[second])[close]
+    unit = next((unit for unit, least in _UNITS_OF_ANCHORS if np.quantile(share, _WITHOUT_ONE) > least), None)
     if unit is not None:
-        rows = [end[int(np.argmax(is_close))] for end in (first, second)]
+        shown = close[np.argmax(share)]
+        rows = first[shown], second[shown]
         ids = " and ".join(log.anchor_ids[log.anchor_index[row]] for row in rows)
         ranges_m = " and ".join(f"{log.range_m[row]:.3g}" for row in rows)
-        message = f"anchors {ids} are {apart_m[is_close][0]:.6g} m apart here, and the ranges to them {ranges_m} m"
+        message = f"anchors {ids} are {apart_m[shown]:.6g} m apart here, and the ranges to them {ranges_m} m"
         raise InputError(
             f"{message}: are the positions in {unit}? expected metres, or their unit (--anchor_unit)", path
         )

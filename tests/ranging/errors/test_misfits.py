@@ -24,6 +24,11 @@ def test_residuals_far_beyond_their_stddev_are_told() -> None:
     assert any("times their stddev" in misfit.reason for misfit in reasons)
 
 
+def test_a_log_that_has_each_range_twice_scatters_as_before() -> None:
+    rows = np.repeat(np.arange(3 * NUM_EACH), 2)
+    assert misfits(make_errors(0.1).subset(rows), noise((0.1, 0.1, 0.1))[rows], rows.astype(np.float64)) == ()
+
+
 def test_a_stretch_that_is_off_is_told() -> None:
     residuals = noise((0.1, 0.1, 0.1))
     residuals[300:360] += 1.0

@@ -335,7 +335,8 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
         told = f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole"
         reasons.append(Misfit(told))
     order = np.lexsort((time_order, errors.anchor_index))
-    steps = np.diff(residuals_m[order])[np.diff(errors.anchor_index[order]) == 0]
+    steps, is_of_one = np.diff(residuals_m[order]), np.diff(errors.anchor_index[order]) == 0
+    steps = steps[is_of_one & ((steps != 0) | (np.diff(time_order[order]) != 0))]  # a range that a log has twice is one
     if len(steps) >= MIN_NUM_OF_SCATTER:
         scatter = max(robust_stddev(steps) / np.sqrt(2), _MIN_SCATTER_M)
         size = robust_stddev(residuals_m)
