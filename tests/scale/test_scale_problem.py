@@ -289,11 +289,9 @@ def test_anchors_on_a_line_leave_a_turn_open_that_gravity_fixes(places_m: list[l
 
 
 def test_coordinates_that_are_all_alike_were_never_measured() -> None:
-    with pytest.raises(
-        GeometryError, match="all 3 anchors have the same coordinates, 0, 0, 1.5: measure them, or leave"
-    ):
-        usable([(0, 0, 1.5), None, (0, 0, 1.5), (0, 0, 1.5)])
-    assert usable([(0, 0, 1.5), (0, 0, 1.5), (0, 4, 1.5), (4, 0, 1.5)]) == ([True] * 4, [])
+    with pytest.raises(GeometryError, match="all 3 anchors have the same coordinates, 0, 0, 1: measure them, or leave"):
+        usable([(0, 0, 1), None, (0, 0, 1), (0, 0, 1)])
+    assert usable([(0, 0, 1), (0, 0, 1), (0, 4, 1), (4, 0, 1)]) == ([True] * 4, [])
 
 
 @pytest.mark.parametrize(("off_vertical_deg", "is_used"), [(19.0, False), (21.0, True)])
