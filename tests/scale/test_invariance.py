@@ -97,7 +97,7 @@ def test_ranges_that_are_all_alike_are_refused(survey: Survey, frame: str, range
 
 
 def test_ranges_that_are_all_alike_are_refused_where_the_first_camera_has_a_place(survey: Survey) -> None:
-    with pytest.raises(GeometryError, match="the scale is only known to"):
+    with pytest.raises(GeometryError, match="the scale is not determined: ranges and photos leave the shape"):
         estimate(survey, log=survey.log_with(np.full(len(survey.simulated.log), 1e6)))
 
 

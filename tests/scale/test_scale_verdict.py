@@ -231,7 +231,7 @@ def test_ranges_that_tell_nothing_of_the_scale_do_not_show_a_motion() -> None:
 
 
 def test_a_map_whose_shape_its_photos_leave_open_is_said_to_be_one() -> None:
-    shape = "the photos leave the shape of the map open"
+    shape = "ranges and photos leave the shape of the map open"
     assert survey_reasons(ROOM, 2.5, by_map=1.01) == [shape]
     assert survey_reasons(ROOM, 2.5, by_map=0.99) == ["the ranges do not show that the camera moved"]
 

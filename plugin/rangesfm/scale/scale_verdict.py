@@ -142,8 +142,8 @@ def _doubts_of_survey(posed: ScaleProblem, solution: Solution, uncertainty: Scal
     if half_width > DOUBTFUL_ABOVE and is_round:
         yield _Doubt(*WHY_SCALE_IS_OPEN[kind])
     elif np.linalg.norm([uncertainty.components.get(name, 0.0) for name in BENDS]) > NOTHING_KNOWN:
-        overlap = "take photos that overlap more, or match more pairs of them"
-        yield _Doubt("the photos leave the shape of the map open", overlap)
+        overlap = "take photos that overlap more, and range more often"
+        yield _Doubt("ranges and photos leave the shape of the map open", overlap)
     elif half_width > NORMAL_95 * NOTHING_KNOWN:
         yield _Doubt("the ranges do not show that the camera moved", "walk a loop of several metres")
     for note in posed.notes:
