@@ -250,7 +250,7 @@ class TestNeighbours:
         longer_m[61] = off_m
         found = linearized(with_longer(on_map, longer_m))
         expected = np.ones(len(longer_m))
-        expected[61] = 1.0 if counts else 1e-6
+        expected[61] = 1.0 if counts else 1e-8
         np.testing.assert_allclose(found.bins.robust_weight, expected, rtol=1e-9)
         assert found.scatter_m == pytest.approx(1e-9)
 

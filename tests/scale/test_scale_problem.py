@@ -294,6 +294,16 @@ def test_coordinates_that_are_all_alike_were_never_measured() -> None:
     assert usable([(0, 0, 1), (0, 0, 1), (0, 4, 1), (4, 0, 1)]) == ([True] * 4, [])
 
 
+@pytest.mark.parametrize("far_m", [100.0, 600.0, 60000.0])
+def test_an_anchor_that_is_far_off_makes_no_line_of_the_others(far_m: float) -> None:
+    places_m = [(far_m, 0, 1), (6, -5, 3), (6, 5, 1), (-6, 5, 4)]
+    assert usable(places_m) == ([True] * 4, [])
+    on_line = [(far_m, 0, 0), (0, 0, 0), (4, 0, 0), (8, 0, 0)]
+    known_, (note,) = usable(on_line)
+    assert known_ == [False] * 4
+    assert note.startswith("surveyed anchors on one line")
+
+
 @pytest.mark.parametrize(("off_vertical_deg", "is_used"), [(19.0, False), (21.0, True)])
 def test_gravity_does_not_fix_the_turn_about_a_line_that_is_nearly_upright(
     off_vertical_deg: float, is_used: bool

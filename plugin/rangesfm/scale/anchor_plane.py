@@ -33,7 +33,7 @@ def anchor_plane(problem: RangeProblem) -> tuple[Array, Array] | None:
     if len(known) < 2:
         return None
     shape = path_shape(known)
-    if is_line(shape):
+    if are_on_line(known):
         if problem.gravity is None or is_steep(shape):
             return None
         along = shape.axes[:, 0]
@@ -48,6 +48,15 @@ def anchor_plane(problem: RangeProblem) -> tuple[Array, Array] | None:
 def is_line(anchors: PathShape) -> bool:
     """Return True if the positions leave a turn about their line open."""
     return bool(anchors.stddevs[1] <= _COLLINEAR * anchors.stddevs[0])
+
+
+def are_on_line(places_m: Array) -> bool:
+    """Return True if places (n, 3) leave a turn about their line open, also without any one of them.
+
+    One that is wrong by hundreds of metres makes a line of all.
+    """
+    without_one = (np.delete(places_m, k, axis=0) for k in range(len(places_m)))
+    return is_line(path_shape(places_m)) and all(is_line(path_shape(some)) for some in without_one)
 
 
 def is_steep(anchors: PathShape) -> bool:

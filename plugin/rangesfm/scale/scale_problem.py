@@ -20,7 +20,7 @@ from rangesfm.ranging.anchors.trilateration import MIN_NUM_RANGES, walking_times
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.anchor_plane import is_line, is_steep
+from rangesfm.scale.anchor_plane import are_on_line, is_steep
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeProblem
 
@@ -252,8 +252,8 @@ def _usable_positions(
         )
     if anchor_frame != "site" or num == 0:
         return given, []
-    shape = path_shape(positions_m)
-    if num >= 2 and (not is_line(shape) or (gravity_is_known and not is_steep(shape))):
+    levelled = gravity_is_known and not is_steep(path_shape(positions_m))
+    if num >= 2 and (not are_on_line(positions_m) or levelled):
         return given, []
     if num == 1:
         why = "1 surveyed anchor leaves every turn of the map about it open"

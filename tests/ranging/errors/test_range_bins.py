@@ -98,8 +98,8 @@ def test_a_bin_is_the_average_of_its_ranges_by_their_robust_weights() -> None:
 
 def test_ranges_without_any_weight_count_a_little_and_a_tag_at_an_anchor_is_in_no_direction() -> None:
     found = bins_of([0, 0], [0.0, 0.0], np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), [0.0, 1.0])
-    np.testing.assert_allclose(found.robust_weight, [1e-6, 1.0])
-    np.testing.assert_allclose(found.worth, [1.0 + 1e-6])
+    np.testing.assert_allclose(found.robust_weight, [1e-8, 1.0])
+    np.testing.assert_allclose(found.worth, [1.0 + 1e-8])
     np.testing.assert_array_equal(found.from_anchor, [[0.0, 0.0, 0.0]])
 
 

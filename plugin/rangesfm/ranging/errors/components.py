@@ -143,7 +143,7 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
 
     of_anchor = functools.partial(of, is_of_anchor=True)
     return (
-        of_anchor("white", "noise of single ranges", lambda c: np.diag(1 / np.maximum(c.worth, 1e-6))),
+        of_anchor("white", "noise of single ranges", lambda c: np.diag(1 / c.worth)),
         of_anchor("time", "errors that last for seconds", lambda c: _fading(c.time_s, LASTING_S) * _same_link(c)),
         of(
             "drift",

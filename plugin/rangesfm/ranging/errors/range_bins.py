@@ -99,7 +99,8 @@ def range_bins(
     towards = from_anchor_m / np.maximum(distance, 1e-9)[:, None]
     of_range = _labels(anchor_index, tag_index, since, max_num)
     first = np.unique(of_range, return_index=True)[1]
-    robust_weight = np.maximum(robust_weight, 1e-6)
+    # A range of an anchor that stands kilometres away is off by many stddevs still, and is no noise of the others.
+    robust_weight = np.maximum(robust_weight, 1e-8)
     begun = RangeBins(
         of_range=of_range,
         robust_weight=robust_weight,
