@@ -648,7 +648,7 @@ def offset_of_motion(
         around=lambda best_s: CostCurve(np.array([best_s]), np.ones(1)),
     )
     left = iter(fits)
-    path = SimpleNamespace(knows=KNOWN.knows, is_known=np.arange(100) < num_known)
+    path = SimpleNamespace(knows=KNOWN.knows, is_known=np.arange(100) < num_known, step_s=0.5)
     final = a_fit(
         2.0,
         rates=np.tile([3.0, -4.0], 50),  # of root mean square sqrt(12.5)
@@ -704,7 +704,9 @@ def test_motion_that_tells_no_offset_is_refused_with_the_reason(monkeypatch: pyt
         offset_of_motion(monkeypatch, fits=[a_fit(2.0)], num_known=1)
     assert offset_of_motion(monkeypatch, fits=[a_fit(2.0)], num_known=2).value_s == 2.0
     for fits, num_near in (([a_fit(2.0, is_testable=False)], 100), ([a_fit(2.0)], 0)):
-        with pytest.raises(GeometryError, match="too few ranges along the camera's path"):
+        lasting = rf"\(the log lasts {np.ptp(HUNDRED.times_s):.4g} s, the photos 49.5 s\)"
+        few = f"too few ranges along the camera's path to find the time offset {lasting}: give"
+        with pytest.raises(GeometryError, match=few):
             offset_of_motion(monkeypatch, fits=fits, num_near=num_near)
     with pytest.raises(GeometryError, match="at no time offset do the ranges follow the camera's path"):
         offset_of_motion(monkeypatch, fits=[a_fit(2.0, explains=lambda: False)])

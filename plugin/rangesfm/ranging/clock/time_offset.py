@@ -180,7 +180,11 @@ def _offset_of_motion(
             fits.append(refine_offset(near, path, offset_s, best))
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
-        raise GeometryError(f"too few ranges along the camera's path to find the time offset: {REMEDY}")
+        log_s, photos_s = np.ptp(ranges.times_s), path.step_s * (len(path.is_known) - 1)
+        raise GeometryError(
+            f"too few ranges along the camera's path to find the time offset (the log lasts {log_s:.4g} s, the photos "
+            f"{photos_s:.4g} s): {REMEDY}"
+        )
     (best, probability), *rivals = _likely_fits(fits, ranges, path)
     if not best.explains():
         raise GeometryError(
