@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -222,16 +223,18 @@ def solve_bundle_adjustment(problem: BundleAdjustment, tolerance_m: float) -> So
         converged=summary.termination_type.name in ("CONVERGENCE", "USER_SUCCESS"),
         is_still=monitor.is_still,
         is_stuck=monitor.is_stuck,
-        message=_message(monitor, tolerance_m, summary.message),
+        message=_message(monitor, tolerance_m, summary),
     )
 
 
-def _message(monitor: ConvergenceMonitor, tolerance_m: float, of_solver: str) -> str:
+def _message(monitor: ConvergenceMonitor, tolerance_m: float, summary: Any) -> str:
     if monitor.is_still:
         return f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
     if monitor.is_stuck:
         return "Some points or the lens allow small steps only, which do not get there."
-    return of_solver
+    if summary.termination_type.name == "USER_SUCCESS":
+        return "The last steps were kept small, so that the keyframes may have farther to go."
+    return str(summary.message)
 
 
 def solve_until_still(
