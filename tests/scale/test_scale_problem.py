@@ -288,12 +288,6 @@ def test_anchors_on_a_line_leave_a_turn_open_that_gravity_fixes(places_m: list[l
     )
 
 
-def test_coordinates_that_are_all_alike_were_never_measured() -> None:
-    with pytest.raises(GeometryError, match="all 3 anchors have the same coordinates, 0, 0, 1: measure them, or leave"):
-        usable([(0, 0, 1), None, (0, 0, 1), (0, 0, 1)])
-    assert usable([(0, 0, 1), (0, 0, 1), (0, 4, 1), (4, 0, 1)]) == ([True] * 4, [])
-
-
 @pytest.mark.parametrize("far_m", [100.0, 600.0, 60000.0])
 def test_an_anchor_that_is_far_off_makes_no_line_of_the_others(far_m: float) -> None:
     places_m = [(far_m, 0, 1), (6, -5, 3), (6, 5, 1), (-6, 5, 4)]

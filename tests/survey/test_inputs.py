@@ -142,3 +142,17 @@ def test_one_position_that_is_far_off_is_no_unit(survey: Survey, tmp_path: Path,
     apart_m, *ranges_m = map(float, message.group(3, 4, 5))
     assert apart_m == pytest.approx(100.0 * np.linalg.norm(first - second), rel=1e-5)
     assert apart_m > 10 * sum(ranges_m)
+
+
+def test_coordinates_that_are_all_alike_were_never_measured(survey: Survey) -> None:
+    of_tag = survey.changed({"tag.tag_id": "left"})
+    assert survey.anchors.path is not None
+    survey.anchors.path.write_text("anchor_id,x_m,y_m,z_m\nA,0,0,1\nB,0,0,1\n")
+    error = refusal(of_tag)
+    assert error.path == survey.anchors.path
+    assert "all 2 anchors of the log have the same coordinates, expected those that were measured, or empty" in str(
+        error
+    )
+    read_ranging_inputs(of_tag.changed({"anchors.frame": "unknown"}))
+    survey.anchors.path.write_text("anchor_id,x_m,y_m,z_m\nA,0,0,1\nB,,,\n")
+    read_ranging_inputs(of_tag)

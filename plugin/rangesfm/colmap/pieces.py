@@ -36,15 +36,15 @@ def loose_pieces(model: pycolmap.Reconstruction) -> tuple[LoosePiece, ...]:
     without points has no parts.
     """
     frame_ids, sees, labels = _parts(model)
-    num_frames = np.bincount(labels)
-    names = _names_of_frames(model, frame_ids)
+    num_frames = np.bincount(labels, minlength=1)
+    largest, names = num_frames.argmax(), _names_of_frames(model, frame_ids)
     return tuple(
         LoosePiece(
             tuple(sorted(name for k in np.flatnonzero(labels == part) for name in names[k])),
             _shared_with_rest(sees, labels == part),
         )
         for part in np.flatnonzero(num_frames > 1).tolist()
-        if part != num_frames.argmax()
+        if part != largest
     )
 
 

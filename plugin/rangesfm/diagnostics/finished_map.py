@@ -30,10 +30,10 @@ _OF_MEDIANS = 1.5
 _LARGE, _MANY_MORE = 10.0, 0.05
 # Largest growth of the median distance of the points from the middle of the path.
 _MAX_POINTS_GROWTH = 2.0
-# A keyframe hangs loose on the map if it is this many times less certain than the median one.
-_LOOSE = 10.0
 # Largest growth of the median residual of the ranges, or of their standard deviation; a refinement should reduce it.
 _MAX_RESIDUAL_GROWTH = 2.0
+# A keyframe hangs loose on the map if it is this many times less certain than the median one.
+_LOOSE = 10.0
 
 
 @dataclass(frozen=True)

@@ -238,20 +238,11 @@ def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:
 def _usable_positions(
     anchors: Sequence[Anchor], given: Mask, anchor_frame: str, gravity_is_known: bool
 ) -> tuple[Mask, list[str]]:
-    """Return a (m,) mask of anchors whose given positions can be used in this frame, and notes why others cannot.
-
-    Raises:
-        GeometryError: all have the same coordinates.
-    """
+    """Return a (m,) mask of anchors whose given positions can be used in this frame, and notes why others cannot."""
     num = int(given.sum())
-    positions_m = np.array([_position(a) for a, k in zip(anchors, given, strict=True) if k]).reshape(-1, 3)
-    if num > 1 and not np.ptp(positions_m, axis=0).any():
-        raise GeometryError(
-            f"all {num} anchors have the same coordinates, {', '.join(f'{at:g}' for at in positions_m[0])}: "
-            "measure them, or leave them empty"
-        )
     if anchor_frame != "site" or num == 0:
         return given, []
+    positions_m = np.array([_position(a) for a, k in zip(anchors, given, strict=True) if k])
     levelled = gravity_is_known and not is_steep(path_shape(positions_m))
     if num >= 2 and (not are_on_line(positions_m) or levelled):
         return given, []

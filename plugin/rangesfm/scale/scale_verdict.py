@@ -108,12 +108,14 @@ def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[s
     """
     if half_width > NORMAL_95 * options.max_relative_stddev:
         planned = "plan it first, which says what would narrow it (rangesfm plan)"
-        known = (
-            f"the scale is only known to {100 * half_width:.1f} % (95 % interval), worse than the "
-            f"{100 * NORMAL_95 * options.max_relative_stddev:.3g} % allowed ({NORMAL_95} times max_relative_stddev)"
-        )
         if half_width > NORMAL_95 * NOTHING_KNOWN:
             known = "the scale is not determined"
+        else:
+            allowed = 100 * NORMAL_95 * options.max_relative_stddev
+            known = (
+                f"the scale is only known to {100 * half_width:.1f} % (95 % interval), worse than the {allowed:.3g} % "
+                f"allowed ({NORMAL_95} times max_relative_stddev)"
+            )
         raise GeometryError(
             f"{known}{''.join(f': {reason}' for reason in reasons[:1])}; next time: {next(iter(advice), planned)}"
         )

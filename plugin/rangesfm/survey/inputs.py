@@ -120,6 +120,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
             survey.anchors.path,
         )
     if frame != "unknown":
+        _check_anchors_differ(log, anchors, survey.anchors.path)
         _check_unit_of_anchors(log, anchors, survey.anchors.path)
     _check_held_out(survey, anchors, frame)
     curve_path, curve_notes = survey.ranges.error_curve, list[str]()
@@ -265,6 +266,21 @@ def _lever_arms_of_log(log: RangeLog, survey: Survey) -> Array:
             )
         arms[k] = given[log.tag_ids[k]]
     return arms
+
+
+def _check_anchors_differ(log: RangeLog, anchors: Sequence[Anchor], path: Path | None) -> None:
+    """Check that the positions of a log's anchors are not all alike, as in a table that was never filled in.
+
+    Raises:
+        InputError: they are.
+    """
+    positions_m = [a.position_m for a in anchors if a.anchor_id in log.anchor_ids and a.position_m is not None]
+    if len(positions_m) > 1 and not np.ptp(positions_m, axis=0).any():
+        raise InputError(
+            f"all {len(positions_m)} anchors of the log have the same coordinates, expected those that were measured, "
+            "or empty cells",
+            path,
+        )
 
 
 def _check_unit_of_anchors(log: RangeLog, anchors: Sequence[Anchor], path: Path | None) -> None:
