@@ -404,13 +404,15 @@ def test_keyframes_that_hang_loose_are_named_beside_how_well_the_others_are_know
         covariance = SimpleNamespace(frame_ids=FRAME_IDS, similarity=np.zeros((7, 7)), centers=centers)
         return place(estimate_of(0.0), summary_of(covariance=covariance), doubts=doubts).reasons
 
-    one = "a hangs loose on the map; each other keyframe is known to 0.2 m or better (95 %)"
+    one = "keyframe a hangs loose on the map; each other keyframe is known to 0.2 m or better (95 %)"
     assert reasons_of(0.1, 0.05, 600.0, doubts=["it is broken"])[1:] == (one, "it is broken")
     # None is far less certain than most, and one that is known well enough is no matter.
     assert len(reasons_of(300.0, 150.0, 600.0)) == len(reasons_of(0.001, 0.001, 0.1)) == 1
     several = Trajectory(np.arange(5), tuple("abcde"), None, np.zeros((5, 3)), np.array([np.eye(3)] * 5))
     (said,) = finished_map._loose_ones(several, np.array([0.1, 5.0, 0.2, 7.0, 0.1]))
-    assert said == "d and 1 more hang loose on the map; each other keyframe is known to 0.39 m or better (95 %)"
+    assert (
+        said == "keyframe d and 1 more hang loose on the map; each other keyframe is known to 0.39 m or better (95 %)"
+    )
 
 
 def test_the_size_of_the_site_is_that_of_path_and_surveyed_anchors() -> None:

@@ -141,7 +141,7 @@ def _loose_ones(path: Trajectory, keyframes_m: Array) -> Iterator[str]:
     if not is_loose.any():
         return
     least, more = int(keyframes_m.argmax()), np.count_nonzero(is_loose) - 1
-    hanging = f"{path.image_names[least]} " + (f"and {more} more hang" if more else "hangs")
+    hanging = f"keyframe {path.image_names[least]} " + (f"and {more} more hang" if more else "hangs")
     others_m = NORMAL_95 * keyframes_m[~is_loose].max()
     yield f"{hanging} loose on the map; each other keyframe is known to {others_m:.2g} m or better (95 %)"
 
