@@ -89,6 +89,41 @@ def test_name_with_blanks_in_a_text_model_is_named_with_its_line(rigs: Path, tmp
     assert (caught.value.path, caught.value.line) == (tmp_path / "text" / "images.txt", 5)
 
 
+@pytest.mark.parametrize("which", ["all", "last", "every other", "end of file"])
+def test_photos_of_a_text_model_may_lack_the_line_of_their_features(which: str, rigs: Path, tmp_path: Path) -> None:
+    model = read_model(rigs)
+    model.write_text(tmp_path)
+    (tmp_path / "points3D.txt").write_text("")
+    lines = [line for line in (tmp_path / "images.txt").read_text().split("\n") if line[:1] != "#"]
+    poses = lines[: 2 * len(model.images) : 2]
+    text = {"all": "\n", "last": "\n\n", "end of file": "\n\n"}.get(which, "").join(poses)
+    if which == "every other":
+        text = "".join(line + "\n" * (1 + k % 2) for k, line in enumerate(poses))
+    (tmp_path / "images.txt").write_text(f"# poses\n{text}" + "\n" * (which != "end of file"))
+    read = read_model(tmp_path)
+    assert read.num_reg_images() == len(poses) == 24
+    for image_id, image in model.images.items():
+        assert read.image(image_id).name == image.name
+        np.testing.assert_allclose(read.image(image_id).projection_center(), image.projection_center(), atol=1e-9)
+
+
+def test_missing_line_of_features_leaves_those_of_other_photos_alone(rigs: Path, tmp_path: Path) -> None:
+    model = read_model(rigs)
+    bare = min(model.images)
+    for feature, point in enumerate(model.image(bare).points2D):
+        if point.has_point3D():
+            model.delete_observation(bare, feature)
+    model.write_text(tmp_path)
+    lines = (tmp_path / "images.txt").read_text().split("\n")
+    at = next(k for k, line in enumerate(lines) if line.split()[:1] == [str(bare)])
+    (tmp_path / "images.txt").write_text("\n".join([*lines[: at + 1], *lines[at + 2 :]]))
+    read = read_model(tmp_path)
+    assert read.num_points3D() == model.num_points3D()
+    seen = [{id: image.num_points3D for id, image in each.images.items()} for each in (read, model)]
+    assert seen[0] == seen[1]
+    assert (read.image(bare).num_points2D(), max(seen[0].values()) > 0) == (0, True)
+
+
 def test_pose_that_is_not_finite_is_named(walked_survey: WalkedSurvey, tmp_path: Path) -> None:
     model = read_model(walked_survey.folder / "sparse" / "0")
     model.frame(3).rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.full(3, np.nan))
@@ -158,7 +193,7 @@ class TestContent:
             del file.groups[0][num_left:]
             file.records[0][-1].value = len(file.groups[0])
 
-        assert "the tracks of the points do not agree with the features in images.bin" in refused(
+        assert "the tracks of the points do not agree with the features of the images" in refused(
             "points3D.bin", change
         )
 
@@ -167,7 +202,7 @@ class TestContent:
             del file.records[3], file.groups[3]
             file.count -= 1
 
-        assert "the tracks of the points do not agree with the features in images.bin" in refused(
+        assert "the tracks of the points do not agree with the features of the images" in refused(
             "points3D.bin", change
         )
 
@@ -175,7 +210,7 @@ class TestContent:
         def change(file: ModelFile) -> None:
             file.groups[0][1] = file.groups[0][0]
 
-        assert "the tracks of the points do not agree with the features in images.bin" in refused(
+        assert "the tracks of the points do not agree with the features of the images" in refused(
             "points3D.bin", change
         )
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import math
+import shutil
 import struct
 import tempfile
 from collections import Counter
@@ -121,7 +123,7 @@ def check_map(images: Records, points: Records) -> None:
         elements["image_id"], elements["feature"], np.repeat(heads["point_id"], points.num_groups(_ELEMENT))
     )
     if not np.array_equal(said_by_features, said_by_tracks):
-        raise InputError("the tracks of the points do not agree with the features in images.bin", points.path)
+        raise InputError("the tracks of the points do not agree with the features of the images", points.path)
 
 
 def _sorted_by_place(
@@ -204,10 +206,10 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         InputError: there is no model, or its files are damaged. COLMAP does not check much of them itself, and would
             fail later with an error in its own code.
     """
-    _require_whole(path)
+    is_text = _require_whole(path)
     records = {name: read_records(path / name) for name in MODEL_FILES if (path / name).is_file()}
     try:
-        model = pycolmap.Reconstruction(path)
+        model = _read_text_model(path) if is_text else pycolmap.Reconstruction(path)
     except (OSError, ValueError, RuntimeError, LookupError, MemoryError) as error:
         raise InputError(f"not a readable COLMAP model, {_EXPECTED}", path) from error
     _check_names(model, path)
@@ -220,8 +222,8 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def _require_whole(path: Path) -> None:
-    """Refuse a model with missing files, or in text form with names that COLMAP would read wrongly.
+def _require_whole(path: Path) -> bool:
+    """Refuse a model with missing files, and return whether it is one of text files.
 
     Of binary and text files in one folder the more complete set counts, and the binary set if both are as complete.
     """
@@ -233,23 +235,52 @@ def _require_whole(path: Path) -> None:
         raise InputError(f"not a COLMAP model, {_EXPECTED}{nested}", path)
     if missing:
         raise InputError(f"not a whole COLMAP model, there is no {missing[0]}; {_EXPECTED}", path)
-    if ending == ".txt":
-        _check_names_of_text(path / "images.txt")
+    return ending == ".txt"
 
 
-def _check_names_of_text(path: Path) -> None:
-    lines = enumerate(read_text(path, errors="replace").split("\n"), 1)
-    for number, line in lines:
+def _read_text_model(path: Path) -> pycolmap.Reconstruction:
+    """Read a model of text files; photos may lack the line of their features, which COLMAP needs even if it is empty.
+
+    Raises:
+        InputError: a photo's name holds blanks.
+    """
+    lines = _with_feature_lines(path / "images.txt")
+    if lines is None:
+        return pycolmap.Reconstruction(path)
+    with tempfile.TemporaryDirectory() as folder:
+        for file in path.glob("*.txt"):
+            shutil.copy(file, folder)
+        Path(folder, "images.txt").write_text("\n".join(lines), "utf-8", "surrogateescape", "\n")
+        return pycolmap.Reconstruction(folder)
+
+
+def _with_feature_lines(path: Path) -> list[str] | None:
+    """Return the lines of images.txt with an empty one after each photo that has none; None if nothing is missing."""
+    given = read_text(path, errors="surrogateescape").removesuffix("\n").split("\n")
+    lines, is_whole, of_features = list[str](), True, False
+    for number, line in enumerate(given, 1):
         words = line.split(maxsplit=_NUM_BEFORE_NAME)
-        if not words or words[0].startswith("#"):
-            continue
-        name = words[-1].strip()
-        if len(words) > _NUM_BEFORE_NAME and len(name.split()) > 1:
+        is_photo = len(words) > _NUM_BEFORE_NAME and not words[0].startswith("#") and not _are_features(line)
+        if of_features and (is_photo or line.startswith("#")):
+            lines.append("")
+            is_whole = False
+        if is_photo and len((name := words[-1].strip()).split()) > 1:
             what = f"the photo's name {name!r} holds blanks, and COLMAP reads names in text files up to a blank only"
             raise InputError(
                 f"{what}: convert the model to binary where it was made, or rename the photos", path, number
             )
-        next(lines, None)  # the line after it lists the features
+        of_features = is_photo
+        lines.append(line)
+    return None if is_whole and not of_features else [*lines, "", ""]
+
+
+def _are_features(line: str) -> bool:
+    """Return whether a line holds features: x, y and the id of a point for each."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(math.isfinite(float(word)) for word in words)
+    except ValueError:
+        return False
 
 
 def write_binary_model(model: pycolmap.Reconstruction, folder: Path) -> None:
