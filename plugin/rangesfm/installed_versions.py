@@ -9,9 +9,10 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 import re
+from pathlib import Path
 
 import rangesfm
-from rangesfm.errors import SolverError
+from rangesfm.errors import InputError, SolverError
 
 PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 # The compiled part exchanges C++ objects with these packages, so another version of either needs another build of it.
@@ -51,6 +52,15 @@ def install_command() -> str:
     """Return the shell command that installs the needed versions, keeping the build of pycolmap that is installed."""
     wanted = [next(reversed(installed_builds(package)), package) for package in NEEDED_VERSIONS]
     return f"python -m pip install {' '.join(map(_requirement, wanted, NEEDED_VERSIONS.values()))}"
+
+
+def missing_extra(need: str, extra: str, path: Path | None = None) -> InputError:
+    """Return the error for a task whose packages are not installed.
+
+    Args:
+        need: which task needs which package. extra: name of the optional dependencies that have it. path: of the input.
+    """
+    return InputError(f"{need}: pip install '.[{extra}]' in a clone of rangesfm installs it", path)
 
 
 def _requirement(package: str, needed: str) -> str:

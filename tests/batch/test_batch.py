@@ -282,5 +282,5 @@ def test_without_dask_it_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert main(["batch", str(tmp_path / "a.toml")]) == 2
-    said = "rangesfm: error: rangesfm batch needs Dask: python -m pip install 'rangesfm[batch]'\n"
+    said = "rangesfm: error: rangesfm batch needs Dask: pip install '.[batch]' in a clone of rangesfm installs it\n"
     assert capsys.readouterr().err == said

@@ -76,7 +76,7 @@ def test_missing_package_is_said_with_the_command_that_installs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install 'rangesfm\[video\]'"):
+    with pytest.raises(InputError, match=r"pip install '\.\[video\]' in a clone"):
         open_source(tmp_path / "a.mp4", None)
 
 

@@ -14,6 +14,7 @@ from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.survey_flags import add_flags, add_restart_argument, overrides_from_arguments
 from rangesfm.cli.terminal import Screen, counts
 from rangesfm.errors import InputError
+from rangesfm.installed_versions import missing_extra
 from rangesfm.progress import Progress, format_duration
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def add_batch_commands(commands: Commands) -> None:
 
 def _batch(args: argparse.Namespace, progress: Progress) -> Outcome:
     r"""Run many surveys, each as rangesfm run does. A survey that fails does not stop the others. The outcome of
-    each is in batch.csv, batch.json and batch.html. Needs pip install 'rangesfm[batch]'.
+    each is in batch.csv, batch.json and batch.html. Needs pip install '.[batch]' in a clone.
 
     Without --scheduler, the workers are processes of this machine, which share its cores and memory. With it,
     they are the workers of a Dask scheduler. These must have this version of rangesfm installed, and find the
@@ -77,7 +78,7 @@ def _batch(args: argparse.Namespace, progress: Progress) -> Outcome:
     try:
         import distributed  # noqa: F401
     except ImportError:
-        raise InputError("rangesfm batch needs Dask: python -m pip install 'rangesfm[batch]'") from None
+        raise missing_extra("rangesfm batch needs Dask", "batch") from None
     from rangesfm.batch.batch_state import exit_status_of, format_rows
     from rangesfm.batch.jobs import BatchOptions, read_jobs
     from rangesfm.batch.run_batch import PAGE_NAME, TABLE_NAME, run_batch

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap, colored_points
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.georeference import GEOGRAPHIC, is_geographic
+from rangesfm.installed_versions import missing_extra
 
 _STEP_M = 1e-4
 _STEP_DEG = 1e-9
@@ -30,9 +30,9 @@ def write_laz(map_: MetricMap, path: Path) -> Path:
     try:
         import laspy
     except ImportError:
-        raise InputError("the format 'laz' needs laspy: pip install 'rangesfm[geo]'") from None
+        raise missing_extra("the format 'laz' needs laspy", "geo") from None
     if not laspy.LazBackend.detect_available():
-        raise InputError("the format 'laz' needs lazrs besides laspy: pip install 'rangesfm[geo]'")
+        raise missing_extra("the format 'laz' needs lazrs besides laspy", "geo")
     places, colors = colored_points(map_.reconstruction)
     xyz, steps = _coordinates(map_, places)
     header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT_WITH_COLOR)
@@ -70,7 +70,7 @@ def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
     try:
         import pyogrio.raw
     except ImportError:
-        raise InputError(f"the format {path.suffix[1:]!r} needs pyogrio: pip install 'rangesfm[geo]'") from None
+        raise missing_extra(f"the format {path.suffix[1:]!r} needs pyogrio", "geo") from None
     anchors = map_.anchors_m or {}
     trajectory = map_.trajectory
     places = np.concatenate([trajectory.centers, np.array(list(anchors.values())).reshape(-1, 3)])

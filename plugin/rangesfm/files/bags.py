@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rangesfm.errors import InputError
+from rangesfm.installed_versions import missing_extra
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -43,9 +44,7 @@ def open_bag(path: Path) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError(
-            "reading a ROS bag needs the package rosbags: python -m pip install 'rangesfm[ros]'", path
-        ) from None
+        raise missing_extra("reading a ROS bag needs the package rosbags", "ros", path) from None
     try:
         # ROS 2 bags from before 2023 do not contain the definitions of their messages.
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:

@@ -17,6 +17,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.installed_versions import missing_extra
 
 if TYPE_CHECKING:
     from pyproj import Transformer
@@ -186,5 +187,5 @@ def _pyproj() -> Any:
     try:
         import pyproj
     except ImportError:
-        raise InputError("coordinate systems need pyproj: pip install 'rangesfm[geo]'") from None
+        raise missing_extra("coordinate systems need pyproj", "geo") from None
     return pyproj

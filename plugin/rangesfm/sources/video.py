@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from PIL import Image
 
 from rangesfm.errors import InputError
+from rangesfm.installed_versions import missing_extra
 from rangesfm.sources.source import Frame, PhotoSource
 
 if TYPE_CHECKING:
@@ -80,9 +81,7 @@ def _reading(path: Path) -> Iterator[InputContainer]:
     try:
         import av
     except ImportError:
-        raise InputError(
-            "reading a video needs the package av: python -m pip install 'rangesfm[video]'", path
-        ) from None
+        raise missing_extra("reading a video needs the package av", "video", path) from None
     try:
         with av.open(path, metadata_errors="replace") as video:
             if not video.streams.video:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array
 from rangesfm.distances.tape import CONTROL, FOUND_STDDEV_PX, Marker, TapedDistance
 from rangesfm.errors import InputError
+from rangesfm.installed_versions import missing_extra
 from rangesfm.progress import Progress
 from rangesfm.vision.photo_files import UNREADABLE, opened_image
 
@@ -126,5 +127,5 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise InputError("looking for printed tags needs OpenCV: pip install 'rangesfm[markers]'") from None
+        raise missing_extra("looking for printed tags needs OpenCV", "markers") from None
     return cv2
