@@ -16,7 +16,8 @@ from rangesfm.files.text_tables import Categories, TextTable, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.layout import MISSING, Layout
-from rangesfm.ranging.readers.reader import ReadOptions, which_are_measured
+from rangesfm.ranging.readers.measured import which_are_measured, which_are_within_reach
+from rangesfm.ranging.readers.reader import ReadOptions
 from rangesfm.ranging.readers.times import (
     CIVIL_TIME,
     CIVIL_UNITS,
@@ -26,7 +27,15 @@ from rangesfm.ranging.readers.times import (
     CivilClock,
     date_order,
 )
-from rangesfm.ranging.readers.units import SLOWEST_S, UNITS_PER_METRE, Ask, days_before_1970, range_unit, time_unit
+from rangesfm.ranging.readers.units import (
+    SLOWEST_S,
+    UNITS_PER_METRE,
+    Ask,
+    days_before_1970,
+    range_unit,
+    time_unit,
+    units_within_reach,
+)
 from rangesfm.ranging.twr import StampOptions, double_sided_range, single_sided_range
 
 STAMPS = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -97,25 +106,30 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
     row = np.repeat(np.arange(len(table)), num_ends)
     anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
     ranges = _ranges(table, name, columns, options)
-    measured, of_far = which_are_measured(ranges, path)
-    notes += of_far
-    row, ranges, anchor, tag = row[measured], ranges[measured], anchor.subset(measured), tag.subset(measured)
-    times = None if timestamps is None else timestamps[row]
+    measured, of_codes = which_are_measured(ranges, path)
+    notes += of_codes
     unit = "m"
     if "range" in name or columns.wide:
-        pair = anchor.index * len(tag.names) + tag.index
+        pair = (anchor.index * len(tag.names) + tag.index)[measured]
         column = name.get("range") or next(iter(columns.wide))
         column = f"{column} {units.get(column, '')}".strip()
         ask = partial(options.which_unit, path, "range")
-        unit = options.range_unit or range_unit(column, ranges, times, pair, notes, ask)
+        times = None if timestamps is None else timestamps[row[measured]]
+        unit = options.range_unit or range_unit(column, ranges[measured], times, pair, notes, ask)
     per_metre = UNITS_PER_METRE[unit]
+    ranges_m = ranges / per_metre
+    mapped = options if options.columns or not columns.is_strict else options.changed(columns=name)
+    others = [mapped.command(path, range_unit=other) for other in units_within_reach(ranges_m[measured], unit)]
+    measured[measured], of_far = which_are_within_reach(ranges_m[measured], path, others)
+    notes += of_far
+    row, anchor, tag = row[measured], anchor.subset(measured), tag.subset(measured)
     stddevs, los = np.full(len(table), np.nan), _line_of_sight(table, name)
     if "range_stddev" in name:
         stddevs = table.numbers(name["range_stddev"], empty=np.nan, expected="a number or nothing") / per_metre
     return RangeLog.from_arrays(
         anchor,
-        ranges / per_metre,
-        timestamp_s=times,
+        ranges_m[measured],
+        timestamp_s=None if timestamps is None else timestamps[row],
         image_name=None if image_name is None else [image_name[k] for k in row.tolist()],
         range_stddev_m=stddevs[row],
         tag_id=tag,

@@ -14,16 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesfm.arrays import Array, Mask
 from rangesfm.errors import InputError
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
-
-# The largest value in a log means no measurement if it occurs at least _MIN_NUM_FAR times and exceeds the next largest
-# by the factor _FAR, and there are at least _MIN_NUM other values.
-_MIN_NUM_FAR, _FAR, _MIN_NUM = 3, 4.0, 20
-_NOTHING = 1e-12  # a smaller value counts as 0, in any unit
+from rangesfm.ranging.readers.measured import which_are_measured, which_are_within_reach
 
 
 class ReadOptions(LogOptions):
@@ -92,28 +87,6 @@ class Reading(NamedTuple):
     los: int = -1
 
 
-def which_are_measured(ranges: Array, path: Path) -> tuple[Mask, tuple[str, ...]]:
-    """Return which ranges in a file (n,) are measurements, and notes about the others.
-
-    A range that is not positive is not a measurement. Neither is a value like 65535 that occurs often and is far above
-    all others.
-
-    Raises:
-        InputError: there is no measurement.
-    """
-    positive = ranges[(ranges > 0) & (ranges < math.inf)]
-    largest = float(np.max(positive, initial=0.0))
-    others = positive[positive < largest]
-    num_far = len(positive) - len(others)
-    is_far = num_far >= _MIN_NUM_FAR and len(others) >= _MIN_NUM and largest > _FAR * others.max()
-    measured: Mask = (ranges > _NOTHING) & (ranges < (largest if is_far else math.inf))
-    if not measured.any():
-        said = f"all {len(ranges)} records say that there was no measurement" if len(ranges) else "no records"
-        raise InputError(f"no usable range: {said}", path)
-    note = f"{largest:.10g} occurs {num_far} times, far above all other ranges: it is taken to mean no measurement"
-    return measured, (note,) if is_far else ()
-
-
 def reader_of_readings(
     name: str,
     recognizes: Callable[[str], bool],
@@ -128,11 +101,13 @@ def reader_of_readings(
             message = "the log's format is not a table: columns, range_unit and separator cannot be given"
             raise InputError(message, path)
         found = list(readings(path, options))
-        measured, notes = which_are_measured(np.array([reading.range_m for reading in found], np.float64), path)
-        times, anchor_ids, ranges, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
+        ranges = np.array([reading.range_m for reading in found], np.float64)
+        measured, notes = which_are_measured(ranges, path)
+        measured[measured], of_far = which_are_within_reach(ranges[measured], path)
+        times, anchor_ids, ranges_m, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
         return RangeLog.from_arrays(
             anchor_ids,
-            ranges,
+            ranges_m,
             timestamp_s=times,
             range_stddev_m=[stddev if 0 < stddev < math.inf else math.nan for stddev in stddevs],
             tag_id=tag_ids,
@@ -140,8 +115,8 @@ def reader_of_readings(
             line=lines,
             source=path,
             format=name,
-            num_no_measurement=len(found) - len(ranges),
-            notes=notes,
+            num_no_measurement=len(found) - len(ranges_m),
+            notes=(*notes, *of_far),
         )
 
     return Reader(name, recognizes, read, read_anchors, roles)

@@ -8,6 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
+from rangesfm.ranging.readers.measured import REACH_M
 from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
@@ -30,8 +31,10 @@ _DAYS_OF_1970 = {(3e4, 6e4): 25569.0, (7e5, 8e5): 719529.0}
 _FASTEST_M_PER_S = 30.0
 _LARGEST_M = {"m": 1000.0, "cm": 300.0, "mm": 300.0}
 _NOISE_M = {"m": 3.0, "cm": 0.6, "mm": 0.6}
-# Ranges in cm or mm must exceed the first length at the 95th percentile, or the second one if they have decimals,
-# because decimals without the name of a unit usually mean metres.
+# Percentile that tells how long the ranges are; more than a few may be garbage. Ranges in cm or mm must exceed the
+# first length at this percentile, or the second one if they have decimals, because decimals without the name of a unit
+# usually mean metres.
+_MOST = 80.0
 _NEAR_M, _NEAR_WITH_DECIMALS_M = 0.6, 2.0
 # Largest share of ranges that differ from the one before by more than noise and motion allow.
 _MAX_SHARE_OF_JUMPS = 0.25
@@ -95,14 +98,14 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, not
     named = named_length_unit(name)
     if named is not None or len(ranges) < _MIN_NUM:
         return named or "m"
-    most, are_whole = float(np.percentile(ranges, 95)), bool(np.all(ranges == np.round(ranges)))
+    most, are_whole = float(np.percentile(ranges, _MOST)), bool(np.all(ranges == np.round(ranges)))
     can_be = [
         unit
         for unit, per_metre in UNITS_PER_METRE.items()
         if unit in _LARGEST_M
         and (not are_whole if unit == "m" else most / per_metre >= (_NEAR_M if are_whole else _NEAR_WITH_DECIMALS_M))
         and most / per_metre <= _LARGEST_M[unit]
-        and _share_of_jumps(ranges / per_metre, times, pair, _NOISE_M[unit]) <= _MAX_SHARE_OF_JUMPS
+        and _share_of_jumps(ranges / per_metre, times, pair, unit) <= _MAX_SHARE_OF_JUMPS
     ]
     if can_be == ["m"]:
         return "m"
@@ -113,11 +116,21 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, not
     return can_be[0]
 
 
-def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, noise_m: float) -> float:
-    """Return the share of ranges that differ from their pair's previous one by more than noise and motion allow."""
+def units_within_reach(ranges_m: Array, unit: str) -> list[str]:
+    """Return the units in which most of some ranges (n,), so far read in ``unit``, are within the reach of a radio."""
+    middle = float(np.median(ranges_m)) * UNITS_PER_METRE[unit]
+    return [other for other in ("cm", "mm", "ft") if other != unit and middle / UNITS_PER_METRE[other] <= REACH_M]
+
+
+def _share_of_jumps(ranges_m: Array, times: Array | None, pair: Indices, unit: str) -> float:
+    """Return the share of ranges that differ from their pair's previous one by more than noise and motion allow.
+
+    Ranges that are too long for the unit are left out.
+    """
     if times is None:
         return 0.0
     order = np.lexsort((times, pair))
+    order, noise_m = order[ranges_m[order] <= _LARGEST_M[unit]], _NOISE_M[unit]
     same = np.diff(pair[order]) == 0
     moved, seconds = np.abs(np.diff(ranges_m[order]))[same], np.diff(times[order])[same]
     return float(np.mean(moved > noise_m + _FASTEST_M_PER_S * seconds)) if len(moved) else 0.0
