@@ -112,6 +112,32 @@ def test_control_points_place_the_map_in_the_site_and_check_points_test_it(yard:
     assert ResultSummary.read(survey.output.path / "result.json") == summary
 
 
+def test_marks_whose_photos_are_spelt_otherwise_count_as_well(yard: Yard, tmp_path: Path) -> None:
+    rows = yard.rows(["control"] * 8)
+    (tmp_path / "markers.csv").write_text((yard.folder / "markers.csv").read_text().replace(".jpg", ".TIF"))
+    values = []
+    for markers in (yard.folder / "markers.csv", tmp_path / "markers.csv"):
+        survey = yard.survey(tmp_path, rows, scale__markers=markers, report__enabled=False)
+        values.append(scale_model(survey, progress=QUIET).summary.scale.value)
+    assert values[0] == values[1]
+
+
+def test_marks_in_photos_that_the_map_lacks_are_counted_and_named(yard: Yard, tmp_path: Path) -> None:
+    text = (yard.folder / "markers.csv").read_text()
+    first = sorted(image.name for image in yard.made.reconstruction.images.values())[0]
+    (tmp_path / "markers.csv").write_text(text.replace(first, "other_7.jpg"))
+    survey = yard.survey(
+        tmp_path, yard.rows(["control"] * 8), scale__markers=tmp_path / "markers.csv", report__enabled=False
+    )
+    num = text.count(first)
+    assert num
+    summary = scale_model(survey, progress=QUIET).summary
+    assert (
+        f"{num} of {text.count('.jpg')} marks in markers.csv are of photos that are not in the map, such as "
+        f"other_7.jpg; the map has {first}" in summary.warnings
+    )
+
+
 @pytest.mark.parametrize("run", [refine_model, scale_model])
 def test_a_control_point_half_a_metre_off_is_named_and_left_out(yard: Yard, tmp_path: Path, run: object) -> None:
     assert callable(run)

@@ -16,7 +16,7 @@ from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
 from rangesfm.demo.simulated_radio import CameraPath
-from rangesfm.errors import GeometryError
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.progress import SilentProgress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
@@ -222,3 +222,35 @@ def test_positions_in_the_photos_exif_data_place_the_map_without_times(walk: Wal
     # What three metres, which last, may do to a path of a hundred metres is in the interval.
     low, high = known(summary.scale.interval_95)
     assert 0.01 < (high - low) / 2 / summary.scale.value < 0.1
+
+
+@pytest.mark.parametrize(
+    "spelt",
+    [str.upper, lambda name: name.partition(".")[0], lambda name: f"flight/{name}"],
+    ids=["capitals", "no ending", "folder"],
+)
+def test_positions_name_photos_in_other_capitals_without_an_ending_or_with_a_folder(
+    walk: Walk, tmp_path: Path, spelt: Callable[[str], str]
+) -> None:
+    result = scale_model(_by_photo(walk, tmp_path, spelt), progress=QUIET)
+    assert known(result.summary.positions).num_used == walk.made.reconstruction.num_reg_images()
+    assert_scale(result.summary, walk.made.metric_from_sfm.scale, 0.01)
+
+
+def test_positions_of_other_photos_are_refused_with_a_name_of_each(walk: Walk, tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"positions\.csv: none of the photos that the file names, such as x_"
+    ) as caught:
+        scale_model(_by_photo(walk, tmp_path, lambda name: f"x_{name}"), progress=QUIET)
+    assert any(image.name in str(caught.value) for image in walk.made.reconstruction.images.values())
+
+
+def _by_photo(walk: Walk, where: Path, spelt: Callable[[str], str]) -> Survey:
+    """Return a survey with a position for each photo, whose names are spelt so."""
+    model, rng = walk.made.reconstruction, np.random.default_rng(2)
+    images = [(image.name, image.projection_center()) for image in model.images.values()]
+    at_m = walk.made.metric_from_sfm.apply(np.array([center for _, center in images]))
+    at_m += 0.01 * rng.standard_normal(at_m.shape)
+    rows = (f"{spelt(name)},{x:.4f},{y:.4f},{z:.4f}\n" for (name, _), (x, y, z) in zip(images, at_m, strict=True))
+    (where / "positions.csv").write_text(f"image_name,x_m,y_m,z_m\n{''.join(rows)}")
+    return walk.survey(where, positions__path=where / "positions.csv", positions__antenna_in_cam_m=(0.0, 0.0, 0.0))

@@ -16,7 +16,7 @@ from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.model_ranges import ModelRanges, ranges_of_result
 from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto, text_or_dash
 from rangesfm.distances.locate_lengths import locate_distances
-from rangesfm.distances.tape import Tape
+from rangesfm.distances.tape import Tape, markers_of_photos
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import Reference, read_reference
@@ -335,7 +335,8 @@ def _taped_lengths(
     if model.model is None:
         return list(zip(unknown, unknown))
     try:
-        located = locate_distances(tape, model.model, list(anchors_m))
+        markers = markers_of_photos(tape.markers, [image.name for image in model.model.images.values()])
+        located = locate_distances(replace(tape, markers=markers), model.model, list(anchors_m))
     except InputError as error:
         raise InputError(f"{error} (model {model.name})") from None
     places = np.array(list(anchors_m.values())).reshape(-1, 3)

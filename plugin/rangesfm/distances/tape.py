@@ -14,6 +14,7 @@ from rangesfm.arrays import Array
 from rangesfm.distances.measured_lists import LENGTHS, MARKS, MeasuredList
 from rangesfm.errors import InputError, number_text
 from rangesfm.files.contents import AnyPath
+from rangesfm.files.photo_names import photos_meant
 from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.text_tables import repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
@@ -162,6 +163,16 @@ def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[st
             raise listed.table.error(rows[again[0]], listed.columns["image_name"], "each photo once for this marker")
         markers[name] = Marker(seen_in, pixels[rows], tuple(listed.table.line[rows].tolist()), stddev_px)
     return markers
+
+
+def markers_of_photos(markers: Mapping[str, Marker], photos: Collection[str]) -> dict[str, Marker]:
+    """Return markers with the names of their photos as these are, by ``photos_meant``."""
+    listed = [*dict.fromkeys(name for marker in markers.values() for name in marker.image_names)]
+    meant = dict(zip(listed, photos_meant(listed, photos), strict=True))
+    return {
+        name: replace(marker, image_names=tuple(meant[photo] for photo in marker.image_names))
+        for name, marker in markers.items()
+    }
 
 
 class DistanceRow(Record):

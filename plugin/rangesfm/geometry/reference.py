@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.contents import AnyPath
+from rangesfm.files.photo_names import rows_of_photos
 from rangesfm.files.text_tables import (
     TextTable,
     has_columns,
@@ -87,8 +88,7 @@ class Reference:
         """
         if self.image_names is not None:
             assert image_names is not None
-            index_of = {name: i for i, name in enumerate(self.image_names)}
-            return self._at_index(np.array([index_of.get(name, -1) for name in image_names], dtype=np.int64))
+            return self._at_index(rows_of_photos(image_names, self.image_names))
         assert times_s is not None
         assert self.timestamps_s is not None
         known = self.timestamps_s

@@ -9,6 +9,7 @@ from scipy.sparse import coo_array, csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.files.photo_names import rows_of_photos, told_none
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import align_points, are_apart
 from rangesfm.geometry.trajectory import Trajectory, keyframes_around
@@ -54,10 +55,13 @@ class AntennaTrack:
         """Return the track with its time offset, which is searched for if it is not given.
 
         Raises:
-            InputError: the positions are by time and the photos have none.
+            InputError: the positions are by time and the photos have none, or they are of other photos.
             GeometryError: too few positions and keyframes have a moment in common.
         """
         if self.log.timestamp_s is None:
+            listed = self.log.image_name or ()
+            if np.all(rows_of_photos(listed, path.image_names) < 0):
+                raise InputError(told_none("the file", listed, path.image_names), self.log.path)
             return self
         if path.timestamps_s is None:
             raise InputError("the positions have times but the photos have none: give image times", self.log.path)
@@ -125,8 +129,7 @@ class AntennaTrack:
         """Return the rows of the log that have a place, and the keyframes before and after each with its fraction."""
         log, options = self.log, self.association
         if log.image_name is not None:
-            index_of = {name: index for index, name in enumerate(path.image_names)}
-            at = np.array([index_of.get(name, -1) for name in log.image_name], dtype=np.int64)
+            at = rows_of_photos(log.image_name, path.image_names)
             rows = np.flatnonzero(at >= 0)
             return rows, at[rows], at[rows], np.zeros(len(rows))
         if path.timestamps_s is None:

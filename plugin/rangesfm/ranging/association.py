@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.files.photo_names import rows_of_photos
 from rangesfm.geometry.motion_prior import learn_motion
 from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
@@ -63,8 +64,7 @@ def associate(
     options = options or AssociationOptions()
     status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
     if log.image_name is not None:
-        index_of = {name: index for index, name in enumerate(trajectory.image_names)}
-        before = after = np.array([index_of.get(name, -1) for name in log.image_name], dtype=np.int64)
+        before = after = rows_of_photos(log.image_name, trajectory.image_names)
         fraction = np.zeros(len(log))
         status[before < 0] = RangeStatus.UNKNOWN_IMAGE
     elif trajectory.timestamps_s is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.distances.tape import Tape, read_tape
+from rangesfm.distances.tape import Marker, Tape, markers_of_photos, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.contents import sha256_of
 from rangesfm.files.folders import walk
@@ -88,6 +88,35 @@ class RangingInputs:
     def needs_times(self) -> bool:
         """True if the photos' times are needed, for ranges or positions by time."""
         return self.log.image_name is None or self.positions.needs_times
+
+    def listed_photos(self) -> Iterator[tuple[str, tuple[str, ...]]]:
+        """Yield the photos that each file names, after what it says of them."""
+        points, antenna, tape = self.positions.points, self.positions.antenna, self.tape
+        if points is not None:
+            yield f"marks in {_name(points.markers_path or points.path)}", _photos_of(points.markers)
+        elif tape is not None:
+            yield f"marks in {_name(tape.markers_path)}", _photos_of(tape.markers)
+        if antenna is not None and antenna.log.image_name is not None:
+            yield f"positions in {_name(antenna.log.path)}", antenna.log.image_name
+        if self.log.image_name is not None:
+            yield f"ranges in {_name(self.log.source)}", self.log.image_name
+
+    def with_photos(self, photos: Collection[str]) -> RangingInputs:
+        """Return the inputs with the photos of marks named as these are."""
+        points, tape = self.positions.points, self.tape
+        if points is not None:
+            points = replace(points, markers=markers_of_photos(points.markers, photos))
+        if tape is not None:
+            tape = replace(tape, markers=markers_of_photos(tape.markers, photos))
+        return replace(self, tape=tape, positions=replace(self.positions, points=points))
+
+
+def _name(path: Path | None) -> str:
+    return "the file" if path is None else path.name
+
+
+def _photos_of(markers: Mapping[str, Marker]) -> tuple[str, ...]:
+    return tuple(photo for marker in markers.values() for photo in marker.image_names)
 
 
 def read_ranging_inputs(survey: Survey) -> RangingInputs:

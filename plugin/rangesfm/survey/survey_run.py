@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.errors import InputError
+from rangesfm.files.photo_names import told_none, told_unknown
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
@@ -62,6 +63,16 @@ class SurveyRun:
     def changed(self, values: Mapping[str, Any]) -> SurveyRun:
         """Return the same with other options by dotted key, as ``Survey.changed``."""
         return replace(self, survey=self.survey.changed(values))
+
+    def with_photos(self, photos: Collection[str], where: str) -> SurveyRun:
+        """Return the same with the photos of marks named as these are, after warnings about names of no photo.
+
+        Args:
+            photos: names of all photos. where: what has these, for the warnings.
+        """
+        for what, listed in self.inputs.listed_photos():
+            self.journal.warn(*told_unknown(what, listed, photos, where))
+        return replace(self, inputs=self.inputs.with_photos(photos))
 
     def find_time_offset(self, trajectory: Trajectory) -> TimeOffset | None:
         """Search for the time offset between the clocks; None where it is given, or where the log names photos.
@@ -135,7 +146,7 @@ class SurveyRun:
 def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:
     times, photo_times = placed.log.timestamp_s, trajectory.timestamps_s
     if times is None or photo_times is None:
-        return "none of the photos that the log names is in the model"
+        return told_none("the log", placed.log.image_name or ("",), trajectory.image_names)
     if np.all(placed.status[placed.log.kind == RangeKind.TAG_ANCHOR] == RangeStatus.OUTSIDE_PATH):
         return (
             f"the log's times ({times.min():.3f} to {times.max():.3f} s, plus an offset of {offset_s:g} s) do not "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
@@ -18,6 +18,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.folders import IMAGE_EXTENSIONS, natural_order, walk
+from rangesfm.files.photo_names import photos_meant
 from rangesfm.files.text_tables import TextTable
 from rangesfm.options import TIME_S
 from rangesfm.vision.photo_files import exif_tags
@@ -152,7 +153,7 @@ def read_image_times_csv(
 ) -> ImageTimes:
     """Read ``image_name,timestamp_s``, or another table with names of photos and times.
 
-    Where photos are known, a name in the table may have other folders in front, or no ending.
+    Where photos are known, names in the table are matched with them by ``photos_meant``.
 
     Args:
         path: the file; other columns are ignored.
@@ -169,7 +170,7 @@ def read_image_times_csv(
     table, times = listed.table, listed.times_s
     frames = frames or {}
     frame_of = {photo: first for first, photos in frames.items() for photo in photos}
-    image_names = _names_of_photos(listed.image_names, {*(names or ()), *frame_of})
+    image_names = photos_meant(listed.image_names, {*(names or ()), *frame_of})
     _refuse_repetitions(table, image_names, times.tolist(), frame_of)
     known, unknown = set(image_names), list[int]()
     if names is not None:
@@ -195,28 +196,6 @@ def read_image_times_csv(
         num = f"{len(unknown)} of the {len(image_names)}"
         notes.append(f"{num} names in {table.path.name} belong to no photo in the folder")
     return replace(ordered, notes=(*notes, *ordered.notes))
-
-
-def _names_of_photos(listed: Sequence[str], photos: Collection[str]) -> list[str]:
-    """Return the photo that each name in a table means; the name itself if there is none, or more than one.
-
-    A name may have further folders in front, separated by either slash, or no folder, or no ending.
-    """
-    without_ending, without_folder = dict[str, set[str]](), dict[str, set[str]]()
-    for photo in photos:
-        base = photo.rpartition("/")[2]
-        without_ending.setdefault(os.path.splitext(photo)[0], set()).add(photo)
-        for short in (base, os.path.splitext(base)[0]):
-            without_folder.setdefault(short, set()).add(photo)
-    found = []
-    for name in listed:
-        parts = name.replace("\\", "/").split("/")
-        tails = ["/".join(parts[k:]) for k in range(len(parts))]
-        meant = [{tail} for tail in tails if tail in photos] or [without_ending.get(tail, set()) for tail in tails]
-        meant += [without_folder.get(name, set())]
-        only = next(filter(None, meant), set())
-        found.append(next(iter(only)) if len(only) == 1 else name)
-    return found
 
 
 def times_from_exif(folder: AnyPath, names: Sequence[str]) -> ImageTimes:

@@ -83,13 +83,13 @@ def check_survey(survey: Survey) -> CheckedSurvey:
         if survey.images.path is not None and is_source(survey.images.path):
             return checked
         if model is None:
-            keyframes, times = checked_keyframes(run)
+            keyframes, times = checked_keyframes(run.with_photos(list_images(survey.photos_path), "the folder"))
         else:
             sfm = read_registered(model, journal)
             checked.facts.append(f"model: {sfm.num_reg_images()} photos and {sfm.num_points3D()} points in {model}")
             keyframes = tuple(image.name for image in sfm.images.values())
             times = times_of_model(survey, sfm, model) if inputs.needs_times else None
-            check_taped_ends(run, keyframes)
+            check_taped_ends(run.with_photos(keyframes, "the map"), keyframes)
         _tell_of_times(survey, inputs, keyframes, times, checked)
         if photos is not None:
             _check_mapper(survey, photos.of(keyframes), checked)

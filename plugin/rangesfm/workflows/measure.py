@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.measured_lists import PAIRS
-from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, read_markers
+from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, markers_of_photos, read_markers
 from rangesfm.errors import InputError, number_text
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import align_rows, write_table
@@ -115,6 +115,7 @@ def _points_of(result: ResultFolder, markers_path: Path | None) -> MapPoints:
     refine = result.summary.refine
     pixel_stddev = None if refine is None else refine.pixel_stddev
     markers = _markers_of(result) | ({} if markers_path is None else read_markers(markers_path))
+    markers = markers_of_photos(markers, [image.name for image in model.images.values()])
     anchors_m = result.anchor_positions_m
     return MapPoints(model, anchors_m, markers, np.nan if pixel_stddev is None else pixel_stddev, markers_path)
 

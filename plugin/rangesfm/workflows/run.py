@@ -23,6 +23,7 @@ from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.vision.image_times import list_images
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.adoption import with_likeliest_cause
 from rangesfm.workflows.make_metric_map import join_by_survey, metric_map
@@ -70,6 +71,7 @@ def _from_photos(survey: Survey, progress: Progress | None, *, restart: bool) ->
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
         run = replace(run, survey=with_photos_in_folder(survey, run.journal, restart=restart))
+        run = run.with_photos(list_images(run.survey.photos_path), "the folder")
         keyframes, times = checked_keyframes(run)
         run = with_tags(run, keyframes)
         # An earlier result keeps its reconstruction until the new result is complete.
@@ -129,7 +131,8 @@ def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) 
         times = times_of_model(run.survey, sfm, run.survey.given_model_path)
         run.journal.warn(*times.notes)
         tell_of_times(run, times)
-    run = with_tags(run, sorted(image.name for image in sfm.images.values()))
+    names = sorted(image.name for image in sfm.images.values())
+    run = with_tags(run.with_photos(names, "the map"), names)
     return map_in_metres(run, place_ranges(run, [sfm], times), refine=refine)
 
 
