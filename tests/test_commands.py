@@ -233,8 +233,8 @@ class TestRefineInASiteFrame:
         half_width = 1.96 * refined.relative_stddev
         assert 3.7 / 1.96 * half_width < reliability["scale_within"] < 0.2
         assert reliability["unchecked"] == []
-        line = f"reliability: scale within {100 * reliability['scale_within']:.2g} % at a risk of 0.0001, "
-        assert line + "one unfound mistake included" in refined.stdout
+        said = f"the scale is off by {100 * reliability['scale_within']:.2g} % at most (risk of more: 0.0001)"
+        assert f"reliability: if one mistake was made and not noticed, {said}" in refined.stdout
         places = {row["subject"]: row for row in refined.result["tests"] if row["name"] == "anchor place"}
         assert set(places) == {"A1", "A2", "A3", "A4"}
         for row in places.values():

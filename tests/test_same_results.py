@@ -101,7 +101,7 @@ CASES = {
         (*UNKNOWN, "--use_anchors", "A1"),
         obstructed,
         "doubtful",
-        "a mistake could stay hidden here",
+        "the ranges cannot show every mistake that matters",
     ),
     "unknown, offset": Case("scale", (*UNKNOWN, "--ranges_time_offset", "auto"), erring),
     "unknown and taped": Case("refine", (*UNKNOWN, "--distances", "taped.csv"), erring),
@@ -112,7 +112,7 @@ CASES = {
         SITE,
         stepping,
         "doubtful",
-        "either from 23 s after the first range on the ranges to anchor A2 read about",
+        "either the ranges to anchor A2 jumped 23 s after the first range: since then they read about",
     ),
     "a slipped clock": Case("scale", SITE, slipping, "doubtful", "probably the clocks' offset jumped by about"),
     "an anchor typed wrong": Case(

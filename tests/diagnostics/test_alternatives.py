@@ -38,7 +38,7 @@ def test_each_two_labels_may_be_swapped() -> None:
         ("labels swapped", "A, C"),
         ("labels swapped", "B, C"),
     ]
-    assert found[1].words == "anchors A and C bear each other's label"
+    assert found[1].words == "the labels of anchors A and C are swapped"
     assert places_of(found[1]) == {"A": ANCHORS_M[2].tolist(), "C": ANCHORS_M[0].tolist()}
 
 
@@ -83,8 +83,11 @@ def test_axes_of_the_anchors_are_changed_as_the_words_say(words: str, of_first: 
     ("words", "factor"),
     [
         ("the anchors' coordinates are in feet", 0.3048),
-        ("the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet", 1 / 0.3048),
-        ("the ranges are of both ways, there and back", 2.0),
+        (
+            "the ranges are in feet, or metres among the anchors' coordinates were taken for feet and converted",
+            1 / 0.3048,
+        ),
+        ("each range is the way to the anchor and back, twice the distance", 2.0),
     ],
 )
 def test_another_unit_changes_the_anchors_distances_about_their_middle(words: str, factor: float) -> None:

@@ -338,7 +338,7 @@ class TestTimes:
     ) -> None:
         offset = standing["clock offset", ""]
         assert offset.words(np.array([-0.15])) == (
-            "the clocks are off by about 0.15 s more than assumed (-0.15 s on the offset)"
+            "the time offset between the clocks is wrong: it needs about -0.15 s more"
         )
         assert offset.correction(np.array([-0.15])).time_shift_s == -0.15
         # Otherwise they have no moment in common.

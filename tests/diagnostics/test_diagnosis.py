@@ -78,7 +78,9 @@ class TestEvidence:
         far = replace(problem.gradient, distance_m=np.full(60, 70.0))
         row = shown(replace(problem, scatter_m=0.6 + over_m, gradient=far), "range noise")
         assert row.rejected == is_seen
-        assert row.words == "the ranges scatter by 0.60 m; radios in the open reach 0.60 m at most"
+        assert row.words == (
+            "the ranges scatter by 0.60 m from one to the next; radios with a clear line of sight stay below 0.60 m"
+        )
 
     def test_errors_that_last_are_those_of_time_place_and_direction(self, problem: Linearized) -> None:
         names = ("white", "time", "place", "view", "drift")
@@ -89,7 +91,8 @@ class TestEvidence:
         assert _lasting_m(replace(problem, errors=errors)) == pytest.approx(0.07)
         far = replace(problem.gradient, distance_m=np.full(60, 10.0))
         row = shown(replace(problem, errors=errors, gradient=far), "lasting errors")
-        said = "the ranges have errors that last for seconds, of 0.07 m; radios in the open reach 0.30 m at most"
+        said = "the ranges have errors of 0.07 m that last for seconds; "
+        said += "radios with a clear line of sight stay below 0.30 m"
         assert row.words == said
         assert not row.rejected
         row = shown(replace(problem, errors=replace(errors, covariances_m2=19.0 * covariances), gradient=far), row.name)
@@ -164,10 +167,8 @@ class TestMixedUp:
         assert row.rejected
         assert (row.name, row.subject) == ("anchor mixed up", "A")
         assert row.size == pytest.approx(0.55)
-        assert row.words == (
-            "55 % of the ranges to anchor A that are far from those right before and after are as long as those to C"
-        )
-        assert "two devices bear the label A" in row.remedy
+        assert row.words == "55 % of the outliers among the ranges to anchor A fit anchor C instead"
+        assert "two devices have the id A" in row.remedy
 
     def test_they_fit_as_well_as_ranges_scatter(self, problem: Linearized) -> None:
         # Three times 8 cm, the least scatter, or three times the own one.
@@ -272,18 +273,21 @@ class TestHidden:
         return list(_what_could_hide(findings))
 
     def test_it_is_told_with_the_smallest_size_that_is_found(self) -> None:
-        said = "a mistake could stay hidden here (clock offset, 0.5 s) and change the scale by 5.0 %: look"
+        said = (
+            "the ranges cannot show every mistake that matters: an error of 0.5 s (time offset of the clocks) would go "
+            "unnoticed and change the scale by 5.0 %; tape a length between two distant points as a check, or look"
+        )
         assert self.told(self.hidden()) == [said]
         of_b = self.hidden(("anchor place", "B"), effect=0.06)
         (told,) = self.told(self.hidden(), of_b, self.hidden())
-        assert told.startswith("a mistake could stay hidden here (anchor place B, 0.5 s) and change the scale by 6.0 %")
+        assert "0.5 s (position of anchor B) would go unnoticed and change the scale by 6.0 %" in told
 
     def test_a_surveyor_notices_what_is_large(self) -> None:
         # Half of what the test would find is noticed anyway, with half of its effect.
         (told,) = self.told(self.hidden(effect=0.10, unnoticed=0.25))
-        assert "(clock offset, 0.25 s) and change the scale by 5.0 %" in told
+        assert "0.25 s (time offset of the clocks) would go unnoticed and change the scale by 5.0 %" in told
         (told,) = self.told(self.hidden(effect=0.10, unnoticed=0.25), self.hidden(("step", ""), effect=0.06))
-        assert "(step, 0.5 s) and change the scale by 6.0 %" in told
+        assert "0.5 s (jump of all ranges) would go unnoticed and change the scale by 6.0 %" in told
 
     def test_a_small_change_of_the_scale_need_not_be_feared(self) -> None:
         assert self.told(self.hidden(effect=1.01 * DOUBTFUL_ABOVE))

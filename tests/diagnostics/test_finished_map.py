@@ -128,14 +128,14 @@ def test_points_thrown_away_are_said_if_they_are_most(share: float, is_said: boo
     points = np.random.default_rng(0).standard_normal((100, 3))
     thrown = np.where((np.arange(100) < 100 * share)[:, None], 1e4 * points, points)
     reasons = list(finished_map._elsewhere(points, thrown))
-    assert [reason.split(":")[0] for reason in reasons] == is_said * ["the points were thrown away from the path"]
+    assert [reason.split(":")[0] for reason in reasons] == is_said * ["the points moved away from the path"]
 
 
 @pytest.mark.parametrize(("factor", "is_said"), [(1.95, False), (2.05, True)])
 def test_points_are_thrown_away_if_their_median_distance_doubles(factor: float, is_said: bool) -> None:
     points = np.array([[0.0, 3, 4], [0, 0, 1], [10, 0, 0]])
     reasons = list(finished_map._elsewhere(points, factor * points))
-    assert reasons == is_said * ["the points were thrown away from the path: from 5 to 10.2 m (median)"]
+    assert reasons == is_said * ["the points moved away from the path: from 5 to 10.2 m (median)"]
     assert list(finished_map._elsewhere(points[:0], points)) == []
     assert list(finished_map._elsewhere(points[:0], points[:0])) == []
 
@@ -198,7 +198,8 @@ def out_of_line(before: PointErrors, after: PointErrors, max_growth: float = 3.0
 
 
 def test_errors_that_grew_by_more_than_the_ranges_account_for_are_said() -> None:
-    grown = "the reprojection error grew from 1.00 to 3.10 px (median); the ranges account for 3.0 times at most"
+    grown = "the reprojection error grew from 1.00 to 3.10 px (median), by more than the "
+    grown += "factor 3.0 that the ranges can cause"
     assert out_of_line(errors_px(1.0, 1.0, 4.0), errors_px(2.0, 3.1, 4.0)) == [grown]
     assert out_of_line(errors_px(1.0, 1.0, 4.0), errors_px(2.0, 2.9, 4.0)) == []
 
@@ -288,7 +289,7 @@ def test_an_anchor_is_lost_beyond_the_size_of_the_path_and_of_its_own_uncertaint
             prior_position_stddev_m=stddev_m,
         ),
     ]
-    said = [f"anchor A7 went {far_m:.3g} m from where it was surveyed"]
+    said = [f"anchor A7 was moved {far_m:.3g} m from its surveyed position"]
     assert apart_from_ranges((0.1,), (0.1,), anchors=anchors) == is_said * said
 
 
@@ -301,6 +302,11 @@ def test_a_place_is_said_with_its_half_widths_of_95_percent() -> None:
     words, is_wide = in_words((0.3, 0.0, 0.4), 0.01, 1.0, 100.0)
     assert words == "the map's place is known to 0.98 m, its heading to 1.1 deg, each keyframe to 2 m or better (95 %)"
     assert not is_wide
+    words, is_wide = in_words((0.3, 0.0, 0.4), 0.01, 3.0, 100.0)
+    assert words.endswith("; to be good, each keyframe has to be known to 4 m, 4 % of the site's size")
+    assert is_wide
+    words, _ = in_words((0.3, 0.0, 0.4), 0.03, 1.0, 100.0)
+    assert words.endswith("; to be good, the heading has to be known to 2.3 deg")
     words, is_wide = in_words((np.inf, 0.0, 0.4), np.inf, np.inf, 100.0)
     assert "place is known to nothing, its heading to nothing, each keyframe to nothing or" in words
     assert is_wide
@@ -404,14 +410,14 @@ def test_keyframes_that_hang_loose_are_named_beside_how_well_the_others_are_know
         covariance = SimpleNamespace(frame_ids=FRAME_IDS, similarity=np.zeros((7, 7)), centers=centers)
         return place(estimate_of(0.0), summary_of(covariance=covariance), doubts=doubts).reasons
 
-    one = "keyframe a hangs loose on the map; each other keyframe is known to 0.2 m or better (95 %)"
+    one = "the photos hardly tie keyframe a to the map; each other keyframe is known to 0.2 m or better (95 %)"
     assert reasons_of(0.1, 0.05, 600.0, doubts=["it is broken"])[1:] == (one, "it is broken")
     # None is far less certain than most, and one that is known well enough is no matter.
     assert len(reasons_of(300.0, 150.0, 600.0)) == len(reasons_of(0.001, 0.001, 0.1)) == 1
     several = Trajectory(np.arange(5), tuple("abcde"), None, np.zeros((5, 3)), np.array([np.eye(3)] * 5))
     (said,) = finished_map._loose_ones(several, np.array([0.1, 5.0, 0.2, 7.0, 0.1]))
-    assert (
-        said == "keyframe d and 1 more hang loose on the map; each other keyframe is known to 0.39 m or better (95 %)"
+    assert said.startswith(
+        "the photos hardly tie keyframe d (and 1 more) to the map; each other keyframe is known to 0.39"
     )
 
 
@@ -453,6 +459,6 @@ def test_a_map_that_moved_as_a_whole_is_not_broken(
         anchor_id="A7", position_m=np.full(3, 4.0), prior_position_m=np.zeros(3), prior_position_stddev_m=0.1
     )
     names: Any = ("scaled", "refined", trajectory, SimpleNamespace(solution=None), summary_of(anchors=[anchor]), 2.0)
-    thrown = ["the points were thrown away from the path: from 5 to 15 m (median)"]
-    lost = ["anchor A7 went 6.93 m from where it was surveyed"]
+    thrown = ["the points moved away from the path: from 5 to 15 m (median)"]
+    lost = ["anchor A7 was moved 6.93 m from its surveyed position"]
     assert [*finished_map.why_broken(*names)] == is_said * thrown + lost

@@ -21,7 +21,7 @@ from rangesfm.diagnostics import hypothesis_tests, mistakes
 from rangesfm.diagnostics.alternatives import Alternative, alternatives
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis import Correction, Hypothesis
+from rangesfm.diagnostics.hypothesis import Correction, Hypothesis, mistake_in_words
 from rangesfm.diagnostics.linearized import Linearized, linearized
 from rangesfm.diagnostics.mistakes import Cause, _settled_test, _varied
 from rangesfm.diagnostics.timed_hypotheses import SCANNING, _changes
@@ -57,9 +57,9 @@ def test_the_worst_that_could_hide_is_named_where_it_does_more_than_a_good_scale
     monkeypatch.setattr("rangesfm.diagnostics.diagnosis.DOUBTFUL_ABOVE", 0.0)
     found = diagnosis(surveyed(DRONE, SEED))
     (reason,) = found.reasons
-    assert reason.startswith("a mistake could stay hidden here")
-    hidden = [test for test in found.tests if f"({test.name} {test.subject}".strip() in reason]
-    assert "range scale" not in reason  # it changes the scale most, but the scale's interval includes it
+    assert reason.startswith("the ranges cannot show every mistake that matters")
+    hidden = [test for test in found.tests if f"({mistake_in_words(test.name, test.subject)})" in reason]
+    assert "scale error of all ranges" not in reason  # it changes the scale most, but the scale's interval includes it
     said = re.search(r"change the scale by ([0-9.]+) %", reason)
     assert hidden
     assert said is not None
@@ -122,7 +122,7 @@ def test_ranges_to_another_anchor_under_a_label_are_named() -> None:
 def test_a_step_of_all_ranges_is_found_at_its_own_time() -> None:
     given = surveyed(DRONE, SEED)
     given.range_m = given.range_m + 0.5 * (given.time_s > np.quantile(given.time_s, 0.5))
-    assert "from 50 s after the first range on the ranges read about 0.5" in diagnosis(given).reasons[0]
+    assert "the ranges jumped 50 s after the first range: since then they read about 0.5" in diagnosis(given).reasons[0]
 
 
 def test_the_coordinate_that_was_typed_wrong_is_named() -> None:

@@ -145,7 +145,7 @@ class TestTimes:
         assert len(list(refine())) == 17
 
     def test_a_time_is_told_from_the_first_range(self, problem: Linearized) -> None:
-        assert _when(problem, 12.0) == "from 7 s after the first range"
+        assert _when(problem, 12.0) == "7 s after the first range"
         assert _when(problem, 12.0, 14.0) == "from 7 to 9 s after the first range"
         assert _when(replace(problem, by_time=None), 12.0, 14.0) == "from 7 to 9 m along the path"
 
@@ -225,13 +225,13 @@ class TestMoves:
     def test_what_moved_is_told(self, of_kind: dict[str, list[Hypothesis]]) -> None:
         told = {name: of_kind[name][0].words(self.SIZE_M) for name in ("anchor moved", "map break", "tag slipped")}
         assert told == {
-            "anchor moved": "anchor A was moved by about 1.30 m from 4 s after the first range "
+            "anchor moved": "anchor A was moved by about 1.30 m 4 s after the first range "
             "(+0.30, -0.40, +1.20 m in x, y, z)",
             # Where the map should be is back from where it is.
-            "map break": "the map breaks: from 1 s after the first range it lies about 1.30 m from where it should "
-            "(-0.30, +0.40, -1.20 m in x, y, z)",
-            "tag slipped": "the tag slipped: from 1 s after the first range it sits about 1.30 m elsewhere on the "
-            "camera (+0.30, -0.40, +1.20 m along the camera's x, y, z)",
+            "map break": "the map breaks 1 s after the first range: its later part lies about 1.30 m from where it "
+            "should (-0.30, +0.40, -1.20 m in x, y, z)",
+            "tag slipped": "the tag slipped 1 s after the first range: since then it sits about 1.30 m elsewhere on "
+            "the camera (+0.30, -0.40, +1.20 m along the camera's x, y, z)",
         }
 
     def test_what_moved_stays_within_reach(self, problem: Linearized, of_kind: dict[str, list[Hypothesis]]) -> None:
@@ -273,19 +273,19 @@ class TestSteps:
     def test_steps_are_told_with_their_time_and_anchor(self, of_kind: dict[str, list[Hypothesis]]) -> None:
         of_a, of_all = of_kind["anchor step"][0], of_kind["step"][0]
         assert of_a.words(np.array([0.5])) == (
-            "from 1 s after the first range on the ranges to anchor A read about 0.50 m longer"
+            "the ranges to anchor A jumped 1 s after the first range: since then they read about 0.50 m longer"
         )
         assert of_all.words(np.array([-0.5])) == (
-            "from 1 s after the first range on the ranges read about 0.50 m shorter"
+            "the ranges jumped 1 s after the first range: since then they read about 0.50 m shorter"
         )
 
     def test_stretches_are_told_with_their_times(self, of_kind: dict[str, list[Hypothesis]]) -> None:
         of_a, of_all = of_kind["anchor stretch"][1], of_kind["stretch"][1]
         assert of_a.words(np.array([0.5])) == (
-            "from 1 to 4 s after the first range the ranges to anchor A read about 0.50 m too long"
+            "the ranges to anchor A read about 0.50 m too long from 1 to 4 s after the first range"
         )
         assert of_all.words(np.array([-0.5])) == (
-            "from 1 to 4 s after the first range the ranges read about 0.50 m too short"
+            "the ranges read about 0.50 m too short from 1 to 4 s after the first range"
         )
 
     def test_no_range_is_too_long_by_more_than_itself(
@@ -329,9 +329,7 @@ class TestSteps:
 
 def test_a_clock_that_jumps_moves_the_later_ranges(problem: Linearized, of_kind: dict[str, list[Hypothesis]]) -> None:
     first = of_kind["clock jump"][0]
-    assert first.words(np.array([-0.25])) == (
-        "the clocks' offset jumped by about -0.25 s from 1 s after the first range"
-    )
+    assert first.words(np.array([-0.25])) == ("the clocks' offset jumped by about -0.25 s 1 s after the first range")
     assert first.most == pytest.approx(LASTS_S)
     assert first.unit == "s"
     shift_s = np.asarray(first.correction(np.array([-0.25])).time_shift_s)

@@ -37,7 +37,7 @@ def test_the_scale_has_the_limit_of_its_verdict(share: float, light: str) -> Non
 
 @pytest.mark.parametrize(("scatter_m", "light"), [(0.29, "green"), (0.31, "amber")])
 def test_the_scatter_of_ranges_has_the_limit_of_its_test(scatter_m: float, light: str) -> None:
-    check = check_of("Range noise", **noise(scatter_m))
+    check = check_of("Scatter of single ranges", **noise(scatter_m))
     assert (check.light, check.limit, check.value) == (light, 0.3, scatter_m)
 
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned_photos import PlannedPhotos
-from rangesfm.planning.survey_plan import SurveyPlan, mistake_in_words, plan_survey
+from rangesfm.planning.survey_plan import SurveyPlan, plan_survey
 from rangesfm.positions.control_points import ControlPoint
 from rangesfm.report.plan_page import accuracy_views, render_plan
 
@@ -79,8 +80,8 @@ def test_page_and_terminal_list_the_same_advice_and_the_same_mistakes(plan: Surv
     for text in (page, lines):
         assert "range share" not in text
     for mistake in plan.largest_mistakes:
-        assert mistake_in_words(mistake) in page
-        assert mistake_in_words(mistake) in lines
+        assert mistake_in_words(mistake.name, mistake.subject) in page
+        assert mistake_in_words(mistake.name, mistake.subject) in lines
     num_advised = len(plan.advice_for_scale) + len(plan.advice_for_place)
     assert len(re.findall(r"^  \d+\. ", lines, re.MULTILINE)) == num_advised
     assert len(re.findall(r'<th scope="row">\d+\. ', page)) == num_advised

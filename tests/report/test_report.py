@@ -163,6 +163,10 @@ def test_every_number_of_the_result_stands_on_the_page_as_it_is(make_result: Mak
     # in one cell.
     counts = ("num_rejected", "num_anchor_anchor", "num_tag_tag", "num_keyframes", "num_without_root")
     others = [key for key in wanted if key.endswith(counts) or "surveyed" in key or "tag_in_cam_m" in key]
+    # A reader shall see one figure of the scale's uncertainty, its 95 % interval, and the scale once.
+    of_scale = {"refine.relative_scale_stddev", "refine.scale_value"}
+    assert not of_scale & {key for key, *_ in shown}
+    others += of_scale
     assert set(wanted) - set(others) <= {key for key, *_ in shown}
 
 
@@ -249,10 +253,11 @@ def test_appendix_says_what_checks_what_was_given_and_bounds_the_scale(make_resu
     bound = {"scale_within": 0.034, "risk": 1e-4, "limited_by": "lever arm", "unchecked": ["anchor place A9"]}
     changes = {"tests": tests, "reliability": bound}
     texts = page_of(make_result(num_keyframes=5, num_ranges_per_anchor=5, changes=changes)).texts
-    first = texts.index("What checks what was given")
+    first = texts.index("How well given values are checked")
     told = " ".join(texts[first:]).replace("\u00a0", " ")
-    assert "anchor A9: place untested 0.41 m 0.42 % anchor A10: place 35 % 0.41 m 0.42 % Checked" in told
-    assert "(the worst is lever arm), the scale is off by more than 3.4 % with a probability of 0.0001 at most." in told
+    given = "position of anchor A9 untested 0.41 m 0.42 % position of anchor A10 35 % 0.41 m 0.42 % Checked"
+    assert given in told
+    assert "(worst case: lever arm), the scale is off by 3.4 % at most (risk of more: 0.0001)." in told
 
 
 def test_no_stddev_stands_above_the_appendix(make_result: MakeResult) -> None:

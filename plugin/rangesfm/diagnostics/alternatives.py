@@ -25,8 +25,8 @@ LEAST_USED = 0.4
 """Least share of an anchor's ranges that fit a map on which it is about where it is said to be."""
 _UNITS_M = {
     "the anchors' coordinates are in feet": FOOT_M,
-    "the ranges are in feet, or the anchors' coordinates were converted from feet and are no feet": 1 / FOOT_M,
-    "the ranges are of both ways, there and back": 2.0,
+    "the ranges are in feet, or metres among the anchors' coordinates were taken for feet and converted": 1 / FOOT_M,
+    "each range is the way to the anchor and back, twice the distance": 2.0,
 }
 # Factors on the scale of the map that are tried, as with ranges in feet or of both ways.
 _SCALE_FACTORS = np.geomspace(1 / 4, 4, 7)
@@ -94,7 +94,7 @@ def _of_labels(names: Sequence[str], given: Mapping[str, Array]) -> Iterator[Alt
     """Yield swapped pairs of anchors' labels (or of lines in their file), and coordinates shifted by one line."""
     remedy = "compare the labels on the devices with the anchors' file"
     for one, other in combinations(given, 2):
-        words = f"anchors {one} and {other} bear each other's label"
+        words = f"the labels of anchors {one} and {other} are swapped"
         swapped = Correction({one: given[other], other: given[one]})
         yield Alternative("labels swapped", f"{one}, {other}", words, remedy, swapped)
     at = [given[name] for name in names]

@@ -290,13 +290,13 @@ def clocks(problem: Linearized) -> Iterator[Hypothesis]:
     if problem.by_time is None:
         return
     of_ranges, since = problem.on_map.time_s - problem.time_s.mean(), problem.time_s - problem.time_s.mean()
-    remedy = "let the offset be searched for (ranges_time_offset auto), or film a sharp turn at both ends"
+    remedy = (
+        "let the offset be searched for (ranges_time_offset auto), or film sharp turns at the beginning and the end"
+    )
     yield Hypothesis(
         "clock offset",
         of_bins(problem, -problem.by_time),
-        words=lambda size: (
-            f"the clocks are off by about {abs(size[0]):.2f} s more than assumed ({size[0]:+.2f} s on the offset)"
-        ),
+        words=lambda size: f"the time offset between the clocks is wrong: it needs about {size[0]:+.2f} s more",
         remedy=remedy,
         correction=lambda size: Correction(time_shift_s=float(size[0])),
         most=duration_s(problem),

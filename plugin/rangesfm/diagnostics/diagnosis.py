@@ -10,6 +10,7 @@ import numpy as np
 from rangesfm.arrays import Indices
 from rangesfm.diagnostics.alternatives import LEAST_USED
 from rangesfm.diagnostics.bent_path import drifts
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, Test, row_of
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
 from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
@@ -113,9 +114,12 @@ def _what_could_hide(found: Findings) -> Iterator[str]:
     worst = max(hidden, key=_hidden_effect, default=None)
     if worst is not None and _hidden_effect(worst) > DOUBTFUL_ABOVE:
         size = min(worst.smallest_detectable, worst.hypothesis.most_unnoticed)
-        what = f"{' '.join(worst.hypothesis.key).strip()}, {size:.2g} {worst.hypothesis.unit}"
         change = f"change the scale by {100 * _hidden_effect(worst):.1f} %"
-        yield f"a mistake could stay hidden here ({what}) and {change}: {worst.hypothesis.remedy}"
+        yield (
+            f"the ranges cannot show every mistake that matters: an error of {size:.2g} {worst.hypothesis.unit} "
+            f"({mistake_in_words(*worst.hypothesis.key)}) would go unnoticed and {change}; tape a length between two "
+            f"distant points as a check, or {worst.hypothesis.remedy}"
+        )
 
 
 def _hidden_effect(test: Test) -> float:
@@ -139,10 +143,10 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
     """Yield faults that are no mistake of one size: noise and lasting errors of all ranges, faults of each anchor."""
     far = _NOISE_BY_DISTANCE * float(problem.gradient.distance_m.mean())
     for kind, what, stddev_m, most_m in (
-        ("range noise", "scatter by", problem.scatter_m, _MOST_ERROR_M + far),
-        ("lasting errors", "have errors that last for seconds, of", _lasting_m(problem), _MOST_ERROR_M + far),
+        ("range noise", "scatter by {:.2f} m from one to the next", problem.scatter_m, _MOST_ERROR_M + far),
+        ("lasting errors", "have errors of {:.2f} m that last for seconds", _lasting_m(problem), _MOST_ERROR_M + far),
     ):
-        words = f"the ranges {what} {stddev_m:.2f} m; radios in the open reach {most_m:.2f} m at most"
+        words = f"the ranges {what.format(stddev_m)}; radios with a clear line of sight stay below {most_m:.2f} m"
         yield _seen(kind, "", stddev_m, most_m, words, _FEW_OBSTRUCTED, unit="m")
     on_map, bins = problem.on_map, problem.bins
     index = on_map.problem.anchor_index
@@ -153,7 +157,7 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
         unused = float(np.mean(weights[is_of] < OUTLIER_BELOW))
         num = int(np.count_nonzero(is_of))
         words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
-        remedy = "look whether it is the anchor that it is taken for, and where it stands"
+        remedy = "check the anchor's id and its position"
         yield _seen("anchor hardly used", name, unused, 1 - LEAST_USED, words, remedy)
         rows = np.flatnonzero(is_of & (bins.robust_weight < DOWN_WEIGHTED_BELOW))
         if len(rows) >= _MIN_NUM_OUTLYING and len(on_map.anchor_ids) > 1:
@@ -172,11 +176,8 @@ def _mixed_up(problem: Linearized, anchor: int, outlying: Indices) -> MistakeTes
     fitting = np.mean(np.abs(off_m) < near_m(problem.scatter_m), axis=0)
     fitting[anchor] = 0.0
     name, other = on_map.anchor_ids[anchor], on_map.anchor_ids[int(np.argmax(fitting))]
-    words = (
-        f"{100 * fitting.max():.0f} % of the ranges to anchor {name} that are far from those right before and after "
-        f"are as long as those to {other}"
-    )
-    remedy = f"see whether two devices bear the label {name}, and leave it out (use_anchors)"
+    words = f"{100 * fitting.max():.0f} % of the outliers among the ranges to anchor {name} fit anchor {other} instead"
+    remedy = f"check whether two devices have the id {name}, or leave that anchor out (use_anchors)"
     return _seen(_MIXED_UP, name, float(fitting.max()), _MOST_OF_OTHER, words, remedy)
 
 

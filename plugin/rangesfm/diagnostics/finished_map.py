@@ -72,7 +72,7 @@ def doubts_of_map(summary: RefineSummary | None, points: PointErrors) -> Iterato
     if not points.fit:
         yield Doubt(points.apart("the map"), MISMATCHED)
     if summary is not None and not summary.converged:
-        remedy = "give it more iterations ([refine] max_num_iterations), or the map fewer wrong points"
+        remedy = "allow more iterations ([refine] max_num_iterations), or remove wrong points from the map"
         yield Doubt(f"the refinement stopped before it converged: {summary.message}", remedy)
     for misfit in () if summary is None else summary.misfits:
         yield Doubt(f"after the refinement {misfit.reason}", misfit.remedy)
@@ -141,9 +141,12 @@ def _loose_ones(path: Trajectory, keyframes_m: Array) -> Iterator[str]:
     if not is_loose.any():
         return
     least, more = int(keyframes_m.argmax()), np.count_nonzero(is_loose) - 1
-    hanging = f"keyframe {path.image_names[least]} " + (f"and {more} more hang" if more else "hangs")
+    loose = f"{path.image_names[least]}" + (f" (and {more} more)" if more else "")
     others_m = NORMAL_95 * keyframes_m[~is_loose].max()
-    yield f"{hanging} loose on the map; each other keyframe is known to {others_m:.2g} m or better (95 %)"
+    yield (
+        f"the photos hardly tie keyframe {loose} to the map; each other keyframe is known to {others_m:.2g} m or "
+        "better (95 %)"
+    )
 
 
 def place_in_words(stddevs: Array, worst_m: float, size_m: float) -> tuple[str, bool]:
@@ -160,7 +163,13 @@ def place_in_words(stddevs: Array, worst_m: float, size_m: float) -> tuple[str, 
     )
     words = f"the map's place is known to {place}, its heading to {heading}, each keyframe to {worst} or better (95 %)"
     # The scale's own limit, applied to the site's size and to a radian: then no length and no place is less certain.
-    return words, bool(half_widths[2] > DOUBTFUL_ABOVE * size_m or NORMAL_95 * stddevs[3] > DOUBTFUL_ABOVE)
+    most_m, most_deg = DOUBTFUL_ABOVE * size_m, np.rad2deg(DOUBTFUL_ABOVE)
+    limit = ""
+    if half_widths[2] > most_m:
+        limit = f"each keyframe has to be known to {most_m:.2g} m, {100 * DOUBTFUL_ABOVE:g} % of the site's size"
+    elif half_widths[1] > most_deg:
+        limit = f"the heading has to be known to {most_deg:.2g} deg"
+    return words + (f"; to be good, {limit}" if limit else ""), bool(limit)
 
 
 def by_similarity(placement: Array, centers_m: Array) -> tuple[Array, Array]:
@@ -213,8 +222,8 @@ def _out_of_line(before: PointErrors, after: PointErrors, summary: RefineSummary
     typical_px = max(before.median_px, summary.pixel_stddev if before.fit else 0.0)
     if after.median_px > max_growth * typical_px:
         yield (
-            f"the reprojection error grew from {before.median_px:.2f} to {after.median_px:.2f} px (median); the ranges "
-            f"account for {max_growth:.1f} times at most"
+            f"the reprojection error grew from {before.median_px:.2f} to {after.median_px:.2f} px (median), by more "
+            f"than the factor {max_growth:.1f} that the ranges can cause"
         )
     shares = [float(np.mean(of.error_px > _LARGE * max_growth * typical_px)) for of in (before, after)]
     if shares[1] > shares[0] + _MANY_MORE:
@@ -229,7 +238,7 @@ def _elsewhere(old_points: Array, new_points: Array) -> Iterator[str]:
     # Points near the horizon may move far, but not half of all points.
     old_m, new_m = (np.median(np.linalg.norm(of, axis=1)) if len(of) else 0.0 for of in (old_points, new_points))
     if len(old_points) and new_m > _MAX_POINTS_GROWTH * old_m:
-        yield f"the points were thrown away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
+        yield f"the points moved away from the path: from {old_m:.3g} to {new_m:.3g} m (median)"
 
 
 def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:
@@ -244,4 +253,4 @@ def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: 
         if anchor.prior_position_m is not None and np.isfinite(anchor.prior_position_stddev_m):
             far_m = float(np.linalg.norm(anchor.position_m - anchor.prior_position_m))
             if far_m > max(size_m, 10 * anchor.prior_position_stddev_m):
-                yield f"anchor {anchor.anchor_id} went {far_m:.3g} m from where it was surveyed"
+                yield f"anchor {anchor.anchor_id} was moved {far_m:.3g} m from its surveyed position"

@@ -18,6 +18,7 @@ from scipy import special
 from scipy.optimize import brentq
 
 from rangesfm.arrays import Array
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.diagnostics.hypothesis_tests import Test
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE, noncentrality
 from rangesfm.scale.scale_by_lengths import LengthScale
@@ -43,7 +44,7 @@ class HiddenMistake:
     """A mistake that a test may miss.
 
     Attributes:
-        words: kind and subject.
+        words: for people.
         slope: change of the scale's logarithm by a mistake that moves the test by one standard deviation; inf for a
             mistake that no test sees.
         threshold, num: of the test, and its degrees of freedom.
@@ -73,7 +74,7 @@ def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:
     """Return the mistakes behind tests, without those whose usual size is already in the interval of the scale."""
     return tuple(
         HiddenMistake(
-            words=" ".join(test.hypothesis.key).strip(),
+            words=mistake_in_words(*test.hypothesis.key),
             slope=test.effect_on_log_scale / float(np.sqrt(noncentrality(max(test.num, 1)))),
             threshold=test.threshold,
             num=test.num,

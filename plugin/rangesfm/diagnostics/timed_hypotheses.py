@@ -42,18 +42,18 @@ _MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
     ),
     "map break": (
         lambda _, when, size: (
-            f"the map breaks: {when} it lies about {np.linalg.norm(size):.2f} m from where it should "
+            f"the map breaks {when}: its later part lies about {np.linalg.norm(size):.2f} m from where it should "
             f"({in_axes(-size)} in x, y, z)"
         ),
-        "look at the photos there for a false match or too little overlap, and map the parts apart",
+        "look for a false match or too little overlap between photos, and reconstruct the parts before and after apart",
         UNSEEN_MOVE_M,
     ),
     "tag slipped": (
         lambda _, when, size: (
-            f"the tag slipped: {when} it sits about {np.linalg.norm(size):.2f} m elsewhere on the "
+            f"the tag slipped {when}: since then it sits about {np.linalg.norm(size):.2f} m elsewhere on the "
             f"camera ({in_axes(size)} along the camera's x, y, z)"
         ),
-        "fix the tag to the camera, and run the two parts as surveys of their own",
+        "fix the tag to the camera, and run the parts before and after as two surveys",
         MISMEASURED_M,
     ),
 }
@@ -132,7 +132,7 @@ def _steps(problem: Linearized, anchor: int | None) -> Iterator[Hypothesis]:
 
     def words(when: str, size: Array) -> str:
         to, how = f" to anchor {name}" if name else "", "longer" if size[0] > 0 else "shorter"
-        return f"{when} on the ranges{to} read about {abs(size[0]):.2f} m {how}"
+        return f"the ranges{to} jumped {when}: since then they read about {abs(size[0]):.2f} m {how}"
 
     def step(when: str, later: Callable[[], Mask], after: Array) -> Hypothesis:
         return Hypothesis(
@@ -154,7 +154,7 @@ def stretches(problem: Linearized) -> Iterator[Hypothesis]:
     windows = list(_windows(problem))
 
     def words(name: str, when: str, size: Array) -> str:
-        return f"{when} the ranges{f' to anchor {name}' if name else ''} {too_long(size)}"
+        return f"the ranges{f' to anchor {name}' if name else ''} {too_long(size)} {when}"
 
     for k in _each_and_all(problem):
         name = _name(problem, k)
@@ -187,7 +187,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
             "clock jump",
             of_bins(problem, -by_time * after),
             words=lambda size: f"the clocks' offset jumped by about {size[0]:+.2f} s {when}",
-            remedy="see whether a logger was restarted then, and run the two parts as surveys of their own",
+            remedy="see whether a logger was restarted then, and run the parts before and after as two surveys",
             correction=lambda size: Correction(time_shift_s=np.where(later(), size[0], 0.0)),
             most=duration_s(problem),
             unit="s",
@@ -272,7 +272,9 @@ def _shares_after(problem: Linearized, times: Array) -> Array:
 def _when(problem: Linearized, start: float, end: float | None = None) -> str:
     begin = problem.on_map.time_s.min()
     what = "m along the path" if problem.by_time is None else "s after the first range"
-    return f"from {start - begin:.0f}{'' if end is None else f' to {end - begin:.0f}'} {what}"
+    return (
+        f"{'' if end is None else 'from '}{start - begin:.0f}{'' if end is None else f' to {end - begin:.0f}'} {what}"
+    )
 
 
 SCANNING: tuple[Callable[[Linearized], Iterator[Hypothesis]], ...] = (

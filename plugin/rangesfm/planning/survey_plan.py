@@ -11,6 +11,7 @@ import numpy as np
 
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.finished_map import place_in_words
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.diagnostics.hypothesis_tests import Factorization, MistakeTest, row_of
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
 from rangesfm.errors import GeometryError
@@ -25,20 +26,6 @@ REFUSED, OPEN_PLACE = "refused", "open"
 """Verdicts of a plan: a run will refuse the scale; it will leave open where the map is."""
 # Most lines of a list, of changes that are advised for one purpose or of mistakes; most components in a line.
 _NUM_LINES, _NUM_COMPONENTS = 8, 5
-_MISTAKES = {
-    "anchor place": "anchor {} is not where its coordinates say",
-    "anchor bias": "ranges to anchor {} are too long",
-    "common bias": "all ranges are too long by one length",
-    "range scale": "all ranges are too long by a share of the distance",
-    "anchor range scale": "ranges to anchor {} are too long by a share of the distance",
-    "anchors' scale": "the anchors' coordinates are all too small by a share",
-    "anchor heights": "the anchors' one height was guessed, and they differ",
-    "lever arm": "the tag sits elsewhere on the camera",
-    "radio drift": "ranges get longer during the survey",
-    "behind the camera": "ranges to anchors behind the camera are too long",
-    "clock offset": "the clocks are apart",
-    "clock drift": "the radio's clock runs too fast",
-}
 # Columns of a mistake's test that do not depend on the measured ranges.
 _SIZES = ("smallest_detectable", "effect_on_scale", "effect_on_place_m")
 
@@ -268,11 +255,6 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
     return tuple(sorted(found, key=lambda each: -np.inf if each.effect_on_scale is None else -each.effect_on_scale))
 
 
-def mistake_in_words(mistake: MistakeTest) -> str:
-    """Return what would be wrong."""
-    return _MISTAKES[mistake.name].format(mistake.subject)
-
-
 def size_in_words(size: float | None, unit: str) -> str:
     """Return the size of a mistake, with a fraction as a percentage; "never found" where no size would be found."""
     if size is None:
@@ -329,7 +311,7 @@ def _found(plan: SurveyPlan) -> Iterator[str]:
         size = size_in_words(mistake.smallest_detectable, mistake.unit)
         scale = "open" if mistake.effect_on_scale is None else f"{100 * mistake.effect_on_scale:.2g} %"
         place_m = np.inf if mistake.effect_on_place_m is None else mistake.effect_on_place_m
-        yield f"  {mistake_in_words(mistake)}: {size}; scale {scale}, place {_rough(place_m)}"
+        yield f"  {mistake_in_words(mistake.name, mistake.subject)}: {size}; scale {scale}, place {_rough(place_m)}"
 
 
 def _advised(plan: SurveyPlan) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.text import count, decimals_for, fixed, keyed, sentence, signed
 from rangesfm.result.summary import ResultSummary
@@ -80,8 +81,8 @@ def _checks_of_ranges(summary: ResultSummary) -> Iterator[QualityCheck]:
 
     for i, test in enumerate(summary.tests):
         if meaning := _OF_ALL_RANGES.get(test.name):
-            name, key = test.name.capitalize(), f"tests.{i}.statistic"
-            yield QualityCheck(name, meaning, test.statistic, "m", 3, limit=test.threshold, key=key)
+            name = mistake_in_words(test.name, test.subject).capitalize()
+            yield QualityCheck(name, meaning, test.statistic, "m", 3, limit=test.threshold, key=f"tests.{i}.statistic")
     of_ranges = Markup("RMS difference between the ranges used and the map; half of the differences are below {}.")
     median = told("ranges.median_abs_m", lambda x: fixed(x, 3, "m"))
     yield QualityCheck("Ranges and map", of_ranges.format(median), ranges.rms_m, "m", 3, key="ranges.rms_m")
@@ -103,6 +104,6 @@ def _checks_of_ranges(summary: ResultSummary) -> Iterator[QualityCheck]:
 
 # Tests whose value is the size of an error of all ranges, with the meaning of that size.
 _OF_ALL_RANGES = {
-    "range noise": "Scatter of single ranges (standard deviation), compared with those right before and after.",
+    "range noise": "Standard deviation of a range from those right before and after; lasting errors are not in it.",
     "lasting errors": "RMS error that ranges share for seconds, such as that of the antennas or of blocked sight.",
 }

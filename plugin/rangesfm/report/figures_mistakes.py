@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.report.content import Content
 from rangesfm.report.plot import Figure, Mark, Panel, Series
-from rangesfm.report.text import mistake, percent, rough, signed
+from rangesfm.report.text import percent, rough, signed
 from rangesfm.result.entries import MistakeEntry
 
 MAX_NUM_ROWS = 16
@@ -33,7 +34,7 @@ def mistakes_figure(content: Content) -> Figure | None:
     evidence = _panel(
         "Evidence",
         "Evidence of the ranges for each mistake, and the limit of chance",
-        "root of test value over threshold",
+        "evidence (1: limit of chance)",
         shown,
         [math.sqrt(max(test.statistic, 0.0) / test.threshold) if test.threshold > 0 else 0.0 for test in shown],
         [_size(test) for test in shown],
@@ -42,20 +43,19 @@ def mistakes_figure(content: Content) -> Figure | None:
     )
     low, high = content.summary.scale.interval_95 or (1.0, 1.0)
     could_hide = _panel(
-        "What could hide",
+        "What could go unnoticed",
         "Largest change of the scale by a mistake of each kind that is just not found",
         "change of the scale %",
         shown,
         [_effect_percent(test) for test in shown],
         [_smallest(test) for test in shown],
         _MOST_EFFECT_PERCENT,
-        band=("half of the scale's interval", 0.0, 50 * math.log(high / low)),
+        band=("half of the scale's 95 % interval", 0.0, 50 * math.log(high / low)),
     )
     caption = (
-        "Tests of possible mistakes. Left: evidence of the ranges for each mistake, with its estimated size; right of "
-        "the line it is more than chance explains. Right: the smallest size that would have been found, and how much a "
-        "mistake of that size changes the scale at most. Values beyond an axis are drawn at its edge; the table has "
-        "them."
+        "Tests of possible mistakes. Left: how strongly the ranges speak for each mistake, with its estimated size; "
+        "beyond the line it is more than chance explains. Right: how much a mistake may change the scale that is just "
+        "too small to be found, with that size. Values beyond an axis are drawn at its edge; the table has them."
     )
     return Figure("mistake_tests", caption, (evidence, could_hide), layout="views")
 
@@ -76,7 +76,7 @@ def _panel(
         kind, to = _kind(test), min(value, end)
         series.append(Series(kind, _COLORS[kind], np.array([[0.0, row], [to, row]]), "line"))
         marks.append(Mark(kind, _COLORS[kind], "disc", to, row, "", test.words))
-        rows.append((float(row), mistake(test.name, test.subject), told))
+        rows.append((float(row), mistake_in_words(test.name, test.subject), told))
     return Panel(
         title,
         description,

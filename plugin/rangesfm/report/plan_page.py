@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.planning.advice import Advice
-from rangesfm.planning.survey_plan import SurveyPlan, mistake_in_words, size_in_words
+from rangesfm.planning.survey_plan import SurveyPlan, size_in_words
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, View, equal_view, views_of
@@ -241,7 +242,7 @@ def _points(plan: SurveyPlan) -> ReportTable:
 def _mistakes(plan: SurveyPlan) -> ReportTable:
     rows = [
         [
-            mistake_in_words(each),
+            mistake_in_words(each.name, each.subject),
             size_in_words(each.smallest_detectable, each.unit),
             "open" if each.effect_on_scale is None else percent(each.effect_on_scale),
             rough(each.effect_on_place_m, "m"),

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.diagnostics.scale_bound import CHECKED_KINDS
 from rangesfm.files.folders import natural_order
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.text import count, duration, fixed, keyed, mistake, percent, plain, rough, signed
+from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, signed
 from rangesfm.result.entries import AnchorEntry, MistakeEntry, median, rms
 from rangesfm.survey.settings import KEYS
 
@@ -27,19 +28,17 @@ _REFINEMENT = {
     "kept": "refined map kept",
     "why_not_kept": "why not kept",
     "iterations": "iterations",
-    "keyframe_graph_steps": "iterations of the keyframe graph before",
-    "bend_m": "RMS bend taken out, m",
-    "bending_factor": "bend before, over that expected from the photos' residuals",
+    "keyframe_graph_steps": "iterations of the adjustment of poses alone before",
+    "bend_m": "change of the path's shape (RMS), m",
+    "bending_factor": "bending of the map, over that expected from the photos' residuals",
     "initial_cost": "cost before",
     "final_cost": "cost after",
     "reprojection_rms_px": "reprojection RMS, px",
-    "pixel_stddev": "scatter of an observation, px",
-    "correlation_inflation": "factor on stddevs, for errors that last",
+    "pixel_stddev": "standard deviation of a feature's position, px",
+    "correlation_inflation": "factor on the ranges' standard deviations, as their errors last",
     "seconds": "time, s",
     "converged": "solver converged",
     "message": "solver's message",
-    "scale_value": "scale after, m per unit",
-    "relative_scale_stddev": "± of the scale as a fraction (95 %), by the solver alone",
     "tag_in_cam_m": "lever arm, m",
     "time_offset_change_s": "change of the time offset, s",
     "short_range_error_m": "error of short ranges, m",
@@ -48,13 +47,13 @@ _REFINEMENT = {
 _POSITIONS = {
     "num": "in the file",
     "num_used": "used",
-    "num_rejected": "on the path that do not fit",
+    "num_rejected": "on the path, and rejected as they do not fit",
     "rms_m": "RMS residual, m",
     "rms_by_axis_m": "by coordinate, m",
-    "stddev_m": "learnt stddev of a coordinate, m",
-    "inflation": "factor on the stddev of a mean, for errors that last",
+    "stddev_m": "standard deviation of a coordinate, as learnt, m",
+    "inflation": "factor on the standard deviation of a mean, as their errors last",
     "time_offset_s": "time offset, s",
-    "time_offset_stddev_s": "its stddev by the search, s",
+    "time_offset_stddev_s": "standard deviation of that offset by the search, s",
     "antenna_in_cam_m": "lever arm, m",
 }
 
@@ -139,7 +138,7 @@ def _mistakes(content: Content, caption: str, *, are_found: bool) -> ReportTable
         cells = _cells(f"tests.{i}", test, dict.fromkeys(numbers, partial(fixed, decimals=4)))
         unit = "fraction" if test.unit == "1" else test.unit
         verdict = "found" if test.rejected else unfound
-        rows.append([mistake(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
+        rows.append([mistake_in_words(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
     return ReportTable(
         caption,
         [
@@ -171,7 +170,7 @@ def reliability(content: Content) -> ReportTable:
     given.sort(key=lambda test: (kinds.index(test.name), natural_order(test.subject)))
     rows = [
         [
-            mistake(test.name, test.subject),
+            mistake_in_words(test.name, test.subject),
             "untested" if test.is_checked is False else percent(test.redundancy),
             percent(test.smallest_detectable) if test.unit == "1" else rough(test.smallest_detectable, test.unit),
             percent(test.effect_on_scale),
@@ -179,17 +178,18 @@ def reliability(content: Content) -> ReportTable:
         for test in given
     ]
     note = (
-        "Checked: how much of an error the other observations show (redundancy number); the rest would move the map. "
-        "Untested: they show no error that is possible. Found from: smallest error that is found in four cases of "
-        "five, and how it would change the scale if it was not."
+        "Checked: how much of an error in it the other observations show (redundancy number); the rest would move the "
+        "map. Untested: they show no error that is possible. The smallest error found is found in four cases of five; "
+        "in the fifth it changes the scale by as much as the last column says."
     )
     if bound is not None and bound.scale_within is not None:
-        worst = f" (the worst is {bound.limited_by})" if bound.limited_by else ""
+        worst = f" (worst case: {bound.limited_by})" if bound.limited_by else ""
         note += (
-            f" Whichever one mistake was made and not found{worst}, the scale is off by more than "
-            f"{percent(bound.scale_within)} with a probability of {bound.risk:g} at most."
+            f" If one mistake was made and not noticed{worst}, the scale is off by {percent(bound.scale_within)} at "
+            f"most (risk of more: {bound.risk:g})."
         )
-    return ReportTable("What checks what was given", ["", "checked", "found from", "then the scale"], rows, note)
+    header = ["given value", "checked", "smallest error found", "its effect on the scale"]
+    return ReportTable("How well given values are checked", header, rows, note)
 
 
 def _from_stddevs(tests: Sequence[MistakeEntry]) -> str:
@@ -198,8 +198,8 @@ def _from_stddevs(tests: Sequence[MistakeEntry]) -> str:
     if least is None:
         return ""
     return (
-        f" (a mistake with a single number is found from {math.sqrt(least):.1f} of its stddevs on: so many mistakes "
-        "are tested that one of three stddevs comes up by chance)"
+        f" (a mistake that is one number is found from {math.sqrt(least):.1f} of its standard deviations on: among so "
+        "many tests, one reaches three by chance)"
     )
 
 
@@ -333,11 +333,9 @@ def refinement(content: Content) -> ReportTable:
     refine = content.summary.refine
     values = {} if refine is None else refine.to_json()
     rows = [
-        [_REFINEMENT[name], keyed(f"refine.{name}", value, plain(value))]
-        if name != "relative_scale_stddev"
-        else [_REFINEMENT[name], _cell(f"refine.{name}", value, plain)]
-        for name, value in values.items()
-        if value not in (None, "", {})
+        [words, keyed(f"refine.{name}", values[name], plain(values[name]))]
+        for name, words in _REFINEMENT.items()
+        if values.get(name) not in (None, "", {})
     ]
     return ReportTable("Refinement", [], rows, is_narrow=True)
 

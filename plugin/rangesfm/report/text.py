@@ -55,12 +55,6 @@ def percent(share: float | None) -> str:
     return rough(None if share is None else 100 * share, "%")
 
 
-def mistake(name: str, subject: str) -> str:
-    """Return a short name of a mistake, for a row of a table or of a figure."""
-    of_anchor = name.removeprefix("anchor's ").removeprefix("anchor ")
-    return f"anchor {subject}: {of_anchor}" if of_anchor != name else f"{name} {subject}".strip()
-
-
 def decimals_for(stddev: float | None, *, default: int) -> int:
     """Return the number of decimals that shows two digits of a standard deviation."""
     if stddev is None or stddev <= 0:

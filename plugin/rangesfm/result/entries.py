@@ -12,6 +12,7 @@ from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Mask
+from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.diagnostics.hypothesis_tests import finite
 from rangesfm.diagnostics.scale_bound import CHECKED_KINDS, RISK, scale_bound
 from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
@@ -106,6 +107,8 @@ class ScaleEntry(Record):
     sensitivity: ScaleSensitivity
     per_anchor: dict[Text, NumberOrNull]
     range_noise_stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("range_noise_stddev_m", "noise_stddev_m"))
+    """Standard deviation of a range about the scaled map, all its errors together. (The test "range noise" compares
+    each range with those right before and after, which have the same lasting errors.)"""
     correlation_inflation: NumberOrNull = Field(
         validation_alias=AliasChoices("correlation_inflation", AliasPath("errors", "inflation"))
     )
@@ -335,6 +338,9 @@ class RefineEntry(Record):
         why_not_kept: reasons why the refined map cannot be right; empty where it is kept.
         bending_factor: bend of the map before the refinement, divided by the bend that the residuals of the photos let
             expect.
+        scale_value: the same as ``scale.value``, if the refined map is kept.
+        relative_scale_stddev: of the scale by the residuals of the refinement alone, without the errors that it does
+            not model; the scale's interval is ``scale.interval_95``.
     """
 
     kept: Flag
@@ -451,8 +457,8 @@ class ReliabilityEntry(Record):
     Attributes:
         scale_within: largest relative error of the scale; null without a limit, or where a mistake was found.
         risk: probability with which it is exceeded.
-        limited_by: kind and subject of the mistake that may change the scale most unnoticed; empty: none adds anything.
-        unchecked: given things of which the other observations show no mistake that is possible: kind and subject.
+        limited_by: mistake that may change the scale most unnoticed, in words; empty: none adds anything.
+        unchecked: mistakes in what was given, in words, that the other observations cannot show.
     """
 
     scale_within: NumberOrNull
@@ -473,7 +479,7 @@ class ReliabilityEntry(Record):
             scale_within=None if is_found else finite(float(np.expm1(bound))),
             risk=RISK,
             limited_by=limited_by,
-            unchecked=tuple(f"{test.name} {test.subject}".strip() for test in given),
+            unchecked=tuple(mistake_in_words(test.name, test.subject) for test in given),
         )
 
 

@@ -122,16 +122,16 @@ class ResultSummary(Record):
             table: of the comparison with a reference, as text; None without one.
         """
         scale, ranges, offset = self.scale, self.ranges, self.time_offset
-        low, high = scale.interval_95 or (None, None)
-        interval = f"{_text(low, '.6g')} to {_text(high, '.6g')}"
+        interval = "unknown"
         if scale.interval_95 is not None:
+            interval = " to ".join(number_text(end, ".6g") for end in scale.interval_95)
             yield f"accuracy: {scale.in_words} (95 % interval)"
         yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {interval}"
         yield f"verdict: {scale.verdict}: {'; '.join(scale.reasons)}"
         if self.place is not None:
             # Reasons that hold for both verdicts were given with that on the scale.
             reasons = [reason for reason in self.place.reasons if reason not in scale.reasons]
-            yield f"place: {self.place.verdict}{': ' if reasons else ''}{'; '.join(reasons)}"
+            yield f"place: {self.place.verdict}: {'; '.join(reasons) or 'for the same reasons as the scale'}"
         for advice in scale.advice:
             yield f"next time: {advice}"
         yield from _notable(scale.sensitivity)
@@ -141,10 +141,11 @@ class ResultSummary(Record):
             yield _reliable(self.reliability)
         if self.loops is not None:
             yield _closed(self.loops)
-        rms, median = (_text(value, ".3f") for value in (ranges.rms_m, ranges.median_abs_m))
-        residuals = f"; they differ from the map by {rms} m (rms), half of them by less than {median} m"
         if self.has_ranges:
-            yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals if ranges.num_used else ''}"
+            residuals = f"; they differ from the map by {_text(ranges.rms_m, '.3f')} m (rms)" if ranges.num_used else ""
+            if ranges.num_used and ranges.median_abs_m is not None:
+                residuals += f", half of them by less than {number_text(ranges.median_abs_m, '.3f')} m"
+            yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"
         if self.distances:
             held = [abs(row.residual_m) for row in self.distances if row.kind == CONTROL and row.residual_m is not None]
             worst = f"; the map differs from these by {max(held):.3f} m at most" if held else ""
@@ -170,37 +171,39 @@ def _refined(refine: entries.RefineEntry) -> str:
     """Return the line that says what the refinement did."""
     if not refine.kept:
         return "the refinement broke the map: the result is the scaled map"
-    bent_back = f"; the ranges took a bend of {refine.bend_m:.2g} m (rms) out of the map"
-    return f"refined after {refine.iterations} iterations{bent_back if refine.bend_m else ''}"
+    bent = f"; it changed the shape of the camera's path by {refine.bend_m:.2g} m (rms)"
+    return f"refined in {refine.iterations} iterations{bent if refine.bend_m else ''}"
 
 
 def _reliable(reliability: entries.ReliabilityEntry) -> str:
     """Return the line about mistakes that were not found."""
-    within = f"{100 * (reliability.scale_within or 0.0):.2g} % at a risk of {reliability.risk:g}"
-    limited = f" (worst: {reliability.limited_by})" if reliability.limited_by else ""
-    unchecked = f"; untested: {', '.join(reliability.unchecked)}" if reliability.unchecked else ""
-    return f"reliability: scale within {within}, one unfound mistake included{limited}{unchecked}"
+    within = f"{100 * (reliability.scale_within or 0.0):.2g} % at most (risk of more: {reliability.risk:g})"
+    limited = f"; worst case: {reliability.limited_by}" if reliability.limited_by else ""
+    unchecked = f"; nothing checks: {', '.join(reliability.unchecked)}" if reliability.unchecked else ""
+    return f"reliability: if one mistake was made and not noticed, the scale is off by {within}{limited}{unchecked}"
 
 
 def _closed(loops: entries.LoopsEntry) -> str:
     """Return the line that says which loops were closed."""
     moved = f", which moved the map by {loops.moved_m:.2g} m (rms)" if loops.num_closed else ""
+    contradicted = f"; {loops.num_contradicted} contradict the ranges and were not used"
     return (
-        f"loops: {loops.num_proposed} pairs proposed by the map, {loops.num_verified} match,"
-        f" {loops.num_closed} closed{moved}; {loops.num_contradicted} contradict the ranges"
+        f"loops: the map suggests that {loops.num_proposed} pairs of photos show the same place; {loops.num_verified} "
+        f"of them match; {loops.num_closed} were used to close loops{moved}"
+        f"{contradicted if loops.num_contradicted else ''}"
     )
 
 
 def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:
     """Yield a line that names the errors of which one centimetre changes the scale much, if there are any."""
     values = {
-        "of bias in short ranges": sensitivity.short_range_per_cm,
-        "of bias in all ranges": sensitivity.common_bias_per_cm,
-        **{f"of lever arm in {axis}": value for axis, value in zip("xyz", sensitivity.lever_arm_per_cm)},
+        "of error in the short ranges": sensitivity.short_range_per_cm,
+        "of error in all ranges": sensitivity.common_bias_per_cm,
+        **{f"of error in the lever arm's {axis}": value for axis, value in zip("xyz", sensitivity.lever_arm_per_cm)},
     }
     notable = [f"{number_text(v, '+.2f')} % per cm {what}" for what, v in values.items() if abs(v) > _NOTABLE_PERCENT]
     if notable:
-        yield f"the scale is sensitive: {', '.join(notable)}"
+        yield f"the scale depends strongly on single errors: it changes by {', by '.join(notable)}"
 
 
 def _within_95(stddev: float | None) -> float | None:

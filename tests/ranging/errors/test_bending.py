@@ -188,7 +188,7 @@ def test_a_part_is_a_component_that_does_not_depend_on_the_anchor(path: Trajecto
     component = ErrorPart("scale_drift", np.eye(2), 0.3, 0.7).component
     assert (component.name, component.median, component.spread) == ("scale_drift", 0.3, 0.7)
     assert (component.is_of_anchor, component.calibrated_median) == (False, None)
-    assert component.words == "the map's scale, drifting along the path"
+    assert component.words == "drift of the map's scale along the path"
     np.testing.assert_array_equal(component.correlation(in_bins(path)), np.eye(2))
 
 

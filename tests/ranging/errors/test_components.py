@@ -209,14 +209,14 @@ def test_components_have_words_for_people() -> None:
     words = component_words(names)
     assert [*words] == names
     assert len(set(words.values())) == len(names)
-    assert words["bias"] == by_name("bias").words == "each anchor's own bias"
-    assert words["bending"] == "the map's own bending"
+    assert words["bias"] == by_name("bias").words == "constant range error of each anchor"
+    assert words["bending"] == "bending of the map"
 
 
 def test_errors_of_positions_have_their_time_in_words() -> None:
     assert component_words(["positions", "positions_2.5s"]) == {
-        "positions": "noise of the positions",
-        "positions_2.5s": "errors of the positions that last for 2.5 s",
+        "positions": "noise of the known positions",
+        "positions_2.5s": "errors of the known positions that last for 2.5 s",
     }
     with pytest.raises(KeyError):
         component_words(["positions_2.5"])

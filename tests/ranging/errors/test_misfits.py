@@ -21,7 +21,7 @@ def test_noise_is_no_misfit() -> None:
 
 def test_residuals_far_beyond_their_stddev_are_told() -> None:
     reasons = misfits(make_errors(0.01), noise((0.1, 0.1, 0.1)), np.arange(3.0 * NUM_EACH))
-    assert any("times their stddev" in misfit.reason for misfit in reasons)
+    assert any("times their standard deviation" in misfit.reason for misfit in reasons)
 
 
 def test_a_log_that_has_each_range_twice_scatters_as_before() -> None:
@@ -33,7 +33,7 @@ def test_a_stretch_that_is_off_is_told() -> None:
     residuals = noise((0.1, 0.1, 0.1))
     residuals[300:360] += 1.0
     (reason,) = misfits(make_errors(0.1), residuals, np.arange(3.0 * NUM_EACH))
-    assert "in 3 of 60 stretches" in reason.reason
+    assert "in 3 of 60 short periods" in reason.reason
     assert reason.remedy == "check clocks, lever arm and anchors"
 
 
@@ -47,7 +47,7 @@ def test_drift_that_is_left_is_told_even_where_the_noise_was_estimated_with_it()
     drift = 3.0 * np.sin(np.arange(3 * NUM_EACH) / 150)
     errors = make_errors(loss=CAUCHY).seen_by_bending_map(noise((0.1, 0.1, 0.1)) + drift, 0.0)
     reasons = misfits(errors, noise((0.1, 0.1, 0.1)) + drift, np.arange(3.0 * NUM_EACH))
-    (reason,) = (misfit for misfit in reasons if "far larger than the ranges' scatter" in misfit.reason)
+    (reason,) = (misfit for misfit in reasons if "far more than they scatter" in misfit.reason)
     assert reason.remedy == "check clocks, lever arm and anchors"
 
 
@@ -56,7 +56,7 @@ def test_photos_too_far_apart_are_told_where_ranges_fit_only_near_them() -> None
     between = np.abs(np.sin(np.arange(3 * NUM_EACH) * np.pi / 40))
     errors = replace(make_errors(0.4), placing_m=0.4 * between)
     reasons = misfits(errors, noise((0.02, 0.02, 0.02)) + 0.5 * between, np.arange(3.0 * NUM_EACH))
-    (reason,) = (misfit for misfit in reasons if "far larger than the ranges' scatter" in misfit.reason)
+    (reason,) = (misfit for misfit in reasons if "far more than they scatter" in misfit.reason)
     assert reason.reason.endswith("the photos are too far apart")
     assert "use more of the photos" in reason.remedy
 
@@ -78,15 +78,20 @@ def test_twenty_residuals_of_more_than_three_stddevs_are_told() -> None:
     def told(num: int, typical: float) -> tuple[Misfit, ...]:
         return misfits(apart(num, 0.1), alternating(num, 0.0, 0.1 * typical / 1.4826022), np.arange(float(num)))
 
-    assert told(20, 3.06) == (Misfit("range residuals are typically 3.1 times their stddev"),)
+    assert told(20, 3.06) == (Misfit("the ranges typically miss the map by 3.1 times their standard deviation"),)
     assert told(20, 2.95) == told(19, 3.06) == ()
+
+
+OFF_AS_A_WHOLE = (
+    "in 1 of 49 short periods all ranges to one anchor miss the map on the same side, by more than their noise explains"
+)
 
 
 @pytest.mark.parametrize(
     ("num_blocks", "num_each", "off", "told"),
     [
-        (49, 5, 3.1, ("in 1 of 49 stretches of time the ranges to an anchor are off as a whole",)),
-        (49, 5, -3.1, ("in 1 of 49 stretches of time the ranges to an anchor are off as a whole",)),
+        (49, 5, 3.1, (OFF_AS_A_WHOLE,)),
+        (49, 5, -3.1, (OFF_AS_A_WHOLE,)),
         (50, 5, 3.1, ()),
         (49, 5, 2.9, ()),
         (49, 4, 3.1, ()),
@@ -118,7 +123,8 @@ def test_residuals_five_times_as_large_as_their_scatter_are_told_of_twenty_steps
     (misfit,) = told(21, 1.02 * limit)
     scatter_m = 1.4826022 * 0.1 * np.sqrt(2)
     assert misfit == Misfit(
-        f"range residuals ({5 * 1.02 * scatter_m:.2f} m) are far larger than the ranges' scatter ({scatter_m:.2f} m)"
+        f"the ranges miss the map by {5 * 1.02 * scatter_m:.2f} m, far more than they scatter from one to the next "
+        f"({scatter_m:.2f} m)"
     )
     assert told(21, 0.98 * limit) == told(20, 1.02 * limit) == ()
 
@@ -126,7 +132,9 @@ def test_residuals_five_times_as_large_as_their_scatter_are_told_of_twenty_steps
 def test_a_scatter_below_a_centimetre_counts_as_one() -> None:
     small, large = (misfits(of_one_anchor(30), np.full(30, mm / 1482.6), np.arange(30.0)) for mm in (49, 51))
     assert small == ()
-    assert large[0].reason == "range residuals (0.05 m) are far larger than the ranges' scatter (0.01 m)"
+    assert (
+        large[0].reason == "the ranges miss the map by 0.05 m, far more than they scatter from one to the next (0.01 m)"
+    )
 
 
 def test_steps_are_between_ranges_of_one_anchor_in_the_order_of_time() -> None:
@@ -136,7 +144,9 @@ def test_steps_are_between_ranges_of_one_anchor_in_the_order_of_time() -> None:
     residuals = np.where(time % 2 == 0, 1.0, -1.0) * (1.0 + 0.002 * time)
     errors = replace(apart(60), anchor_index=time[order] % 2)
     (misfit,) = misfits(errors, residuals[order], time[order].astype(np.float64))
-    assert misfit.reason == "range residuals (1.57 m) are far larger than the ranges' scatter (0.01 m)"
+    assert (
+        misfit.reason == "the ranges miss the map by 1.57 m, far more than they scatter from one to the next (0.01 m)"
+    )
     anchors = np.repeat([0, 1], 30)
     assert misfits(replace(apart(60), anchor_index=anchors), alternating(60, 0.0, 1.0), np.arange(60.0)) == ()
 
@@ -149,7 +159,7 @@ def test_the_fifth_of_the_ranges_nearest_to_photos_tells_whether_these_are_too_f
     residuals[:num_near] = share
     errors = replace(of_one_anchor(100), placing_m=np.linspace(0.0, 0.1, 100))
     (misfit,) = misfits(errors, residuals, np.arange(100.0))
-    told = "range residuals (1.48 m) are far larger than the ranges' scatter (0.01 m)"
+    told = "the ranges miss the map by 1.48 m, far more than they scatter from one to the next (0.01 m)"
     if is_told:
         assert misfit.reason == f"{told}, but not those nearest to the photos (0.73 m): the photos are too far apart"
         assert misfit.remedy.startswith("use more of the photos")

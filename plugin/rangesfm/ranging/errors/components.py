@@ -144,30 +144,40 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
     of_anchor = functools.partial(of, is_of_anchor=True)
     return (
         of_anchor("white", "noise of single ranges", lambda c: np.diag(1 / c.worth)),
-        of_anchor("time", "errors that last for seconds", lambda c: _fading(c.time_s, LASTING_S) * _same_link(c)),
+        of_anchor("time", "range errors that last for seconds", lambda c: _fading(c.time_s, LASTING_S) * _same_link(c)),
         of(
             "drift",
-            "slow drift of the radio, alike to all anchors",
+            "slow drift of the radio, the same to all anchors",
             lambda c: _fading(c.time_s, DRIFT_S) * _same(c.tag_index),
         ),
-        of_anchor("place", "errors that belong to a place: echoes", _in_place),
+        of_anchor("place", "range errors that depend on the place, as by reflections", _in_place),
         of_anchor(
             "view",
-            "lobes of the tag's antenna towards each anchor",
+            "the tag's antenna by direction, fine pattern for each anchor",
             lambda c: np.exp((c.in_cam @ c.in_cam.T - 1) / _LOBE) * _same_link(c),
         ),
-        of_anchor("bias", "each anchor's own bias", lambda c: _same(c.anchor_index)),
-        of("tag_bias", "each tag's own bias", lambda c: _same(c.tag_index)),
-        of("common_bias", "the bias of all ranges", lambda c: np.ones((len(c), len(c))), calibrated_median=0.04),
-        of("short", "short ranges", _short, calibrated_median=0.08),
-        of("curve", "the radio's error curve", lambda c: _smooth(_log_distance(c)), calibrated_median=0.02),
-        of("slope", "ranges long by a share", lambda c: np.outer(c.distance_m, c.distance_m), calibrated_median=0.003),
+        of_anchor("bias", "constant range error of each anchor", lambda c: _same(c.anchor_index)),
+        of("tag_bias", "constant range error of each tag", lambda c: _same(c.tag_index)),
+        of("common_bias", "constant error of all ranges", lambda c: np.ones((len(c), len(c))), calibrated_median=0.04),
+        of("short", "errors of short ranges", _short, calibrated_median=0.08),
+        of(
+            "curve",
+            "range errors that vary with the distance",
+            lambda c: _smooth(_log_distance(c)),
+            calibrated_median=0.02,
+        ),
+        of(
+            "slope",
+            "range errors proportional to the distance",
+            lambda c: np.outer(c.distance_m, c.distance_m),
+            calibrated_median=0.003,
+        ),
         of_anchor(
             "antenna",
-            "anchors' antennas by direction",
+            "each anchor's antenna by direction",
             lambda c: _same(c.anchor_index) * _by_direction(c.from_anchor),
         ),
-        of("off_axis", "anchors' antennas, alike, away from the path's middle", _off_axis),
+        of("off_axis", "anchors' antennas seen from the side, all alike", _off_axis),
         of("tag_antenna", "the tag's antenna by direction", lambda c: _same(c.tag_index) * _by_direction(c.in_cam)),
     )
 
@@ -197,9 +207,9 @@ def population(without: str | None = None) -> dict[str, tuple[float, float]]:
 COMPONENTS = components(population())
 
 BENDS = {
-    "scale_drift": "the map's scale, drifting along the path",
-    "heading_drift": "the map's heading, drifting along the path",
-    "bending": "the map's own bending",
+    "scale_drift": "drift of the map's scale along the path",
+    "heading_drift": "drift of the map's heading along the path",
+    "bending": "bending of the map",
 }
 """Components that are errors of the map, not of the ranges, with descriptions; their effect depends on the map."""
 
@@ -226,19 +236,19 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
     """Return descriptions of components for people, by name."""
     words = {component.name: component.words for component in COMPONENTS} | BENDS
     words |= {
-        LEARNT_CURVE: "the learnt error curve",
-        GIVEN: "tapes, anchors' positions and what else was given",
-        REWEIGHTING: "what the best weights for these errors would change",
-        CLOCKS: "the clocks' offset, as far as the motion leaves it open",
-        PLACES: "the camera's places at and between the photos",
+        LEARNT_CURVE: "what the calibration of the radio leaves open",
+        GIVEN: "given values: anchors' positions, lengths and others",
+        REWEIGHTING: "choice of the ranges' weights",
+        CLOCKS: "time offset between the clocks",
+        PLACES: "positions of the camera at and between the photos",
         "points": "coordinates of the control points",
-        "positions": "noise of the positions",
-        "tape": "how the lengths were measured",
-        "marks": "where marks are in the photos",
+        "positions": "noise of the known positions",
+        "tape": "errors of the measured lengths",
+        "marks": "marking of points in the photos",
     }
     lasting = re.compile(r"positions_(.+)s")
     return {
-        name: f"errors of the positions that last for {found[1]} s"
+        name: f"errors of the known positions that last for {found[1]} s"
         if (found := lasting.fullmatch(name))
         else words[name]
         for name in names

@@ -328,11 +328,15 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
     stated = residuals_m / errors.stddev_m
     typical = robust_stddev(stated)
     if len(stated) >= MIN_NUM_OF_SCATTER and typical > SIGNIFICANT_STDDEVS:
-        reasons.append(Misfit(f"range residuals are typically {typical:.1f} times their stddev"))
+        told = f"the ranges typically miss the map by {typical:.1f} times their standard deviation"
+        reasons.append(Misfit(told))
     off = [np.median(stated[rows]) for rows in rows_by_key(errors.group) if len(rows) >= _MIN_BLOCK]
     num_off = int(np.sum(np.abs(off) > SIGNIFICANT_STDDEVS))
     if num_off > _FEW_BLOCKS * len(off):
-        told = f"in {num_off} of {len(off)} stretches of time the ranges to an anchor are off as a whole"
+        told = (
+            f"in {num_off} of {len(off)} short periods all ranges to one anchor miss the map on the same side, by more "
+            "than their noise explains"
+        )
         reasons.append(Misfit(told))
     order = np.lexsort((time_order, errors.anchor_index))
     steps, is_of_one = np.diff(residuals_m[order]), np.diff(errors.anchor_index[order]) == 0
@@ -341,7 +345,8 @@ def misfits(errors: RangeErrors, residuals_m: Array, time_order: Array) -> tuple
         scatter = max(robust_stddev(steps) / np.sqrt(2), _MIN_SCATTER_M)
         size = robust_stddev(residuals_m)
         if size > _MAX_STDDEV_OVER_SCATTER * scatter:
-            told = f"range residuals ({size:.2f} m) are far larger than the ranges' scatter ({scatter:.2f} m)"
+            told = f"the ranges miss the map by {size:.2f} m, far more than they scatter from one to the next"
+            told += f" ({scatter:.2f} m)"
             at_photos_m = robust_stddev(residuals_m[errors.placing_m <= np.quantile(errors.placing_m, _NEAREST)])
             if at_photos_m < _AT_PHOTOS * size:
                 told += f", but not those nearest to the photos ({at_photos_m:.2f} m): the photos are too far apart"
