@@ -84,7 +84,7 @@ def _span(times: tuple[float, ...]) -> tuple[float, ...]:
     return times
 
 
-_TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "d", "iso", "dmy", "mdy"]
+_TimeUnit = Literal["s", "ms", "us", "ns", "ticks", "min", "h", "d", "iso", "dmy", "mdy"]
 _LengthUnit = Literal["m", "cm", "mm", "ft"]
 
 
@@ -212,8 +212,9 @@ class LogOptions(Options, table="ranges"):
     tag_id, range_stddev, los; range:A1 for a column that holds the ranges of anchor A1. A log without ranges needs the
     time stamps of two-way ranging: tx1, rx1, tx2, rx2 and possibly tx3, rx3."""
     timestamp_unit: _TimeUnit | None = None
-    """Unit of the log's times. d: days, also as Excel and MATLAB count them; iso: dates and times; dmy, mdy: the same
-    with dates that begin with the day or the month (default: by format, column name or values)."""
+    """Unit of the log's times. ticks: those of a DW1000, of 15.65 ps; d: days, also as Excel and MATLAB count them;
+    iso: dates and times; dmy, mdy: the same with dates that begin with the day or the month (default: by format, column
+    name or values)."""
     range_unit: _LengthUnit | None = None
     """Unit of the log's ranges (default: by format, column name or values)."""
     separator: Annotated[

@@ -144,7 +144,7 @@ class RangeLog:
         times = self.timestamp_s
         if times is None or len(self) < 2:
             return 0.0
-        steps = self._steps_of_links(times, np.argsort(times, kind="stable"))
+        steps, _ = self._steps_of_links(times, np.argsort(times, kind="stable"))
         if not len(steps) or np.mean(steps == 0) < _MIN_REPEATED_SHARE:
             return 0.0
         between = np.diff(np.unique(times))
@@ -155,16 +155,21 @@ class RangeLog:
         """Number of times that the clock jumps back by a quarter of the log or more; 0 if the log is unordered."""
         if self.timestamp_s is None or len(self) < 2:
             return 0
-        steps = self._steps_of_links(self.timestamp_s, np.arange(len(self)))
+        steps, link = self._steps_of_links(self.timestamp_s, np.arange(len(self)))
         if np.count_nonzero(steps < 0) > _MOST_GOING_BACK * len(steps):
             return 0
-        return int(np.count_nonzero(steps < -0.25 * np.ptp(self.timestamp_s)))
+        # Each of the links goes back when the clock does.
+        return int(np.bincount(link[steps < -0.25 * np.ptp(self.timestamp_s)], minlength=1).max())
 
-    def _steps_of_links(self, times: Array, order: Indices) -> Array:
-        """Return the time steps between successive ranges of the same tag and anchor, with the rows in ``order``."""
-        link = self.tag_index * len(self.anchor_ids) + self.anchor_index
+    def _steps_of_links(self, times: Array, order: Indices) -> tuple[Array, Indices]:
+        """Return the time steps between successive ranges of the same tag and anchor, with the rows in ``order``.
+
+        The second result is the link of each step: a number for its pair of tag and anchor.
+        """
+        link = (self.tag_index + 1) * (len(self.anchor_ids) + 1) + self.anchor_index + 1
         order = order[np.argsort(link[order], kind="stable")]
-        return np.asarray(np.diff(times[order])[np.diff(link[order]) == 0])
+        same = np.diff(link[order]) == 0
+        return np.diff(times[order])[same], link[order][1:][same]
 
     def peer_ranges(self, kind: RangeKind) -> PeerRanges:
         """Return the ranges between two anchors, which do not depend on the camera, or those between two tags."""

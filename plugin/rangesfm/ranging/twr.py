@@ -18,7 +18,7 @@ from rangesfm.options import LogOptions
 VACUUM_M_PER_S = 299_792_458.0
 AIR_M_PER_S = 299_702_547.0  # refractive index 1.0003, as radio firmware assumes
 DW1000_TICK_S = 1 / (499.2e6 * 128)
-_UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ticks": DW1000_TICK_S}
+SECONDS_PER_STAMP = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ticks": DW1000_TICK_S}
 _MAX_RATE_DIFFERENCE = 1e-3  # relative difference of two clocks' rates; fifty times that of a crystal of 20 ppm
 
 
@@ -44,7 +44,7 @@ class StampOptions:
         speeds: dict[str | float, float] = {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}
         speed = options.propagation_speed
         return cls(
-            unit_s=_UNITS_S[options.stamp_unit],
+            unit_s=SECONDS_PER_STAMP[options.stamp_unit],
             wrap_s=2**options.stamp_bits * DW1000_TICK_S,
             propagation_speed_m_per_s=speeds[speed] if speed in speeds else float(speed),
             t_off_s=options.t_off_s,

@@ -444,7 +444,8 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
         notes.append(f"{log.num_no_measurement} records of the log have no measurement")
     if num := log.num_restarts:
         notes.append(
-            f"the log's times go back {num} times by a quarter of its length or more: was its clock restarted?"
+            f"the log's times go back {num} time{'s' * (num > 1)} by a quarter of its length or more: was its clock "
+            "restarted?"
         )
     if (step_s := log.time_resolution_s) >= _COARSE_STEP_S:
         notes.append(f"the log's times have steps of {step_s:.2g} s: somebody who walks moves that many metres in one")

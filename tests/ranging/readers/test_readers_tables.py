@@ -298,6 +298,29 @@ def test_zone_of_civil_times_counts_and_its_lack_is_said(tmp_path: Path) -> None
         assert ("civil times without a zone are read as UTC" in log.notes) is said
 
 
+@pytest.mark.parametrize(
+    ("header", "begin"),
+    [
+        ("timestamp_iso,timestamp_unix", "{civil},{unix:.3f}"),
+        ("datetime,epoch_ms", "{civil},{ms:.0f}"),
+        ("Date,Time,Timestamp_ns", "{civil},{ms:.0f}000000"),
+        ("unix,local_time", "{unix:.3f},{civil}"),
+    ],
+)
+def test_times_since_1970_are_taken_before_civil_times_without_a_zone(tmp_path: Path, header: str, begin: str) -> None:
+    start_s = 1780931061.5
+
+    def row(time: float, anchor_id: str, range_m: float) -> str:
+        local = np.datetime64(round((start_s + time + 3 * 3600) * 1000), "ms")
+        civil = str(local).replace("T", "," if "Date" in header else " ")
+        return f"{begin.format(civil=civil, unix=start_s + time, ms=1000 * (start_s + time))},{anchor_id},{range_m:.3f}"
+
+    log = read_ranges(write(tmp_path, lines(f"{header},anchor,range_m", row)))
+    assert log.timestamp_s is not None
+    assert log.timestamp_s[0] == pytest.approx(start_s + ROWS[0][0], abs=2e-3)
+    assert not any("zone" in note for note in log.notes)
+
+
 @pytest.mark.parametrize("nothing", ["0", "-1", "", "nan", "None"])
 def test_no_measurement_is_counted_whatever_stands_for_it(tmp_path: Path, nothing: str) -> None:
     content = wide("t,d0,d1,d2,d3", lambda t: f"{t:.3f}").split("\n")

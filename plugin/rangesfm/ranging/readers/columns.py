@@ -15,6 +15,7 @@ from rangesfm.arrays import Array
 from rangesfm.files.text_tables import Categories, TextTable, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
+from rangesfm.ranging.readers.counters import continued
 from rangesfm.ranging.readers.layout import MISSING, Layout
 from rangesfm.ranging.readers.measured import which_are_measured, which_are_within_reach
 from rangesfm.ranging.readers.reader import ReadOptions
@@ -248,8 +249,13 @@ def read_timestamps(
     column = name["timestamp"]
     if said in CIVIL_UNITS or "date" in name or (said is None and not table.begins_with_number(column)):
         return _civil_times(table, name, said, notes, ask), "s"
-    times = table.numbers(column, expected=f"a time in {said or 's'}")
-    unit = said or time_unit(f"{column} {units.get(column, '')}".strip(), times, notes, ask, slowest_s)
+    times, counter = continued(table.numbers(column, expected=f"a time in {said or 's'}"))
+    is_in_ticks = counter is not None and counter.counts_dw1000_ticks
+    if counter is not None:
+        taken = ", taken for the ticks of a DW1000" * (said is None and is_in_ticks)
+        notes.append(f"{column} {counter}{taken}: its times are continued")
+    name_with_unit = f"{column} {units.get(column, '')}".strip()
+    unit = said or ("ticks" if is_in_ticks else time_unit(name_with_unit, times, notes, ask, slowest_s))
     seconds = (times - (days_before_1970(times) if unit == "d" else 0.0)) * SECONDS_PER_UNIT[unit]
     table.refuse(~TIME_S.hold(seconds), column, f"a time in {unit}")
     return (seconds + 1e-9 * table.numbers(name["nanoseconds"]) if "nanoseconds" in name else seconds), unit

@@ -15,8 +15,10 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.ranging.readers import vocabulary as terms
+from rangesfm.ranging.readers.counters import continued
 from rangesfm.ranging.readers.layout import ColumnSample, Layout
 from rangesfm.ranging.readers.reader import EndpointRoles
+from rangesfm.ranging.readers.times import are_seconds_since_1970, unit_by_digits
 
 MAX_NUM_IDS = 64
 """Largest number of tags and anchors of a survey, where a table does not say what it holds."""
@@ -66,6 +68,9 @@ def guess_columns(layout: Layout) -> Guess:
 def find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     """Find the time by the names of columns, or else names of photos, and return the other columns."""
     ranked = sorted((rank, k) for k, column in enumerate(free) if (rank := _time_rank(column)) is not None)
+    finest = max((free[k].num_distinct for _, k in ranked), default=0)
+    if any(_is_since_1970(free[k]) and 2 * free[k].num_distinct > finest for _, k in ranked):
+        ranked.sort(key=lambda one: free[one[1]].is_without_zone)  # civil times without a zone leave hours open
     if not ranked:
         photos = [column for column in free if column.names_photos]
         guess.columns |= {"image_name": photos[0].name} if photos else {}
@@ -101,6 +106,12 @@ def _time_rank(column: ColumnSample) -> tuple[float, int] | None:
     # Columns like rostopic's %time hold the time of arrival of a message. Its stamp holds the time of measurement.
     is_arrival = column.name.startswith(("%", "__")) or bool(terms.SECOND_TIME & {*words})
     return is_arrival + 0.5 * (not terms.TIME & {*words}), len({*words} - terms.TIME - terms.TIME_IN_SHORT)
+
+
+def _is_since_1970(column: ColumnSample) -> bool:
+    """Return whether a column holds times since 1970 by their size."""
+    middle = float(np.median(column.numbers)) if column.kind == "numbers" and len(column.numbers) else 0.0
+    return unit_by_digits(middle) is not None or are_seconds_since_1970(middle)
 
 
 def _find_pairs(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
@@ -355,10 +366,9 @@ def _ids_by_values(ids: list[ColumnSample], guess: Guess) -> None:
 
 
 def is_rising(column: ColumnSample) -> bool:
-    """Return whether the numbers of a column rise from row to row, with few exceptions."""
-    if column.kind != "numbers" or len(column.numbers) < 2 or column.numbers[-1] <= column.numbers[0]:
-        return False
-    return bool(np.mean(np.diff(column.numbers) >= 0) > 0.95)
+    """Return whether the numbers of a column rise from row to row, with few exceptions, or count around."""
+    numbers, _ = continued(column.numbers if column.kind == "numbers" else np.zeros(0))
+    return len(numbers) > 1 and bool(numbers[-1] > numbers[0] and np.mean(np.diff(numbers) >= 0) > 0.95)
 
 
 def _is_positive(column: ColumnSample) -> bool:

@@ -124,6 +124,13 @@ class ColumnSample:
         return "text" if self.filled else "nothing"
 
     @cached_property
+    def is_without_zone(self) -> bool:
+        """Whether the cells are civil times some of which do not say their zone."""
+        return self.kind == "times" and not all(
+            (match := CIVIL_TIME.fullmatch(cell)) and match[5] for cell in self.filled
+        )
+
+    @cached_property
     def is_whole(self) -> bool:
         return self.kind == "numbers" and bool(np.all(self.numbers == np.round(self.numbers)))
 

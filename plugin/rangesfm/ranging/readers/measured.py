@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 
 REACH_M = 2000.0
@@ -50,7 +50,7 @@ def which_are_measured(ranges: Array, path: Path) -> tuple[Mask, tuple[str, ...]
     return measured, (note,)
 
 
-def _failure_codes(positive: Array) -> tuple[Array, Array]:
+def _failure_codes(positive: Array) -> tuple[Array, Indices]:
     """Return the numbers that mean no measurement, and how often each occurs."""
     values, counts = np.unique(positive, return_counts=True)
     are_codes = np.zeros(len(values), bool)

@@ -18,6 +18,7 @@ from rangesfm.errors import InputError
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
+from rangesfm.ranging.readers.counters import continued
 from rangesfm.ranging.readers.measured import which_are_measured, which_are_within_reach
 
 
@@ -105,10 +106,12 @@ def reader_of_readings(
         measured, notes = which_are_measured(ranges, path)
         measured[measured], of_far = which_are_within_reach(ranges[measured], path)
         times, anchor_ids, ranges_m, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
+        times_s, counter = continued(np.array(times, np.float64))
+        of_times = () if counter is None else (f"the time {counter}: the times are continued",)
         return RangeLog.from_arrays(
             anchor_ids,
             ranges_m,
-            timestamp_s=times,
+            timestamp_s=times_s,
             range_stddev_m=[stddev if 0 < stddev < math.inf else math.nan for stddev in stddevs],
             tag_id=tag_ids,
             los=los,
@@ -116,7 +119,7 @@ def reader_of_readings(
             source=path,
             format=name,
             num_no_measurement=len(found) - len(ranges_m),
-            notes=(*notes, *of_far),
+            notes=(*notes, *of_far, *of_times),
         )
 
     return Reader(name, recognizes, read, read_anchors, roles)

@@ -9,14 +9,13 @@ import numpy as np
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
 from rangesfm.ranging.readers.measured import REACH_M
-from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
+from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, are_seconds_since_1970, unit_by_digits
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
 FOOT_M = 0.3048
 UNITS_PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / FOOT_M}
 
 _MIN_NUM = 20  # number of values below which the values do not show their unit
-_SECONDS_SINCE_1970 = (1e9, 4e9)  # the years 2001 to 2096
 # Smallest plausible median step between times, in seconds, by unit. In other units than seconds, a smaller step means
 # that the unit is wrong.
 _FASTEST_S = {"s": 0.0, "ms": 2e-3, "us": 2e-3, "ns": 2e-3}
@@ -71,7 +70,7 @@ def time_unit(name: str, times: Array, notes: list[str], ask: Ask, slowest_s: fl
         notes.append(f"{name} looks like days (steps of {mean_step:.2g}): taken as such")
         return "d"
     can_be = [unit for unit, least in _FASTEST_S.items() if least <= step * SECONDS_PER_UNIT[unit] <= slowest_s]
-    if can_be == ["s"] or _SECONDS_SINCE_1970[0] <= distinct[0] < _SECONDS_SINCE_1970[1]:
+    if can_be == ["s"] or are_seconds_since_1970(float(distinct[0])):
         return "s"
     if len(can_be) != 1:
         raise ask(can_be or [*_FASTEST_S], f"steps of {step:g} between its numbers")
