@@ -394,7 +394,7 @@ class TestPhotos:
         ("line", "text", "said"),
         [
             (3, "0.png,111", r"/photos.csv:3: 0.png is in line 2 already, expected one row per photo"),
-            (3, "1.jpg,111", r"/photos.csv:3: image_name is '1.jpg', expected the name of a photo in the folder"),
+            (3, "1b.png,111", r"/photos.csv:3: image_name is '1b.png', expected the name of a photo in the folder"),
             (3, "1.png,110", r"/photos.csv:3: 1.png has the same time as 0.png in line 2, expected another"),
         ],
     )

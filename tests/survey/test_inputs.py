@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.known import known
 
 from rangesfm.errors import InputError
 from rangesfm.options import AnchorOptions, RangesOptions
@@ -102,6 +103,21 @@ def test_stranger_among_the_anchors_is_named_with_its_line(survey: Survey, tmp_p
     error = refusal(survey.changed({"tag.lever_arms_m": {"right": RIGHT, "left": LEFT}}))
     assert "anchor_id is 'C'" in str(error)
     assert error.line == 7
+
+
+def test_anchors_with_numbers_of_points_are_those_of_the_log_if_one_rule_makes_them_so(
+    survey: Survey, tmp_path: Path
+) -> None:
+    of_tag = survey.changed({"tag.tag_id": "left"})
+    assert survey.anchors.path is not None
+    (tmp_path / "uwb.csv").write_text("timestamp_s,anchor_id,range_m,tag_id\n0,1,1,left\n1,2,2,left\n")
+    survey.anchors.path.write_text("anchor_id,x_m,y_m,z_m\nS1,9,9,9\n101,0,0,0\n102,1.5,0,0\n")
+    inputs = read_ranging_inputs(of_tag)
+    places = {anchor.anchor_id: known(anchor.position_m).tolist() for anchor in inputs.anchors}
+    assert places == {"S1": [9, 9, 9], "1": [0, 0, 0], "2": [1.5, 0, 0]}
+    assert any("101 is 1, 102 is 2 (100 is added to the numbers)" in line for line in inputs.assumed)
+    survey.anchors.path.write_text("anchor_id,x_m,y_m,z_m\n101,0,0,0\n102,1.5,0,0\n111,0,0,0\n112,1.5,0,0\n")
+    assert "anchors.csv: 101, 102, 111, 112; the log has 1, 2 (" in str(refusal(of_tag))
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("millimetres", 1000.0), ("centimetres", 100.0)])

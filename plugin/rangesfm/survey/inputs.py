@@ -14,7 +14,7 @@ from rangesfm.arrays import Array
 from rangesfm.distances.tape import Marker, Tape, markers_of_photos, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.contents import sha256_of
-from rangesfm.files.folders import walk
+from rangesfm.files.folders import natural_order, walk
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
@@ -25,6 +25,7 @@ from rangesfm.positions.position_formats import read_positions
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
 from rangesfm.ranging.anchors.anchor_file import AnchorList, read_anchor_list
+from rangesfm.ranging.anchors.anchor_ids import ids_in_log
 from rangesfm.ranging.anchors.site import Site, local_site, site_of
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.range_log import RangeKind, RangeLog
@@ -129,16 +130,17 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     survey.require_metres()
     _check_rigs_are_metric(survey)
     listed = _listed_anchors(survey)
-    given = None if listed is None else listed.anchors
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
     if survey.ranges.path is None:
         log = RangeLog.from_arrays([], [], image_name=[])
     else:
-        log = read_log(survey.ranges, [anchor.anchor_id for anchor in given or ()], tag_ids)
+        log = read_log(survey.ranges, _ids(listed), tag_ids)
+        if listed is not None and (named := _named_as_in_log(listed, log, survey.anchors.path)) is not None:
+            listed, log = named, read_log(survey.ranges, _ids(named), tag_ids)
         log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
         _check_camera_is_heard(log)
     tag_in_cam_m = _lever_arms_of_log(log, survey)
-    anchors = _anchors_of_log(log) if given is None else given
+    anchors = _anchors_of_log(log) if listed is None else listed.anchors
     _check_anchors_known(log, anchors, survey)
     frame = survey.anchors.frame or default_anchor_frame(anchors)
     site, anchors = local_site(anchors, frame, survey.anchors.crs, survey.anchors.path)
@@ -157,7 +159,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_reference(survey.report.reference)
-    notes = (*_notes(log, anchors, survey, anchors_are_of_log=given is None), *curve_notes)
+    notes = (*_notes(log, anchors, survey, anchors_are_of_log=listed is None), *curve_notes)
     assumed = (
         *log.notes,
         *(() if listed is None else listed.notes),
@@ -172,6 +174,22 @@ def _listed_anchors(survey: Survey) -> AnchorList | None:
     """Return the content of the anchor file, or None if there is none."""
     anchors = survey.anchors
     return None if anchors.path is None else read_anchor_list(anchors.path, columns=anchors.columns, unit=anchors.unit)
+
+
+def _ids(listed: AnchorList | None) -> list[str]:
+    return [anchor.anchor_id for anchor in listed.anchors] if listed is not None else []
+
+
+def _named_as_in_log(listed: AnchorList, log: RangeLog, path: Path | None) -> AnchorList | None:
+    """Return the anchors with the ids of the log, if only one rule leads to these, with a note; else None."""
+    found = ids_in_log(_ids(listed), log.anchor_ids)
+    if found is None:
+        return None
+    id_of, rule = found
+    anchors = tuple(replace(one, anchor_id=id_of.get(one.anchor_id, one.anchor_id)) for one in listed.anchors)
+    same = ", ".join(f"{there} is {here}" for there, here in id_of.items())
+    note = f"{_name(path)}: its anchors are named otherwise than in the log and are taken so: {same} ({rule})"
+    return AnchorList(anchors, (*listed.notes, note))
 
 
 def _surveyed_positions(
@@ -413,15 +431,18 @@ def _of_wanted_anchors(log: RangeLog, use_anchors: Sequence[str]) -> RangeLog:
 
 def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> None:
     known = {anchor.anchor_id for anchor in anchors}
-    for k, anchor_id in enumerate(log.anchor_ids):
-        if anchor_id not in known:
-            first = int(np.argmax((log.anchor_index == k) | ((log.tag_index < 0) & (log.peer_index == k))))
-            raise InputError(
-                f"anchor_id is {anchor_id!r}, expected one of {survey.anchors.path}: {', '.join(sorted(known))} "
-                "(--use_anchors leaves out others)",
-                log.source,
-                int(log.line[first]),
-            )
+    unknown = [k for k, anchor_id in enumerate(log.anchor_ids) if anchor_id not in known]
+    if unknown:
+        k, path = unknown[0], survey.anchors.path
+        first = int(np.argmax((log.anchor_index == k) | ((log.tag_index < 0) & (log.peer_index == k))))
+        listed = ", ".join(sorted(known, key=natural_order))
+        raise InputError(
+            f"anchor_id is {log.anchor_ids[k]!r}, expected one of {path}: {listed}; the log has "
+            f"{', '.join(log.anchor_ids)} (--use_anchors leaves out others; --anchor_columns names a column "
+            "with the ids of the log)",
+            log.source,
+            int(log.line[first]),
+        )
 
 
 def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_are_of_log: bool) -> list[str]:

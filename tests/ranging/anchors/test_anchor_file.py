@@ -423,3 +423,70 @@ def test_a_grid_or_a_code_without_names_may_have_north_before_east(tmp_path: Pat
         "if they are north, east, height (PNEZD)": "--anchor_columns anchor_id=1,x=3,y=2,z=4",
     }
     assert columns_of(table(tmp_path, "A,500,1,2/B,3,-500,4")) == UNNAMED
+
+
+# Lists as total stations and drawing programs export them: names of the columns, a row, and which cell is which.
+EXPORTS = {
+    "English": "Point;Easting;Northing;Elevation;Code/S1;{x};{y};{z};ST/1;{x};{y};{z};PR",
+    "German": "Punktnummer;Rechtswert;Hochwert;Höhe/S1;{x};{y};{z}/101;{x};{y};{z}",
+    "French": "N° de point;Est;Nord;Altitude/S1;{x};{y};{z}/1;{x};{y};{z}",
+    "French register": "Matricule;X (m);Y (m);Z (m)/S1;{x};{y};{z}/1;{x};{y};{z}",
+    "Italian": "N. punto;Est (m);Nord (m);Quota;Codice/S1;{x};{y};{z};P/1;{x};{y};{z};P",
+    "Spanish": "Nº de punto;Coordenada X;Coordenada Y;Cota/S1;{x};{y};{z}/1;{x};{y};{z}",
+    "Dutch": "Puntnummer;X-coördinaat;Y-coördinaat;Hoogte/S1;{x};{y};{z}/1;{x};{y};{z}",
+    "north first": "Punkt;Hochwert;Rechtswert;Höhe/S1;{y};{x};{z}/1;{y};{x};{z}",
+    "code first": "Nr.;Code;Ost;Nord;Höhe/S1;7;{x};{y};{z}/1;7;{x};{y};{z}",
+    "unit once": "Punto;Este (m);Norte (m);Cota/S1;{x};{y};{z}/1;{x};{y};{z}",
+    "row of units": "Point;East;North;Height/;m;m;m/S1;{x};{y};{z}/1;{x};{y};{z}",
+}
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "|", " "])
+@pytest.mark.parametrize("number", ["{:.3f}", "{:.3f},"], ids=["points", "commas"])
+@pytest.mark.parametrize("name", EXPORTS)
+def test_lists_of_total_stations_begin_with_their_station(
+    tmp_path: Path, name: str, separator: str, number: str
+) -> None:
+    places = [(1010.0, 5000.0, 100.0), (1004.125, 5003.5, 101.25)]
+    header, *rows = EXPORTS[name].split("/")
+    units = rows[:-2]
+    cells = [[number.format(value) for value in place] for place in places]
+    if number.endswith(","):
+        cells = [[cell.rstrip(",").replace(".", ",") for cell in row] for row in cells]
+    lines = [row.format(x=x, y=y, z=z) for row, (x, y, z) in zip(rows[-2:], cells, strict=True)]
+    text = "\n".join([header, *units, *lines])
+    if separator == " ":
+        text = text.replace(" ", "_").replace("\n;", "\n-;")
+    found = read_anchor_list(table(tmp_path, "Site: hall 4/" + text.replace(";", separator)))
+    np.testing.assert_array_equal([known(anchor.position_m) for anchor in found.anchors], places)
+    assert [anchor.anchor_id for anchor in found.anchors] == [row.partition(";")[0] for row in rows[-2:]]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "utf-16"])
+@pytest.mark.parametrize("apart", [" ", "'", "\xa0"])
+@pytest.mark.parametrize("end", ["", ";"])
+def test_lists_come_in_the_encodings_and_with_the_thousands_of_their_country(
+    tmp_path: Path, encoding: str, apart: str, end: str
+) -> None:
+    rows = [f"{k};2{apart}600{apart}01{k},25;1{apart}200{apart}030,5;40{k},75{end}" for k in (1, 2, 3)]
+    text = "\r\n".join(["Relevé du 12.03.2026", "", f"N°;Est;Nord;Altitude{end}", *rows])
+    anchors = read_anchors(write(tmp_path, text.encode(encoding)))
+    expected = [[2600010.25 + k, 1200030.5, 400.75 + k] for k in (1, 2, 3)]
+    np.testing.assert_array_equal([known(anchor.position_m) for anchor in anchors], expected)
+
+
+def test_header_may_end_in_a_separator_where_the_rows_do_not_and_the_last_row_may_lack_a_line_end(
+    tmp_path: Path,
+) -> None:
+    path = write(tmp_path, "Point;East;North;Height;\nA1;1.5;2.5;3.5\nA2;4.5;5.5;6.5\nA3;1\xa0007.5;8.5;9.5")
+    np.testing.assert_array_equal(known(read_anchors(path)[2].position_m), [1007.5, 8.5, 9.5])
+
+
+def test_a_single_height_of_unknown_name_is_offered_with_its_column(tmp_path: Path) -> None:
+    _, choices = doubts_about(table(tmp_path, "Point,East,North,Level/1,1.5,2.5,3.5/2,4.5,5.5,6.5"))
+    assert choices == {"if Level is z": "--anchor_columns anchor_id=Point,x=East,y=North,z=Level"}
+
+
+def test_whole_numbers_as_names_of_columns_stay_names(tmp_path: Path) -> None:
+    layout = known(find_layout(table(tmp_path, "time,101,102/0.5,1.25,2.5/0.6,1.5,2.75", "log.csv")))
+    assert [column.name for column in layout.columns] == ["time", "101", "102"]

@@ -19,7 +19,14 @@ from rangesfm.ranging.anchors.site import LOCAL_M
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.guess import MAX_NUM_IDS, by_id_rather_than_index, is_named_time, is_range
 from rangesfm.ranging.readers.layout import MISSING, ColumnSample, Layout, find_layout
-from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns, columns_flag, read_list
+from rangesfm.ranging.readers.lists import (
+    Choice,
+    UnclearListError,
+    check_columns,
+    columns_flag,
+    read_list,
+    ways_to_complete,
+)
 from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
 
 WHAT = "anchors"
@@ -147,6 +154,8 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
             choices += those
     if not doubts:
         return columns
+    if not choices and not degrees:
+        choices = [_choice(when, ways) for when, ways in ways_to_complete(columns, _candidates(layout, columns))]
     unknown = {quantity: "NAME" for quantity in ("anchor_id", *_AXES) if quantity not in columns | degrees}
     choices = choices or [_choice("with the names of the columns", columns | degrees | unknown)]
     raise UnclearListError(WHAT, path, layout, doubts, choices)
@@ -155,6 +164,18 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
 def _choice(when: str, columns: Mapping[str, str], *flags: str) -> Choice:
     ordered = {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
     return Choice(when, (*columns_flag("anchor_columns", ordered), *flags))
+
+
+def _candidates(layout: Layout, columns: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return the columns that may hold each quantity that has none yet, by their values."""
+    free = [column for column in layout.columns if column.name not in columns.values()]
+    may_be = {quantity: [one.name for one in free if one.kind == "numbers"] for quantity in _AXES}
+    may_be["anchor_id"] = [one.name for one in free if one.num_distinct == len(one.cells) and _may_be_id(one)]
+    return {quantity: may_be[quantity] for quantity in ("anchor_id", *_AXES) if quantity not in columns}
+
+
+def _may_be_id(column: ColumnSample) -> bool:
+    return column.kind == "text" or column.is_whole
 
 
 def _listed(columns: Sequence[ColumnSample]) -> str:
@@ -178,6 +199,7 @@ def _by_name(layout: Layout) -> dict[str, list[ColumnSample]]:
 
 def _named_quantity(words: set[str]) -> str | None:
     """Return the quantity in a column with these words in its name, or None."""
+    words = words - terms.LINKING
     about = words - terms.BESIDE_COORDINATE - terms.RANGE
     if about and about <= terms.STDDEV | terms.BIAS:
         if not about & terms.BIAS:
@@ -190,16 +212,23 @@ def _named_quantity(words: set[str]) -> str | None:
 
 
 def _by_values(layout: Layout) -> dict[str, list[ColumnSample]]:
-    """Return the columns of a table without names: an id with three numbers after it, and perhaps some text."""
+    """Return the columns of a table without names: an id with three numbers after it, and perhaps a code."""
     found: dict[str, list[ColumnSample]] = {quantity: [] for quantity in QUANTITIES}
-    first, *others = layout.columns
+    first, *others = (column for column in layout.columns if column.kind != "nothing")
     numbers = [column for column in others if column.kind == "numbers"]
-    is_id = first.num_distinct == len(first.cells) and (first.kind == "text" or first.is_whole)
-    is_short = len(first.cells) <= MAX_NUM_IDS and len(layout.columns) <= 5
+    if len(numbers) > 3:
+        numbers = [column for column in numbers if not _is_code(column)]
+    is_id = first.num_distinct == len(first.cells) and _may_be_id(first)
+    is_short = len(first.cells) <= MAX_NUM_IDS and len(others) <= 4
     if is_id and is_short and len(numbers) == 3 and numbers == others[:3]:
         found["anchor_id"] = [first]
         found |= {axis: [column] for axis, column in zip(_AXES, numbers)}
     return found
+
+
+def _is_code(column: ColumnSample) -> bool:
+    """Return whether all numbers of a column are one whole number, as a total station's code of a kind of point."""
+    return column.is_whole and column.num_distinct == 1 and len(column.cells) > 1 and column.cells[0].isdigit()
 
 
 def _degrees(layout: Layout) -> dict[str, str]:
@@ -239,7 +268,7 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
     elif order.index(y) < order.index(x) and {"x", "y"} == {*by_name[x].words, *by_name[y].words} - terms.LENGTH_UNIT:
         yield f"{y} comes before {x}, as where surveyors call north x", [north_first, east_first]
     units = {axis: named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in _AXES}
-    if len({*units.values()}) > 1 and None in units.values():
+    if None in units.values() and {*units.values()} - {None, "m"}:
         told = sorted({unit for unit in units.values() if unit})
         choices = [_choice(f"if all are in {unit}", columns, "--anchor_unit", unit) for unit in told]
         yield f"some of the coordinates are in {' and '.join(told)}, others have no unit", choices

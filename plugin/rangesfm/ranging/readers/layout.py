@@ -36,6 +36,7 @@ MISSING = (
 
 _SEPARATORS = "\t;|, "  # the comma and the blank come last, because numbers may contain commas and times blanks
 _NUM_ROWS = 1000  # rows from which the layout is found
+_MOST_OF_LIST = 64  # lines of a list that somebody wrote
 _MAX_NUM_WORDS = 20  # lines of text before the table
 _MAX_SHARE_OF_WORDS = 0.02  # lines of text inside the table, as a share of all
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
@@ -213,7 +214,9 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
         first_rows = (ColumnSample(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
         return Layout(tuple(column.cured() for column in first_rows), True, lambda _: (table, []), True)
     lines = read_head(path).split("\n")
-    numbered = [(number, line) for number, line in enumerate(lines[:-1] or lines, 1) if line.strip()]
+    # The last line may be cut off, where the beginning ends or the recording did, but not in a short list.
+    whole = lines if len(lines) <= _MOST_OF_LIST else lines[:-1]
+    numbered = [(number, line) for number, line in enumerate(whole, 1) if line.strip()]
     content = [(number, line) for number, line in numbered if not _is_comment(line)][:_NUM_ROWS]
     split = next(filter(None, (_split(content, one) for one in separator or _SEPARATORS)), None)
     if split is None:
@@ -223,13 +226,18 @@ def find_layout(path: Path, separator: str | None = None) -> Layout | None:
     first = next(k for k, row in enumerate(rows) if len(row) == num)
     if first and len(rows[first - 1]) == num - 1 and not any(row[-1] for row in rows[first:] if len(row) == num):
         first -= 1  # the rows end in a separator and the header does not
+    elif first and len(rows[first - 1]) == num + 1 and not rows[first - 1][-1]:
+        first -= 1  # the header ends in a separator and the rows do not
+        rows[first] = rows[first][:-1]
+    while separator == " " and _is_title(rows[first:], num):
+        first += 1
     body = [row for row in rows[first:] if len(row) == num]
     names, num_skipped = None, content[first][0] - 1
     below = body[1:] if len(rows[first]) == num else body
     again = [row for row in below if row != rows[first]]  # in joined files the header row is repeated
     if _is_header(rows[first], again) or _is_header(rows[first], again[1:]):
         names, num_skipped, body = rows[first], content[first][0], again
-        if len(body) > 1 and len(names) == num and _is_header(body[0], body[1:]):  # a second header row with units
+        if len(body) > 1 and len(names) == num and _is_second_header(body[0], body[1:]):
             names, num_skipped = [" ".join(both) for both in zip(names, body[0])], content[first + 1][0]
             body = body[1:]
     elif comments := [line for number, line in numbered if number < content[first][0] and _is_comment(line)]:
@@ -276,10 +284,16 @@ def _is_comment(line: str) -> bool:
 def _split(content: list[tuple[int, str]], separator: str) -> tuple[list[list[str]], str] | None:
     """Return the cells of all rows and the separator, or None if most rows do not have the same number of cells."""
     rows = [_cells(line, separator) for _, line in content]
-    if not rows:
+    if not rows or (separator == "," and sum(_has_decimal_commas(line) for _, line in content) > len(rows) / 2):
         return None
     num, count = Counter(map(len, rows)).most_common(1)[0]
     return (rows, separator) if num > 1 and count >= max(2, len(rows) - _MAX_NUM_WORDS, len(rows) / 2) else None
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """Return whether all commas of a line are decimal ones, of numbers that blanks set apart."""
+    numbers = sum(_DECIMAL_COMMA.fullmatch(word) is not None for word in line.split())
+    return numbers > 1 and numbers == line.count(",")
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -294,12 +308,36 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _is_header(row: list[str], rows: list[list[str]]) -> bool:
-    """Return whether a row has words where those below it have numbers or times."""
+    """Return whether a row has words where those below it have numbers or times, and no values of its own there.
+
+    Whole numbers may be names, as ids of anchors are, if another cell of the row is a word.
+    """
     below = [ColumnSample("", tuple(cells)).cured() for cells in zip(*rows)]
-    return any(
-        column.kind in ("numbers", "times") and cell and ColumnSample("", (cell,)).cured().kind == "text"
-        for cell, column in zip(row, below)
-    ) or (not rows and all(ColumnSample("", (cell,)).kind == "text" for cell in row))
+    cells = [ColumnSample("", (cell,)).cured() for cell in row]
+    if not rows:
+        return all(cell.kind == "text" for cell in cells)
+    of_values = [cell for cell, column in zip(cells, below) if column.kind in ("numbers", "times")]
+    values = [cell.cells[0] for cell in of_values if cell.kind in ("numbers", "times")]
+    words = [cell for cell in cells if cell.kind == "text" and not any(map(str.isdigit, cell.cells[0]))]
+    may_be_names = all(map(str.isdigit, values)) and bool(words)
+    return any(cell.kind == "text" for cell in of_values) and (not values or may_be_names)
+
+
+def _is_second_header(row: list[str], rows: list[list[str]]) -> bool:
+    """Return whether a row below the header holds units, or more of the names."""
+    return _is_header(row, rows) and not any(map(_NUMBER.fullmatch, row))
+
+
+def _is_title(rows: list[list[str]], num: int) -> bool:
+    """Return whether the first of some rows is a line of text that has as many words as the table has columns."""
+    body = [row for row in rows if len(row) == num]
+    return (
+        len(body) > 2
+        and len(rows[0]) == len(rows[1]) == num
+        and _is_header(body[0], body[2:])
+        and _is_second_header(body[1], body[2:])
+        and not {word for cell in body[1] for word in words_of(cell)} <= _UNITS
+    )
 
 
 def _unique(names: list[str], num: int) -> list[str]:

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 from rangesfm.errors import InputError, printable
 from rangesfm.files.text_tables import TextTable
 from rangesfm.ranging.readers.guess import described
 from rangesfm.ranging.readers.layout import ColumnSample, Layout
+
+_MAX_NUM_WAYS = 6  # ways to read a list that are offered
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,21 @@ def _renamed(text: str, quantities: Mapping[str, str], flags: Mapping[str, str])
 def columns_flag(flag: str, columns: Mapping[str, str]) -> tuple[str, str]:
     """Return a flag with columns by quantity as the user types them."""
     return f"--{flag}", ",".join(f"{quantity}={name}" for quantity, name in columns.items())
+
+
+def ways_to_complete(
+    columns: Mapping[str, str], candidates: Mapping[str, Sequence[str]]
+) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield the ways to give all quantities columns of their own, each after the case in which it is right.
+
+    Args:
+        columns: name of the column of each quantity that is known.
+        candidates: names of the columns that may hold each of the others.
+    """
+    ways = [way for way in product(*candidates.values()) if len({*way}) == len(way)]
+    for way in ways if candidates and len(ways) <= _MAX_NUM_WAYS else ():
+        more = dict(zip(candidates, way, strict=True))
+        yield f"if {' and '.join(f'{name} is {quantity}' for quantity, name in more.items())}", {**columns, **more}
 
 
 def check_columns(given: Mapping[str, str], quantities: Collection[str], layout: Layout, path: Path) -> None:

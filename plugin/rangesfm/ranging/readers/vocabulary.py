@@ -31,10 +31,13 @@ LENGTHS = _unit_by_word(
 """Units of lengths, by the words for them."""
 
 
+_NUMERO = re.compile(r"\b[Nn](?:[°º]|\.[ _](?=[^\W\d]))")  # N° de point, N. punto: a number, not the north
+
+
 def words_of(name: str) -> list[str]:
     """Split a column's name into words in small letters; digits are separate words, a hexadecimal id is one word."""
     words: list[str] = []
-    for part in re.findall(r"[^\W_]+", name):
+    for part in re.findall(r"[^\W_]+", _NUMERO.sub(" no ", name)):
         is_id = re.fullmatch("(?:0[xX])?[0-9A-F]{4,16}", part) and not part.isdigit()
         pattern = r"\d+|[^\W\d][^\W\dA-Z]*|[A-Z]+"
         words += [part] if is_id else re.findall(rf"[A-Z]{{2,}}(?![^\W\dA-Z])|{pattern}", part)
@@ -67,12 +70,13 @@ LENGTH_UNIT = frozenset(LENGTHS)
 ASKED = _words("responder rspdr resp rsp receiver to dest dst destination target peer remote neighbor neighbour")
 ASKING = _words("requester rqstr req sender initiator init from src source self")
 ANCHOR = _words(
-    "anchor anchors anc an beacon landmark station base basestation bs node anker ancla ancre balise gateway 基站"
+    "anchor anchors anc an beacon landmark station base basestation bs node anker ancla ancora ancre balise gateway "
+    "基站"
 )
 TAG = _words("tag tags mobile robot rover user wearable 标签")
 ANTENNA = _words("ant antenna")
 ANY_ID = _words("id uid bssid nodeid identifier address addr mac device dev serial")
-ID = ANY_ID | _words("ids tid name no num nr number index idx short")
+ID = ANY_ID | _words("ids tid name no num nr number numéro numero número núm nummer index idx short")
 ROLES = {
     "antenna": ANTENNA,
     "anchor": ANCHOR,
@@ -86,19 +90,26 @@ PLAIN = _words("uwb field msg data header twr tof ranging meas measured measurem
 
 # Words in the names of columns of lists: anchors with positions, and photos with times.
 POINT = _words(
-    "point points pointid pointnumber ptid pt pts pnt punkt punkte punktnummer punktnr punktname pktnr pkt label nom "
-    "bezeichnung numéro numero punto"
+    "point points pointid pointnumber ptid ptno pt pts pnt p punkt punkte punktnummer punktnr punktname pktnr pkt "
+    "label nom nombre nome naam bezeichnung matricule repère punto caposaldo estación punt puntnummer puntnr puntnaam"
 )
 COORDINATES = {
-    "x": _words("x e east easting eastings est este ost ostwert rechts rechtswert rw"),
-    "y": _words("y n north northing northings nord norte nordwert hoch hochwert hw"),
-    "z": _words("z h u up height hgt ht elevation elev alt altitude höhe hoehe hauteur cote cota quota altura"),
+    "x": _words("x e east easting eastings est este ost ostwert rechts rechtswert rw oost abscisse ascissa"),
+    "y": _words("y n north northing northings nord norte nordwert hoch hochwert hw noord ordonnée ordinata"),
+    "z": _words(
+        "z h u up height hgt ht elevation elev alt altitude höhe hoehe hauteur cote cota quota altura kote altezza "
+        "hoogte elevación altitud rl nap nn nhn über ü ortho orthometric ell ellipsoidal"
+    ),
 }
 DEGREES = {
     "x": _words("lon long lng longitude längengrad laengengrad"),
     "y": _words("lat latitude breitengrad breite"),
 }
-BESIDE_COORDINATE = LENGTH_UNIT | _words("coord coords coordinate coordinates koordinate pos position value wert local")
+BESIDE_COORDINATE = LENGTH_UNIT | _words(
+    "coord coords coordinate coordinates koordinate coordonnée coordenada coordinata coördinaat pos position value "
+    "wert local"
+)
+LINKING = _words("de du des del di der van of the")
 STDDEV = _words("stddev stdev std sigma sd uncertainty accuracy genauigkeit standardabweichung")
 BIAS = _words("bias offset")
 PHOTO = _words("image images img photo photos foto fotos picture pictures pic bild bilder bildname frame imagen")
