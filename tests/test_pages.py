@@ -181,6 +181,7 @@ PAGE_NAMES = {
     "mauwb": "MaUWB",
     "arduino": "Arduino",
     "makerfabs_json": "Makerfabs",
+    "trek1000": "TREK1000",
 }
 
 

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.range_summary import summarize_ranges
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, reader_names
 
@@ -216,9 +216,67 @@ def test_mauwb_ranges_whose_anchor_ids_are_lost_are_not_given_to_any(tmp_path: P
     assert log.num_no_measurement == 4
 
 
+def test_mauwb_with_blanks_is_read(tmp_path: Path) -> None:
+    for line in (
+        "AT+RANGE=tid:0, mask:03, seq: 182, range: (232,401,0,0), rssi: (-79.80,-81.10,0,0), ancid: (0,1,-1,-1)",
+        "AT+RANGE= tid: 0 ,mask: 03,seq:182,range: ( 232, 401, 0, 0),rssi:(-79.80,-81.10,0,0)",
+    ):
+        assert ranges_by_anchor(read_ranges(write(tmp_path, f"1 {line}\n"))) == {"0": [2.32], "1": [4.01]}
+
+
+def test_lines_that_are_not_understood_are_not_said_to_be_no_measurements(tmp_path: Path) -> None:
+    path = write(tmp_path, "1 AT+RANGE=tid:0;mask:03;range:(232;401)\n" * 5)
+    with pytest.raises(InputError, match=r"begins as a line of mauwb, and is not understood: .* expected such as AT"):
+        read_ranges(path)
+
+
 def test_several_tags_are_kept_apart(tmp_path: Path) -> None:
     log = read_ranges(write(tmp_path, f"1 {MAUWB}\n2 {MAUWB.replace('tid:0', 'tid:7')}\n"))
     assert log.tag_ids == ("0", "7")
+
+
+# TREK1000
+TREK_MR = "mr 07 00000407 0000082b 000007a3 00000000 6cba 09 40414041 a0:0"
+TREK_MA = "ma 0e 00000000 000006d9 0000069c 0000026b 6cbd 51 00a0641e a0:0"
+TREK_MC = "mc 07 000004ec 000008ee 0000087e 00000000 6cc0 0a 00a0642b a0:0"
+
+
+def test_trek1000_lines_are_read_with_the_radios_clock(tmp_path: Path) -> None:
+    later = TREK_MC.replace("642b", "648f").replace("0000087e", "ffffffff")
+    log = read_ranges(write(tmp_path, "\n".join([TREK_MR, TREK_MA, TREK_MC, "mc 07 0000", later]) + "\n"))
+    assert (log.format, log.tag_ids, log.anchor_ids) == ("trek1000", ("T0",), ("A0", "A1", "A2"))
+    between = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
+    assert [*zip(between.end_ids, log.range_m[between.rows])] == [
+        (("A0", "A1"), 1.753),
+        (("A0", "A2"), 1.692),
+        (("A1", "A2"), 0.619),
+    ]
+    of_tag = log.subset(log.kind == RangeKind.TAG_ANCHOR)
+    assert of_tag.range_m.tolist() == [1.26, 2.286, 2.174, 1.26, 2.286]
+    assert log.timestamp_s is not None
+    assert np.ptp(log.timestamp_s) == pytest.approx(0.113)
+    assert log.num_no_measurement == 1
+
+
+def test_trek1000_lines_with_eight_anchors_decimal_clock_and_no_mask(tmp_path: Path) -> None:
+    line = "mc 00 00000807 00000991 ffffffff 00000815 00000000 0000095e ffffffff ffffffff 00b6 b7 000213{} t1:0 0000"
+    path = write(tmp_path, "".join(line.format(32 + 10 * k) + "\r\n$NKT0,2.06,LO=[no solution]\r\n" for k in range(5)))
+    log = read_ranges(path)
+    assert (log.tag_ids, log.anchor_ids) == (("T1",), ("A0", "A1", "A3", "A5"))
+    assert log.timestamp_s is not None
+    np.testing.assert_allclose(np.unique(log.timestamp_s), 21.332 + 0.01 * np.arange(5))
+
+
+def test_trek1000_lines_are_read_with_the_hosts_time_and_inside_json(tmp_path: Path) -> None:
+    lines = "".join(f"2026-01-31 12:00:0{k}.5 {TREK_MC}\n" for k in range(3))
+    log = read_ranges(write(tmp_path, lines))
+    assert log.timestamp_s is not None
+    assert log.timestamp_s[-1] == 1769860802.5
+    messages = [TREK_MC.replace("642b", f"64{k}b") for k in range(3)]
+    records = ", ".join(f'{{"message": "{message}\\r\\n", "position": [0.25, 0.5]}}' for message in messages)
+    assert len(read_ranges(write(tmp_path, f"[{records}]"))) == 9
+    with pytest.raises(InputError, match="no time before the range"):
+        read_ranges(write(tmp_path, TREK_MR + "\n"))
 
 
 # Qorvo

@@ -410,7 +410,72 @@ def test_column_that_is_missing_is_asked_for(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_ranges(path)
     assert "not sure: no column seems to be the timestamp" in caught.value.advice
-    assert "timestamp=NAME" in caught.value.advice[-1]
+    assert caught.value.advice[-1] == "no other column of numbers can be the timestamp, which a log needs"
+
+
+def test_commands_name_the_columns_that_may_be_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, lines("count,range,anchor", lambda t, a, r: f"{-t:.3f},{r:.3f},{a}"))
+    assert main(["ranges", str(path)]) == 2
+    command = capsys.readouterr().err.rstrip("\n").split("perhaps: rangesfm ")[-1]
+    assert main(shlex.split(command)) == 0
+    assert f"ranges  {len(ROWS)}," in capsys.readouterr().out
+
+
+# Records of JSON
+def test_ranges_beside_a_position_are_found(tmp_path: Path) -> None:
+    pose = '"position": {{"x": 1.5, "y": 2.25, "z": 0.5}}, "quat": [0.1, 0.2, 0.3, 0.9]'
+    record = '{{"t": {:.3f}, "anc": "{}", "val": {:.3f}, ' + pose + "}}"
+    with pytest.raises(InputError, match="not known for sure") as caught:
+        read_ranges(write(tmp_path, lines(None, record.format)))
+    assert "closest guess: timestamp = t, anchor_id = anc, range = val" in caught.value.advice
+    only = lines(None, lambda t, a, r: f'{{"t": {t:.3f}, "position": {{"x": {r:.3f}, "y": {t / 3:.3f}, "z": 1.0}}}}')
+    with pytest.raises(InputError, match="holds positions that the radio computed"):
+        read_ranges(write(tmp_path, only))
+
+
+def test_ranges_within_a_record_by_anchor_are_read(tmp_path: Path) -> None:
+    def record(rows: list[Row]) -> str:
+        by_anchor = ", ".join(
+            f'"0{NUM[a]}9E": {{"anc_id": "0{NUM[a]}9E", "x": 1.0, "y": 2.0, "dist_to": {r:.3f}}}' for _, a, r in rows
+        )
+        return f'{{"ts": {rows[0][0]:.3f}, {by_anchor}, "est_pos": {{"x": 1.0, "y": 2.0}}}}'
+
+    log = read_ranges(write(tmp_path, "\n".join(record(ROWS[k : k + 4]) for k in range(0, len(ROWS), 4)) + "\n"))
+    assert len(log) == len(ROWS)
+    assert len(log.anchor_ids) == len(ANCHORS)
+
+
+@pytest.mark.parametrize("prompt", [False, True])
+def test_json_of_uwb_core_is_read_behind_other_lines_of_the_board(tmp_path: Path, prompt: bool) -> None:
+    content = lines(
+        "main(): started\n> range start" if prompt else None,
+        lambda t, a, r: (
+            f'{{"utime": {t * 1e6:.0f},"c": {t * 20:.0f},"uid": 6699,"ouid": {4660 + int(NUM[a])},'
+            f'"raz": [{r:.6f},0.5,-0.25],"los": [{0.5 * (t % 2 > 1):.6f}]}}'
+        ),
+    )
+    if prompt:
+        content = content.replace('\n{"utime"', '\n> {"utime"', 1)
+    log = read_ranges(write(tmp_path, content))
+    assert log.tag_ids == ("6699",)
+    assert log.anchor_ids == ("4660", "4661", "4662", "4663")
+    np.testing.assert_allclose(log.range_m, [r for *_, r in ROWS], atol=1e-5)
+    check_times(log, ROWS)
+
+
+def test_time_in_front_of_json_is_the_time(tmp_path: Path) -> None:
+    for begin in ("{:.3f} ", "[{:.3f}] ", "{:.3f},"):
+        record = begin + '{{"anchor": "{}", "range": {:.3f}}}'
+        check_times(read_ranges(write(tmp_path, lines(None, record.format))), ROWS)
+
+
+def test_an_id_that_never_changes_is_not_the_anchors(tmp_path: Path) -> None:
+    path = write(tmp_path, lines("time,id,peerid,range", lambda t, a, r: f"{t:.3f},7,{int(NUM[a]) + 20},{r:.3f}"))
+    with pytest.raises(InputError, match="not known for sure") as caught:
+        read_ranges(path)
+    assert any("anchor_id = peerid, tag_id = id" in line for line in caught.value.advice)
 
 
 def test_columns_are_told_by_number_and_in_spans(tmp_path: Path) -> None:

@@ -20,14 +20,14 @@ from rangesfm.options import COORDINATE_M, LENGTH_M, STDDEV_M, TIME_S, LogOption
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.readers import ros
+from rangesfm.ranging.readers import ros, trek
 from rangesfm.ranging.readers.printed import PRINTED
 from rangesfm.ranging.readers.reader import Reader, ReadOptions, tell_roles
 from rangesfm.ranging.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, table_reader, write_ranges_csv
 
 __all__ = ["files_of_log", "find_log_reader", "read_anchors_in_log", "read_ranges", "reader_names", "write_ranges_csv"]
 
-_READERS = (ros.READER, CANONICAL, *PRESETS, MAPPED, TABLE, *PRINTED)
+_READERS = (ros.READER, CANONICAL, *PRESETS, MAPPED, TABLE, *PRINTED, trek.READER)
 _NOTHING_SAID = ReadOptions()
 
 

@@ -6,6 +6,7 @@ the user is asked.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ from rangesfm.ranging.readers.times import are_seconds_since_1970, unit_by_digit
 
 MAX_NUM_IDS = 64
 """Largest number of tags and anchors of a survey, where a table does not say what it holds."""
+_POSITION = re.compile(r"(?:^|[^0-9A-Za-z])POS(?:\[|$)", re.ASCII)
 _SAME_SPOT_M = 1.5  # largest distance between tags on one rig, and so largest difference of their ranges to an anchor
 
 
@@ -153,6 +155,7 @@ def _find_range(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     if guess.wide:
         return free
     numbers = [column for column in free if column.kind == "numbers" and not terms.NO_RANGE & {*column.words}]
+    numbers = [column for column in numbers if not _is_angle(column)]
     named = [column for column in numbers if is_range(column)]
     stamps = {name: column.name for column in free if (name := column.name.lower()) in ("tx1", "rx1", "tx2", "rx2")}
     groups = [group for group in _groups(numbers) if all(map(_may_be_wide, group))]
@@ -178,9 +181,14 @@ def _find_range(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
 def is_range(column: ColumnSample) -> bool:
     """Return whether a column holds ranges by its name; ``d`` and ``r`` count only alone or with a unit."""
     words = {*_without_numbers(column)}
-    if column.kind != "numbers" or terms.NO_RANGE & words:
+    if column.kind != "numbers" or terms.NO_RANGE & words or _is_angle(column):
         return False
     return bool(words & terms.RANGE) or (bool(words) and words <= terms.RANGE_IN_SHORT | terms.LENGTH_UNIT)
+
+
+def _is_angle(column: ColumnSample) -> bool:
+    """Return whether a column is the azimuth or the zenith angle in a list of range, azimuth and zenith (raz)."""
+    return "raz" in column.words and "0" not in column.words and bool(_numbers(column))
 
 
 def _groups(columns: Sequence[ColumnSample]) -> list[list[tuple[ColumnSample, list[int]]]]:
@@ -250,18 +258,26 @@ def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
             ids[role].append(column)
     anchor, tag = ids["anchor"] or ids["asked"], ids["tag"] or ids["asking"]
     nameless = ids["any"]
+    varying = [column for column in free if _is_id(column) and column.num_distinct > 1]
     if guess.wide:
         tag = tag or nameless[:1]
     elif not anchor and nameless:
-        anchor = [column for column in nameless if column.name.startswith(within)] or nameless[-1:]
+        others = [column for column in varying if column not in nameless and _ends_in_id(column)]
+        if others and not any(column in varying for column in nameless):  # one id in all rows is not the anchor's
+            anchor = others[:1]
+            guess.doubts.append(f"{others[0].name} may be the anchor")
+        else:
+            anchor = [column for column in nameless if column.name.startswith(within)] or nameless[-1:]
         tag = tag or [column for column in nameless if column not in anchor][:1]
+    elif anchor and anchor[0] in ids["asked"]:
+        tag = tag or [column for column in nameless if _is_id(column)][:1]
     guess.roles = (
         EndpointRoles.ASKER_AND_ASKED
         if anchor and anchor[0] not in ids["anchor"] and tag
         else EndpointRoles.TAG_AND_ANCHOR
     )
     anchor, tag = by_id_rather_than_index(anchor), by_id_rather_than_index(tag)
-    if guess.wide and max(len(anchor), len(nameless)) > 1:
+    if guess.wide and max(len([column for column in anchor if column in varying]), len(nameless)) > 1:
         guess.doubts.append("the anchor of a column of ranges seems to be given in another column")
     for role, columns in (("anchor_id", anchor), ("tag_id", tag), ("antenna", ids["antenna"][: bool(tag)])):
         if columns and not (guess.wide and role == "anchor_id"):
@@ -269,7 +285,7 @@ def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
             if len(columns) > 1:
                 guess.doubts.append(f"any of {_names(columns)} may be the {role}")
     unlike = terms.NO_RANGE - terms.ANY_ID
-    others = [column for column in free if _is_id(column) and column.num_distinct > 1 and not unlike & {*column.words}]
+    others = [column for column in varying if not unlike & {*column.words}]
     if others and not (guess.wide or anchor):
         guess.columns["anchor_id"] = others[0].name
         guess.doubts.append(f"{others[0].name} may be the anchor")
@@ -282,6 +298,11 @@ def _find_nodes(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
         if name in ("los", "nlos") and {*column.cells} <= {"0", "1", "0.0", "1.0", ""}:
             guess.columns[name] = column.name
     return [column for column in free if not any(column in columns for columns in ids.values())]
+
+
+def _ends_in_id(column: ColumnSample) -> bool:
+    """Return whether the name of a column ends as those of ids do, such as peerid or remote_addr."""
+    return bool(column.words) and (column.words[-1] in terms.ANY_ID or column.words[-1].endswith(("id", "addr")))
 
 
 def by_id_rather_than_index(columns: list[ColumnSample]) -> list[ColumnSample]:
@@ -309,6 +330,7 @@ def _find_by_values(free: list[ColumnSample], guess: Guess, has_names: bool) -> 
             guess.columns["nanoseconds"] = fractions[0].name
     if guess.wide or {"range", "tx1"} & {*guess.columns}:
         return
+    free = [column for column in _before_position(free) if not terms.POSE & {*column.words}]
     pairs = _pairs_by_values(free)
     if len(pairs) > 1:
         _take_pairs(pairs, guess)
@@ -331,6 +353,12 @@ def _find_by_values(free: list[ColumnSample], guess: Guess, has_names: bool) -> 
         _wide_by_values(reals, guess)
     else:
         guess.missing.append("range")
+
+
+def _before_position(free: list[ColumnSample]) -> list[ColumnSample]:
+    """Return the columns in front of the word POS, after which radios print the position that they computed."""
+    words = (k for k, column in enumerate(free) if column.cells and all(map(_POSITION.search, column.cells)))
+    return free[: next(words, len(free))]
 
 
 def _pairs_by_values(free: Sequence[ColumnSample]) -> list[tuple[ColumnSample, ColumnSample]]:

@@ -23,7 +23,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.folders import IMAGE_EXTENSIONS
 from rangesfm.files.text_tables import TextTable, read_head, read_text
 from rangesfm.ranging.readers.gsi import gsi_records, is_gsi
-from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date
+from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_alone
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
 # fmt: off
@@ -56,7 +56,9 @@ NamedValues = dict[str, str]
 _BLOCK = "\n---\n"  # end of a message of rostopic echo
 _NAMED = re.compile(r"(?<![\w.:/])([A-Za-z]\w*)(?: ?= ?|: +)(\"[^\"]*\"|[^\s,;\[\]{}]+)", re.ASCII)
 _KEY = re.compile(r"([A-Za-z_]\w*):(?: +(.*))?", re.ASCII)
-_MIN_SHARE_NAMED = 0.9  # smallest share of lines or blocks with named values in a file of records
+# Smallest share of lines or blocks with named values, and of lines with JSON, in a file of records. Boards print other
+# lines beside JSON.
+_MIN_SHARE_NAMED, _MIN_SHARE_JSON = 0.9, 0.5
 
 
 @dataclass(frozen=True)
@@ -353,7 +355,7 @@ def _read_records(path: Path) -> TextTable | None:
     head = read_head(path).lstrip()
     if is_gsi(head):
         numbered = [*gsi_records(read_text(path, errors="replace"))]
-    elif head.startswith(("{", "[{")):
+    elif head.startswith(("{", "[{")) or _share_json(head) > _MIN_SHARE_JSON:
         numbered = list(_json_records(read_text(path)))
     elif _share_named(head) > _MIN_SHARE_NAMED:
         text = read_text(path, errors="replace")
@@ -369,6 +371,12 @@ def _share_named(head: str) -> float:
     """Return the share of complete lines or blocks that hold at least two named values."""
     units = [unit for _, unit in _units(head)][:-1]
     return sum(len(_NAMED.findall(unit)) > 1 for unit in units) / len(units) if units else 0.0
+
+
+def _share_json(head: str) -> float:
+    """Return the share of complete lines that end in a JSON object, whatever is in front of it."""
+    rows = [row for row in head.split("\n")[:-1] if row.strip()]
+    return sum(any(True for _ in _json_records(row)) for row in rows) / len(rows) if rows and "{" in head else 0.0
 
 
 def _units(text: str) -> Iterator[tuple[int, str]]:
@@ -423,15 +431,17 @@ def _value(text: str) -> Any:
 
 
 def _json_records(text: str) -> Iterator[tuple[int, NamedValues]]:
+    """Yield each record with its line number. A time in front of an object comes first in its records, as "time"."""
     decoder, at, line, counted = json.JSONDecoder(), 0, 1, 0
     while (begin := text.find("{", at)) >= 0:
         line, counted = line + text.count("\n", counted, begin), begin
+        time = time_alone(text[max(at, text.rfind("\n", 0, begin) + 1) : begin])
         try:
             value, at = decoder.raw_decode(text, begin)
         except (ValueError, RecursionError):  # a truncated line, or not a record
             at = begin + 1
             continue
-        yield from ((line, record) for record in _flat(value))
+        yield from ((line, {"time": time, **record} if time else record) for record in _flat(value))
 
 
 def _flat(value: Any) -> list[NamedValues]:

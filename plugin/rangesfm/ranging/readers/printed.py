@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.errors import InputError
+from rangesfm.errors import InputError, printable
 from rangesfm.files.text_tables import read_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID
 from rangesfm.ranging.readers.reader import EndpointRoles, Reader, Reading, ReadOptions, reader_of_readings
 from rangesfm.ranging.readers.times import HostClock
 
-_LOST = Reading(0.0, "", math.nan)
+LOST = Reading(0.0, "", math.nan)
 
 
 def _one_range(phrase: re.Match[str], timestamp_s: float, line: int) -> Iterator[Reading]:
@@ -35,6 +35,7 @@ def _one_range(phrase: re.Match[str], timestamp_s: float, line: int) -> Iterator
 def _reader(
     name: str,
     *,
+    example: str,
     begin: str,
     each: str,
     whole: str,
@@ -44,6 +45,7 @@ def _reader(
     """Make the reader of lines with phrases that are given as ASCII patterns.
 
     Args:
+        example: part of a line that is understood, for messages.
         begin: beginning of the first range in a line; the host's time is before it.
         each: beginning of each range.
         whole: a complete phrase. Groups x, y and z, if present, are the position of the anchor in metres. A group time,
@@ -55,8 +57,8 @@ def _reader(
     has_time = "time" in phrase.groupindex
 
     def readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
-        clock = HostClock(path, options)
-        for line, text in _numbered_lines(path):
+        clock, lost, num_found = HostClock(path, options), (0, ""), 0
+        for line, text in numbered_lines(path):
             num_begun = len(begun.findall(text))
             at = first.search(text) if num_begun else None
             if at is None:
@@ -65,7 +67,11 @@ def _reader(
             found = list(phrase.finditer(text))
             for one in found:
                 yield from ranges(one, clock.seconds(one["time"], line) if has_time else timestamp_s, line)
-            yield from [_LOST] * (num_begun - len(found))
+            yield from [LOST] * (num_begun - len(found))
+            num_found, lost = num_found + len(found), lost if lost[0] or found else (line, text)
+        if lost[0] and not num_found:
+            message = f"begins as a line of {name}, and is not understood: '{printable(lost[1].strip())}'"
+            raise InputError(f"{message}; expected such as {example}", path, lost[0])
 
     def recognizes(head: str) -> bool:
         return first.search(head) is not None
@@ -79,7 +85,7 @@ def _anchors_said(phrase: re.Pattern[str], path: Path) -> tuple[Anchor, ...]:
     Equal positions mean that nobody has set up the anchors.
     """
     positions: dict[str, list[tuple[float, float, float]]] = {}
-    for _, text in _numbered_lines(path) if "x" in phrase.groupindex else ():
+    for _, text in numbered_lines(path) if "x" in phrase.groupindex else ():
         for one in phrase.finditer(text):
             if one["z"] is not None:  # a position in the plane has no height
                 positions.setdefault(one["anchor_id"], []).append((float(one["x"]), float(one["y"]), float(one["z"])))
@@ -91,7 +97,7 @@ def _anchors_said(phrase: re.Pattern[str], path: Path) -> tuple[Anchor, ...]:
     )
 
 
-def _numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
+def numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield every line with its 1-based number; bytes that are not text, as in serial logs, are replaced."""
     return enumerate(read_text(path, errors="replace").split("\n"), 1)
 
@@ -105,26 +111,30 @@ _QUALITY = r"\d{1,3}"
 _ANCHOR = r"(?P<anchor_id>[0-9A-F]{4})"
 _ALONE = r"(?<![0-9A-Za-z])"
 _DWM1001 = (
-    _reader(  # POS,..,MEAS,4,AN0,8EAA,5.14,-2.16,0.00,100,1.41,..
+    _reader(
         "leaps_meas",
+        example="POS,4.07,-2.85,0.59,74,MEAS,1,AN0,8EAA,5.14,-2.16,0.00,100,1.41",
         begin=r"(?:POS,[-\d.,]{0,60})?MEAS,\d{1,2},AN\d",
         each=r"AN\d{1,2},",
         whole=rf"AN\d{{1,2}},{_ANCHOR},{_XYZ},{_QUALITY},{_RANGE}",
     ),
-    _reader(  # 8EAA[5.14,-2.16,0.00,100]=1.41 ..
+    _reader(
         "leaps_lea",
+        example="8EAA[5.14,-2.16,0.00,100]=1.41",
         begin=rf"(?:POS\[[-\d.,]{{0,60}}\]\s*)?{_ALONE}[0-9A-F]{{4}}\[{_XYZ},{_QUALITY}\]",
         each=rf"{_ALONE}[0-9A-F]{{4}}\[",
         whole=rf"{_ALONE}{_ANCHOR}\[{_XYZ},{_QUALITY}\]={_RANGE}",
     ),
-    _reader(  # DIST,4,AN0,022E,7.94,8.03,0.00,3.44,..
+    _reader(
         "dwm1001_lec",
+        example="DIST,1,AN0,022E,7.94,8.03,0.00,3.44",
         begin=rf"(?:DIST,\d{{1,2}},)?{_ALONE}AN\d{{1,2}},[0-9A-F]{{4}},",
         each=r"AN\d{1,2},",
         whole=rf"AN\d{{1,2}},{_ANCHOR},{_XYZ},{_RANGE}",
     ),
-    _reader(  # 022E[7.94,8.03,0.00]=3.38 ..
+    _reader(
         "dwm1001_les",
+        example="022E[7.94,8.03,0.00]=3.38",
         begin=rf"{_ALONE}[0-9A-F]{{4}}\[-?\d{{1,6}}\.\d\d,",
         each=rf"{_ALONE}[0-9A-F]{{4}}\[",
         whole=rf"{_ALONE}{_ANCHOR}\[{_XYZ}\]={_RANGE}",
@@ -138,8 +148,9 @@ _RANGE_AND_VARIANCE = rf"(?P<range>{_NUMBER}) (?P<variance>{_NUMBER})"
 # A12 is the twelfth pose of the robot A, which counts as the node A; L3 is a landmark, which is the node L3.
 _ROBOT_OR_LANDMARK = r"L\d{1,9}|[A-KM-Za-z](?=\d{1,9} )"
 _FACTOR_GRAPHS = (
-    _reader(  # range2 TIME RANGE VARIANCE X Y ID SNR, or range3
+    _reader(
         "librsf",
+        example="range2 12.5 3.38 0.01 7.94 8.03 104 1.0",
         begin=rf"^range[23] {_NUMBER} ",
         each=r"^range[23] ",
         whole=(
@@ -147,8 +158,9 @@ _FACTOR_GRAPHS = (
             rf"(?:(?P<z>{_NUMBER}) )?(?P<anchor_id>\w{{1,16}}) {_NUMBER}\s*$"
         ),
     ),
-    _reader(  # EDGE_RANGE TIME POSE LANDMARK RANGE VARIANCE
+    _reader(
         "pyfg",
+        example="EDGE_RANGE 12.5 A7 L1 3.38 0.01",
         begin=rf"^(?:EDGE_RANGE|VERTEX_SE2|VERTEX_SE3:QUAT) {_NUMBER} [A-Za-z]",
         each=r"^EDGE_RANGE ",
         whole=(
@@ -167,7 +179,7 @@ def _mauwb_ranges(record: re.Match[str], timestamp_s: float, line: int) -> Itera
     else:
         anchor_ids = [slot if int(record["mask"], 16) >> slot & 1 else -1 for slot in range(len(ranges_cm))]
     if len(anchor_ids) != len(ranges_cm):  # the line is damaged, and the anchors of the ranges are not known
-        yield from [_LOST] * len(ranges_cm)
+        yield from [LOST] * len(ranges_cm)
         return
     for range_cm, anchor_id in zip(ranges_cm, anchor_ids):
         if anchor_id >= 0:
@@ -214,7 +226,7 @@ def _qorvo_readings(path: Path, options: ReadOptions) -> Iterator[Reading]:
         for found in measurements:
             anchor_id, range_cm = found["id"] or found["json_id"], found["cm"] or found["json_cm"]
             yield Reading(timestamp_s, anchor_id, int(range_cm) / 100, line)
-        yield from [_LOST] * (len(_QORVO_EACH.findall(body)) - len(measurements))
+        yield from [LOST] * (len(_QORVO_EACH.findall(body)) - len(measurements))
 
 
 def _qorvo_count(body: str, last: int, path: Path, line: int) -> int:
@@ -232,30 +244,37 @@ def _qorvo_count(body: str, last: int, path: Path, line: int) -> int:
     return count
 
 
+_BLANKS = r"[ \t]{0,9}"
+# A blank stands for any blanks.
+_MAUWB = (
+    r"AT\+RANGE= tid: (?P<tag_id>\d{1,9}) , mask: (?P<mask>[0-9A-Fa-f]{1,16}) , seq: \d{1,9} , "
+    r"range: \( (?P<range>-?\d{1,9} (?:, -?\d{1,9} ){0,63})\) (?:, rssi: \([^()]{0,999}\) )?"
+    r"(?P<rest>, ancid: (?:\( (?P<anchor_id>-?\d{1,9} (?:, -?\d{1,9} ){0,63})\))?)?"
+)
+
 PRINTED = (
     *_FACTOR_GRAPHS,
     *_DWM1001,
     reader_of_readings("qorvo", lambda head: _QORVO_BEGIN.search(head) is not None, _qorvo_readings),
-    _reader(  # DW3000 with AT commands: AT+RANGE=tid:0,mask:03,seq:182,range:(232,401,..),ancid:(0,1,..)
+    _reader(
         "mauwb",
-        begin=r"AT\+RANGE=tid:",
-        each=r"AT\+RANGE=tid:",
-        whole=(
-            r"AT\+RANGE=tid:(?P<tag_id>\d{1,9}),mask:(?P<mask>[0-9A-Fa-f]{1,16}),seq:\d{1,9},"
-            r"range:\((?P<range>-?\d{1,9}(?:,-?\d{1,9}){0,63})\)(?:,rssi:\([^()]{0,999}\))?"
-            r"(?P<rest>,ancid:(?:\((?P<anchor_id>-?\d{1,9}(?:,-?\d{1,9}){0,63})\))?)?"
-        ),
+        example="AT+RANGE=tid:0,mask:03,seq:182,range:(232,401),ancid:(0,1)",
+        begin=rf"AT\+RANGE={_BLANKS}tid:",
+        each=rf"AT\+RANGE={_BLANKS}tid:",
+        whole=_MAUWB.replace(" ", _BLANKS),
         ranges=_mauwb_ranges,
         roles=EndpointRoles.NUMBERED_APART,
     ),
-    _reader(  # Arduino sketches for the DW1000, such as those of Makerfabs: from: D325 Range: 29.40 m ..
+    _reader(
         "arduino",
+        example="from: D325 Range: 29.40 m",
         begin=r"from:\s{0,9}[0-9A-Fa-f]{1,16}\s{1,9}Range:",
         each=r"from:",
         whole=r"from:\s{0,9}(?P<anchor_id>[0-9A-Fa-f]{1,16})\s{1,9}Range:\s{0,9}(?P<range>-?\d{1,6}\.\d{1,4}) ?m\b",
     ),
-    _reader(  # {"links":[{"A":"1782","R":"1.2"},..]}
+    _reader(
         "makerfabs_json",
+        example='{"links":[{"A":"1782","R":"1.2"}]}',
         begin=r'\{\s*"links"\s*:\s*\[\s*\{\s*"A"',
         each=r'"A"',
         whole=(

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import islice, permutations
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,7 @@ _INROLS_COMMENT = re.compile(
     r"\s{0,99}#[ \t]{0,9}index[ \t]{1,9}timestamp[ \t]{1,9}anchor_id[ \t]{1,9}r[ \t]{0,9}(?:\n|$)"
 )
 _ID_IN_NAME = re.compile(r"(?:.*[^0-9A-Za-z])?([A-Za-z]{0,2}\d{1,3}|(?=[A-F]*\d)[0-9A-F]{4})", re.ASCII)
+_MOST_COMMANDS = 4  # commands for columns of which nothing is known
 _SPAN = re.compile(r"(\D*)(\d{1,4})-(\D*)(\d{1,4})", re.ASCII)
 _POSITIONS_ONLY = (
     "holds positions that the radio computed and not the ranges they came from; "
@@ -49,7 +51,8 @@ _TDOA = (
     "holds differences of arrival times (TDoA), which are no ranges between a tag and an anchor; "
     "record two-way ranging instead"
 )
-# Logs of radios that hold no ranges, and what they hold instead.
+# Logs of radios that hold no ranges, and what they hold instead. Positions may stand beside ranges, and are the reason
+# only if nothing in the log can be the ranges.
 _NO_RANGES = (
     (re.compile(r'\btdoa\b|\btdoa_|"tdoa|\bidA\b.{0,99}\bidB\b', re.ASCII | re.IGNORECASE), _TDOA),
     (re.compile(r'"tagId".{0,2000}"(?:tagData|coordinates|anchorData)"', re.ASCII | re.DOTALL), _POSITIONS_ONLY),
@@ -94,16 +97,18 @@ def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
 
 def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
     head = read_head(path)
-    if instead := next((what for pattern, what in _NO_RANGES if pattern.search(head)), None):
+    reasons = _NO_RANGES if guess is None or "range" in guess.missing else _NO_RANGES[:1]
+    if instead := next((what for pattern, what in reasons if pattern.search(head)), None):
         return InputError(f"the log {instead}", path)
     if layout is None or guess is None:
         first_line = printable(head.strip().split("\n")[0])
         return InputError(f"neither a known log format nor a table; it begins with '{first_line}'", path)
     found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
-    told = {**guess.told, **dict.fromkeys(guess.missing, "NAME")}
-    command = options.changed(columns=told).command(path)
     closest = ", ".join(f"{quantity} = {name}" for quantity, name in guess.told.items()) or "none"
     why = "; ".join([*(f"no column seems to be the {missing}" for missing in guess.missing), *guess.doubts])
+    commands = [options.changed(columns=columns).command(path) for columns in _possible_columns(layout, guess)]
+    last = "perhaps" if guess.missing else "if that is right"
+    nothing = f"no other column of numbers can be the {' or the '.join(guess.missing)}, which a log needs"
     return InputError(
         "a table whose columns are not known for sure",
         path,
@@ -111,9 +116,17 @@ def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Gu
             found,
             f"closest guess: {closest}",
             f"not sure: {why}",
-            f"{'name the column' if guess.missing else 'if that is right'}: {command}",
+            *([f"{last}: {command}" for command in commands] or [nothing]),
         ],
     )
+
+
+def _possible_columns(layout: Layout, guess: Guess) -> Iterable[dict[str, str]]:
+    """Yield the columns of a guess, with a few columns of numbers in the place of those that it misses."""
+    taken = guess.told.values()
+    free = [column.name for column in layout.columns if column.kind == "numbers" and column.name not in taken]
+    for names in islice(permutations(free, len(guess.missing)), _MOST_COMMANDS):
+        yield {**guess.told, **dict(zip(guess.missing, names))}
 
 
 def _recognizes(format: str, head: str) -> bool:

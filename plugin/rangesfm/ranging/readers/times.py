@@ -84,6 +84,15 @@ def _seconds_from_civil(text: str, order: str) -> float:
     return seconds - (-1 if zone[0] == "-" else 1) * (hours * 3600.0 + minutes * 60.0)
 
 
+def time_alone(text: str) -> str | None:
+    """Return the time in a text that holds nothing else but marks such as brackets, or None."""
+    civil = CIVIL_TIME.search(text) or TIME_OF_DAY.search(text)
+    number = _NUMBER.search(text)
+    if civil is None and number is not None and not re.search("[A-Za-z0-9]", text.replace(number[0], "", 1)):
+        return number[0]
+    return civil and civil[0]
+
+
 class CivilClock:
     """Reader of successive civil times; times of day without a date continue after midnight."""
 

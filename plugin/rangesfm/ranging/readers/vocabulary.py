@@ -48,13 +48,18 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-RANGE = _words("range ranges rng distance distances dist dists dis abstand entfernung distanz distancia 距离")
+RANGE = _words("range ranges rng raz distance distances dist dists dis abstand entfernung distanz distancia 距离")
 RANGE_IN_SHORT = _words("d r")
 # Words in the names of columns that accompany the range and are not ranges.
 NO_RANGE = _words(
     "gt true truth ground actual real ref reference expected est estimated error err bias std stddev stdev sigma var "
     "variance cov covariance rate dot vel velocity speed count quality rssi power snr offset x y z min max threshold "
-    "id index idx rtt"
+    "id index idx rtt los nlos"
+)
+# Words in the names of columns of where and how the tag or an anchor is, as the radio or the phone computed it.
+POSE = _words(
+    "position positions pos location coordinate coordinates x y z lat lon latitude longitude orientation rotation "
+    "quaternion quat euler eulerangle angle azimuth elevation heading yaw pitch roll accel acceleration acc gyro mag"
 )
 # Words in the names of processed ranges, which are used only if there is no other range.
 SECOND_RANGE = _words("calib calibrated corr corrected filtered filter smoothed smooth mean avg average median last")
@@ -67,7 +72,7 @@ NANOSECONDS = _words("nsec nsecs nanosec nanosecs nanosecond nanoseconds")
 NO_TIME = _words("flight of delta dt diff duration latency tx rx offset since zone out le")
 SECOND_TIME = _words("device wearable sensor boot local received record rosbag bag")
 LENGTH_UNIT = frozenset(LENGTHS)
-ASKED = _words("responder rspdr resp rsp receiver to dest dst destination target peer remote neighbor neighbour")
+ASKED = _words("ouid responder rspdr resp rsp receiver to dest dst destination target peer remote neighbor neighbour")
 ASKING = _words("requester rqstr req sender initiator init from src source self")
 ANCHOR = _words(
     "anchor anchors anc an beacon landmark station base basestation bs node anker ancla ancora ancre balise gateway "

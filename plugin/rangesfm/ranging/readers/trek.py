@@ -1,0 +1,115 @@
+"""Lines that TREK1000 kits and the many boards with its firmware print: ranges in hexadecimal millimetres.
+
+A line is, with blanks between, what it reports (``mc``: ranges between tag and anchors, ``mr``: the same before a
+correction, ``ma``: ranges between anchors), the mask of valid ranges, four or more ranges, two counts, the radio's
+milliseconds (in ``mr`` other numbers), and the ids of tag and anchor.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.readers.printed import LOST, numbered_lines
+from rangesfm.ranging.readers.reader import (
+    EndpointRoles,
+    Reader,
+    Reading,
+    ReadOptions,
+    log_of_readings,
+    refuse_options_of_tables,
+)
+from rangesfm.ranging.readers.times import HostClock
+
+_LINE = re.compile(
+    r"(?<![0-9A-Za-z])m(?P<kind>[acr]) (?P<mask>[0-9a-fA-F]{2}) (?P<ranges>(?:[0-9a-fA-F]{8} {1,2}){3,16})"
+    r"[0-9a-fA-F]{4} [0-9a-fA-F]{2} (?P<clock>[0-9a-fA-F]{1,8}) [at](?P<tag>\d{1,5}):\d{1,5}",
+    re.ASCII,
+)
+_BEGIN = re.compile(r"(?<![0-9A-Za-z])m[acr] [0-9a-fA-F]{2} [0-9a-fA-F]{8} ", re.ASCII)
+_NO_RANGE = (0, 0xFFFFFFFF)
+# Ends of the ranges of a line ``ma``, by their place in it.
+_BETWEEN_ANCHORS = {1: ("A0", "A1"), 2: ("A0", "A2"), 3: ("A1", "A2")}
+
+
+@dataclass(frozen=True)
+class _Report:
+    """One line, with the text in front of it."""
+
+    number: int
+    prefix: str
+    kind: str
+    mask: int
+    ranges_mm: tuple[int, ...]
+    clock: str
+    tag: str
+
+
+def _reports(path: Path) -> Iterator[_Report | None]:
+    """Yield every line of a log; None for one that is damaged."""
+    for number, text in numbered_lines(path):
+        found = list(_LINE.finditer(text))
+        yield from [None] * (len(_BEGIN.findall(text)) - len(found))
+        for one in found:
+            ranges_mm = tuple(int(digits, 16) for digits in one["ranges"].split())
+            prefix = text[: one.start()]
+            yield _Report(number, prefix, one["kind"], int(one["mask"], 16), ranges_mm, one["clock"], one["tag"])
+
+
+def _read(path: Path, options: ReadOptions) -> RangeLog:
+    refuse_options_of_tables(options, path)
+    all_reports = list(_reports(path))
+    whole = [report for report in all_reports if report is not None]
+    unused = "r" if any(report.kind == "c" for report in whole) else ""  # ``mr`` repeats the ranges of ``mc``
+    reports = [report for report in whole if report.kind != unused]
+    seconds, notes = _times(reports, path, options)
+    is_masked = any(report.mask for report in reports)  # some firmware leaves the mask at 0
+    readings = [
+        (report.kind, slot, _reading(report, slot, seconds(report), is_masked))
+        for report in reports
+        for slot in range(len(report.ranges_mm))
+    ]
+    # A place without any range belongs to no anchor.
+    used = {(kind, slot) for kind, slot, reading in readings if reading.range_m > 0}
+    found = [reading for kind, slot, reading in readings if (kind, slot) in used]
+    found += [LOST] * (len(all_reports) - len(whole))
+    log = log_of_readings(found, path, _NAME, notes)
+    ends = {*log.tag_ids, *log.anchor_ids}
+    return log.with_anchors({node for node in ends if node.startswith("A")})
+
+
+def _reading(report: _Report, slot: int, time_s: float, is_masked: bool) -> Reading:
+    """Return the range at a place in a line; it is 0 if there is none."""
+    range_mm = report.ranges_mm[slot]
+    is_valid = range_mm not in _NO_RANGE and (not is_masked or report.mask >> slot & 1)
+    tag_id, anchor_id = f"T{report.tag}", f"A{slot}"
+    if report.kind == "a":
+        tag_id, anchor_id = _BETWEEN_ANCHORS.get(slot, ("", ""))
+    return Reading(time_s, anchor_id, range_mm / 1000 * bool(is_valid and anchor_id), report.number, tag_id)
+
+
+def _times(
+    reports: Sequence[_Report], path: Path, options: ReadOptions
+) -> tuple[Callable[[_Report], float], tuple[str, ...]]:
+    """Return a function that gives the time of a line in seconds, and a note on the clock.
+
+    The time in front of the lines is that of the host. Without one, the radio's count of milliseconds is the time.
+    """
+    host = HostClock(path, options)
+    has_host_time = all(host.find_seconds(report.prefix) is not None for report in reports)
+    counted = [report for report in reports if report.kind != "r"]
+    are_distinct = len({report.clock for report in counted}) > 1
+    if has_host_time or len(counted) < len(reports) or not are_distinct:
+        clock = HostClock(path, options)
+        return lambda report: clock.seconds(report.prefix, report.number), ()
+    # Some firmware prints the count in decimals.
+    base = 16 if any(re.search("[a-fA-F]", report.clock) for report in reports) else 10
+    note = "no time of the host in front of the lines: the time is the radio's count of milliseconds"
+    return lambda report: int(report.clock, base) / 1000, (note,)
+
+
+_NAME = "trek1000"
+READER = Reader(_NAME, lambda head: _BEGIN.search(head) is not None, _read, roles=EndpointRoles.NUMBERED_APART)
