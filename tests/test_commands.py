@@ -224,7 +224,7 @@ class TestRefineInASiteFrame:
         assert refined.result["warnings"] == []
         assert set(refined.result["anchors"]) == {"A1", "A2", "A3", "A4"}
         assert refined.result["time_offset"]["value_s"] == 2.0
-        assert [row["name"] for row in refined.result["comparison"]] == ["true scale", "estimated scale", "refined"]
+        assert [row["name"] for row in refined.result["comparison"]] == ["true scale", "scaled", "refined"]
         for row in refined.result["comparison"]:
             assert_has(row, COMPARISON)
 
@@ -261,7 +261,7 @@ class TestRefineInASiteFrame:
         self, refined: Left, walked_survey: WalkedSurvey
     ) -> None:
         by_name = {row["name"]: row for row in refined.result["comparison"]}
-        for name, model in (("estimated scale", "sparse_scaled"), ("refined", "sparse_metric")):
+        for name, model in (("scaled", "sparse_scaled"), ("refined", "sparse_metric")):
             errors = np.linalg.norm(refined.centers(model) - walked_survey.centers_m, axis=1)
             assert by_name[name]["rmse_m"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
         assert by_name["true scale"]["scale_error_percent"] == pytest.approx(0, abs=1e-9)
@@ -524,8 +524,8 @@ class TestResultFolder:
         reference = walked_survey.folder / "reference.csv"
         text = rangesfm_command("compare", out, "--reference", reference, cwd=out.parent).stdout
         rmse_m = {row["name"]: row["rmse_m"] for row in refined.result["comparison"]}
-        for name in ("true scale", "estimated scale", "refined"):
-            (line,) = (line for line in text.splitlines() if line.startswith(name))
+        for name in ("true scale", "scaled", "refined"):
+            (line,) = (line for line in text.splitlines() if line.startswith(f"{name} "))
             assert f" {rmse_m[name]:.4f} " in line
         text = rangesfm_command("compare", cwd=out.parent).stdout  # "out" is the default folder
         assert "RMSE m" not in text

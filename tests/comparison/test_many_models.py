@@ -119,6 +119,22 @@ def test_a_results_ranges_fit_its_own_model_as_its_file_says(result: Path, model
     assert own.range_rms_m[0] == pytest.approx(said, rel=1e-4)
 
 
+def test_a_results_row_is_the_same_whatever_it_is_compared_with(
+    result: Path, walked_survey: WalkedSurvey, tmp_path: Path
+) -> None:
+    """Another result used other ranges, to anchors that it placed elsewhere."""
+    files = walked_survey.folder
+    survey = survey_of(files, {"anchors.frame": "unknown", "output.path": tmp_path / "other", "report.enabled": False})
+    survey = survey.changed({"images.model": files / "sparse" / "0", "ranges.check_share": 0.3})
+    scale_model(survey, progress=SilentProgress())
+    alone, _ = compared(result, files / "sparse" / "0").rows
+    other, beside = compared(tmp_path / "other", result).rows
+    for row, folder in ((alone, result), (beside, result), (other, tmp_path / "other")):
+        assert row.range_rms_m is not None
+        said = json.loads((folder / "result.json").read_text())["ranges"]["rms_m"]
+        assert row.range_rms_m[0] == pytest.approx(said, rel=1e-3)
+
+
 def test_a_log_is_held_against_models_that_no_run_has_made(
     dense_survey: WalkedSurvey, models: tuple[Path, Path, Path]
 ) -> None:
@@ -239,8 +255,8 @@ def test_truth_by_time_needs_no_times_of_its_own(
     ratios = [float(row[4]) for row in by_result[1:4]]
     assert ratios == pytest.approx([1.0, 1 / scale, 1.0], rel=0.02)
     by_table = printed(models[0], "--reference", "truth.csv", "--images", files / "images.csv")
-    assert by_table[-1] == [str(models[0]), "40", "-", "-", by_table[-1][4], f"{1 / scale:.6g}"]
-    assert float(by_table[-1][4]) < 0.001
+    assert by_table[-1] == [str(models[0]), "40", *3 * "-", by_table[-1][5], f"{1 / scale:.6g}"]
+    assert float(by_table[-1][5]) < 0.001
     done = rangesfm_command("compare", models[0], "--reference", "truth.csv", cwd=tmp_path, status=2)
     assert "the photos have no times" in done.stderr
 
@@ -264,8 +280,9 @@ def test_only_models_that_are_known_to_be_metric_have_lengths_in_metres(
     cells = {row.split()[0]: row.split()[2:] for row in against_truth[1:]}
     assert cells[str(models[1])][:2] == ["-", "-"]
     for metric in (result, scaled):
-        rmse_m, after_se3_m = map(float, cells[str(metric)][:2])
-        assert after_se3_m <= rmse_m < 0.5
+        rmse_m, aligned_by, after_se3_m = cells[str(metric)][:3]
+        assert float(after_se3_m) <= float(rmse_m) < 0.5
+        assert aligned_by == "nothing"
 
 
 def test_models_of_other_photos_are_refused(models: tuple[Path, Path, Path], tmp_path: Path) -> None:

@@ -133,7 +133,7 @@ def test_the_papers_table_separates_the_error_of_the_scale_from_that_of_the_shap
     scaled = in_first_camera(make_path(1.05 * (truth.centers + drift), truth.world_from_cam))
     rows = papers_table(scaled, in_first_camera(truth), reference_of(truth), frame="first_camera")
     true_scale, estimated, refined = rows
-    assert [row.name for row in rows] == ["true scale", "estimated scale", "refined"]
+    assert [row.name for row in rows] == ["true scale", "scaled", "refined"]
     assert true_scale.scale_error_percent == pytest.approx(0.0, abs=1e-9)
     assert estimated.scale_error_percent == pytest.approx(5.0, abs=3.0)
     assert true_scale.rmse_sim3_m == pytest.approx(estimated.rmse_sim3_m)
@@ -196,7 +196,7 @@ def test_the_reference_in_the_maps_frame_lies_on_a_perfect_path() -> None:
 
 def test_the_printed_table_has_a_dash_for_what_is_not_known() -> None:
     truth = make_path(*walk())
-    header, line = format_table(compare({"a map": truth}, reference_of(truth), frame=None)).splitlines()
+    header, line = format_table(compare({"a map": truth}, reference_of(truth), frame=None), "site").splitlines()
     assert header.split()[:4] == ["trajectory", "keyframes", "RMSE", "m"]
     assert line.startswith("a map")
     assert line.split()[2:5] == ["30", "-", "0.0000"]
@@ -278,7 +278,9 @@ def test_a_result_folder_is_compared_with_a_reference_file(tmp_path: Path, model
     assert refined.rmse_m == pytest.approx(0.0, abs=1e-6)
     assert result.models is not None
     assert result.models.range_rms_m == pytest.approx((np.sqrt(0.125), 0.1))
-    assert "estimated scale" in str(result)
+    header, *rows = str(result).split("\n\n")[0].splitlines()
+    assert "RMSE m  after SE(3)" in header  # in the site's frame
+    assert [row.split("  ")[0] for row in rows] == ["true scale", "scaled", "refined"]
     assert "reprojection RMS px" in str(result)
 
 

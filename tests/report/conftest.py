@@ -242,7 +242,7 @@ def _summary(
         "refine": REFINE if is_refined else None,
         "comparison": [
             _comparison_row("true scale", 0.0712, 0.0633, 0.0633, 0.0),
-            _comparison_row("estimated scale", 0.0801, 0.0702, 0.0633, 1.094),
+            _comparison_row("scaled", 0.0801, 0.0702, 0.0633, 1.094),
             _comparison_row("refined", 0.0214, 0.0187, 0.0186, -0.051),
         ],
         "inputs": [{"path": "uwb.csv", "sha256": "0" * 64, "bytes": 12345, "hashed": "content"}],

@@ -127,7 +127,7 @@ def test_a_number_that_rounds_to_zero_has_no_sign() -> None:
     assert number_text(-3e-7, ".2e") == "-3.00e-07"
     assert number_text(-float("inf"), "+.1f") == "-inf"
     row = {"name": "true scale", "num_keyframes": 9, "rmse_m": None, "rmse_se3_m": -0.0, "rmse_sim3_m": 0.1}
-    table = format_table((ComparisonRow.model_validate({**row, "scale_error_percent": -2e-9}),))
+    table = format_table((ComparisonRow.model_validate({**row, "scale_error_percent": -2e-9}),), "site")
     assert "-0.000" not in table
     assert "0.000 %" in table
 

@@ -149,7 +149,7 @@ def print_row(survey: Survey, sfm: pycolmap.Reconstruction) -> None:
         {"output.path": survey.output.path / "result", "refine.covariance": False, "report.enabled": False}
     )
     result = refine_model(cut, progress=SilentProgress()).summary
-    print(format_table((*unscaled, *result.comparison)))
+    print(format_table((*unscaled, *result.comparison), result.frame))
     print(f"{known(result.refine).iterations} iterations of the full problem\n", flush=True)
 
 

@@ -31,7 +31,8 @@ _HEADER = (
 )
 _NOTE = (
     "Scale: metres per unit of the unscaled model, ± half of its 95 % interval. RMSE: error of the keyframe centres "
-    "against a reference, without any alignment. Attempts: more than one where a worker was killed."
+    "against a reference, without any alignment in a site, and aligned by the first pose elsewhere. "
+    "Attempts: more than one where a worker was killed."
 )
 
 

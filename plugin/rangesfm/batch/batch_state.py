@@ -44,7 +44,7 @@ class SurveyRow:
         scale: metres per unit of the unscaled model.
         scale_stddev: its empirical standard deviation, which is never less than the formal one.
         num_photos: number of photos in the model.
-        rmse_m: RMSE of the final map's keyframe centres without alignment, where there is a reference.
+        rmse_m: ``ComparisonRow.rmse_m`` of the final map, where there is a reference.
     """
 
     survey: str

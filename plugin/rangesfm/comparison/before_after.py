@@ -95,13 +95,17 @@ class FolderComparison:
     Attributes:
         rows: comparison with the reference, as in the 2018 paper; empty without a reference.
         models: comparison of the scaled with the refined model; None where the run did not refine.
+        frame: of the models.
     """
 
     rows: tuple[ComparisonRow, ...]
     models: ModelComparison | None
+    frame: str
 
     def __str__(self) -> str:
-        return "\n\n".join(filter(None, (format_table(self.rows) if self.rows else "", str(self.models or ""))))
+        return "\n\n".join(
+            filter(None, (format_table(self.rows, self.frame) if self.rows else "", str(self.models or "")))
+        )
 
 
 def compare_folder(output_path: Path, reference_path: Path | None = None) -> FolderComparison:
@@ -123,7 +127,7 @@ def compare_folder(output_path: Path, reference_path: Path | None = None) -> Fol
         path_of_refined = None if refined is None else path.as_in(refined)
         rows = papers_table(path, path_of_refined, read_reference(reference_path), frame=result.summary.frame)
     changed = None if refined is None else compare_models(scaled, refined, range_residuals_m=_used_residuals(result))
-    return FolderComparison(rows, changed)
+    return FolderComparison(rows, changed, result.summary.frame)
 
 
 def _used_residuals(result: ResultFolder) -> tuple[Array, Array] | None:

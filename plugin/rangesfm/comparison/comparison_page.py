@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.comparison.many_models import ModelsComparison, carried_by
+from rangesfm.comparison.many_models import ModelsComparison, NamedModel, carried_by
 from rangesfm.export.metric_map import colored_points
 from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
@@ -52,6 +52,10 @@ def _color(index: int) -> str:
     return COLORS[index % len(COLORS)]
 
 
+def _unit(base: NamedModel) -> str:
+    return "SfM units" if base.frame is None else "m"
+
+
 def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) -> Scene:
     """Return the scene with a model's map and all paths. The first model's is last: on that, cameras are chosen."""
     base = comparison.models[0]
@@ -69,6 +73,7 @@ def _scene(comparison: ModelsComparison, aligned: list[Trajectory], frame: str) 
         points_m=points_m,
         points_rgb=points_rgb,
         anchors={} if base.result is None else base.result.summary.anchors,
+        unit=_unit(base),
     )
 
 
@@ -87,7 +92,7 @@ def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
         "Distance of each camera from its position in the first model, after the best similarity, in the unit of the "
         "first model.",
         "Distance of each camera from its position in the first model",
-        ("photo", "moved"),
+        ("photo", f"moved, {_unit(comparison.models[0])}"),
         series,
         y_range=from_zero(series),
         size=WIDE_SIZE,
@@ -103,6 +108,6 @@ def _path_figure(comparison: ModelsComparison, aligned: list[Trajectory], frame:
             for i, (model, path) in enumerate(zip(comparison.models, aligned))
         ]
         limits = equal_view(np.concatenate([line.points for line in lines]))
-        panels.append(view.panel("all paths", "", lines, limits))
+        panels.append(view.panel("all paths", f" {_unit(comparison.models[0])}", lines, limits))
     caption = "All paths after the best similarity to the first, in the frame and the unit of the first model."
     return Figure("paths", caption, tuple(panels), layout="views")

@@ -72,8 +72,10 @@ class ModelRow:
         moved, moved_aligned: (n,) distance of each common camera from its position in the first model, before and after
             that similarity, in the unit of the first model; ``moved_aligned`` is None without a similarity.
         reprojection_rms_px: None for a file of positions, NaN for a model without points.
-        range_rms_m: RMS of range residuals, with the cameras as they are, and with the cameras moved by the similarity
-            that brings them closest to ``ModelRanges.metric_path``; None without ranges.
+        range_rms_m: RMS of range residuals. First with the cameras as they are; if the model is a result and no log is
+            given, of the ranges and anchors of its own run, so that it does not depend on the other models. Then of the
+            ranges that all models share, with the cameras moved by the similarity that brings them closest to
+            ``ModelRanges.metric_path``. None without ranges.
     """
 
     name: str
@@ -226,11 +228,12 @@ def compare_many(
         InputError: a model has no photo in common with the first, or lacks an end of a taped distance; or the reference
             has no keyframe of a model, or is by time and the times of its photos are not known.
     """
+    own = [ranges] * len(models)
     if ranges is None:
-        of_results = (ranges_of_result(one.result, one.path) for one in models if one.result is not None)
-        ranges = next(filter(None, of_results), None)
+        own = [None if one.result is None else ranges_of_result(one.result, one.path) for one in models]
+        ranges = next(filter(None, own), None)
     onto_ranges = [None if ranges is None else _onto(ranges.metric_path, model.path) for model in models]
-    rows = tuple(_row(models[0], model, ranges, onto) for model, onto in zip(models, onto_ranges))
+    rows = tuple(_row(models[0], *each, ranges) for each in zip(models, own, onto_ranges, strict=True))
     taped = () if tape is None else tuple(_taped(models, ranges, onto_ranges, tape))
     truth = () if reference is None else tuple(_truth_cells(model, reference) for model in models)
     return ModelsComparison(tuple(models), rows, lengths_along([model.path for model in models]), taped, truth)
@@ -263,7 +266,13 @@ def _read_positions(path: Path, base: Trajectory) -> NamedModel:
     return NamedModel(str(path), trajectory, None, None, "site", has_orientations=rotations is not None)
 
 
-def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None, onto_ranges: Similarity | None) -> ModelRow:
+def _row(
+    base: NamedModel,
+    other: NamedModel,
+    own: ModelRanges | None,
+    onto_ranges: Similarity | None,
+    ranges: ModelRanges | None,
+) -> ModelRow:
     names, ours, theirs = common_photos(base.path, other.path)
     if not names:
         raise InputError(f"it has no photo in common with {base.name}", other.name)
@@ -277,7 +286,7 @@ def _row(base: NamedModel, other: NamedModel, ranges: ModelRanges | None, onto_r
         moved=np.linalg.norm(theirs - ours, axis=1),
         moved_aligned=None if similarity is None else np.linalg.norm(similarity.apply(theirs) - ours, axis=1),
         reprojection_rms_px=None if other.model is None else reprojection_rms_px(other.model),
-        range_rms_m=_range_rms(ranges, other, onto_ranges) if ranges and onto_ranges else None,
+        range_rms_m=_range_rms(own or ranges, ranges, other, onto_ranges) if ranges and onto_ranges else None,
     )
 
 
@@ -295,12 +304,14 @@ def _onto(goal: Trajectory, path: Trajectory) -> Similarity | None:
     return similarity_onto(source, target)
 
 
-def _range_rms(ranges: ModelRanges, model: NamedModel, onto_ranges: Similarity) -> tuple[float, float] | None:
-    """Return the RMS of range residuals with the cameras of a model as they are, and after the similarity."""
+def _range_rms(
+    own: ModelRanges, ranges: ModelRanges, model: NamedModel, onto_ranges: Similarity
+) -> tuple[float, float] | None:
+    """Return ``ModelRow.range_rms_m``, given the model's own ranges and those that all models share."""
     if not model.has_orientations:
         return None
-    own, carried = (rms(ranges.residuals_m(path)) for path in (model.path, carried_by(onto_ranges, model.path)))
-    return None if np.isnan(own) else (own, carried)
+    as_it_is, carried = rms(own.residuals_m(model.path)), rms(ranges.residuals_m(carried_by(onto_ranges, model.path)))
+    return None if np.isnan(as_it_is) else (as_it_is, carried)
 
 
 def carried_by(similarity: Similarity | None, path: Trajectory) -> Trajectory:
@@ -366,18 +377,22 @@ def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
     return rmse(np.concatenate(errors))
 
 
-_TRUTH_HEADER = ("model", "keyframes", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale / truth")
+_TRUTH_HEADER = ("model", "keyframes", "RMSE m", "aligned by", "after SE(3) m", "after Sim(3) m", "scale / truth")
+_ALIGNED_BY = {"site": "nothing", "first_camera": "first pose", None: "-"}
 _TRUTH_NOTE = (
-    "Root mean square distances of the cameras from the reference: as the model is, after the best rotation and shift, "
-    "and after the best similarity. Of a model that is not known to be in metres, only the last is compared."
+    "Root mean square distances of the cameras from the reference: of a model in the site's frame without any "
+    "alignment, and of one in the first camera's frame after alignment by the pose of its first known keyframe; after "
+    "the best rotation and shift; and after the best similarity. Of a model that is not known to be in metres, only "
+    "the last is compared."
 )
 _UNIT_NOTE = "Lengths of a model whose unit is not known to be the metre are in its own units."
 _NOTE = (
     "Scale / first: lengths in the model divided by those in the first model. Turn: rotation of the best similarity "
     "from the model to the first model. Moved: RMS distance of the cameras from their positions in the first model, "
     "before and after that similarity, where both are in metres or neither is known to be. Range RMS: of the residuals "
-    "of the ranges used, with the cameras as they are (for models in metres), and after the best similarity onto the "
-    "path that the ranges were placed on."
+    "of ranges with the cameras as they are, for models in metres. A result has its own ranges and anchors, unless a "
+    "log is given; the other models have those of the first result. After Sim(3): of these for all models, after the "
+    "best similarity onto the path that they were placed on."
 )
 _TAPED_NOTE = (
     f"{_UNIT_NOTE} After Sim(3): with the scale that brings the cameras of the model onto the path that the ranges "
@@ -388,10 +403,11 @@ _TAPED_NOTE = (
 def _truth_cells(model: NamedModel, reference: Reference) -> Sequence[str]:
     """Return the cells of a model's row against a reference, under ``_TRUTH_HEADER``."""
     (row,) = compare({model.name: model.path}, reference, frame=model.frame)
-    unaligned_m = (row.rmse_m, None if model.frame is None else row.rmse_se3_m)
     ratio = None if row.scale_error_percent is None else 1.0 + row.scale_error_percent / 100.0
-    lengths = [text_or_dash(length_m, ".4f") for length_m in (*unaligned_m, row.rmse_sim3_m)]
-    return (model.name, str(row.num_keyframes), *lengths, text_or_dash(ratio, ".6g"))
+    rmse_se3_m = None if model.frame is None else row.rmse_se3_m
+    first, *aligned = (text_or_dash(length_m, ".4f") for length_m in (row.rmse_m, rmse_se3_m, row.rmse_sim3_m))
+    by = _ALIGNED_BY[None if row.rmse_m is None else model.frame]
+    return (model.name, str(row.num_keyframes), first, by, *aligned, text_or_dash(ratio, ".6g"))
 
 
 def _cells(row: ModelRow, first: NamedModel) -> list[tuple[str, str]]:

@@ -15,7 +15,7 @@ from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.similarity import Similarity, align_points, rmse, similarity_between
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.result.entries import ComparisonRow
+from rangesfm.result.entries import ComparisonRow, rmse_heading
 
 MIN_NUM_ALIGNED = 3
 """Smallest number of keyframes for an alignment: two points always fit exactly after Sim(3)."""
@@ -54,7 +54,7 @@ def papers_table(
     frame: str = "site",
     loops_open: Trajectory | None = None,
 ) -> tuple[ComparisonRow, ...]:
-    """Return the table of the 2018 paper: with the true scale, with the estimated scale and, if there is one, refined.
+    """Return the table of the 2018 paper: with the true scale, scaled and, if there is one, refined.
 
     Args:
         scaled: metric path before the refinement.
@@ -63,7 +63,7 @@ def papers_table(
         frame: as in ``compare``.
         loops_open: the refined path before its loops were closed, which gives a further row; None without loops.
     """
-    paths = {"true scale": with_true_scale(scaled, reference, frame=frame), "estimated scale": scaled}
+    paths = {"true scale": with_true_scale(scaled, reference, frame=frame), "scaled": scaled}
     further = {"refined, loops open": loops_open, "refined": refined}
     paths |= {name: path for name, path in further.items() if path is not None}
     return compare(paths, reference, frame=frame)
@@ -142,9 +142,9 @@ def similarity_onto(source: Array, target: Array) -> Similarity | None:
     return similarity_between(source, target) if len(source) >= MIN_NUM_ALIGNED else None
 
 
-def format_table(rows: tuple[ComparisonRow, ...]) -> str:
-    """Return the rows as a table in plain text, lengths in metres."""
-    header = ("trajectory", "keyframes", "RMSE m", "after SE(3)", "after Sim(3)", "scale error")
+def format_table(rows: tuple[ComparisonRow, ...], frame: str) -> str:
+    """Return the rows as a table in plain text, lengths in metres; ``frame`` as in ``compare``."""
+    header = ("trajectory", "keyframes", rmse_heading(frame), "after SE(3)", "after Sim(3)", "scale error")
     cells = [
         (
             row.name,

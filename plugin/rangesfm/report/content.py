@@ -94,7 +94,7 @@ class Content:
         The size follows from the scale error that the comparison found, because the reference may hold the positions of
         only a few photos.
         """
-        errors = [row.scale_error_percent for row in self.summary.comparison if row.name == "estimated scale"]
+        errors = [row.scale_error_percent for row in self.summary.comparison if row.name == "scaled"]
         if self.scaled is None or not errors or errors[0] is None:
             return None
         return self.scaled.resized(1.0 / (1.0 + errors[0] / 100.0), self.summary.frame)

@@ -29,7 +29,7 @@ _NUM_WINDOWS = 20
 
 
 def trajectory_views(content: Content) -> Figure | None:
-    """Return plan and elevation of the path: with the true scale, with the estimated scale, and refined."""
+    """Return plan and elevation of the path: with the true scale, scaled, and refined."""
     if not content.final:
         return None
     frame = content.summary.frame
@@ -74,7 +74,7 @@ def local_scale(content: Content) -> Figure | None:
 
 
 def _trajectory_view(content: Content, view: View) -> Panel:
-    paths = [("true scale", "true-scale", content.true_scale), ("estimated scale", "before", content.scaled)]
+    paths = [("true scale", "true-scale", content.true_scale), ("scaled", "before", content.scaled)]
     paths.append(("refined", "after", content.refined))
     lines = [Series(name, color, view.seen(path.centers), "line") for name, color, path in paths if path is not None]
     if content.reference_m is not None:

@@ -19,7 +19,7 @@ from rangesfm.ranging.errors.components import component_words
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, signed
-from rangesfm.result.entries import AnchorEntry, MistakeEntry, median, rms
+from rangesfm.result.entries import AnchorEntry, MistakeEntry, median, rms, rmse_heading
 from rangesfm.survey.settings import KEYS
 
 _Columns = Mapping[str, Callable[[Any], str]]
@@ -44,6 +44,10 @@ _REFINEMENT = {
     "short_range_error_m": "error of short ranges, m",
 }
 
+_ALIGNED = {
+    "site": "in the site's frame, without any alignment",
+    "first_camera": "after alignment by the pose of the first keyframe, because the map has no place in the site",
+}
 _POSITIONS = {
     "num": "in the file",
     "num_used": "used",
@@ -210,10 +214,10 @@ def comparison(content: Content) -> ReportTable:
     rows = [[row.name, *_cells(f"comparison.{i}", row, columns)] for i, row in enumerate(content.summary.comparison)]
     return ReportTable(
         "Keyframe centres against the reference",
-        ["trajectory", "RMSE m", "after SE(3) m", "after Sim(3) m", "scale error %"],
+        ["trajectory", rmse_heading(content.summary.frame), "after SE(3) m", "after Sim(3) m", "scale error %"],
         rows,
-        "The first RMSE is computed without any alignment. The others are computed after the best rigid motion, SE(3), "
-        "and after the best similarity, Sim(3), which also removes an error of the scale.",
+        f"The first RMSE is computed {_ALIGNED[content.summary.frame]}. The others are computed after the best rigid "
+        "motion, SE(3), and after the best similarity, Sim(3), which also removes an error of the scale.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Data of the 3-D view: positions in metres relative to a nearby origin, and texts of the page around the view."""
+"""Data of the 3-D view: positions relative to a nearby origin, and texts of the page around the view."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class ScenePath:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that the 3-D view shows, in one metric frame.
+    """Everything that the 3-D view shows, in one frame.
 
     Attributes:
         frame: "site" (z up), or any other name for the frame of a camera (y down).
@@ -79,6 +79,7 @@ class Scene:
         anchors: by id. Ranges are drawn to those that have a position.
         content: result whose ranges and photos are shown, too; None: only the map is shown.
         point_ids: (m,) ids of the points in the model; None if they are not known.
+        unit: of all lengths; "m" unless nobody knows the scale.
     """
 
     frame: str
@@ -88,6 +89,7 @@ class Scene:
     anchors: Mapping[str, AnchorEntry]
     content: Content | None = None
     point_ids: npt.NDArray[np.int64] | None = None
+    unit: str = "m"
 
     @property
     def result(self) -> Trajectory:
@@ -105,7 +107,7 @@ def scene_of(content: Content) -> Scene | None:
         reference = Trajectory(np.arange(n), tuple(map(str, range(n))), None, content.reference_m, nowhere)
         paths.append(ScenePath("reference", "Reference", "reference", reference, False))
     if content.scaled:
-        paths.append(ScenePath("scaled", "Cameras, scaled only", "before", content.scaled))
+        paths.append(ScenePath("scaled", "Cameras, scaled", "before", content.scaled))
     if content.refined:
         paths.append(ScenePath("refined", "Cameras, refined", "after", content.refined))
     summary = content.summary
@@ -146,6 +148,7 @@ def view_of(scene: Scene) -> dict[str, Any]:
         "Ellipsoids around the anchors are their 95 % regions, at true size." if anchors else "",
     )
     return {
+        "unit": scene.unit,
         "up": [0, 0, 1] if scene.frame == "site" else [0, -1, 0],
         "origin": origin_m.tolist(),
         "box": box,

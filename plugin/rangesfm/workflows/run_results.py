@@ -101,7 +101,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
             with journal.stage("report"):
                 content = Content(read_result_folder(staged), images_path=survey.images.path, home=folder)
                 write_report_of(content, staged)
-    lines = [*summary.lines(folder, format_table(comparison) if comparison else None)]
+    lines = [*summary.lines(folder, format_table(comparison, summary.frame) if comparison else None)]
     if survey.report.enabled:
         lines.append(f"report: {folder / REPORT_NAME}")
     if not_exported is not None:

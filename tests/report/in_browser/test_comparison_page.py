@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +17,22 @@ if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser
 
 MakeResult = Callable[..., Path]
+
+
+def test_lengths_are_in_metres_only_where_the_first_model_is(
+    browser: Browser, make_result: MakeResult, tmp_path: Path
+) -> None:
+    result = make_result("result", num_keyframes=30, num_ranges_per_anchor=20, num_points=500)
+    unscaled = tmp_path / "sfm" / "0"
+    shutil.copytree(result / "sparse_scaled" / "0", unscaled)
+    for first, others, unit in ((result, unscaled, "c?m"), (unscaled, result, "SfM units")):
+        page = write_comparison(compare_many(read_named_models([first, others])), tmp_path / "page")
+        browser.open(page)
+        browser.wait_for("window.rangesfmView && document.querySelector('.scale-bar').textContent")
+        told = browser.run(
+            "return ['.scale-bar', '.grid-cell', '.photo .place'].map(at => document.querySelector(at).innerText)"
+        )
+        assert all(re.search(rf"\d {unit}(;|$)", text) for text in told), told
 
 
 def test_all_paths_are_drawn_and_each_can_be_taken_away(

@@ -8,7 +8,9 @@ function roundLength(length) {
   return [5, 2, 1].map((factor) => factor * power).find((round) => round <= length * 1.0001);
 }
 
-function lengthText(length) {
+/** unit: "m", or that of a model whose scale nobody knows. */
+function lengthText(length, unit) {
+  if (unit !== "m") return `${+length.toPrecision(6)} ${unit}`;
   return length < 0.01 ? `${+(1000 * length).toPrecision(2)} mm` : length < 1 ? `${+(100 * length).toPrecision(2)} cm` : `${+length.toPrecision(6)} m`;
 }
 
@@ -27,11 +29,11 @@ function makeGrid(box, up) {
 }
 
 /** Keeps the scale bar at a round length as the view changes. */
-function attachScaleBar(stage, bar) {
+function attachScaleBar(stage, bar, unit) {
   stage.addEventListener("frame", () => {
     const perPixel = stage.metresPerPixel();
     const length = roundLength(130 * perPixel);
     bar.style.width = `${(length / perPixel).toFixed(1)}px`;
-    bar.textContent = lengthText(length);
+    bar.textContent = lengthText(length, unit);
   });
 }

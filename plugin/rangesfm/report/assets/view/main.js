@@ -10,7 +10,7 @@ class View {
     this.#fillStage();
     this.#attachControls();
     onClick(this.canvas, (pixel) => this.click(pixel));
-    attachScaleBar(this.stage, root.querySelector(".scale-bar"));
+    attachScaleBar(this.stage, root.querySelector(".scale-bar"), scene.unit);
     this.look("oblique");
   }
 
@@ -79,7 +79,7 @@ class View {
   #fillStage() {
     const { scene, stage } = this;
     const { grid, cell } = makeGrid(scene.box, scene.up);
-    this.root.querySelector(".grid-cell").textContent = `grid ${lengthText(cell)}`;
+    this.root.querySelector(".grid-cell").textContent = `grid ${lengthText(cell, scene.unit)}`;
     this.layers = { grid, anchors: makeAnchors(scene.anchors, 0.016 * scene.box.radius) };
     if (scene.points !== null) this.layers.points = makePoints(stage, scene.points);
     for (const [order, path] of scene.paths.entries()) {

@@ -33,8 +33,8 @@ class RelativeErrors {
 
 class Measuring {
   /** scene: has errors of cameras and anchors, or null, and the 95 % interval of the scale relative to its value. */
-  constructor(stage, output, { errors, scale_interval }) {
-    Object.assign(this, { stage, output, errors: errors && new RelativeErrors(errors), scaleInterval: scale_interval });
+  constructor(stage, output, { errors, scale_interval, unit }) {
+    Object.assign(this, { stage, output, unit, errors: errors && new RelativeErrors(errors), scaleInterval: scale_interval });
     this.line = themed(THREE.Line, [], new THREE.LineBasicMaterial({ depthTest: false }), "chosen");
     this.line.renderOrder = 1;
     this.label = makeLabel("distance", "");
@@ -64,9 +64,9 @@ class Measuring {
     moveTo(this.line, [a.position, b.position]);
     this.line.visible = true;
     this.label.position.set(...a.position.map((value, axis) => (value + b.position[axis]) / 2));
-    this.label.element.textContent = `${distance.toFixed(3)} m`;
+    this.label.element.textContent = `${distance.toFixed(3)} ${this.unit}`;
     const ends = `${a.kind} ${a.name} to ${b.kind} ${b.name}`;
-    this.output.textContent = `${ends}: ${distance.toFixed(3)} m${this.#precision(a, b, apart, distance)}`;
+    this.output.textContent = `${ends}: ${distance.toFixed(3)} ${this.unit}${this.#precision(a, b, apart, distance)}`;
     this.stage.requestFrame();
   }
 

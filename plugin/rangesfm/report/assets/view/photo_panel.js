@@ -28,7 +28,7 @@ class PhotoPanel {
   #place(path, i) {
     const at = inFrame(this.scene, row3(path.centers, i)).map((value) => value.toFixed(3).replace("-", "−"));
     const time = path.times === null ? "" : ` at ${path.times[i].toFixed(2)} s`;
-    return `Photo ${i + 1} of ${path.names.length}${time}; x, y, z = ${at.join(", ")} m${this.#moved(path, i)}`;
+    return `Photo ${i + 1} of ${path.names.length}${time}; x, y, z = ${at.join(", ")} ${this.scene.unit}${this.#moved(path, i)}`;
   }
 
   /** Returns a text that says how far the refinement moved this camera. */
@@ -37,7 +37,7 @@ class PhotoPanel {
     const j = before?.names.indexOf(path.names[i]) ?? -1;
     if (j < 0) return "";
     const shift = Math.hypot(...row3(path.centers, i).map((value, axis) => value - before.centers[3 * j + axis]));
-    return `; ${shift.toFixed(3)} m from where "${before.name}" has it`;
+    return `; ${shift.toFixed(3)} ${this.scene.unit} from where "${before.name}" has it`;
   }
 
   #list(ranges, numbers) {
