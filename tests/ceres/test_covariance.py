@@ -14,7 +14,7 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import orbit_path
+from tests.simulated.path import look_at, orbit_path
 
 from rangesfm.ceres import (
     PlacedRanges,
@@ -344,6 +344,34 @@ def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None
         found = survey.covariance(anchors=[at], others=survey.biases[:1])
         counts.append(found.num_free_directions)
     assert counts[0] == counts[1]
+
+
+def test_a_turn_about_a_straight_path_leaves_the_variances_of_places_right() -> None:
+    """Ranges of an antenna at the lens do not determine this turn, beside whose variance rounding left no digit."""
+    times = np.arange(30, dtype=np.float64)
+    centers = np.column_stack([0.3 * times - 4.5, 0.0 * times, 0.0 * times]) + np.array([60.0, 40.0, 20.0])
+    sway = np.column_stack([0.2 * np.sin(times), np.ones(30), 0.1 * np.cos(times)])
+    anchors = list(ANCHORS_M + np.array([60.0, 40.0, 20.0]))
+    found = []
+    for height_m in (1e-3, 0.3):  # a path that is bent by 0.3 m determines the turn
+        bent = centers + np.column_stack([np.zeros((30, 2)), height_m * np.sin(0.2 * times)])
+        made = synthetic_model(times, bent, look_at(bent, bent + sway), num_observations=40, metric_from_sfm=IDENTITY)
+        adjuster = bundle_adjuster(made.reconstruction, hold_first=False)
+        survey = Joint(made.reconstruction, adjuster, anchors, [np.zeros(1)], adjuster.problem.num_residuals())
+        for pose, center in zip(survey.poses, bent, strict=True):
+            for anchor in anchors:
+                range_m = float(np.linalg.norm(center - anchor))
+                cost = range_cost(range_m=range_m, tag_in_cam_m=np.zeros(3), stddev_m=RANGE_STDDEV_M)
+                add_residual_block(adjuster, cost, None, [pose, anchor, survey.biases[0]])
+        for block in (*anchors, *survey.biases):
+            survey.problem.set_parameter_block_constant(block)
+        found.append(survey.covariance())
+    stddevs_m = [np.sqrt(np.trace(each.centers, axis1=1, axis2=2)) for each in found]
+    np.testing.assert_allclose(stddevs_m[0], stddevs_m[1], rtol=0.25)
+    assert np.linalg.eigvalsh(found[0].centers).min() > 0
+    turns = [np.sqrt(np.linalg.eigvalsh(each.rig_from_world[:, :3, :3])[:, 2]) for each in found]
+    assert np.all(turns[0] < np.pi)
+    assert np.all(turns[1] < 0.1)
 
 
 def photos_alone(*, hold_first: bool = False) -> tuple[pycolmap.Reconstruction, pycolmap.CeresBundleAdjuster]:

@@ -204,6 +204,16 @@ def report(lines: Sequence[Line]) -> tuple[list[str], bool]:
     return texts, is_well
 
 
+def outcomes(seeds: Sequence[int], num_workers: int) -> Iterator[Line]:
+    """Yield the outcomes of surveys as they come."""
+    if num_workers == 1:
+        yield from map(told, seeds)
+        return
+    with ProcessPoolExecutor(num_workers, get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(told, seed) for seed in seeds]):
+            yield future.result()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -221,15 +231,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     before = asked.out.read_text(encoding="utf-8").splitlines() if asked.out is not None and asked.out.exists() else []
     done = {line["seed"]: line for line in map(json.loads, before)}
     seeds = [seed for seed in range(asked.first_seed, asked.first_seed + asked.num) if seed not in done]
-    with ProcessPoolExecutor(asked.workers, get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(told, seed) for seed in seeds]):
-            line = future.result()
-            done[line["seed"]] = line
-            if found := failures(line):
-                print(f"{line['seed']}: {'; '.join(found)}: {line['words']}", flush=True)
-            if asked.out is not None:
-                with asked.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(line) + "\n")
+    for line in outcomes(seeds, asked.workers):
+        done[line["seed"]] = line
+        if found := failures(line):
+            print(f"{line['seed']}: {'; '.join(found)}: {line['words']}", flush=True)
+        if asked.out is not None:
+            with asked.out.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(line) + "\n")
     texts, is_well = report([done[seed] for seed in sorted(done)])
     print(*texts, sep="\n")
     return int(not is_well)

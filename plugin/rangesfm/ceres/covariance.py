@@ -12,7 +12,7 @@ from scipy.sparse import csr_array, diags_array
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.ceres.linear_solver import factor
 from rangesfm.ceres.nested_dissection import NestedFactor, SingularError
-from rangesfm.ceres.normal_equations import BlockColumns, NormalEquations, address, rotation_of
+from rangesfm.ceres.normal_equations import HALF_A_REVOLUTION, BlockColumns, NormalEquations, address, rotation_of
 from rangesfm.ceres.part_errors import PartSteps, map_errors
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.map_errors import MapErrors
@@ -103,11 +103,12 @@ def joint_covariance(
     Raises:
         GeometryError: a block is not determined by the residuals.
     """
-    equations, inverse = _held_if_loose(equations, _joint_inverse)
-    columns, spread = equations.columns, _Spread.of(equations, errors)
+    columns, variance = equations.columns, residual_stddev**2
+    equations, inverse, spread, blocks = _solved(equations, errors)
+    turns = [2.0 * np.sqrt(variance * np.trace(columns.covariance(pose, blocks)[:3, :3])) for pose in columns.poses]
+    if np.median(turns) > HALF_A_REVOLUTION and not inverse.free.shape[1]:
+        equations, inverse, spread, blocks = _solved(equations.with_turns_bounded(residual_stddev), errors)
     size, num_free_directions = inverse.free.shape
-    blocks = inverse.diagonal_blocks(spread)
-    variance = residual_stddev**2
     frames = columns.frames
     poses = np.array([variance * columns.covariance(pose, blocks) for pose in columns.poses]).reshape(-1, 6, 6)
     turn = np.diag([2.0, 2, 2, 1, 1, 1])  # Ceres turns by twice its step
@@ -267,6 +268,15 @@ class _Inverse:
             + of_errors[rows] @ by_error[rows].T
             for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
         ]
+
+
+def _solved(
+    equations: NormalEquations, errors: ResidualErrors | None
+) -> tuple[NormalEquations, _Inverse, _Spread, list[Array]]:
+    """Return the equations, perhaps with loose poses held, their inverse, the spread, and the blocks' covariances."""
+    equations, inverse = _held_if_loose(equations, _joint_inverse)
+    spread = _Spread.of(equations, errors)
+    return equations, inverse, spread, inverse.diagonal_blocks(spread)
 
 
 def _held_if_loose(

@@ -19,6 +19,9 @@ from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import both
 
+HALF_A_REVOLUTION = float(np.pi / np.sqrt(3.0))
+"""Standard deviation of angles that are spread evenly over a revolution, radians."""
+
 
 @dataclass(frozen=True)
 class BlockColumns:
@@ -195,6 +198,22 @@ class NormalEquations:
         is_pose = np.repeat([kind == "pose" for kind in self.columns.kinds], np.diff(self.columns.starts))
         held = diags_array(ROUNDING * is_pose * self.of_photos.diagonal())
         return replace(self, of_photos=self.of_photos + held)
+
+    def with_turns_bounded(self, residual_stddev: float) -> NormalEquations:
+        """Return the equations with the knowledge that a turn of the map is anything up to half a revolution.
+
+        Where residuals hardly determine a turn, as that about a straight path, its variance would otherwise be
+        thousands of squared radians, beside which rounding leaves no digit of the variances of places. Each of n poses
+        gets an n-th of the information.
+
+        Args:
+            residual_stddev: standard deviation of the residuals.
+        """
+        starts = self.columns.starts[:-1][np.array([kind == "pose" for kind in self.columns.kinds], dtype=bool)]
+        information = np.zeros(len(self.gradient))
+        # Ceres turns by twice its step.
+        information[np.add.outer(starts, np.arange(3))] = (2 / HALF_A_REVOLUTION) ** 2 / max(len(starts), 1)
+        return replace(self, of_photos=self.of_photos + diags_array(residual_stddev**2 * information))
 
     @property
     def seen_blocks(self) -> Indices:

@@ -30,11 +30,10 @@ def test_far_anchors_are_moved_by_whole_metres_and_unknown_ones_stay_unknown() -
 
 @pytest.mark.parametrize("frame", ["site", "first_camera"])
 def test_near_anchors_and_those_of_other_frames_stay(frame: str) -> None:
-    at = [10.0, 20.0, 3.0] if frame == "site" else [*FAR]
-    site, anchors = local_site(anchors_at(at), frame, None)
+    places = [[10.0, 20.0, 3.0], [-10.0, 0.0, 1.0]] if frame == "site" else [[*FAR]]
+    site, anchors = local_site(anchors_at(*places), frame, None)
     assert not site.offset_m.any()
-    assert anchors[0].position_m is not None
-    np.testing.assert_array_equal(anchors[0].position_m, at)
+    np.testing.assert_array_equal([anchor.position_m for anchor in anchors], places)
 
 
 @pytest.mark.parametrize(
@@ -65,9 +64,9 @@ def test_points_without_the_coordinate_system_of_the_anchors_are_refused(
         site.local(FAR[None], of_points)
 
 
-@pytest.mark.parametrize(("distance_m", "offset_m"), [(499.0, 0.0), (501.0, 501.0)])
-def test_a_site_is_moved_if_its_middle_is_farther_than_half_a_kilometre(distance_m: float, offset_m: float) -> None:
-    across = np.array([0.0, 400.0, 0.0])
+@pytest.mark.parametrize(("distance_m", "offset_m"), [(7.0, 0.0), (9.0, 9.0)])
+def test_a_site_is_moved_if_it_is_farther_away_than_it_is_large(distance_m: float, offset_m: float) -> None:
+    across = np.array([0.0, 4.0, 0.0])
     coordinates = np.array([distance_m, 0.0, 0.0]) + np.stack([across, np.full(3, np.nan), -across])
     site, local = site_of(coordinates, None)
     np.testing.assert_array_equal(site.offset_m, [offset_m, 0.0, 0.0])

@@ -15,7 +15,6 @@ from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, rea
 from rangesfm.option_model import Bounds
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.site import LOCAL_M
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.guess import MAX_NUM_IDS, by_id_rather_than_index, is_named_time, is_range
 from rangesfm.ranging.readers.layout import MISSING, ColumnSample, Layout, find_layout
@@ -40,6 +39,8 @@ _OPTIONAL = tuple(name for name in _CANONICAL.values() if name not in _REQUIRED)
 _ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
 _EXPECTED = f"expected a table with {','.join(_REQUIRED)}"
 _GEOGRAPHIC = "EPSG:4979"
+# Coordinates beyond this, metres, are not local but those of a surveyed grid.
+_LOCAL_M = 500.0
 
 
 @dataclass(frozen=True)
@@ -261,7 +262,7 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
     if not layout.has_names:
         largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in _AXES), default=0.0)
         # In a surveyed grid, north often comes before east.
-        if largest > LOCAL_M or len(order) > 4:
+        if largest > _LOCAL_M or len(order) > 4:
             first = _choice("if the numbers are x, y, z or east, north, height", columns)
             second = _choice("if they are north, east, height (PNEZD)", swapped)
             yield "a table without names, in which either east or north may come first", [first, second]

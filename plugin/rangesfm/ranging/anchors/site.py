@@ -12,9 +12,6 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.georeference import Georeference, georeference_at
 from rangesfm.ranging.anchors.anchor import Anchor
 
-LOCAL_M = 500.0
-"""Distance from the origin, metres, beyond which coordinates are not local but those of a surveyed grid."""
-
 
 @dataclass(frozen=True)
 class Site:
@@ -85,10 +82,12 @@ def site_of(coordinates: Array, crs: str | None, path: Path | None = None) -> tu
         except InputError as error:
             raise InputError(str(error), path) from None
         return Site(np.zeros(3), georeference), local
-    middle = coordinates[np.isfinite(coordinates).all(axis=1)].mean(axis=0)
-    # With large coordinates, least squares lose digits. The offset is in whole metres, so that adding it again restores
-    # every digit.
-    offset = np.round(middle) if np.linalg.norm(middle) > LOCAL_M else np.zeros(3)
+    known = coordinates[np.isfinite(coordinates).all(axis=1)]
+    middle = known.mean(axis=0)
+    # Far from the origin, measured in the size of the site, least squares lose digits: a turn of the map about the
+    # origin is then nearly a shift. The offset is in whole metres, so that adding it again restores every digit.
+    is_far = np.linalg.norm(middle) > np.linalg.norm(np.ptp(known, axis=0))
+    offset = np.round(middle) if is_far else np.zeros(3)
     return Site(offset), coordinates - offset
 
 
