@@ -227,8 +227,7 @@ class PhotoRun:
 @pytest.fixture(scope="session")
 def photo_run(rangesfm_process: Command, tmp_path_factory: pytest.TempPathFactory) -> PhotoRun:
     """A run on 14 small photos of the demo's yard. Tests must not write to it."""
-    # One thread: with more, COLMAP starts from whichever suitable pair is found first.
-    flags = ("survey.toml", "--ranges_time_offset", str(DEMO_TIME_OFFSET_S), "--num_threads", "1")
+    flags = ("survey.toml", "--ranges_time_offset", str(DEMO_TIME_OFFSET_S), "--reproducible")
     with _shared_folder(tmp_path_factory, "photo_run") as folder:
         survey = make_small_demo(folder / "yard")
         printed = folder / "printed.json"

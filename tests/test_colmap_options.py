@@ -87,6 +87,7 @@ AS_GIVEN = {
     "mapper.abs_pose_refine_extra_params": False,
 }
 GLOBALLY = {
+    "num_threads": 3,
     "random_seed": SEED,
     "mapper.global_positioning.use_gpu": False,
     "mapper.bundle_adjustment.ceres.use_gpu": False,
@@ -114,7 +115,7 @@ def database_of(path: Path, *sizes: tuple[int, int]) -> Path:
 @pytest.mark.parametrize(
     ("method", "from_the_start", "as_given"),
     [
-        ("incremental", SEEDS, AS_GIVEN),
+        ("incremental", {"num_threads": 3} | SEEDS, AS_GIVEN),
         ("global", GLOBALLY, GLOBALLY_AS_GIVEN),
         ("hierarchical", of_clusters(SEEDS), of_clusters(AS_GIVEN)),
     ],
@@ -122,11 +123,13 @@ def database_of(path: Path, *sizes: tuple[int, int]) -> Path:
 def test_models_are_mapped_as_colmap_maps_them(
     method: str, from_the_start: dict[str, Any], as_given: dict[str, Any], tmp_path: Path
 ) -> None:
-    mapper, threads = MapperOptions(device="cpu", num_threads=3).changed(method=method), {"num_threads": 1}
+    mapper = MapperOptions(device="cpu", num_threads=3).changed(method=method)
     database = database_of(tmp_path / "database.db", (256, 192))
-    assert changes(pipeline_options(CameraOptions(), mapper, SEED)) == threads | from_the_start
+    assert changes(pipeline_options(CameraOptions(), mapper, SEED)) == from_the_start
+    alone = changes(pipeline_options(CameraOptions(), mapper.changed(reproducible=True), SEED))
+    assert alone == from_the_start | {"num_threads": 1}
     kept = mapping_options(KNOWN_CAMERA.changed(refine_intrinsics=False), mapper, NO_RIGS, SEED, database)
-    assert changes(kept.growing) == threads | from_the_start | as_given
+    assert changes(kept.growing) == from_the_start | as_given
     assert kept.whole is None
 
 
@@ -136,7 +139,7 @@ def test_a_calibration_holds_until_the_map_is_whole(
 ) -> None:
     mapper = MapperOptions(num_threads=3).changed(method=method)
     options = mapping_options(KNOWN_CAMERA, mapper, NO_RIGS, SEED, database_of(tmp_path / "database.db", (256, 192)))
-    threads = {"num_threads": 1}
+    threads = {"num_threads": 1 if method == "hierarchical" else 3}
     assert changes(options.growing) == threads | named(SEEDS | AS_GIVEN)
     assert options.whole is not None
     assert changes(options.whole) == threads | SEEDS
@@ -149,10 +152,10 @@ def test_a_camera_that_is_guessed_beside_a_calibrated_one_is_refined_from_the_st
     database = database_of(tmp_path / "database.db", (256, 192), (256, 192), (300, 300))
     camera = KNOWN_CAMERA.changed(refine_intrinsics=refines)
     options = mapping_options(camera, MapperOptions(num_threads=3), NO_RIGS, SEED, database)
-    assert changes(options.growing) == {"num_threads": 1, "constant_cameras": {1, 2}} | SEEDS
+    assert changes(options.growing) == {"num_threads": 3, "constant_cameras": {1, 2}} | SEEDS
     assert (options.whole is None) == (refines is False)
     if options.whole is not None:
-        assert changes(options.whole) == {"num_threads": 1} | SEEDS
+        assert changes(options.whole) == {"num_threads": 3} | SEEDS
 
 
 @pytest.mark.parametrize("camera", [CameraOptions(), KNOWN_CAMERA.changed(refine_intrinsics=True)])
@@ -162,7 +165,7 @@ def test_what_nobody_knows_is_refined_from_the_start_and_nothing_is_left_to_do(
     database = database_of(tmp_path / "database.db", (256, 192))
     options = mapping_options(camera, MapperOptions(num_threads=3), NO_RIGS, SEED, database)
     assert options.whole is None
-    assert changes(options.growing) == {"num_threads": 1} | SEEDS
+    assert changes(options.growing) == {"num_threads": 3} | SEEDS
 
 
 def test_a_camera_is_guessed_as_colmap_guesses_it(monkeypatch: pytest.MonkeyPatch) -> None:

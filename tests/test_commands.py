@@ -701,7 +701,7 @@ def test_photos_and_a_log_that_names_them_need_no_times(
     write_ranges_csv(log, tmp_path / "uwb.csv")
     flags = ("--images", "images", "--ranges", "uwb.csv", "--anchors", survey.folder / "anchors.csv", "--seed", "0")
     camera = ("--camera_model", CAMERA_MODEL, "--camera_params", "280.8,180,120,-0.04")  # the small photos'
-    tag = ("--tag_in_cam", ",".join(map(str, TAG_IN_CAM_M)), "--num_threads", "1")
+    tag = ("--tag_in_cam", ",".join(map(str, TAG_IN_CAM_M)), "--reproducible")
     rangesfm_command("run", *flags, *camera, *tag, "--output_path", "out", cwd=tmp_path)
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["ranges"]["num"] == len(log)

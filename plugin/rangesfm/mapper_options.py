@@ -61,10 +61,11 @@ class MapperOptions(Options, table="mapper"):
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)],
         KeyMeta(expected="1 or more up to 4096, or -1 for all cores"),
     ] = -1
-    """Number of threads; -1: one for each core. It does not change the result. Matching on the processor runs this many
-    processes with one thread each, because pycolmap 4.2 loses matches with several threads; matcher.num_threads sets
-    the threads of a process. Mapping adds up in one thread; with more, by pipeline.num_threads, each run gives another
-    map."""
+    """Number of threads; -1: one for each core. Matching on the processor runs this many processes with one thread
+    each, because pycolmap 4.2 loses matches with several threads; matcher.num_threads sets the threads of a process."""
+    reproducible: bool = False
+    """Map in one thread, so that every run with the same seed gives the same bytes. With several threads, sums differ
+    in their last digits from run to run, and the map may begin with another pair of photos."""
 
     @property
     def num_cores(self) -> int:
@@ -82,6 +83,8 @@ class MapperOptions(Options, table="mapper"):
             raise self.refused("command", f"{where}, expected it with method external, and only there")
         if self.method == "external" and self.pipeline:
             raise self.refused("pipeline", "is given, expected none: an external mapper takes its options in command")
+        if self.reproducible and self.pipeline.get("num_threads", 1) != 1:
+            raise self.refused("pipeline", "sets num_threads, expected 1 or none with reproducible")
         if self.mask_path is not None and self.database_path is not None:
             why = "is given beside database_path, expected one of them: there are features already"
             raise self.refused("mask_path", why)

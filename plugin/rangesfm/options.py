@@ -520,4 +520,5 @@ class OutputOptions(Options, table="output"):
     path: Annotated[Path, KeyMeta(flag="output_path", role="output", is_common=True)] = Path("out")
     """Folder of the results."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
-    """Seed of everything random: same input and seed, same result."""
+    """Seed of everything random: the same model and ranges give the same result with it, and so do photos with
+    reproducible."""

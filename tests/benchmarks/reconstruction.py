@@ -14,10 +14,10 @@ The second table is about matching alone, on the same features: by one process b
 the same, row for row. A process matches in one thread and verifies in another, so on two cores it is not much slower
 than two processes. Compare with the process bound to one core to see how matching scales.
 
-The third table is about incremental mapping alone, from the same matches: by rangesfm, which maps in one thread, and
-by rangesfm and pycolmap with ``--num_threads``. "Caller" are the processor seconds of the thread that calls the mapper:
-the wall-clock time on a machine without other load, if the other threads never keep it waiting. The last column gives
-how many different models the rounds have given.
+The third table is about incremental mapping alone, from the same matches: by rangesfm with ``reproducible`` (in one
+thread), and by rangesfm and pycolmap with ``--num_threads``. "Caller" are the processor seconds of the thread that
+calls the mapper: the wall-clock time on a machine without other load, if the other threads never keep it waiting. The
+last column gives how many different models the rounds have given.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ from rangesfm.vision.photo_files import usable_photos
 from rangesfm.vision.reconstruct import reconstruct
 
 STAGES = ("features", "matching", "mapping")
+WAYS = ("rangesfm, reproducible", "rangesfm", "pycolmap")
 
 
 @dataclass(frozen=True)
@@ -157,17 +158,17 @@ class Mapped:
     content: str
 
 
-def map_anew(photos: Path, database: Path, is_ours: bool, num_threads: int, seed: int) -> Mapped:
-    """Map the photos from their matches by rangesfm or by pycolmap, from the same seed."""
+def map_anew(photos: Path, database: Path, way: str, num_threads: int, seed: int) -> Mapped:
+    """Map the photos from their matches in one of ``WAYS``, from the same seed."""
     models: list[pycolmap.Reconstruction] = []
-    mapper = MapperOptions(pipeline={"num_threads": num_threads})
+    mapper = MapperOptions(num_threads=num_threads, reproducible=way == WAYS[0])
     ours = pipeline_options(CameraOptions(), mapper, seed)
     assert isinstance(ours, pycolmap.IncrementalPipelineOptions)
     theirs = pycolmap.IncrementalPipelineOptions(num_threads=num_threads, random_seed=seed)
     with tempfile.TemporaryDirectory() as scratch, colmap_log(Path(scratch) / "mapper.log"):
 
         def work() -> None:
-            if is_ours:
+            if way != WAYS[2]:
                 models.extend(incremental_mapping(database, photos, options=ours))
             else:
                 models.extend(pycolmap.incremental_mapping(database, photos, scratch, theirs).values())
@@ -183,16 +184,15 @@ def map_anew(photos: Path, database: Path, is_ours: bool, num_threads: int, seed
 
 
 def compare_mappings(photos: Path, database: Path, num_threads: int, num_rounds: int, seed: int) -> None:
-    ways = (("rangesfm", 1), ("rangesfm", num_threads), ("pycolmap", num_threads))
-    found: list[list[Mapped]] = [[] for _ in ways]
+    found: list[list[Mapped]] = [[] for _ in WAYS]
     for _ in range(num_rounds):
-        for of_way, (program, num) in zip(found, ways, strict=True):
-            of_way.append(map_anew(photos, database, program == "rangesfm", num, seed))
-    print(f"{'mapping alone':20}{'clock':>9} {'processors':>10} {'caller':>9}   models ({load()})")
-    for of_way, (program, num) in zip(found, ways, strict=True):
+        for of_way, way in zip(found, WAYS, strict=True):
+            of_way.append(map_anew(photos, database, way, num_threads, seed))
+    print(f"{'mapping alone':25}{'clock':>9} {'processors':>10} {'caller':>9}   models ({load()})")
+    for of_way, way in zip(found, WAYS, strict=True):
         clock_s = median(one.effort.clock_s for one in of_way)
         processor_s, caller_s = median(one.effort.processor_s for one in of_way), median(one.caller_s for one in of_way)
-        line = f"{f'{program}, threads: {num}':20}{clock_s:8.1f}s {processor_s:9.1f}s {caller_s:8.1f}s"
+        line = f"{way:25}{clock_s:8.1f}s {processor_s:9.1f}s {caller_s:8.1f}s"
         print(f"{line}   {len({one.content for one in of_way})} of {num_rounds}", flush=True)
 
 

@@ -33,32 +33,42 @@ def test_plain_lines_tell_start_and_end_of_stages() -> None:
 def test_plain_updates_are_sparse() -> None:
     stream, clock = io.StringIO(), Clock()
     progress = TerminalProgress(stream, clock=clock)
-    progress.stage("mapping")
+    progress.stage("matching")
     for num_done in range(101):
         progress.update(num_done, 400)
         clock.now_s += 1
     lines = stream.getvalue().splitlines()
     assert len(lines) == 1 + 10
-    assert lines[-1] == "mapping 100/400, 25 %, 5 min 00 s left"
+    assert lines[-1] == "matching 100/400, 25 %, 5 min 00 s left"
+
+
+def test_no_time_left_is_given_where_a_photo_takes_longer_than_those_before_it() -> None:
+    stream, clock = io.StringIO(), Clock()
+    progress = TerminalProgress(stream, clock=clock)
+    progress.stage("mapping")
+    for num_done in range(101):
+        clock.now_s += num_done
+        progress.update(num_done, 400)
+    assert stream.getvalue().splitlines()[-1] == "mapping 100/400, 25 %"
 
 
 def test_terminal_has_one_line_that_is_written_anew() -> None:
     stream, clock = Terminal(), Clock()
     progress = TerminalProgress(stream, clock=clock)
-    progress.stage("mapping")
-    assert stream.lines() == ["mapping"]
+    progress.stage("matching")
+    assert stream.lines() == ["matching"]
     clock.now_s += 2.0
     progress.update(10, 40)
-    assert stream.lines() == ["mapping 10/40, 25 %, 6.0 s left"]
+    assert stream.lines() == ["matching 10/40, 25 %, 6.0 s left"]
     clock.now_s += 2.0
     progress.update(40, 40)
-    assert stream.lines() == ["mapping 40/40, 100 %"]
+    assert stream.lines() == ["matching 40/40, 100 %"]
     progress.message("two models")
     clock.now_s += 1.0
     progress.update(40, 40)
-    assert stream.lines() == ["two models", "mapping 40/40, 100 %"]
+    assert stream.lines() == ["two models", "matching 40/40, 100 %"]
     progress.end_stage()
-    assert stream.lines() == ["two models", "mapping: 5.0 s"]
+    assert stream.lines() == ["two models", "matching: 5.0 s"]
     assert stream.getvalue().rfind("\033[?25h") > stream.getvalue().rfind("\033[?25l")
 
 

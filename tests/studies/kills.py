@@ -56,8 +56,8 @@ class Undisturbed:
 
 
 def start(survey: Path, output: Path, *flags: str) -> subprocess.Popen[str]:
-    """Start a run with one thread: with more, COLMAP starts from whichever pair is ready first."""
-    flags = ("--ranges_time_offset", str(TIME_OFFSET_S), "--num_threads", "1", *flags)
+    """Start a run that gives the same map each time."""
+    flags = ("--ranges_time_offset", str(TIME_OFFSET_S), "--reproducible", *flags)
     command = [sys.executable, "-m", "rangesfm", "run", "survey.toml", *flags, "--output_path", str(output)]
     return subprocess.Popen(command, cwd=survey, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 

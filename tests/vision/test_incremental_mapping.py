@@ -1,4 +1,4 @@
-"""The incremental mapping gives COLMAP's models, the same in every run, and can be ended and continued."""
+"""The incremental mapping gives COLMAP's models, and can be ended and continued."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.studies.simulated_database import write_database
 
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.vision.incremental_mapping import adjust_whole, incremental_mapping
+from rangesfm.vision.incremental_mapping import UnfinishedMapping, adjust_whole, incremental_mapping
 from rangesfm.vision.mapping import pipeline_options
 
 
@@ -46,17 +46,22 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_matches(tmp_path_factory.mktemp("database") / "database.db", model)
 
 
-@pytest.fixture
-def options() -> pycolmap.IncrementalPipelineOptions:
+def options_of(num_threads: int, *, reproducible: bool) -> pycolmap.IncrementalPipelineOptions:
     pipeline = {
         "min_model_size": 3,
         "extract_colors": False,
         "mapper": {"init_min_num_inliers": 20, "abs_pose_min_num_inliers": 15},
     }
     camera = CameraOptions(model="PINHOLE", params=(750.0, 750.0, 480.0, 320.0))
-    options = pipeline_options(camera, MapperOptions(num_threads=1, pipeline=pipeline), seed=0)
+    mapper = MapperOptions(num_threads=num_threads, reproducible=reproducible, pipeline=pipeline)
+    options = pipeline_options(camera, mapper, seed=0)
     assert isinstance(options, pycolmap.IncrementalPipelineOptions)
     return options
+
+
+@pytest.fixture
+def options() -> pycolmap.IncrementalPipelineOptions:
+    return options_of(1, reproducible=False)
 
 
 def mapped(
@@ -84,15 +89,23 @@ def test_it_gives_colmaps_models(database: Path, options: pycolmap.IncrementalPi
         assert np.abs(centers(ours) - centers(theirs)).max() < 1e-8
 
 
-def test_threads_do_not_change_the_map(tmp_path: Path, options: pycolmap.IncrementalPipelineOptions) -> None:
-    """The mapping of pycolmap itself, with several threads, begins with one of seven pairs of photos."""
+def test_threads_do_not_change_a_reproducible_map(tmp_path: Path) -> None:
+    """With several threads, the mapping begins with one of seven pairs of photos."""
     database = write_matches(tmp_path / "database.db", walk(28, max_track_length=7))
-    (expected,) = mapped(database, options)
+    (expected,) = mapped(database, options_of(1, reproducible=False))
     assert expected.num_reg_images() == 28
-    options.num_threads = 8
     for _ in range(4):
-        (found,) = mapped(database, options)
-        assert np.abs(centers(found) - centers(expected)).max() < 1e-9
+        (found,) = mapped(database, options_of(8, reproducible=True))
+        assert np.array_equal(centers(found), centers(expected))
+
+
+def test_threads_give_a_map_as_good(tmp_path: Path) -> None:
+    true = walk(28, max_track_length=7)
+    database = write_matches(tmp_path / "database.db", true)
+    options = options_of(8, reproducible=False)
+    assert options.num_threads == 8
+    (found,), (alone,) = mapped(database, options), mapped(database, options_of(1, reproducible=False))
+    assert off_by(found, true) < 1.5 * off_by(alone, true)
 
 
 def test_a_whole_map_finds_out_a_calibration_that_it_grew_with(
@@ -117,37 +130,73 @@ def test_a_whole_map_finds_out_a_calibration_that_it_grew_with(
 def test_cancelled_mapping_ends_with_the_photo_at_hand(
     database: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> None:
-    token, registered = pycolmap.CancellationToken(), list[str]()
+    token = pycolmap.CancellationToken()
 
-    def cancel_the_second_time(model: pycolmap.Reconstruction) -> None:
-        registered.append("")
-        if len(registered) == 2:
+    def cancel_with_four_photos(mapping: UnfinishedMapping) -> None:
+        if mapping.growing.num_reg_images() == 4:
             token.cancel()
 
-    (model,) = mapped(database, options, next_image_callback=cancel_the_second_time, cancellation_token=token)
+    (model,) = mapped(database, options, callback=cancel_with_four_photos, cancellation_token=token)
     assert model.num_reg_images() == 4
 
 
 def test_a_mapping_ends_when_its_time_is_over(database: Path, options: pycolmap.IncrementalPipelineOptions) -> None:
     options.max_runtime_seconds = 1
-    (model,) = mapped(database, options, next_image_callback=lambda model: time.sleep(0.6))
+    (model,) = mapped(database, options, callback=lambda mapping: time.sleep(0.6))
     assert 2 <= model.num_reg_images() <= 4
     assert all(point.error >= 0 for point in model.points3D.values())
 
 
-def test_a_mapping_goes_on_from_a_snapshot(
-    database: Path, options: pycolmap.IncrementalPipelineOptions, tmp_path: Path
+def moments_of(
+    database: Path, options: pycolmap.IncrementalPipelineOptions
+) -> tuple[list[UnfinishedMapping], list[pycolmap.Reconstruction]]:
+    """Return what a mapping had after each photo, and its models."""
+    moments: list[UnfinishedMapping] = []
+
+    def keep(mapping: UnfinishedMapping) -> None:
+        *finished, growing = map(pycolmap.Reconstruction, mapping.models)
+        moments.append(UnfinishedMapping(tuple(finished), growing, mapping.size_at_adjustment))
+
+    return moments, mapped(database, options, callback=keep)
+
+
+def assert_goes_on(
+    moment: UnfinishedMapping,
+    database: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    whole: list[pycolmap.Reconstruction],
 ) -> None:
-    options.snapshot_path, options.snapshot_frames_freq, options.multiple_models = tmp_path, 2, False
-    (whole,) = mapped(database, options)
-    snapshots = [pycolmap.Reconstruction(folder) for folder in sorted(tmp_path.iterdir())]
-    assert [model.num_reg_images() for model in snapshots] == [4, 6, 8, 10]
-    options.snapshot_frames_freq, registered = 0, list[str]()
-    (continued,) = mapped(
-        database,
-        options,
-        input_path=sorted(tmp_path.iterdir())[1],
-        next_image_callback=lambda model: registered.append(""),
+    seen: list[int] = []
+    continued = mapped(
+        database, options, unfinished=moment, callback=lambda mapping: seen.append(mapping.growing.num_reg_images())
     )
-    assert len(registered) == 4
-    assert set(continued.reg_image_ids()) == set(whole.reg_image_ids())
+    assert seen[0] == moment.growing.num_reg_images()
+    assert len(continued) == len(whole)
+    for found, expected in zip(continued, whole, strict=True):
+        assert found.num_points3D() == expected.num_points3D()
+        assert set(found.reg_image_ids()) == set(expected.reg_image_ids())
+        assert np.abs(centers(found) - centers(expected)).max() < 1e-9
+
+
+def test_a_mapping_goes_on_after_any_photo_of_any_model(
+    database: Path, options: pycolmap.IncrementalPipelineOptions
+) -> None:
+    moments, whole = moments_of(database, options)
+    assert [model.num_reg_images() for model in whole] == [10, 6]
+    assert [len(moment.finished) for moment in moments] == 9 * [0] + 5 * [1]
+    for moment in moments:
+        assert_goes_on(moment, database, options, whole)
+
+
+def test_a_mapping_that_goes_on_adjusts_the_whole_when_it_would_have(
+    tmp_path: Path, options: pycolmap.IncrementalPipelineOptions
+) -> None:
+    database = write_matches(tmp_path / "database.db", walk(28, max_track_length=7))
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
+    moments, whole = moments_of(database, options)
+    # In smaller models, the adjustment of a photo's neighbourhood changes all photos, too.
+    moments = [moment for moment in moments if moment.growing.num_reg_images() > 8]
+    assert len(moments) == 20
+    assert len({moment.size_at_adjustment for moment in moments}) < 7
+    for moment in moments[::3]:
+        assert_goes_on(moment, database, options, whole)

@@ -15,14 +15,15 @@ from tests.outputs import names_in, unfinished
 
 from rangesfm.options import MapperOptions
 from rangesfm.vision import snapshots as snapshots_module
+from rangesfm.vision.incremental_mapping import Size, UnfinishedMapping
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
-# One thread: with more, COLMAP starts from whichever pair is ready first.
-MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}, num_threads=1)
+# With several threads, COLMAP would start from whichever pair is ready first.
+MAPPER = MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}, reproducible=True)
 NUM_PHOTOS = 13
 
 
@@ -34,7 +35,7 @@ class Mapping:
         self.output = output
 
     def run(self, listener: Listener | None = None, **pipeline: Any) -> pycolmap.Reconstruction:
-        mapper = MapperOptions(features=MAPPER.features, pipeline=pipeline, num_threads=1)
+        mapper = MapperOptions(features=MAPPER.features, pipeline=pipeline, reproducible=True)
         names, camera = self.room.names, self.room.camera
         found = reconstruct(self.room.folder, names, self.output, camera=camera, mapper=mapper, progress=listener)
         return found.models[0]
@@ -62,21 +63,23 @@ def mapping(undisturbed: Mapping, tmp_path: Path) -> Mapping:
 
 @pytest.fixture
 def interrupted(mapping: Mapping, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Mapping]:
-    """Return a function that interrupts a mapping after this number of snapshots; the last one is kept."""
+    """Return a function that interrupts a mapping after this number of photos, each with a snapshot."""
 
     def interrupt(num_snapshots: int) -> Mapping:
         kept: list[Path] = []
 
-        def keep_and_interrupt(model: Path, path: Path) -> None:
+        def keep_and_interrupt(snapshot: Path, path: Path) -> None:
             if len(kept) < num_snapshots:
-                keep(model, path)
-                kept.append(model)
+                keep(snapshot, path)
+                kept.append(snapshot)
             if len(kept) == num_snapshots:
                 raise RuntimeError("killed")
 
         keep = snapshots_module._keep
         with monkeypatch.context() as patched:
             patched.setattr(snapshots_module, "_keep", keep_and_interrupt)
+            patched.setattr(snapshots_module, "_MIN_INTERVAL_S", 0.0)
+            patched.setattr(snapshots_module, "_INTERVAL_OVER_DURATION", 0.0)
             with pytest.raises(Exception, match="killed"):
                 mapping.run()
         return mapping
@@ -96,14 +99,14 @@ def assert_as_undisturbed(model: pycolmap.Reconstruction, undisturbed: Mapping) 
     assert model.num_points3D() == whole.num_points3D()
 
 
-@pytest.mark.parametrize("num_snapshots", [1, 8])
+@pytest.mark.parametrize("num_snapshots", [1, 8, 12])
 def test_goes_on_from_the_photos_it_had_and_ends_as_if_nothing_had_been(
     num_snapshots: int, interrupted: Callable[[int], Mapping], undisturbed: Mapping, listener: Listener
 ) -> None:
     mapping = interrupted(num_snapshots)
     (snapshot,) = mapping.snapshots.iterdir()
-    num_photos = pycolmap.Reconstruction(snapshot).num_reg_images()
-    assert num_photos > num_snapshots
+    num_photos = pycolmap.Reconstruction(snapshot / "0").num_reg_images()
+    assert num_photos == 1 + num_snapshots
     assert_as_undisturbed(mapping.run(listener), undisturbed)
     assert f"mapping: continues from {num_photos} photos of an earlier run" in listener.messages
     assert listener.updates["mapping"][-1] == (NUM_PHOTOS, NUM_PHOTOS)
@@ -122,49 +125,51 @@ def test_with_a_snapshot_that_is_cut_off_begins_anew(
 ) -> None:
     mapping = interrupted(4)
     (snapshot,) = mapping.snapshots.iterdir()
-    points = snapshot / "points3D.bin"
+    points = snapshot / "0" / "points3D.bin"
     points.write_bytes(points.read_bytes()[:-10])
     assert_as_undisturbed(mapping.run(listener), undisturbed)
     assert listener.messages[-1] == "matching: taken over from an earlier run"
 
 
-def test_a_snapshot_between_two_refinements_of_the_whole_is_not_kept(
+def test_a_mapping_that_is_killed_loses_seconds(
     undisturbed: Mapping, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Continuing from it would give another map than an uninterrupted mapping."""
+    """However slowly the model grows, what the newest snapshot lacks was done in seconds."""
+    now_s = 0.0
+    monkeypatch.setattr("time.monotonic", lambda: now_s)
     monkeypatch.setattr("time.time_ns", lambda: 1_700_000_000_000_000_000)  # all within one millisecond
     model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
+    mapping = UnfinishedMapping((), model, Size.of(model))
     (tmp_path / "scratch").mkdir()
-    snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch")
-    rng = np.random.default_rng(0)
-    seen: set[str] = set()
-
-    def keeps_after_photo() -> bool:
-        snapshots.add_photo(model)
+    snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch", min_model_size=10)
+    names: list[str] = []
+    for now_s in range(60):
+        snapshots.add_photo(mapping)
         assert not os.listdir(tmp_path / "scratch")
         kept = os.listdir(tmp_path / "kept") if (tmp_path / "kept").exists() else []
         assert len(kept) <= 1
-        is_new = not seen.issuperset(kept)
-        seen.update(kept)
-        return is_new
+        assert kept or now_s < 10
+        names += [name for name in kept if name not in names]
+    assert 6 <= len(names) <= 20
+    assert names == sorted(names)
 
-    def move(num_frames: int) -> None:
-        for frame_id in sorted(model.frames)[:num_frames]:
-            place = np.append(rng.normal(size=2), frame_id)
-            model.frames[frame_id].rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), place)
 
-    assert not keeps_after_photo()  # there is nothing to compare it with
-    move(NUM_PHOTOS - 1)
-    assert not keeps_after_photo()
-    move(NUM_PHOTOS)
-    assert keeps_after_photo()
-    move(6)
-    assert not keeps_after_photo()
-    move(NUM_PHOTOS)
-    assert keeps_after_photo()
-    newest = newest_snapshot(tmp_path / "kept")
-    assert newest is not None
-    assert newest.name == max(seen)
+def test_what_earlier_models_have_is_kept_with_the_model_at_hand(undisturbed: Mapping, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
+    few = pycolmap.Reconstruction(model)
+    for frame_id in sorted(few.reg_frame_ids())[4:]:
+        few.deregister_frame(frame_id)
+    (tmp_path / "scratch").mkdir()
+    kept = []
+    for growing in (model, few):
+        snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch", min_model_size=10)
+        snapshots._next_s = 0.0
+        snapshots.add_photo(UnfinishedMapping((model,), growing, Size(3, 5)))
+        newest = newest_snapshot(tmp_path / "kept")
+        assert newest is not None
+        kept.append(([found.num_reg_images() for found in newest.models], newest.size_at_adjustment))
+    # The second model is still too small to be kept by COLMAP, so that its snapshot does not replace the other.
+    assert kept == 2 * [([NUM_PHOTOS, NUM_PHOTOS], Size(3, 5))]
 
 
 def test_snapshots_of_the_user_are_left_alone(mapping: Mapping, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_holds_every_photo_at_its_place_says_so_and_comes_again(
 ) -> None:
     before = dump(output / "database.db")
     # with so many threads, two runs would hardly ever end in the same order
-    asked = MAPPER.changed(method=method, num_threads=16)
+    asked = MAPPER.changed(method=method, num_threads=16, reproducible=True)
     summaries = [
         reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper, seed=0, progress=listener)
         for mapper in (asked, asked.changed(pipeline=other), asked)

@@ -104,8 +104,7 @@ def test_a_folder_with_one_bag_of_camera_and_radio_is_a_whole_survey(
     flags = (
         "--ranges_time_offset",
         str(TIME_OFFSET_S),
-        "--num_threads",
-        "1",
+        "--reproducible",
         "--features",
         "sift.max_num_features=2000",
     )

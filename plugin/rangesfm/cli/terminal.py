@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 _TERMINAL_INTERVAL_S = 0.1
 _PLAIN_INTERVAL_S = 10.0
+# In these stages an item takes the longer the more are done: a photo of a large map takes longer than one of a small
+# map. Their time left is not known, and an estimate by the items done would be several times too short.
+_GROWING_STAGES = ("rigs", "mapping")
 
 
 def discard_output(stream: TextIO | None) -> None:
@@ -110,7 +113,8 @@ class TerminalProgress:
         now = self._clock()
         if now - self._last_update >= (_TERMINAL_INTERVAL_S if self._screen.is_terminal else _PLAIN_INTERVAL_S):
             self._last_update = now
-            self._show(f"{self._stage or ''} {counts(num_done, num_total, now - self._stage_start)}".strip())
+            taken_s = 0.0 if self._stage in _GROWING_STAGES else now - self._stage_start
+            self._show(f"{self._stage or ''} {counts(num_done, num_total, taken_s)}".strip())
 
     def message(self, text: str) -> None:
         self._screen.say([text])

@@ -1,17 +1,18 @@
-"""COLMAP's incremental mapping with the same result in every run.
-
-pycolmap.incremental_mapping searches for the initial pair in several threads. Sometimes a thread finds a pair that
-comes late in the order, and this ends another thread's search for an earlier pair. Here a single thread searches.
-"""
+"""COLMAP's incremental mapping, which goes on after any photo as if it had not been interrupted."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pycolmap
+
+from rangesfm.geometry.trajectory import pose_of
 
 # Rounds of lower demands on the initial pair, as in COLMAP.
 _NUM_RELAXATIONS = 2
@@ -23,14 +24,43 @@ class _StoppedError(Exception):
     """Raised in a callback to stop COLMAP's mapping, whose parts watch neither a cancellation nor the time."""
 
 
+@dataclass(frozen=True)
+class Size:
+    """Size of a model: numbers of its registered frames and of its points."""
+
+    num_frames: int
+    num_points: int
+
+    @classmethod
+    def of(cls, model: pycolmap.Reconstruction) -> Size:
+        return cls(model.num_reg_frames(), model.num_points3D())
+
+
+@dataclass(frozen=True)
+class UnfinishedMapping:
+    """All that a mapping needs to go on.
+
+    Attributes:
+        finished: the models that are done. growing: the model to which photos are being added.
+        size_at_adjustment: of the growing model when it was last adjusted as a whole.
+    """
+
+    finished: tuple[pycolmap.Reconstruction, ...]
+    growing: pycolmap.Reconstruction
+    size_at_adjustment: Size
+
+    @property
+    def models(self) -> tuple[pycolmap.Reconstruction, ...]:
+        return (*self.finished, self.growing)
+
+
 def incremental_mapping(
     database_path: Path,
     image_path: Path,
     *,
     options: pycolmap.IncrementalPipelineOptions,
-    input_path: Path | None = None,
-    initial_image_pair_callback: Callable[[], None] = lambda: None,
-    next_image_callback: Callable[[pycolmap.Reconstruction], None] = lambda model: None,
+    unfinished: UnfinishedMapping | None = None,
+    callback: Callable[[UnfinishedMapping], None] = lambda unfinished: None,
     cancellation_token: pycolmap.CancellationToken | None = None,
 ) -> list[pycolmap.Reconstruction]:
     """Run the incremental mapping and return all models, in the order in which they were begun.
@@ -38,33 +68,102 @@ def incremental_mapping(
     COLMAP's parts do not release Python's global lock, so that other threads run only during the callbacks.
 
     Args:
-        input_path: folder of a model to continue.
-        initial_image_pair_callback: called when a model has its initial pair, or is continued.
-        next_image_callback: called for each further photo, with the model that the photo was added to.
+        unfinished: a mapping to continue.
+        callback: called when a model has its initial pair or is continued, and after each further photo.
         cancellation_token: ends the mapping after the current photo, as does ``options.max_runtime_seconds``.
     """
     options.image_path = image_path
     manager = pycolmap.ReconstructionManager()
-    if input_path is not None:
-        manager.read(input_path)
+    finished = () if unfinished is None else unfinished.finished
     with pycolmap.Database.open(database_path) as database:
         pipeline = pycolmap.IncrementalPipeline(options, database, manager)
     token, begin_s = cancellation_token or pycolmap.CancellationToken(), time.monotonic()
+    adjustments = _WholeAdjustments(pipeline.options)
+    left = [] if unfinished is None else [unfinished]
 
-    def call(callback: Callable[[], None]) -> None:
-        callback()
+    def models() -> list[pycolmap.Reconstruction]:
+        return [*finished, *(manager.get(index) for index in range(manager.size()))]
+
+    def call(note: Callable[[pycolmap.Reconstruction], None]) -> None:
+        *done, growing = models()
+        note(growing)
+        callback(UnfinishedMapping(tuple(done), growing, adjustments.size_at_last))
         if token.is_cancelled or 0 < options.max_runtime_seconds <= time.monotonic() - begin_s:
             raise _StoppedError
 
-    def add_photo() -> None:
-        next_image_callback(manager.get(manager.size() - 1))
+    def begin(growing: pycolmap.Reconstruction) -> None:
+        adjustments.begin(growing, left.pop().size_at_adjustment if left else Size.of(growing))
 
     whens = pycolmap.IncrementalPipelineCallback
-    pipeline.add_callback(whens.INITIAL_IMAGE_PAIR_REG_CALLBACK, partial(call, initial_image_pair_callback))
-    pipeline.add_callback(whens.NEXT_IMAGE_REG_CALLBACK, partial(call, add_photo))
+    pipeline.add_callback(whens.INITIAL_IMAGE_PAIR_REG_CALLBACK, partial(call, begin))
+    pipeline.add_callback(whens.NEXT_IMAGE_REG_CALLBACK, partial(call, adjustments.add_photo))
     if pipeline.database_cache.num_images():
-        _map_with_relaxed_demands(pipeline)
-    return [manager.get(index) for index in range(manager.size())]
+        mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
+        if unfinished is not None:
+            _take_up(unfinished, mapper, manager)
+        _map_with_relaxed_demands(pipeline, mapper)
+    return models()
+
+
+def _take_up(
+    unfinished: UnfinishedMapping, mapper: pycolmap.IncrementalMapper, manager: pycolmap.ReconstructionManager
+) -> None:
+    """Tell COLMAP which photos the finished models have, and which model it should continue."""
+    for model in unfinished.finished:
+        mapper.begin_reconstruction(model)
+        mapper.end_reconstruction(discard=False)
+    with TemporaryDirectory() as folder:  # a manager only takes a model from the disk
+        unfinished.growing.write_binary(folder)
+        manager.read(folder)
+
+
+class _WholeAdjustments:
+    """Keeper of the size at which a growing model was last adjusted as a whole.
+
+    COLMAP does that each time the model has grown by a tenth since the last time. It begins to count at the size at
+    which it begins to map. So the first adjustment of a continued model is made due at the size at which it would have
+    been without the interruption.
+
+    Args:
+        options: of a pipeline, which reads them again after each photo.
+    """
+
+    def __init__(self, options: pycolmap.IncrementalPipelineOptions):
+        self._options = options
+        self._ratios = options.ba_global_frames_ratio, options.ba_global_points_ratio
+        self._steps = options.ba_global_frames_freq, options.ba_global_points_freq
+        self._poses: dict[int, bytes] = {}
+        self.size_at_last = Size(0, 0)
+
+    def begin(self, model: pycolmap.Reconstruction, size_at_last: Size) -> None:
+        """Begin with a model, new or continued."""
+        self._poses, self.size_at_last = _poses(model), size_at_last
+        now, last = Size.of(model), size_at_last
+        if now == last:
+            self._count_as_usual()
+            return
+        of_frames, of_points = self._ratios
+        options = self._options
+        # Half a frame less, so that rounding does not matter.
+        options.ba_global_frames_ratio = (math.ceil(of_frames * last.num_frames) - 0.5) / now.num_frames
+        options.ba_global_points_ratio = (math.ceil(of_points * last.num_points) - 0.5) / now.num_points
+        options.ba_global_frames_freq = self._steps[0] + last.num_frames - now.num_frames
+        options.ba_global_points_freq = self._steps[1] + last.num_points - now.num_points
+
+    def add_photo(self, model: pycolmap.Reconstruction) -> None:
+        """Note whether the model has been adjusted, which changes all poses."""
+        before, self._poses = self._poses, _poses(model)
+        if all(self._poses[id_] != pose for id_, pose in before.items() if id_ in self._poses):
+            self.size_at_last = Size.of(model)
+            self._count_as_usual()
+
+    def _count_as_usual(self) -> None:
+        self._options.ba_global_frames_ratio, self._options.ba_global_points_ratio = self._ratios
+        self._options.ba_global_frames_freq, self._options.ba_global_points_freq = self._steps
+
+
+def _poses(model: pycolmap.Reconstruction) -> dict[int, bytes]:
+    return {id_: pose_of(model.frame(id_)).params.tobytes() for id_ in model.reg_frame_ids()}
 
 
 def adjust_whole(
@@ -109,9 +208,8 @@ def _adjust_all(
     mapper.filter_frames(of_mapper)
 
 
-def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline) -> None:
+def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline, mapper: pycolmap.IncrementalMapper) -> None:
     """Map until nothing is left to register, lowering the demands on the initial pair step by step."""
-    mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
     goes_on = pipeline.reconstruction_manager.size() > 0
     for options in _relaxed(pipeline.options.get_mapper(), mapper):
         try:
@@ -129,7 +227,6 @@ def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline) -> None:
 def _relaxed(
     options: pycolmap.IncrementalMapperOptions, mapper: pycolmap.IncrementalMapper
 ) -> Iterator[pycolmap.IncrementalMapperOptions]:
-    options.num_threads = 1  # COLMAP uses these threads only in the search for an initial pair
     yield options
     for _ in range(_NUM_RELAXATIONS):
         options.init_min_num_inliers //= 2

@@ -25,17 +25,13 @@ from rangesfm.processes.supervision import run_children
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.device import uses_gpu
-from rangesfm.vision.incremental_mapping import adjust_whole, incremental_mapping
+from rangesfm.vision.incremental_mapping import UnfinishedMapping, adjust_whole, incremental_mapping
 from rangesfm.vision.own_process import MODULE, ExternalMapping, WholeMapping, WholePipelineOptions
 from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot
 from rangesfm.vision.steps import DATABASE_NAME, MODELS_NAME, Workspace
 
-# With several threads Ceres adds up in the order in which they finish, also with a fixed number of threads: every run
-# would give another map. Two threads would save 7 to 21 % of the mapping's time (see "One thread for the
-# mapping" in examples/measured.md). [mapper.pipeline] num_threads overrides this.
-_NUM_THREADS = 1
 _MAX_LINE = 200
 
 
@@ -94,18 +90,22 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
     if mapper.command is not None:
         return ExternalMapper.of(mapper.command)
     options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions
+    # Several threads search for an initial pair until one of them has found some pair, and Ceres adds up what they
+    # compute in the order in which they finish: every run gives another map.
+    num_threads = 1 if mapper.reproducible else mapper.num_threads
     if mapper.method == "global":
-        options = pycolmap.GlobalPipelineOptions(num_threads=_NUM_THREADS, random_seed=seed)
+        options = pycolmap.GlobalPipelineOptions(num_threads=num_threads, random_seed=seed)
         positioning, adjustment = options.mapper.global_positioning, options.mapper.bundle_adjustment
         positioning.use_gpu = adjustment.ceres.use_gpu = uses_gpu(mapper)
         if any(table.intrinsics_in_mapping == "kept" for table in camera.tables):
             adjustment.refine_focal_length = adjustment.refine_extra_params = False
     elif mapper.method == "hierarchical":
-        # COLMAP 4.2 passes this number of threads on to the clusters, whatever their own options say.
-        options = pycolmap.HierarchicalPipelineOptions(num_threads=_NUM_THREADS, num_workers=mapper.num_cores)
+        # COLMAP 4.2 passes this number of threads on to the clusters, whatever their own options say. The workers, each
+        # with a cluster, keep all cores busy.
+        options = pycolmap.HierarchicalPipelineOptions(num_threads=1, num_workers=mapper.num_cores)
         _set_seed(options.incremental_options, seed)
     else:
-        options = pycolmap.IncrementalPipelineOptions(num_threads=_NUM_THREADS)
+        options = pycolmap.IncrementalPipelineOptions(num_threads=num_threads)
         _set_seed(options, seed)
     apply_options(options, mapper.pipeline, "mapper.pipeline")
     return options
@@ -197,36 +197,35 @@ def _map_incrementally(
 ) -> list[pycolmap.Reconstruction]:
     """Return all models that COLMAP's incremental mapper makes; there may be none."""
     begun = newest_snapshot(space.snapshots)
-    num_begun = 0
+    num_registered = 0  # in all models; a photo may be in more than one
     if begun is not None:
-        num_begun = pycolmap.Reconstruction(begun).num_reg_images()
-        space.progress.message(f"mapping: continues from {num_begun} photos of an earlier run")
-    num_registered: list[int] = []  # photos of each model; a photo may be in more than one
+        num_registered = _num_registered(begun)
+        space.progress.message(f"mapping: continues from {num_registered} photos of an earlier run")
     with scratch_folder(space.output / "mapping") as folder:
-        snapshots = Snapshots(space.snapshots, folder)
+        snapshots = Snapshots(space.snapshots, folder, options.min_model_size)
 
-        def begin_model() -> None:
-            num_registered.append(0 if num_registered else num_begun)
-
-        def add_photo(model: pycolmap.Reconstruction) -> None:
-            num_registered[-1] = model.num_reg_images()
-            if len(num_registered) == 1:
-                snapshots.add_photo(model)
+        def add_photo(mapping: UnfinishedMapping) -> None:
+            nonlocal num_registered
+            num_registered = _num_registered(mapping)
+            snapshots.add_photo(mapping)
 
         return run_in_background(
             lambda token: incremental_mapping(
                 space.database,
                 photos.folder,
                 options=options,
-                input_path=begun,
-                initial_image_pair_callback=begin_model,
-                next_image_callback=add_photo,
+                unfinished=begun,
+                callback=add_photo,
                 cancellation_token=token,
             ),
             space.progress,
-            lambda: sum(num_registered),
+            lambda: num_registered,
             len(photos.names),
         )
+
+
+def _num_registered(mapping: UnfinishedMapping) -> int:
+    return sum(model.num_reg_images() for model in mapping.models)
 
 
 def _map_at_once(space: Workspace, image_path: Path, options: WholePipelineOptions) -> list[pycolmap.Reconstruction]:

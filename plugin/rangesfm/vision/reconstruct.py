@@ -131,7 +131,7 @@ def _map(
     """
     intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
     command = [] if mapper.command is None else [mapper.command]
-    inputs = fingerprint(of_matches, mapper.method, *command, mapper.pipeline, *intrinsics)
+    inputs = fingerprint(of_matches, mapper.method, *command, mapper.reproducible, mapper.pipeline, *intrinsics)
     with space.logged():
         if not all(rigs.are_known):
             space.steps.run(

@@ -2,74 +2,81 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
+from dataclasses import asdict
 from pathlib import Path
-
-import pycolmap
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import InputError
-from rangesfm.geometry.trajectory import pose_of
+from rangesfm.files.contents import open_regular
+from rangesfm.files.records import write_json
+from rangesfm.vision.incremental_mapping import Size, UnfinishedMapping
+
+# Time between two snapshots: at least this, and so long that writing them takes a twentieth of the time at most.
+_MIN_INTERVAL_S = 5.0
+_INTERVAL_OVER_DURATION = 20.0
+_SIZE_NAME = "size_at_adjustment.json"
 
 
 class Snapshots:
-    """Keeper of the newest snapshot of a mapping's first model.
-
-    A mapping that continues from a snapshot gives the same result as an undisturbed one. COLMAP refines the whole model
-    each time it has grown by a tenth, counted from the last such refinement. A continued mapping starts counting at its
-    first model, so that snapshots are taken only just after a refinement.
-
-    Further models are begun when the first is done, and have no snapshots.
+    """Keeper of the newest snapshot of a mapping.
 
     Args:
         path: folder of the newest snapshot, made with the first snapshot.
         scratch: folder on the same disk, where a snapshot is written before it is moved to ``path``.
+        min_model_size: a further model with fewer photos than that may not be kept by COLMAP, and has no snapshot.
     """
 
-    def __init__(self, path: Path, scratch: Path):
+    def __init__(self, path: Path, scratch: Path, min_model_size: int):
         self._path = path
         self._scratch = scratch
-        self._poses: dict[int, bytes] = {}
+        self._min_model_size = min_model_size
         self._newest_ms = 0
+        self._next_s = time.monotonic() + _MIN_INTERVAL_S
 
-    def add_photo(self, model: pycolmap.Reconstruction) -> None:
-        """Take a snapshot if one is due; to be called when COLMAP has added a photo to the first model."""
-        if self._is_just_refined(model):
-            # Two snapshots within a millisecond must not have the same name.
-            self._newest_ms = max(time.time_ns() // 1_000_000, self._newest_ms + 1)
-            _keep(_write(model, self._scratch / f"{self._newest_ms:013d}"), self._path)
-
-    def _is_just_refined(self, model: pycolmap.Reconstruction) -> bool:
-        """Return whether the whole model was refined, that is, all poses have changed since the last photo."""
-        poses = {id_: pose_of(model.frame(id_)).params.tobytes() for id_ in model.reg_frame_ids()}
-        before, self._poses = self._poses, poses
-        return bool(before) and all(poses[id_] != pose for id_, pose in before.items() if id_ in poses)
+    def add_photo(self, mapping: UnfinishedMapping) -> None:
+        """Take a snapshot if one is due; to be called when COLMAP has added a photo to the growing model."""
+        begin_s = time.monotonic()
+        if begin_s < self._next_s or (mapping.finished and mapping.growing.num_reg_frames() < self._min_model_size):
+            return
+        # Two snapshots within a millisecond must not have the same name.
+        self._newest_ms = max(time.time_ns() // 1_000_000, self._newest_ms + 1)
+        _keep(_write(mapping, self._scratch / f"{self._newest_ms:013d}"), self._path)
+        end_s = time.monotonic()
+        self._next_s = end_s + max(_MIN_INTERVAL_S, _INTERVAL_OVER_DURATION * (end_s - begin_s))
 
 
-def _write(model: pycolmap.Reconstruction, folder: Path) -> Path:
-    """Write a model into a new folder, named by the time in milliseconds as COLMAP does; return the folder."""
+def _write(mapping: UnfinishedMapping, folder: Path) -> Path:
+    """Write the models into a new folder, named by the time in milliseconds as COLMAP does; return the folder."""
     folder.mkdir()
-    model.write_binary(folder)
+    write_json(asdict(mapping.size_at_adjustment), folder / _SIZE_NAME)
+    for number, model in enumerate(mapping.models):
+        (folder / str(number)).mkdir()
+        model.write_binary(folder / str(number))
     return folder
 
 
-def newest_snapshot(path: Path) -> Path | None:
-    """Return the folder of the newest complete snapshot, or None if there is none."""
+def newest_snapshot(path: Path) -> UnfinishedMapping | None:
+    """Return the newest complete snapshot, or None if there is none."""
     for folder in sorted(path.iterdir(), reverse=True) if path.is_dir() else ():
         try:
-            read_model(folder)
-        except InputError:
+            with open_regular(folder / _SIZE_NAME) as file:
+                size = Size(**json.loads(file.read()))
+            numbers = sorted(int(model.name) for model in folder.iterdir() if model.name.isdecimal())
+            *finished, growing = (read_model(folder / str(number)) for number in numbers)
+        except (InputError, OSError, ValueError, TypeError):
             continue
-        return folder
+        return UnfinishedMapping(tuple(finished), growing, size)
     return None
 
 
-def _keep(model: Path, path: Path) -> None:
-    """Move a complete model into the folder of snapshots, and remove the older ones."""
+def _keep(snapshot: Path, path: Path) -> None:
+    """Move a complete snapshot into the folder of snapshots, and remove the older ones."""
     path.mkdir(exist_ok=True)
     older = list(path.iterdir())
-    os.replace(model, path / model.name)
+    os.replace(snapshot, path / snapshot.name)
     for folder in older:
         shutil.rmtree(folder)
