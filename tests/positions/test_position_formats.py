@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from tests.known import known
 
 from rangesfm.errors import InputError
 from rangesfm.options import PositionOptions
 from rangesfm.positions.position_formats import read_positions
 from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.positions.true_positions import read_true_positions
 from rangesfm.ranging.readers.lists import UnclearListError
 
 DAY_S = datetime(2024, 3, 1, tzinfo=timezone.utc).timestamp()
@@ -164,4 +166,135 @@ def test_a_mistake_in_positions_is_named(tmp_path: Path, text: str, options: dic
 def test_unclear_columns_are_asked_for(tmp_path: Path) -> None:
     with pytest.raises(UnclearListError, match="a table of positions whose columns are not known for sure") as error:
         read(tmp_path, "time,a,b,c\n1,2,3,4\n2,3,4,5\n")
-    assert any("--position_columns timestamp=time,x=NAME" in str(choice) for choice in error.value.choices)
+    told = [str(choice) for choice in error.value.choices]
+    assert told == ["if a, b, c are x, y, z, add --position_columns timestamp=time,x=a,y=b,z=c"]
+
+
+ROWS = [(1403636579763555584 + 100_000_000 * k, 3.0 + 0.25 * k, -1.5 * k, 1.5 + 0.125 * k) for k in range(30)]
+EUROC = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+    "b_w_RS_S_z [rad s^-1]"
+)
+# A header, a row with the time t in ns, the time s in seconds and the place x, y, z, and the cells that come after.
+TRAJECTORIES = {
+    "EuRoC": (EUROC, "{t},{x},{y},{z},0.6,0.0,0.8,0.0,0.1,0.2,0.3,0,0,0"),
+    "VINS": ("", "{t},{x},{y},{z},0.6,0.0,0.8,0.0,0.1,0.2,0.3,"),
+    "MCD": ("num t x y z qx qy qz qw", "{k} {s} {x} {y} {z} 0.0 0.8 0.0 0.6"),
+    "DWM1001": ("Time,POSX,POSY,POSZ", "{s},{x},{y},{z}"),
+    "ROS": (
+        "time,pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,pose.orientation.y,"
+        "pose.orientation.z,pose.orientation.w,twist.linear.x,twist.linear.y,twist.linear.z",
+        "{s},{x},{y},{z},0,0,0,1,0.1,0.2,0.3",
+    ),
+    "plain": ("", "{s} {x} {y} {z}"),
+    "transform": ("timestamp;tx;ty;tz", "{s};{x};{y};{z}"),
+}
+
+
+@pytest.mark.parametrize("name", TRAJECTORIES)
+def test_trajectories_of_other_programs_give_their_positions(tmp_path: Path, name: str) -> None:
+    header, row = TRAJECTORIES[name]
+    rows = [row.format(k=k, t=t, s=f"{t / 1e9:.6f}", x=x, y=y, z=z) for k, (t, x, y, z) in enumerate(ROWS)]
+    path = tmp_path / "positions.txt"
+    found = read(tmp_path, "\n".join([header] * bool(header) + rows) + "\n")
+    np.testing.assert_allclose(known(found.timestamp_s), [t / 1e9 for t, *_ in ROWS], atol=1e-6)
+    np.testing.assert_array_equal(found.position_m, [place for _, *place in ROWS])
+    reference = read_true_positions(path)
+    np.testing.assert_array_equal(reference.positions_m, found.position_m)
+    np.testing.assert_array_equal(known(reference.timestamps_s), known(found.timestamp_s))
+
+
+PHOTOS = [f"DJI_{k:04}.JPG" for k in range(5)]
+PLACES = [[9.0 + 1e-6 * k, 46.95 - 2e-6 * k, 430.5 + k] for k in range(5)]
+
+
+def by_photo(row: str) -> str:
+    return "".join(
+        row.format(photo=photo, label=photo[:-4], x=x, y=y, z=z) + "\n"
+        for photo, (x, y, z) in zip(PHOTOS, PLACES, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "crs"),
+    [
+        ("EPSG:4326\n" + by_photo("{photo} {x} {y} {z}"), "EPSG:4326"),
+        ("EPSG:4326\n" + by_photo("{photo} {x} {y} {z} 10 0 -90 0.02 0.04"), "EPSG:4326"),
+        ("+proj=utm +zone=32 +datum=WGS84\n" + by_photo("{photo}\t{x}\t{y}\t{z}"), "+proj=utm +zone=32 +datum=WGS84"),
+        (
+            "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll\n" + by_photo("{label},{x},{y},{z},0,0,0"),
+            GEOGRAPHIC,
+        ),
+        (
+            '# CoordinateSystem: GEOGCS["WGS 84",DATUM["x",AUTHORITY["EPSG","6326"]],AUTHORITY["EPSG","4326"]]\n'
+            "#Label,X/Longitude,Y/Latitude,Z/Altitude\n" + by_photo("{label},{x},{y},{z}"),
+            "EPSG:4326",
+        ),
+        ("SourceFile,Longitude,Latitude,Altitude\n" + by_photo("{photo},{x},{y},{z}"), GEOGRAPHIC),
+    ],
+)
+def test_positions_of_photos_keep_their_coordinate_system(tmp_path: Path, text: str, crs: str) -> None:
+    found = read(tmp_path, text)
+    assert found.crs == crs
+    assert [name[:8] for name in known(found.image_name)] == [photo[:8] for photo in PHOTOS]
+    np.testing.assert_array_equal(found.position_m, PLACES)
+    if "0.02" in text:
+        np.testing.assert_allclose(found.covariance_m2, np.tile(np.diag([4e-4, 4e-4, 16e-4]), (5, 1, 1)))
+
+
+def test_columns_by_number_do_not_drop_the_coordinate_system_of_the_first_line(tmp_path: Path) -> None:
+    text = "EPSG:4326\n" + by_photo("{photo} {x} {y} {z}")
+    found = read(tmp_path, text, columns={"image_name": "1", "x": "2", "y": "3", "z": "4"})
+    assert found.crs == "EPSG:4326"
+    np.testing.assert_array_equal(found.position_m, PLACES)
+
+
+def test_local_metres_under_a_heading_for_both_are_no_degrees(tmp_path: Path) -> None:
+    found = read(tmp_path, "#Label,X/Longitude,Y/Latitude,Z/Altitude\na,1.5,2.5,0.5\nb,8.5,12.5,0.5\n")
+    assert found.crs is None
+
+
+def test_photos_with_large_coordinates_are_asked_about_with_whole_commands(tmp_path: Path) -> None:
+    with pytest.raises(UnclearListError) as error:
+        read(tmp_path, "".join(f"{photo} {2e6 + k} {1e6 - k} {400 + k}\n" for k, photo in enumerate(PHOTOS)))
+    assert [choice.flags for choice in error.value.choices] == [
+        ("--position_columns", "image_name=1,x=2,y=3,z=4"),
+        ("--position_columns", "image_name=1,x=3,y=2,z=4"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("header", "lost"),
+    [
+        ("timestamp_s,x_m,y_m,z_m", "2.0,nan,nan,nan"),
+        ("timestamp_s,x_m,y_m,z_m", "2.0,,,"),
+        ("Time,POSX,POSY,POSZ", "2.0,null,null,null"),
+        ("timestamp_s,x_m,y_m,z_m,quality", "2.0,0,0,0,0"),
+        ("t,Longitude,Latitude,Height", "2.0,0,0,0"),
+    ],
+)
+def test_rows_without_a_fix_are_counted_and_left_out(tmp_path: Path, header: str, lost: str) -> None:
+    more = ",4" * (header.count(",") - 3)
+    rows = [f"{k}.0,{8 + 1e-5 * k},{47 + 1e-5 * k},3{more}" if k != 2 else lost for k in range(6)]
+    found = read(tmp_path, "\n".join([header, *rows]) + "\n")
+    assert known(found.timestamp_s).tolist() == [0.0, 1.0, 3.0, 4.0, 5.0]
+    assert np.isfinite(found.position_m).all()
+    assert "positions.txt: 1 of 6 rows have no position (no fix) and are left out" in found.notes
+
+
+def test_a_true_trajectory_may_have_gaps(tmp_path: Path) -> None:
+    for name, text in (
+        ("a.csv", "timestamp_s,x_m,y_m,z_m\n0,1,2,3\n1,nan,nan,nan\n2,4,5,6\n"),
+        ("a.tum", "0 1 2 3 0 0 0 1\n1 nan nan nan 0 0 0 1\n2 4 5 6 0 0 0 1\n"),
+    ):
+        (tmp_path / name).write_text(text)
+        found = read_true_positions(tmp_path / name)
+        assert known(found.timestamps_s).tolist() == [0.0, 2.0]
+        assert found.notes == (f"{name}: 1 of 3 rows have no position and are left out",)
+
+
+def test_true_positions_in_degrees_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "geo.txt").write_text("EPSG:4326\n" + by_photo("{photo} {x} {y} {z}"))
+    with pytest.raises(InputError, match=r"geo\.txt: the positions are in EPSG:4326, expected metres"):
+        read_true_positions(tmp_path / "geo.txt")

@@ -220,11 +220,11 @@ def _read_anchors(args: argparse.Namespace) -> tuple[Anchor, ...]:
 
 def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
     """Read the n ranges of one tag, and return them with the position of the tag at each, (n, 3); NaN if unknown."""
-    from rangesfm.geometry.reference import read_reference
+    from rangesfm.positions.true_positions import read_true_positions
     from rangesfm.ranging.association import tag_positions
     from rangesfm.survey.inputs import of_one_tag
 
-    log, known = of_one_tag(_read_log(args), args.tag_id), read_reference(args.positions)
+    log, known = of_one_tag(_read_log(args), args.tag_id), read_true_positions(args.positions)
     offset_s, max_gap_s = args.time_offset, args.max_interpolation_gap_s
     return log, tag_positions(log, known, args.tag_in_cam, time_offset_s=offset_s, max_gap_s=max_gap_s)
 

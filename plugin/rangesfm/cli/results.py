@@ -188,7 +188,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.comparison.many_models import compare_many, read_named_models
     from rangesfm.distances.tape import read_tape
-    from rangesfm.geometry.reference import read_reference
+    from rangesfm.positions.true_positions import read_true_positions
     from rangesfm.workflows.ranges_for_models import ranges_of_survey
 
     if args.output_path is not None:
@@ -204,7 +204,7 @@ def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
         ranges = ranges_of_survey(survey, model, path)
     if survey.scale.distances is not None:
         tape = read_tape(survey.scale.distances, survey.scale.markers)
-    reference = None if args.reference is None else read_reference(args.reference)
+    reference = None if args.reference is None else read_true_positions(args.reference)
     comparison = compare_many(models, ranges, tape, reference)
     lines = [str(comparison)]
     if args.output_path is not None:

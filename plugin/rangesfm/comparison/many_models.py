@@ -19,9 +19,10 @@ from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Tape, markers_of_photos
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows
-from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.similarity import Similarity, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.positions.true_positions import read_true_positions
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.result.entries import rms
 from rangesfm.result.model_path import path_in_result
@@ -252,7 +253,7 @@ def _read_model(path: Path) -> NamedModel:
 
 
 def _read_positions(path: Path, base: Trajectory) -> NamedModel:
-    reference = read_reference(path)
+    reference = read_true_positions(path)
     known, positions, rotations = known_keyframes(base, reference)
     if len(known) == 0:
         raise InputError(reference.why_nothing_is_known("keyframes", base.image_names, base.timestamps_s), path)

@@ -95,9 +95,11 @@ class TextTable:
         return len(self.line)
 
     def where(self, chosen: Sequence[bool]) -> TextTable:
-        """Return the table with the rows that are true in ``chosen``; all cells must be text."""
+        """Return the table with the rows that are true in ``chosen``, with all cells as text unless these are all."""
         if all(chosen):
             return self
+        if self.reread is not None:
+            return self.reread().where(chosen)
         cells = {name: [*compress(texts, chosen)] for name, texts in self.cells.items()}
         return TextTable(self.path, self.columns, self.line[np.array(chosen)], cells)
 
@@ -431,6 +433,11 @@ def _check_names(names: list[str], required: Sequence[str], optional: Sequence[s
 
 def _expected(required: Sequence[str], optional: Sequence[str]) -> str:
     return _listed(required) + (f" (and possibly {_listed(optional)})" if optional else "")
+
+
+def is_number(cell: str) -> bool:
+    """Return whether a cell is a number."""
+    return _number(cell) is not None
 
 
 def _number(cell: str) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,12 +44,14 @@ class Reference:
         image_names: names of the n photos, or None.
         timestamps_s: (n,) times on the camera's clock, strictly increasing, or None.
         world_from_cam: (n, 3, 3) rotations of COLMAP's camera frame (x right, y down, z forward), or None.
+        notes: lines for the user about how the file was read.
     """
 
     positions_m: Array
     image_names: tuple[str, ...] | None = None
     timestamps_s: Array | None = None
     world_from_cam: Array | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.image_names is None) == (self.timestamps_s is None):
@@ -159,7 +162,7 @@ def read_reference(path: AnyPath) -> Reference:
     path = Path(path)
     names = header_names(read_head(path))
     if path.suffix == ".tum" or is_tum_row(names):
-        return _from_table(_read_tum(path), "timestamp_s")
+        return _from_table(tum_table(path), "timestamp_s")
     if names and not {"image_name", "timestamp_s"} & set(names):
         found = printable(", ".join(names))
         raise InputError(f"no column image_name or timestamp_s; found {found}; expected one of them", path)
@@ -189,7 +192,12 @@ def is_tum_row(cells: Sequence[str]) -> bool:
         return False
 
 
-def _read_tum(path: Path) -> TextTable:
+def tum_table(path: Path) -> TextTable:
+    """Read the lines of a TUM trajectory as a table.
+
+    Raises:
+        InputError: a line does not have eight cells, or there is none.
+    """
     columns = ("timestamp_s", *POSITION_COLUMNS, *QUATERNION_COLUMNS)
     rows = [(line, text.split()) for line, text in enumerate(read_text(path).split("\n"), start=1)]
     rows = [(line, cells) for line, cells in rows if cells and not cells[0].startswith("#")]
@@ -206,16 +214,29 @@ def _read_tum(path: Path) -> TextTable:
 def _from_table(table: TextTable, key: str) -> Reference:
     if len(table) == 0:
         raise InputError("no pose in the file, only its header row", table.path)
+    table, notes = _with_positions(table)
     positions = np.column_stack([table.numbers(column, bounds=COORDINATE_M) for column in POSITION_COLUMNS])
     rotations = _rotations(table)
     if again := repeated(table.text(key) if key == "image_name" else table.numbers(key, bounds=TIME_S).tolist()):
         raise table.error(again[0], key, "each one once")
     if key == "image_name":
-        return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations)
+        return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations, notes=notes)
     times = table.numbers(key, bounds=TIME_S)
     order = np.argsort(times)
     turns = None if rotations is None else rotations[order]
-    return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns)
+    return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns, notes=notes)
+
+
+def _with_positions(table: TextTable) -> tuple[TextTable, tuple[str, ...]]:
+    """Return the rows that have a position, with a note if others are left out."""
+    places = [table.numbers(column, empty=np.nan, missing=("", "nan", "null")) for column in POSITION_COLUMNS]
+    has_place = [not all(map(math.isnan, place)) for place in zip(*places, strict=True)]
+    if all(has_place):
+        return table, ()
+    if not any(has_place):
+        raise InputError(f"holds no position in any of {len(table)} rows", table.path)
+    note = f"{table.path.name}: {has_place.count(False)} of {len(table)} rows have no position and are left out"
+    return table.where(has_place), (note,)
 
 
 def _rotations(table: TextTable) -> Array | None:

@@ -10,8 +10,8 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
 from rangesfm.geometry.numerics import UNDETERMINED
-from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.positions.true_positions import read_true_positions
 
 # A plan of more would take minutes.
 _MAX_NUM_KEYFRAMES = 20_000
@@ -120,7 +120,7 @@ def path_from_file(path: Path, photo_rate_hz: float) -> Trajectory:
     Raises:
         InputError: the file has no times or no rotations, or is not valid.
     """
-    recorded = read_reference(path)
+    recorded = read_true_positions(path)
     if recorded.timestamps_s is None or recorded.world_from_cam is None:
         raise InputError("has no times or no rotations, expected timestamp tx ty tz qx qy qz qw", path)
     _, chosen = np.unique(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.text_tables import (
     TextTable,
     has_columns,
+    is_number,
     is_plain_table,
     read_head,
     read_table,
@@ -24,6 +24,7 @@ from rangesfm.files.text_tables import (
     repeated,
 )
 from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
+from rangesfm.positions.position_log import crs_of_line
 from rangesfm.ranging.anchors.anchor_file import find_anchor_columns
 from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
 from rangesfm.ranging.readers.lists import UnclearListError, check_columns, read_list
@@ -36,8 +37,6 @@ QUANTITIES = tuple(_CANONICAL)
 _AXES = ("x", "y", "z")
 _KINDS = (CONTROL, CHECK)
 _EXPECTED = f"expected a table with {','.join(POINT_COLUMNS)}"
-# First line of ODM's gcp_list.txt: the coordinate system, by number, by PROJ's parameters, or as a zone of UTM.
-_CRS = re.compile(r"\s*(?:(EPSG:\d+)|(\+(?:proj|init)=.+)|WGS ?84\s+UTM\s+(\d{1,2})\s*([NS])\w*)\s*", re.IGNORECASE)
 _NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
 
 
@@ -129,7 +128,9 @@ def read_control_points(options: PointOptions, markers_path: Path | None) -> Con
 def is_gcp_list(head: str) -> bool:
     """Return whether a file with this beginning is ODM's list of ground control points."""
     first, *rows = [line for line in head.split("\n") if line.strip() and not line.startswith("#")] or [""]
-    return _CRS.fullmatch(first) is not None and any(len(row.split()) > _NUM_GCP_NUMBERS for row in rows)
+    cells = [row.split() for row in rows]
+    are_points = any(len(row) > _NUM_GCP_NUMBERS and all(map(is_number, row[:_NUM_GCP_NUMBERS])) for row in cells)
+    return crs_of_line(first) is not None and are_points
 
 
 def is_point_file(head: str) -> bool:
@@ -226,7 +227,7 @@ def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
         if not text.strip() or text.lstrip().startswith("#"):
             continue
         if crs is None:
-            crs = _crs_of(text)
+            crs = crs_of_line(text)
             continue
         numbers, image_name, rest = _cells_of_gcp(text, path, line)
         name = rest or next(
@@ -240,13 +241,6 @@ def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
         marks.setdefault(name, []).append((image_name, numbers[3:], line))
     markers = {name: _marker(name, seen, path) for name, seen in marks.items()}
     return ControlPoints(tuple(points.values()), markers, False, crs, path)
-
-
-def _crs_of(text: str) -> str:
-    found = _CRS.fullmatch(text)
-    assert found is not None, "the first line was recognized"
-    number, parameters, zone, half = found.groups()
-    return number or parameters or f"EPSG:{(326 if half.upper() == 'N' else 327) * 100 + int(zone)}"
 
 
 def _cells_of_gcp(text: str, path: Path, line: int) -> tuple[list[float], str, str]:

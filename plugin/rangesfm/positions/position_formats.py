@@ -1,4 +1,4 @@
-"""Readers of positions: tables of any layout, TUM, NMEA, RTKLIB, Marvelmind's dashboard, and databases of COLMAP.
+"""Readers of positions: tables of any layout, TUM, NMEA, RTKLIB, ODM, Marvelmind's dashboard, and COLMAP's databases.
 
 Each is a function that returns a PositionLog, and one that recognises the beginning of a file. Pozyx and other systems
 write tables with names of columns, which are recognised like those of range logs.
@@ -15,31 +15,44 @@ import numpy as np
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.errors import InputError, nearest_known, printable
-from rangesfm.files.text_tables import TextTable, has_columns, header_names, read_head, read_table, read_text
-from rangesfm.geometry.reference import is_tum_row, read_reference
+from rangesfm.files.text_tables import (
+    TextTable,
+    has_columns,
+    header_names,
+    is_number,
+    read_head,
+    read_table,
+    read_text,
+)
+from rangesfm.geometry.reference import is_tum_row, tum_table
 from rangesfm.option_model import Bounds
 from rangesfm.options import COORDINATE_M, STDDEV_M, TIME_S, PositionOptions
 from rangesfm.positions.pose_priors import is_database, read_pose_priors
-from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.positions.position_columns import (
+    AXES,
+    COVARIANCES,
+    QUANTITIES,
+    STDDEVS,
+    find_position_columns,
+    is_degrees,
+)
+from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.columns import read_timestamps
-from rangesfm.ranging.readers.guess import Guess, find_time
-from rangesfm.ranging.readers.layout import ColumnSample, Layout, find_layout
-from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns, columns_flag
+from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
+from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns
 from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
 
-_AXES = ("x", "y", "z")
-_STDDEVS = tuple(f"stddev_{axis}" for axis in _AXES)
-_COVARIANCES = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
-QUANTITIES = ("timestamp", "date", "nanoseconds", "image_name", *_AXES, "stddev", *_STDDEVS, *_COVARIANCES, "tag_id")
 _CANONICAL = {
     "timestamp": "timestamp_s",
     "image_name": "image_name",
-    **{name: f"{name}_m" for name in (*_AXES, "stddev", *_STDDEVS)},
-    **{name: f"{name}_m2" for name in _COVARIANCES},
+    **{name: f"{name}_m" for name in (*AXES, "stddev", *STDDEVS)},
+    **{name: f"{name}_m2" for name in COVARIANCES},
+    "quality": "quality",
 }
-POSITION_COLUMNS = tuple(_CANONICAL[axis] for axis in _AXES)
+POSITION_COLUMNS = tuple(_CANONICAL[axis] for axis in AXES)
 _EXPECTED = f"expected a table with timestamp_s or image_name, and {','.join(POSITION_COLUMNS)}"
+_WIDEST_DEG = 0.5
 DEGREES = Bounds(-360, 360, "degrees")
 _SLOWEST_S = 120.0
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
@@ -72,13 +85,15 @@ def read_positions(options: PositionOptions) -> PositionLog | None:
     head = read_head(path)
     if not head.strip():
         raise InputError(f"the file is empty, {_EXPECTED}", path)
+    if options.columns:
+        return _read_table(path, options)
     read = next((read for is_it, read in POSITION_READERS.values() if is_it(head)), _read_table)
     return read(path, options)
 
 
-def is_of_satellites(head: str) -> bool:
-    """Return whether a file with this beginning holds positions by satellites, which no log of ranges looks like."""
-    return _is_nmea(head) or _is_rtklib(head)
+def is_of_positions(head: str) -> bool:
+    """Return whether a file with this beginning holds measured positions in a format that nothing else looks like."""
+    return _is_nmea(head) or _is_rtklib(head) or _is_odm(head)
 
 
 def _is_canonical(head: str) -> bool:
@@ -89,7 +104,7 @@ def _read_canonical(path: Path, options: PositionOptions) -> PositionLog:
     if options.columns or options.unit or options.timestamp_unit or not _is_canonical(read_head(path)):
         return _read_table(path, options)
     key = "timestamp" if has_columns(read_head(path), [_CANONICAL["timestamp"]]) else "image_name"
-    optional = [name for quantity, name in _CANONICAL.items() if quantity not in (key, *_AXES)]
+    optional = [name for quantity, name in _CANONICAL.items() if quantity not in (key, *AXES)]
     text = ["image_name"]
     table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, text=text, separator=None)
     names = {quantity: name for quantity, name in _CANONICAL.items() if name in table}
@@ -102,7 +117,9 @@ def _read_table(path: Path, options: PositionOptions) -> PositionLog:
     if layout is None:
         raise InputError(f"no table, {_EXPECTED}", path)
     columns, notes = (
-        (_columns_by_user(options.columns, layout, path), []) if options.columns else _found_columns(path, layout)
+        (_columns_by_user(options.columns, layout, path), [])
+        if options.columns
+        else find_position_columns(path, layout)
     )
     table, more = layout.read()
     notes += more
@@ -117,8 +134,8 @@ def _read_table(path: Path, options: PositionOptions) -> PositionLog:
         times, _ = read_timestamps(table, columns, layout.units, said, notes, ask, slowest_s=_SLOWEST_S)
     by_name = {column.name: column.unit for column in layout.columns}
     named = {quantity: named_length_unit(f"{name} {by_name[name]}") for quantity, name in columns.items()}
-    units = {quantity: (options.unit if quantity in _AXES else None) or unit or "m" for quantity, unit in named.items()}
-    others = sorted({units[axis] for axis in _AXES} - {"m"})
+    units = {quantity: (options.unit if quantity in AXES else None) or unit or "m" for quantity, unit in named.items()}
+    others = sorted({units[axis] for axis in AXES} - {"m"})
     notes += [f"coordinates are in {' and '.join(others)}"] if others else []
     return _log_of_table(table, columns, units, times, path, notes, options)
 
@@ -133,15 +150,21 @@ def _log_of_table(
     options: PositionOptions,
 ) -> PositionLog:
     """Return the log of a table, given the column and the unit of each quantity."""
-    degrees = {axis for axis in ("x", "y") if terms.DEGREES[axis] & {*terms.words_of(names[axis])}}
+    crs = crs_in_head(read_head(path))
     kept = _of_one_tag(table, names, options.tag_id, path)
-    bounds = {axis: DEGREES if axis in degrees else COORDINATE_M for axis in _AXES}
-    per_metre = {axis: 1.0 if axis in degrees else UNITS_PER_METRE[units[axis]] for axis in _AXES}
-    columns = [table.numbers(names[axis], empty=np.nan, expected=str(bounds[axis])) / per_metre[axis] for axis in _AXES]
-    for axis, values in zip(_AXES, columns, strict=True):
-        table.refuse(~(np.isnan(values) | bounds[axis].hold(values)), names[axis], str(bounds[axis]))
+    columns = [table.numbers(names[axis], empty=np.nan, missing=MISSING, expected=str(COORDINATE_M)) for axis in AXES]
+    are_degrees = crs is None and options.crs is None and options.unit is None and _are_degrees(names, columns)
+    bounds = {axis: DEGREES if are_degrees and axis != "z" else COORDINATE_M for axis in AXES}
+    for k, axis in enumerate(AXES):
+        columns[k] /= 1.0 if are_degrees and axis != "z" else UNITS_PER_METRE[units[axis]]
+        table.refuse(~(np.isnan(columns[k]) | bounds[axis].hold(columns[k])), names[axis], str(bounds[axis]))
     position = np.column_stack(columns)
-    kept = kept & np.isfinite(position).all(axis=1)
+    is_lost = np.zeros(len(table), dtype=bool)
+    if are_degrees or crs is not None:  # receivers without a fix write zeros, which is in the Atlantic
+        is_lost |= (position[:, 0] == 0) & (position[:, 1] == 0)
+    if "quality" in names:
+        is_lost |= table.numbers(names["quality"], empty=0.0, missing=MISSING) == 0
+    position[is_lost] = np.nan
     image_name = None if times is not None else [name for name, k in zip(table.text(names["image_name"]), kept) if k]
     return PositionLog.of(
         path,
@@ -151,9 +174,22 @@ def _log_of_table(
         times_s=None if times is None else times[kept],
         image_name=image_name,
         covariance_m2=_covariances(table, names, units)[kept],
-        crs=GEOGRAPHIC if len(degrees) == 2 else None,
+        crs=GEOGRAPHIC if are_degrees else crs,
         notes=notes,
     )
+
+
+def _are_degrees(names: Mapping[str, str], columns: Sequence[Array]) -> bool:
+    """Return whether x and y are longitude and latitude: by their names, or where these leave it open by their spread.
+
+    The spread is of degrees if it is less than half of one: a survey of metres is wider, one of degrees never.
+    """
+    if not all(is_degrees(names[axis], axis) for axis in ("x", "y")):
+        return False
+    if not any(axis in terms.words_of(names[axis]) for axis in ("x", "y")):
+        return True
+    known = [values[np.isfinite(values)] for values in columns[:2]]
+    return all(len(values) > 0 and float(np.ptp(values)) < _WIDEST_DEG for values in known)
 
 
 def _of_one_tag(table: TextTable, names: Mapping[str, str], tag_id: str | None, path: Path) -> Mask:
@@ -174,14 +210,14 @@ def _of_one_tag(table: TextTable, names: Mapping[str, str], tag_id: str | None, 
 def _covariances(table: TextTable, names: Mapping[str, str], units: Mapping[str, str]) -> Array:
     """Return (n, 3, 3) covariances, NaN where the table has none: as a matrix, by axis, or of any coordinate."""
     covariances = np.full((len(table), 3, 3), np.nan)
-    if set(_COVARIANCES) <= names.keys():
+    if set(COVARIANCES) <= names.keys():
         rows, columns = np.triu_indices(3)
-        for name, i, j in zip(_COVARIANCES, rows, columns, strict=True):
+        for name, i, j in zip(COVARIANCES, rows, columns, strict=True):
             covariances[:, i, j] = covariances[:, j, i] = table.numbers(names[name], empty=np.nan)
         is_valid = np.isnan(covariances).any(axis=(1, 2)) | (np.linalg.eigvalsh(np.nan_to_num(covariances))[:, 0] > 0)
         table.refuse(~is_valid, names["cov_xx"], "a positive definite covariance")
         return covariances
-    for axis, own in enumerate(_STDDEVS):
+    for axis, own in enumerate(STDDEVS):
         if (name := own if own in names else "stddev") in names:
             stddev = table.numbers(names[name], empty=np.nan) / UNITS_PER_METRE[units[name]]
             table.refuse(~(np.isnan(stddev) | STDDEV_M.hold(stddev)), names[name], f"{STDDEV_M}, or nothing")
@@ -191,47 +227,9 @@ def _covariances(table: TextTable, names: Mapping[str, str], units: Mapping[str,
     return covariances
 
 
-def _found_columns(path: Path, layout: Layout) -> tuple[dict[str, str], list[str]]:
-    """Return the column of each quantity by the names of the columns.
-
-    Raises:
-        UnclearListError: it may be several.
-    """
-    guess = Guess()
-    free = find_time([*layout.columns], guess) if layout.has_names else []
-    columns = dict(guess.columns)
-    if photos := [column for column in layout.columns if column.names_photos]:
-        columns = {"image_name": photos[0].name} | {key: name for key, name in columns.items() if key != "image_name"}
-    doubts = [] if {"timestamp", "image_name"} & columns.keys() else ["no column seems to be the time or the photo"]
-    for axis in _AXES:
-        found = [column for column in free if _is_axis(column, axis)]
-        if len(found) == 1:
-            columns[axis] = found[0].name
-        else:
-            doubts.append(f"{'no column seems' if not found else 'several columns seem'} to be {axis}")
-    for column in free:
-        words = {*column.words} - terms.LENGTH_UNIT
-        if words & terms.STDDEV:
-            of_axes = [f"stddev_{axis}" for axis in _AXES if words & terms.COORDINATES[axis]]
-            columns.setdefault(of_axes[0] if of_axes else "stddev", column.name)
-        elif words & terms.TAG and words <= terms.TAG | terms.ID:
-            columns.setdefault("tag_id", column.name)
-    if doubts:
-        unknown = {quantity: "NAME" for quantity in ("timestamp", *_AXES) if quantity not in columns}
-        choice = Choice("with the names of the columns", columns_flag("position_columns", columns | unknown))
-        raise UnclearListError("positions", path, layout, doubts, [choice])
-    return columns, guess.notes
-
-
-def _is_axis(column: ColumnSample, axis: str) -> bool:
-    words = {*column.words} - terms.BESIDE_COORDINATE - terms.TAG
-    names = terms.COORDINATES[axis] | terms.DEGREES.get(axis, frozenset())
-    return column.kind == "numbers" and bool(words) and words <= names
-
-
 def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
     check_columns(columns, QUANTITIES, layout, path)
-    missing = [quantity for quantity in _AXES if quantity not in columns]
+    missing = [quantity for quantity in AXES if quantity not in columns]
     if missing or not {"timestamp", "image_name"} & columns.keys():
         message = "columns do not name all of x, y, z and one of timestamp and image_name"
         raise InputError(message, path)
@@ -243,9 +241,47 @@ def _is_tum(head: str) -> bool:
 
 
 def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
-    poses = read_reference(path)
-    line = np.arange(1, len(poses) + 1)
-    return PositionLog.of(path, "tum", poses.positions_m, line, times_s=poses.timestamps_s)
+    table = tum_table(path)
+    times_s, *places = (table.numbers(name, empty=np.nan, missing=MISSING) for name in table.columns[:4])
+    return PositionLog.of(path, "tum", np.column_stack(places), table.line, times_s=times_s)
+
+
+def _is_odm(head: str) -> bool:
+    """Return whether the first line is a coordinate system, and the next one a photo with numbers."""
+    first, second = ([line for line in head.split("\n") if line.strip() and line[0] != "#"] + ["", ""])[:2]
+    name, *numbers = second.split() or [""]
+    are_numbers = len(numbers) > 1 and all(map(is_number, numbers[:2]))
+    return crs_of_line(first) is not None and not is_number(name) and are_numbers
+
+
+def _read_odm(path: Path, options: PositionOptions) -> PositionLog:
+    """Read ODM's ``geo.txt``: the coordinate system, then image_name geo_x geo_y geo_z [yaw pitch roll [stddevs]].
+
+    The two stddevs at the end are horizontal and vertical (docs.opendronemap.org, "Image geolocation files").
+    """
+    crs, names, lines, numbers = None, list[str](), list[int](), list[list[float]]()
+    for line, text in enumerate(read_text(path).split("\n"), 1):
+        if not text.strip() or text.startswith("#"):
+            continue
+        if crs is None:
+            crs = crs_of_line(text)
+            continue
+        name, *cells = text.split("\t") if text.count("\t") > 2 else text.split()
+        try:
+            values = [float("nan" if cell.strip().lower() in MISSING else cell) for cell in cells]
+        except ValueError:
+            values = []
+        if len(values) < 3:
+            raise InputError("is no line of a photo, expected image_name geo_x geo_y geo_z", path, line)
+        names.append(name.strip())
+        lines.append(line)
+        numbers.append((values + 5 * [np.nan])[:8])
+    rows = np.array(numbers).reshape(-1, 8)
+    covariances = np.zeros((len(rows), 3, 3))
+    for axis, column in enumerate((6, 6, 7)):
+        covariances[:, axis, axis] = np.where(rows[:, column] > 0, rows[:, column], np.nan) ** 2
+    covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
+    return PositionLog.of(path, "odm", rows[:, :3], lines, image_name=names, covariance_m2=covariances, crs=crs)
 
 
 def _is_marvelmind(head: str) -> bool:
@@ -443,6 +479,7 @@ POSITION_READERS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "colmap": (is_database, lambda path, _options: read_pose_priors(path)),
     "nmea": (_is_nmea, _read_nmea),
     "rtklib": (_is_rtklib, _read_rtklib),
+    "odm": (_is_odm, _read_odm),
     "tum": (_is_tum, _read_tum),
     "marvelmind": (_is_marvelmind, _read_marvelmind),
     "table": (_is_canonical, _read_canonical),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +12,31 @@ import numpy as np
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
 
+# The coordinate system in a file's first line, as in ODM's files: by number, by PROJ's parameters, or as a zone of UTM.
+_CRS = re.compile(r"\s*(?:(EPSG:\d+)|(\+(?:proj|init)=.+)|WGS ?84\s+UTM\s+(\d{1,2})\s*([NS])\w*)\s*", re.IGNORECASE)
+_EPSG = re.compile(r"EPSG\W{1,5}(\d{4,5})\b", re.IGNORECASE)
 GEOGRAPHIC = "EPSG:4979"
 """WGS 84: longitude and latitude in degrees, ellipsoidal height in metres."""
+
+
+def crs_of_line(text: str) -> str | None:
+    """Return the coordinate system that a line consists of; None if it is none."""
+    found = _CRS.fullmatch(text)
+    if found is None:
+        return None
+    number, parameters, zone, half = found.groups()
+    return number or parameters or f"EPSG:{(326 if half.upper() == 'N' else 327) * 100 + int(zone)}"
+
+
+def crs_in_head(head: str) -> str | None:
+    """Return the coordinate system that a file names before its rows: a line of its own, or a number in a comment."""
+    for line in head.split("\n"):
+        if line.strip() and not line.lstrip().startswith("#"):
+            return crs_of_line(line)
+        # The number at the end of a long text (WKT) is that of the whole system.
+        if numbers := _EPSG.findall(line):
+            return f"EPSG:{numbers[-1]}"
+    return None
 
 
 @dataclass(frozen=True)
@@ -61,18 +85,22 @@ class PositionLog:
         crs: str | None = None,
         notes: Sequence[str] = (),
     ) -> PositionLog:
-        """Make a log in the order of time, without positions of a time that an earlier one has.
+        """Make a log in the order of time, without rows that have no position or the time of an earlier one.
 
         Raises:
             InputError: there is no position.
         """
-        num = len(position_m)
+        total, told = len(position_m), list(notes)
+        rows = np.flatnonzero(np.isfinite(position_m).all(axis=1))
+        num = len(rows)
         if not num:
-            raise InputError(f"holds no position (read as {format})", path)
-        covariance_m2 = np.full((num, 3, 3), np.nan) if covariance_m2 is None else covariance_m2
-        rows, told = np.arange(num), list(notes)
+            lost = f"holds no position in any of {total} rows" if total else "holds no position"
+            raise InputError(f"{lost} (read as {format})", path)
+        if num < total:
+            told.append(f"{total - num} of {total} rows have no position (no fix) and are left out")
+        covariance_m2 = np.full((total, 3, 3), np.nan) if covariance_m2 is None else covariance_m2
         if times_s is not None:
-            order = np.argsort(times_s, kind="stable")
+            order = rows[np.argsort(times_s[rows], kind="stable")]
             rows = order[np.append(True, np.diff(times_s[order]) > 0)]
             if len(rows) < num:
                 told.append(f"{num - len(rows)} of {num} positions have the time of an earlier one and are left out")
@@ -80,7 +108,7 @@ class PositionLog:
             position_m[rows],
             covariance_m2[rows],
             None if times_s is None else times_s[rows],
-            None if image_name is None else tuple(image_name),
+            None if image_name is None else tuple(image_name[row] for row in rows.tolist()),
             np.asarray(line, dtype=np.int64)[rows],
             path,
             format,

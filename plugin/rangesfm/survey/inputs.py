@@ -15,7 +15,7 @@ from rangesfm.distances.tape import Marker, Tape, markers_of_photos, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.contents import sha256_of
 from rangesfm.files.folders import natural_order, walk
-from rangesfm.geometry.reference import Reference, read_reference
+from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
 from rangesfm.positions.antenna_track import AntennaTrack
@@ -23,6 +23,7 @@ from rangesfm.positions.control_points import read_control_points
 from rangesfm.positions.known_positions import LASTING_S
 from rangesfm.positions.position_formats import read_positions
 from rangesfm.positions.surveyed_positions import SurveyedPositions
+from rangesfm.positions.true_positions import read_true_positions
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
 from rangesfm.ranging.anchors.anchor_file import AnchorList, read_anchor_list
 from rangesfm.ranging.anchors.anchor_ids import ids_in_log
@@ -158,13 +159,14 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     if curve_path is not None:
         log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
-    reference = None if survey.report.reference is None else read_reference(survey.report.reference)
+    reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
     notes = (*_notes(log, anchors, survey, anchors_are_of_log=listed is None), *curve_notes)
     assumed = (
         *log.notes,
         *(() if listed is None else listed.notes),
         *positions.notes,
         *(() if tape is None else tape.notes),
+        *(() if reference is None else reference.notes),
     )
     log = log.in_time_order()
     return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions)

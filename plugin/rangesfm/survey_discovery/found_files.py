@@ -20,7 +20,7 @@ from rangesfm.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
 from rangesfm.files.text_tables import has_columns, read_head
 from rangesfm.geometry.reference import is_reference_file
 from rangesfm.positions.control_points import is_point_file
-from rangesfm.positions.position_formats import is_of_satellites
+from rangesfm.positions.position_formats import is_of_positions
 from rangesfm.ranging.anchors import anchor_file
 from rangesfm.ranging.errors.error_curve import is_error_curve_file
 from rangesfm.ranging.readers import find_log_reader, read_ranges
@@ -184,7 +184,7 @@ def _key_of(path: Path) -> str | None:
         return "scale.distances"
     if MARKS.is_such(path):
         return "scale.markers"
-    if is_of_satellites(head):
+    if is_of_positions(head):
         return POSITIONS
     unsure = None
     try:

@@ -15,10 +15,9 @@ from rangesfm.errors import InputError, printable
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, read_table
 from rangesfm.options import TIME_S
-from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.columns import read_timestamps
-from rangesfm.ranging.readers.guess import Guess, find_time, is_range, is_rising
-from rangesfm.ranging.readers.layout import ColumnSample, Layout, find_layout
+from rangesfm.ranging.readers.guess import Guess, find_time, is_range, is_rising, named_photos
+from rangesfm.ranging.readers.layout import Layout, find_layout
 from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns, columns_flag, read_list
 from rangesfm.ranging.readers.times import SECONDS_PER_UNIT
 
@@ -100,7 +99,7 @@ def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     Raises:
         UnclearListError: it may be one, but the columns are not known for sure.
     """
-    photos = [column for column in layout.columns if column.names_photos] or _photos_by_name(layout)
+    photos = [column for column in layout.columns if column.names_photos] or named_photos(layout)
     others = [column for column in layout.columns if column not in photos and column.kind != "nothing"]
     if not photos or any(map(is_range, others)):
         return None
@@ -123,18 +122,6 @@ def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
         columns = {"image_name": one.name, **guess.columns}
         choices.append(Choice(f"if {one.name} is the photo", columns_flag("image_times_columns", columns)))
     raise UnclearListError("photo times", path, layout, doubts, choices)
-
-
-def _photos_by_name(layout: Layout) -> list[ColumnSample]:
-    """Return the columns that name photos without an ending by the names of the columns."""
-    return [
-        column
-        for column in layout.columns
-        if layout.has_names
-        and terms.PHOTO & {*column.words}
-        and {*column.words} <= terms.PHOTO | terms.FILE | terms.ID
-        and (column.kind == "text" or column.is_whole)
-    ]
 
 
 def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:

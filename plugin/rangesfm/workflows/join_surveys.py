@@ -15,8 +15,8 @@ from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import require_apart, sole_writer
 from rangesfm.files.folders import real_path
-from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
+from rangesfm.positions.true_positions import read_true_positions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
@@ -257,7 +257,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress 
     site, anchors = local_site(anchors, frame, crs, survey.anchors.path)
     arms = {tag_id: arm for one in finished for tag_id, arm in one.tags_in_cam_m.items()}
     tags_in_cam_m = np.array([arms[tag_id] for tag_id in log.tag_ids])
-    reference = None if survey.report.reference is None else read_reference(survey.report.reference)
+    reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
     inputs = RangingInputs(log, tags_in_cam_m, anchors, frame, site, None, reference, ())
     as_joined = survey.changed(
         {

@@ -40,7 +40,7 @@ _ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "
 _EXPECTED = f"expected a table with {','.join(_REQUIRED)}"
 _GEOGRAPHIC = "EPSG:4979"
 # Coordinates beyond this, metres, are not local but those of a surveyed grid.
-_LOCAL_M = 500.0
+LOCAL_M = 500.0
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
     if not layout.has_names:
         largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in _AXES), default=0.0)
         # In a surveyed grid, north often comes before east.
-        if largest > _LOCAL_M or len(order) > 4:
+        if largest > LOCAL_M or len(order) > 4:
             first = _choice("if the numbers are x, y, z or east, north, height", columns)
             second = _choice("if they are north, east, height (PNEZD)", swapped)
             yield "a table without names, in which either east or north may come first", [first, second]

@@ -90,6 +90,18 @@ def find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     return [column for column in free if column not in (time, *others, *dates, *fractions)]
 
 
+def named_photos(layout: Layout) -> list[ColumnSample]:
+    """Return the columns that name photos without an ending by the names of the columns."""
+    return [
+        column
+        for column in layout.columns
+        if layout.has_names
+        and terms.PHOTO & {*column.words}
+        and {*column.words} <= terms.PHOTO | terms.FILE | terms.ID
+        and (column.kind == "text" or column.is_whole)
+    ]
+
+
 def is_named_time(column: ColumnSample) -> bool:
     """Return whether a column holds times by its name."""
     return bool(terms.TIME & {*column.words}) and _time_rank(column) is not None

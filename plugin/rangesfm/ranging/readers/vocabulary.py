@@ -99,11 +99,15 @@ POINT = _words(
     "label nom nombre nome naam bezeichnung matricule repère punto caposaldo estación punt puntnummer puntnr puntnaam"
 )
 COORDINATES = {
-    "x": _words("x e east easting eastings est este ost ostwert rechts rechtswert rw oost abscisse ascissa"),
-    "y": _words("y n north northing northings nord norte nordwert hoch hochwert hw noord ordonnée ordinata"),
+    "x": _words(
+        "x posx xpos px tx e east easting eastings est este ost ostwert rechts rechtswert rw oost abscisse ascissa"
+    ),
+    "y": _words(
+        "y posy ypos py ty n north northing northings nord norte nordwert hoch hochwert hw noord ordonnée ordinata"
+    ),
     "z": _words(
-        "z h u up height hgt ht elevation elev alt altitude höhe hoehe hauteur cote cota quota altura kote altezza "
-        "hoogte elevación altitud rl nap nn nhn über ü ortho orthometric ell ellipsoidal"
+        "z posz zpos pz tz h u up height hgt ht elevation elev alt altitude höhe hoehe hauteur cote cota quota altura "
+        "kote altezza hoogte elevación altitud rl nap nn nhn über ü ortho orthometric ell ellipsoidal"
     ),
 }
 DEGREES = {
@@ -114,6 +118,14 @@ BESIDE_COORDINATE = LENGTH_UNIT | _words(
     "coord coords coordinate coordinates koordinate coordonnée coordenada coordinata coördinaat pos position value "
     "wert local"
 )
+# Words in the names of triples that are no positions: turns, velocities, accelerations, biases.
+NO_POSITION = _words(
+    "q quat quaternion orientation rotation rot v vel velocity twist linear angular a acc accel acceleration w omega "
+    "gyro gyroscope b bias ba bg bw mag magnetometer error err"
+)
+# Words in the name of a column that is 0 where a receiver has no position.
+QUALITY = _words("quality qual fix q qf")
+BESIDE_QUALITY = _words("gps gnss position pos solution factor indicator")
 LINKING = _words("de du des del di der van of the")
 STDDEV = _words("stddev stdev std sigma sd uncertainty accuracy genauigkeit standardabweichung")
 BIAS = _words("bias offset")
