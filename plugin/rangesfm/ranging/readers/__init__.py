@@ -21,6 +21,7 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import find_quantization_m, quantization_stddev_m
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import ros, trek
+from rangesfm.ranging.readers.held import without_held
 from rangesfm.ranging.readers.printed import PRINTED
 from rangesfm.ranging.readers.reader import Reader, ReadOptions, tell_roles
 from rangesfm.ranging.readers.table import CANONICAL, MAPPED, PRESETS, TABLE, table_reader, write_ranges_csv
@@ -57,9 +58,9 @@ def read_ranges(
             with the tag.
 
     Returns:
-        All ranges in the order of the log. Those that are not positive (no measurement) are counted and left out. The
-        log's notes say what was assumed. If all ranges are whole centimetres or decimetres, the log's standard
-        deviations are at least that of the rounding.
+        All ranges in the order of the log. Those that are no measurements are counted and left out, and so are
+        repetitions of a value that a logger held until the next one came. The log's notes say what was assumed. If all
+        ranges are whole centimetres or decimetres, the log's standard deviations are at least that of the rounding.
 
     Raises:
         InputError: the file is missing, empty or damaged, is not understood for sure (the advice says what to type), or
@@ -74,7 +75,7 @@ def read_ranges(
         _check_numbers(one)
     source = paths[0] if len(paths) == 1 else paths[0].parent
     log = logs[0] if len(logs) == 1 else _join_logs(logs, source)
-    log = tell_roles(log, chosen[0][1].roles, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
+    log = tell_roles(without_held(log), chosen[0][1].roles, known_anchor_ids=anchor_ids, known_tag_ids=tag_ids)
     step_m = None if np.all(np.isnan(log.range_stddev_m)) else find_quantization_m(log.range_m)
     least_m = 0.0 if step_m is None else quantization_stddev_m(step_m)
     return replace(log, range_stddev_m=np.maximum(log.range_stddev_m, least_m))
