@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -37,12 +37,13 @@ class SilentProgress:
 
 @dataclass
 class Journal:
-    """Record of a run beside its results: seconds by stage, and warnings.
+    """Record of a run beside its results: seconds by stage, warnings and notes.
 
     Attributes:
-        progress: the listener that is told of stages and warnings.
+        progress: the listener that is told of stages, warnings and notes.
         seconds: by name of the stage.
-        warnings: one line each.
+        warnings: one line each, about what may be wrong with the result.
+        notes: one line each, about how the inputs were understood.
         start: reading of the monotonic clock, seconds.
         stage_name: stage that was announced last.
     """
@@ -50,6 +51,7 @@ class Journal:
     progress: Progress
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     start: float = field(default_factory=time.monotonic)
     stage_name: str = ""
 
@@ -74,9 +76,16 @@ class Journal:
         return {**self.seconds, "total": time.monotonic() - self.start}
 
     def warn(self, *texts: str) -> None:
-        """Tell the user these lines, and keep them for ``result.json``."""
+        """Tell the user these warnings, and keep them for ``result.json``."""
+        self._tell(texts, self.warnings)
+
+    def note(self, *texts: str) -> None:
+        """Tell the user how inputs were understood, and keep these lines for ``result.json``."""
+        self._tell(texts, self.notes)
+
+    def _tell(self, texts: Sequence[str], kept: list[str]) -> None:
         for text in texts:
-            self.warnings.append(text)
+            kept.append(text)
             self.progress.message(text)
 
 

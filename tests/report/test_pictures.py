@@ -15,7 +15,10 @@ from rangesfm.errors import InputError
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.report import write_report_pictures
 from rangesfm.report.chart import figure_spec, write_picture
+from rangesfm.report.content import Content
+from rangesfm.report.figures_mistakes import mistakes_figure
 from rangesfm.report.figures_ranges import plot_ranges
+from rangesfm.result.result_folder import read_result_folder
 
 MakeResult = Callable[..., Path]
 LOG = RangeLog.from_arrays(["a", "b", "a"], [1.0, 2.0, 3.0], timestamp_s=[1.7e9, 1.7e9 + 1, 1.7e9 + 2])
@@ -34,6 +37,17 @@ def test_every_figure_has_its_pictures_with_something_on_them(make_result: MakeR
         assert pixels.shape[1] > 900
         colorful = np.ptp(pixels, axis=2) > 60
         assert colorful.mean() > 1e-3, path.name
+
+
+def test_texts_beside_rows_stand_beside_the_panel_in_each_of_several_panels(make_result: MakeResult) -> None:
+    """The texts on the right of a row once stood on its bar."""
+    content = Content(read_result_folder(make_result(num_keyframes=20, num_ranges_per_anchor=20)))
+    figure = mistakes_figure(content)
+    assert figure is not None
+    for panel in figure_spec(figure)["concat"]:
+        texts = [layer for layer in panel["layer"] if layer["mark"]["type"] == "text"]
+        sides = {layer["mark"]["align"]: (layer["encoding"]["x"]["value"], layer["mark"]["dx"]) for layer in texts}
+        assert sides == {"right": (0, -8), "left": ("width", 8)}
 
 
 def test_plot_shows_each_anchors_ranges_over_the_time_since_the_first() -> None:

@@ -16,9 +16,11 @@ import pytest
 from PIL import Image
 from tests.outputs import names_in
 
+from rangesfm.cli import main
 from rangesfm.errors import InputError
 from rangesfm.report import write_report
 from rangesfm.report.content import Content
+from rangesfm.report.figures_ranges import residuals_over_time
 from rangesfm.report.scene import scene_of, thumbnails, view_of
 from rangesfm.result.result_folder import read_result_folder
 
@@ -318,6 +320,35 @@ def test_the_policy_allows_the_pages_own_script_and_no_other(make_result: MakeRe
     assert html.count("<script") == 3  # the other scripts hold data
 
 
+def test_notes_on_how_the_inputs_were_read_are_no_warnings(make_result: MakeResult) -> None:
+    note, warning = "uwb.csv: columns taken: range = d", "no ranges to anchor A9"
+    texts = page_of(make_result(changes={"notes": [note], "warnings": [warning]})).texts
+    first_screen, appendix = texts[: texts.index("Appendix")], texts[texts.index("Appendix") :]
+    assert f"{warning[0].upper()}{warning[1:]}." in first_screen
+    assert not any("columns taken" in text for text in first_screen)
+    assert f"U{note[1:]}." in appendix
+
+
+def test_the_page_may_have_another_title_and_author_than_the_run_was_given(make_result: MakeResult) -> None:
+    folder = make_result(changes={"settings": {"report": {"title": "Hall", "by": "A. Other"}}})
+    assert "Hall" in page_of(folder).texts
+    assert main(["report", str(folder), "--report_title", "North wing", "--report_by", "E. Muster"]) == 0
+    texts = Page((folder / "report.html").read_text(encoding="utf-8")).texts
+    before_appendix = set(texts[: texts.index("Appendix")])  # which has the settings of the run
+    assert {"North wing", "E. Muster"} <= before_appendix
+    assert not {"Hall", "A. Other"} & before_appendix
+
+
+def test_the_used_dots_of_a_figure_of_residuals_are_of_one_map(make_result: MakeResult) -> None:
+    """Dots of two maps, one over the other, had the grey of the rejected ones."""
+    content = Content(read_result_folder(make_result(num_keyframes=20, num_ranges_per_anchor=20)))
+    figure = residuals_over_time(content)
+    assert figure is not None
+    for panel in figure.panels:
+        dots = {one.name: one.color for one in panel.series if one.kind == "dots"}
+        assert dots == {"used": "after", "rejected": "red"}
+
+
 def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
     evil = '<script>alert("1")</script>'
     folder = make_result(
@@ -425,7 +456,7 @@ def test_a_long_log_makes_no_long_page(make_result: MakeResult) -> None:
     assert long < 3.5e6 + 20 * 9000
     panels = figures_in(folder)["range_residuals"]
     drawn = sum(len(series["points"]["data"]) * 3 // 4 // 8 for panel in panels for series in panel["series"])
-    assert drawn < 2 * 6_000 + 16 * 48  # dots before and after, and running medians
+    assert drawn < 6_000 + 8 + 16 * 48  # dots and running medians
     assert any("One range in 6 is drawn" in text for text in page_of(folder).texts)
 
 

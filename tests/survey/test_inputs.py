@@ -43,8 +43,8 @@ def test_each_tag_has_its_lever_arm_in_the_order_of_the_log(survey: Survey) -> N
 def test_all_ranges_are_kept_and_those_between_two_of_a_kind_are_told(survey: Survey) -> None:
     inputs = read_ranging_inputs(survey.changed({"tag.lever_arms_m": {"right": RIGHT, "left": LEFT}}))
     assert inputs.log.kind.tolist() == [0, 0, 0, RangeKind.ANCHOR_ANCHOR, RangeKind.TAG_TAG]
-    assert "1 ranges are between two anchors: they are used as distances between these" in inputs.notes
-    assert "1 ranges are between two tags: they are not used" in inputs.notes
+    assert "1 ranges are between two anchors: they are used as distances between these" in inputs.assumed
+    assert "1 ranges are between two tags: they are not used" in inputs.assumed
 
 
 def test_tag_without_lever_arm_is_named_with_its_line(survey: Survey) -> None:

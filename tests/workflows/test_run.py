@@ -385,6 +385,18 @@ def test_two_surveyed_anchors_stay_as_far_apart_as_they_were_surveyed(survey: Su
     assert np.linalg.norm(first - second) == pytest.approx(np.linalg.norm(places[0] - places[1]), abs=0.01)
 
 
+def test_how_columns_were_read_is_a_note_and_no_warning(survey: Survey, tmp_path: Path) -> None:
+    log = (survey.ranges.path or Path()).read_text()
+    (tmp_path / "log.csv").write_text(log.replace("timestamp_s,anchor_id,range_m", "Zeit [s];Anker;Abstand [m]", 1))
+    lines = (tmp_path / "log.csv").read_text().splitlines()
+    (tmp_path / "log.csv").write_text("\n".join([lines[0], *(line.replace(",", ";") for line in lines[1:])]))
+    listener = Listener()
+    result = scale_model(survey.changed({"ranges.path": tmp_path / "log.csv"}), progress=listener).summary
+    assert any(text.startswith("columns taken") for text in result.notes)
+    assert not any("columns" in text for text in result.warnings)
+    assert set(result.notes) <= set(listener.messages)
+
+
 def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:
     listener = Listener()
     result = scale_model(survey.changed({"scale.method": "two-candidate"}), progress=listener).summary
@@ -401,10 +413,12 @@ def test_journal_times_stages_and_all_of_it() -> None:
     with journal.timed("quick"):
         pass
     journal.warn("careful")
+    journal.note("in feet")
     with journal.stage("scale"):
         pass
     assert listener.stages == ["scale"]
-    assert listener.messages == journal.warnings == ["careful"]
+    assert (journal.warnings, journal.notes) == (["careful"], ["in feet"])
+    assert listener.messages == ["careful", "in feet"]
     seconds = journal.all_seconds()
     assert seconds.keys() == {"scale", "quick", "total"}
     assert 0.01 <= seconds["scale"] <= seconds["total"]

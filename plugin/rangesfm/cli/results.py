@@ -73,6 +73,7 @@ def add_results_commands(commands: Commands) -> None:
         help="folder of the photos, for thumbnails (default: that of the run, beside the result)",
     )
     report.add_argument("--png", action="store_true", help="also write the figures as PNG and SVG files")
+    add_flags(report, "report.title", "report.by")
 
 
 def _add_result_argument(parser: Parser) -> None:
@@ -222,7 +223,7 @@ def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
 
     example:
       rangesfm report out
-      rangesfm report results/monday --images photos
+      rangesfm report results/monday --images photos --report_title "Hall 7"
     """
     from rangesfm.report import write_report, write_report_pictures
     from rangesfm.result.result_folder import read_result_folder
@@ -230,8 +231,9 @@ def _report(args: argparse.Namespace, progress: Progress) -> Outcome:
     source = _result_path(args)
     if args.images is not None and not args.images.is_dir():
         raise InputError("no such folder of photos", args.images)
-    pictures = write_report_pictures if args.png else lambda _: ()
-    written = [str(write_report(source, images_path=args.images)), *map(str, pictures(source))]
+    pictures, labels = write_report_pictures if args.png else lambda _: (), survey_from_arguments(args).report
+    page = write_report(source, images_path=args.images, title=labels.title, by=labels.by)
+    written = [str(page), *map(str, pictures(source))]
     result = read_result_folder(source)
     recorded = result.summary.settings.images.path
     if args.images is None and recorded is not None and result.images_path is None:

@@ -14,13 +14,16 @@ from rangesfm.result.result_folder import REPORT_NAME, read_result_folder
 __all__ = ["write_report", "write_report_of", "write_report_pictures"]
 
 
-def write_report(result_folder: AnyPath, *, images_path: AnyPath | None = None) -> Path:
+def write_report(
+    result_folder: AnyPath, *, images_path: AnyPath | None = None, title: str | None = None, by: str | None = None
+) -> Path:
     """Write ``report.html`` into the output folder of a run.
 
     Args:
         result_folder: must hold ``result.json``. ``ranges.csv``, ``images.csv``, ``reference.csv`` (in the frame of the
             map) and the models are shown where they are there.
         images_path: folder of the photos, for thumbnails; None: that of the run, if it is beside the result folder.
+        title, by: title of the page, and who made the survey; None: those that the run was given.
 
     Returns:
         Path of the page.
@@ -30,7 +33,7 @@ def write_report(result_folder: AnyPath, *, images_path: AnyPath | None = None) 
     """
     folder, images = Path(result_folder), None if images_path is None else Path(images_path)
     with sole_writer(folder):
-        return write_report_of(Content(read_result_folder(folder), images_path=images), folder)
+        return write_report_of(Content(read_result_folder(folder), images_path=images, title=title, by=by), folder)
 
 
 def write_report_of(content: Content, folder: Path) -> Path:

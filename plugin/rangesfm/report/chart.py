@@ -202,9 +202,10 @@ def _labels(panel: Panel) -> list[Spec]:
     if panel.rows:
         rows = [{"y": at, "left": left, "right": right} for at, left, right in panel.rows]
         of_left, of_right = _beside_rows(panel)
-        left, right = (-8, "right", of_left), ({"expr": "width + 8"}, "left", of_right)
-        for side, (x, align, limit) in {"left": left, "right": right}.items():
-            how = _LABEL | {"clip": False, "align": align, "limit": limit - 8}
+        # The right end is "width", because an expression has no width in a picture of several panels.
+        left, right = (0, -8, "right", of_left), ("width", 8, "left", of_right)
+        for side, (x, dx, align, limit) in {"left": left, "right": right}.items():
+            how = _LABEL | {"clip": False, "align": align, "dx": dx, "limit": limit - 8}
             layers.append(_layer("text", rows, {"x": {"value": x}, "text": {"field": side}}, **how))
     marks = [{"x": m.x, "y": m.y, "shape": _SYMBOLS[m.shape], "color": css(m.color)} for m in panel.marks]
     if marks:

@@ -44,6 +44,7 @@ class Content:
 
     Attributes:
         title: name of the result.
+        by: who made the survey; None where nobody said it.
         summary: content of ``result.json``; ``result`` reads the tables beside it.
         images_path: folder of the photos; None where it is not known.
         ranges: content of ``ranges.csv``; None without ranges.
@@ -58,19 +59,29 @@ class Content:
         cameras: intrinsics in the scaled and in the refined model.
     """
 
-    def __init__(self, result: ResultFolder, *, images_path: Path | None = None, home: Path | None = None):
+    def __init__(
+        self,
+        result: ResultFolder,
+        *,
+        images_path: Path | None = None,
+        home: Path | None = None,
+        title: str | None = None,
+        by: str | None = None,
+    ):
         """Read what the report needs.
 
         Args:
             result: the folder to read.
             images_path: folder of the photos, for thumbnails; None: that of the run, if it is beside the result.
             home: folder that names the result, where the result is still in a temporary folder; None: its own folder.
+            title, by: None: those that the run was given.
 
         Raises:
             InputError: a file of the result is there but cannot be read.
         """
         self.result, self.summary = result, result.summary
-        self.title = self.summary.settings.report.title or _title(real_path(home or result.path))
+        given = self.summary.settings.report
+        self.title, self.by = title or given.title or _title(real_path(home or result.path)), by or given.by
         self.images_path = images_path or result.images_path
         self.ranges = result.read(RangesAsUsed)
         self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)

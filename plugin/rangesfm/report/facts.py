@@ -23,11 +23,10 @@ class Fact(NamedTuple):
 
 def facts_of(content: Content) -> list[Fact]:
     """Return the facts about a result that are known."""
-    summary = content.summary
     found = (
         Fact("What was done", _what(content)),
         Fact("When", _when(content)),
-        Fact("By", summary.settings.report.by or ""),
+        Fact("By", content.by or ""),
         Fact("Coordinates", _coordinates(content)),
         Fact("Computed", _computed(content)),
     )

@@ -37,15 +37,18 @@ _COLORS = {"measured": "rejected", "scaled": "before", "refined": "after"}
 
 
 def residuals_over_time(content: Content) -> Figure | None:
-    """Return the figure of range residuals over time, before and after the refinement, with a panel for each anchor."""
+    """Return the figure of range residuals over time, with a panel for each anchor.
+
+    The dots are of the final map alone: those of two maps, one over the other, would have the colour of neither.
+    """
     ranges = content.ranges
     if ranges is None or not _of_used(ranges):
         return None
     panels = tuple(_residual_panel(content, ranges, anchor_id) for anchor_id in in_natural_order(ranges.anchor_id))
     caption = (
-        "Range residuals (predicted minus measured) over time, with their running median. A steady offset is a bias; "
-        "a slow wave is drift of the map or an error of the time offset. Values beyond an axis are drawn at its edge."
-        + _thinned(len(ranges.status))
+        "Range residuals (predicted minus measured) over time: dots of the final map, and running medians of the "
+        "ranges used. A steady offset is a bias; a slow wave is drift of the map or an error of the time offset. "
+        "Values beyond an axis are drawn at its edge." + _thinned(len(ranges.status))
     )
     return Figure("range_residuals", caption, panels, layout="panels", table="ranges")
 
@@ -99,7 +102,7 @@ def absolute_errors(content: Content) -> Figure | None:
         "those of this map." + _thinned(len(rows)),
         "Absolute range errors over time",
         (time_label, "absolute error m"),
-        [*dots, *(_median(name, errors, x_range) for name, errors in points.items())],
+        [*dots, *(_median(name, _COLORS[name], errors, x_range) for name, errors in points.items())],
         table="range_errors",
         x_range=x_range,
         y_range=(0.0, 1.1 * max(float(np.nanquantile(sizes, 0.98)), 1e-3)),
@@ -122,9 +125,12 @@ def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> P
         f"Range residuals of anchor {anchor_id} over time",
         (time_label, "residual m"),
         (
-            Series("rejected", "rejected", final[is_rejected & is_drawn]),
-            *(Series(name, _COLORS[name], of_model[is_used & is_drawn]) for name, of_model in points.items()),
-            *(_median(name, of_model[is_used], time_range) for name, of_model in points.items()),
+            Series("used", "after", final[is_used & is_drawn]),
+            Series("rejected", "red", final[is_rejected & is_drawn]),
+            *(
+                _median(f"{name}, median", _COLORS[name], of_model[is_used], time_range)
+                for name, of_model in points.items()
+            ),
         ),
         x_range=time_range,
         y_range=(-limit, limit),
@@ -133,8 +139,8 @@ def _residual_panel(content: Content, ranges: RangesAsUsed, anchor_id: str) -> P
     )
 
 
-def _median(name: str, points: Array, x_range: Range) -> Series:
-    return Series(name, _COLORS[name], running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False)
+def _median(name: str, color: str, points: Array, x_range: Range) -> Series:
+    return Series(name, color, running_median(points, x_range, NUM_MEDIAN_BINS), "line", is_data=False)
 
 
 def _thinned(num: int) -> str:

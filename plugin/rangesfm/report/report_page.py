@@ -73,7 +73,7 @@ _APPENDIX: dict[tuple[str, str], tuple[_Maker, ...]] = {
         *(figures_scale.candidates, report_tables.two_candidates),
     ),
     ("run", "How it was computed"): (
-        *(report_tables.stages, report_tables.refinement, report_tables.versions),
+        *(report_tables.stages, report_tables.refinement, report_tables.versions, report_tables.notes),
         *(report_tables.intrinsics, report_tables.inputs, report_tables.settings),
     ),
 }

@@ -18,7 +18,7 @@ from rangesfm.files.folders import natural_order
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.content import Content, in_natural_order
-from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, signed
+from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, sentence, signed
 from rangesfm.result.entries import AnchorEntry, MistakeEntry, median, rms, rmse_heading
 from rangesfm.survey.settings import KEYS
 
@@ -312,6 +312,11 @@ def intrinsics(content: Content) -> ReportTable:
         for name, before, after in camera.parameters
     ]
     return ReportTable("Cameras", header[:num_columns], rows)
+
+
+def notes(content: Content) -> ReportTable:
+    """Return the table of how the inputs were understood."""
+    return ReportTable("How the inputs were understood", [], [[sentence(note)] for note in content.summary.notes])
 
 
 def inputs(content: Content) -> ReportTable:

@@ -47,6 +47,8 @@ class ResultSummary(Record):
         versions: of the software, by name.
         seconds: by stage, also of stages that an earlier run did, and of this run in total ("total").
         computed: date and time of the end of the run, ISO 8601 in UTC; null for results of earlier versions.
+        warnings: what may be wrong with the result.
+        notes: how the inputs were understood.
     """
 
     NAME: ClassVar[str] = "result.json"
@@ -76,6 +78,7 @@ class ResultSummary(Record):
     seconds: dict[Text, NumberOrNull]
     computed: entries.Time | None = None
     warnings: tuple[Text, ...]
+    notes: tuple[Text, ...] = ()
 
     def __repr__(self) -> str:
         """Return the accuracy and the verdict of the map on one line."""

@@ -70,8 +70,8 @@ class RangingInputs:
         site: frame of the anchors' positions.
         tape: taped distances; None if not given.
         reference: true positions; None if not given.
-        notes: lines that the user should know.
-        assumed: lines about how log and anchor file were read.
+        notes: warnings for the user.
+        assumed: lines about how the files were read.
         positions: known positions of marks, in the frame of the anchors.
     """
 
@@ -146,7 +146,8 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     frame = survey.anchors.frame or default_anchor_frame(anchors)
     site, anchors = local_site(anchors, frame, survey.anchors.crs, survey.anchors.path)
     site, positions = _surveyed_positions(survey, site, anchors, frame)
-    if frame != "unknown" and all(anchor.position_m is None for anchor in anchors):
+    is_placed = any(anchor.position_m is not None for anchor in anchors)
+    if frame != "unknown" and not is_placed:
         raise InputError(
             f"anchor frame {frame!r} needs anchor positions and there are none: give anchors.csv, or frame unknown",
             survey.anchors.path,
@@ -160,9 +161,11 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
     tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
-    notes = (*_notes(log, anchors, survey, anchors_are_of_log=listed is None), *curve_notes)
+    notes = (*_warnings(log, anchors, survey), *curve_notes)
     assumed = (
         *log.notes,
+        *_kinds_of_ranges(log),
+        *(["the anchor positions are those in the log"] if listed is None and is_placed else ()),
         *(() if listed is None else listed.notes),
         *positions.notes,
         *(() if tape is None else tape.notes),
@@ -447,7 +450,19 @@ def _check_anchors_known(log: RangeLog, anchors: Sequence[Anchor], survey: Surve
         )
 
 
-def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_are_of_log: bool) -> list[str]:
+def _kinds_of_ranges(log: RangeLog) -> Iterator[str]:
+    """Yield lines about the records of a log that are no ranges between a tag and an anchor."""
+    for kind, what in (
+        (RangeKind.ANCHOR_ANCHOR, "anchors: they are used as distances between these"),
+        (RangeKind.TAG_TAG, "tags: they are not used"),
+    ):
+        if num := int(np.count_nonzero(log.kind == kind)):
+            yield f"{num} ranges are between two {what}"
+    if log.num_no_measurement:
+        yield f"{log.num_no_measurement} records of the log have no measurement"
+
+
+def _warnings(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> list[str]:
     # With use_anchors, the ranges to other anchors were left out on purpose.
     silent = [
         anchor.anchor_id for anchor in anchors if not survey.anchors.use and anchor.anchor_id not in log.anchor_ids
@@ -455,16 +470,6 @@ def _notes(log: RangeLog, anchors: Sequence[Anchor], survey: Survey, *, anchors_
     notes = [*([f"no ranges to anchor {', '.join(silent)}"] if silent else [])]
     silent = [tag_id for tag_id in survey.tag.lever_arms_m if tag_id not in log.tag_ids and survey.tag.tag_id is None]
     notes += [f"no ranges of tag {', '.join(silent)}"] if silent else []
-    for kind, what in (
-        (RangeKind.ANCHOR_ANCHOR, "anchors: they are used as distances between these"),
-        (RangeKind.TAG_TAG, "tags: they are not used"),
-    ):
-        if num := int(np.count_nonzero(log.kind == kind)):
-            notes.append(f"{num} ranges are between two {what}")
-    if anchors_are_of_log and any(anchor.position_m is not None for anchor in anchors):
-        notes.append("the anchor positions are those in the log")
-    if log.num_no_measurement:
-        notes.append(f"{log.num_no_measurement} records of the log have no measurement")
     if num := log.num_restarts:
         notes.append(
             f"the log's times go back {num} time{'s' * (num > 1)} by a quarter of its length or more: was its clock "

@@ -48,7 +48,8 @@ class ImageTimes:
         resolution_s: the finest step of that clock as written down, at least 0.001.
         source: "csv", "rate", "exif" or "file_names".
         num_left_out: photos that have no time, or the same time as another photo.
-        notes: one-line remarks on these times for the user.
+        notes: warnings for the user, one line each.
+        assumed: lines about how the times were read.
     """
 
     image_names: tuple[str, ...]
@@ -57,6 +58,7 @@ class ImageTimes:
     source: str
     num_left_out: int = 0
     notes: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.image_names)
@@ -140,7 +142,7 @@ def times_at_rate(names: Sequence[str], rate_hz: float) -> ImageTimes:
     """
     ordered = sorted(names, key=natural_order)
     note = f"image times are by the given rate of {rate_hz:g} photos a second, from {ordered[0]} to {ordered[-1]}"
-    return ImageTimes(tuple(ordered), np.arange(len(ordered)) / rate_hz, _FINEST_RESOLUTION_S, "rate", notes=(note,))
+    return ImageTimes(tuple(ordered), np.arange(len(ordered)) / rate_hz, _FINEST_RESOLUTION_S, "rate", assumed=(note,))
 
 
 def read_image_times_csv(
@@ -191,11 +193,11 @@ def read_image_times_csv(
         first: stamps[own[0]] for first, photos in frames.items() if (own := [p for p in photos if p in stamps])
     }
     ordered = _in_time_order(stamps, names or tuple(stamps), "csv")
-    notes = [*listed.notes]
+    notes = []
     if unknown:
         num = f"{len(unknown)} of the {len(image_names)}"
         notes.append(f"{num} names in {table.path.name} belong to no photo in the folder")
-    return replace(ordered, notes=(*notes, *ordered.notes))
+    return replace(ordered, notes=(*notes, *ordered.notes), assumed=tuple(listed.notes))
 
 
 def times_from_exif(folder: AnyPath, names: Sequence[str]) -> ImageTimes:

@@ -66,7 +66,7 @@ class CheckedSurvey:
 def check_survey(survey: Survey) -> CheckedSurvey:
     """Read all inputs of a run as the run does, and return what they are and what is wrong with them."""
     checked = CheckedSurvey()
-    journal = Journal(SilentProgress(), warnings=checked.warnings)
+    journal = Journal(SilentProgress(), warnings=checked.warnings, notes=checked.assumed)
     model = survey.images.model
     photos = None
     with checked.finding_faults():
@@ -75,8 +75,6 @@ def check_survey(survey: Survey) -> CheckedSurvey:
     with checked.finding_faults():
         run = begin_run(survey, journal)
         inputs = run.inputs
-        checked.assumed += inputs.assumed
-        checked.warnings[:] = [text for text in checked.warnings if text not in inputs.assumed]
         if len(inputs.log):
             _tell_of_radio(survey, inputs, checked)
         checked.facts += _facts_of_others(survey, inputs)

@@ -45,7 +45,8 @@ def begin_run(survey: Survey, journal: Journal) -> SurveyRun:
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite(survey)
     inputs = read_ranging_inputs(survey)
-    journal.warn(*inputs.assumed, *inputs.notes, *notes_before_work(survey, inputs))
+    journal.note(*inputs.assumed)
+    journal.warn(*inputs.notes, *notes_before_work(survey, inputs))
     return SurveyRun(survey, inputs, journal)
 
 
@@ -114,7 +115,7 @@ def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = F
         taken_before = (place for place in places if earlier_photos(path, place, rate_hz=rate_hz, topic=topic))
         folder = places[0] if restart else next(taken_before, places[0])
         taken = take_photos(path, folder, rate_hz=rate_hz, topic=topic, progress=journal.progress, restart=restart)
-    journal.warn(*taken.notes)
+    journal.note(*taken.notes)
     values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
     given = survey.camera
     if taken.camera is not None and given.model is None and given.params is None and not given.others:
@@ -156,6 +157,7 @@ def find_keyframes(
         if image_times is None or (log_names_photos and not survey.images.times and image_times.num_left_out):
             return select_keyframes(names, survey.images), None
         keyframes = select_keyframes(image_times, survey.images)
+        journal.note(*image_times.assumed)
         journal.warn(*image_times.notes)
         return keyframes, image_times.of(keyframes)
 

@@ -129,6 +129,7 @@ def map_of_model(run: SurveyRun, sfm: pycolmap.Reconstruction, *, refine: bool) 
     times = None
     if run.inputs.needs_times:
         times = times_of_model(run.survey, sfm, run.survey.given_model_path)
+        run.journal.note(*times.assumed)
         run.journal.warn(*times.notes)
         tell_of_times(run, times)
     names = sorted(image.name for image in sfm.images.values())

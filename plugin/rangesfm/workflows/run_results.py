@@ -95,6 +95,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
             seconds=journal.all_seconds(),
             computed=datetime.now(timezone.utc).isoformat(timespec="seconds"),
             warnings=journal.warnings,
+            notes=journal.notes,
         )
         summary.write(staged / summary.NAME)
         if survey.report.enabled:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from tests.report.in_browser.conftest import downloaded
 
 from rangesfm.report import write_report
@@ -344,6 +346,14 @@ def test_on_paper_a_picture_stands_for_the_view(browser: Browser, page: Path) ->
     pdf = base64.b64decode(browser.command("Page.printToPDF", printBackground=True)["data"])
     assert len(re.findall(rb"/Type */Page\b", pdf)) >= 3
     assert browser.run("return document.querySelector('.printed').naturalWidth") > 300
+    # The picture has the names of the anchors, the scale bar and the grid, which stand over the view.
+    data = browser.run("return document.querySelector('.printed').src").partition(",")[2]
+    with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
+        pixels = np.asarray(picture.convert("RGB"), dtype=np.int64)
+    for selector in (".label.anchor", ".scale-bar", ".grid-cell"):
+        rgb = browser.run("return getComputedStyle(document.querySelector(arguments[0])).color", selector)
+        color = [int(part) for part in re.findall(r"\d+", rgb)[:3]]
+        assert np.count_nonzero(np.abs(pixels - color).max(axis=2) < 3) > 20, selector
     assert browser.run("return document.querySelectorAll('.chart svg').length") == NUM_CHARTS
     browser.command("Emulation.setEmulatedMedia", media="print")
     hidden: Any = browser.run("return getComputedStyle(document.querySelector('.stage canvas')).display")

@@ -1,6 +1,8 @@
 // The figures, drawn by Vega-Lite in the colours of the page, as wide as there is room.
 
 const POINTER_PX = 24;
+const PAPER_PX = 700; // width of a printed page, and of each of its two columns
+const COLUMN_ON_PAPER_PX = 339;
 
 class Chart {
   constructor(node, chart) {
@@ -39,14 +41,14 @@ class Chart {
     return Number(value.toPrecision(Math.min(numDigits + Math.max(0, Math.ceil(Math.log10(share))), 17)));
   }
 
-  #size() {
-    const width = Math.max(this.node.clientWidth - this.sides, 80);
+  #size(room = this.node.clientWidth) {
+    const width = Math.max(room - this.sides, 80);
     return [width, this.keeps_shape ? Math.round((width * this.spec.height) / this.spec.width) : this.spec.height];
   }
 
-  /** Makes the chart as wide as there is room. */
-  fit() {
-    const [width, height] = this.#size();
+  /** Makes the chart as wide as there is room, by default that in the window. */
+  fit(room) {
+    const [width, height] = this.#size(room);
     this.view.width(width).height(height).run();
   }
 
@@ -89,9 +91,10 @@ function makeFigures(figures) {
   addEventListener("beforeprint", () => {
     for (const chart of chartOf.values()) {
       chart.draw();
-      chart.fit();
+      chart.fit(chart.node.closest(".wide > .single") === null ? COLUMN_ON_PAPER_PX : PAPER_PX);
     }
   });
+  addEventListener("afterprint", () => chartOf.forEach((chart) => chart.fit()));
   for (const [name, charts] of Object.entries(figures)) {
     const nodes = document.querySelectorAll(`#${name} .chart`);
     figures[name] = charts.map((chart, i) => new Chart(nodes[i], chart));

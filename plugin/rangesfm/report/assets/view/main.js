@@ -109,13 +109,45 @@ class View {
     // A printed page has a picture in place of the view.
     addEventListener("beforeprint", () => {
       this.stage.draw(); // the canvas can be read only directly after it is drawn
-      this.root.querySelector(".printed").src = this.canvas.toDataURL("image/png");
+      const texts = this.root.querySelectorAll(".stage .label, .scale-bar, .grid-cell");
+      this.root.querySelector(".printed").src = pictureWith(texts, this.canvas);
     });
     this.slider = this.root.querySelector("[name=photo]");
     if (this.slider === null) return;
     this.photo = new PhotoPanel(this.root.querySelector(".photo"), this.scene);
     this.choose(Number(this.slider.value));
   }
+}
+
+const PRINTED_TEXT = 1.6; // the view is about that much smaller on paper than in a window
+
+/** Returns a canvas as a picture (data URI), with the texts that the page shows over it. */
+function pictureWith(texts, canvas) {
+  const { width, height } = canvas;
+  const picture = Object.assign(document.createElement("canvas"), { width, height });
+  const draw = picture.getContext("2d");
+  draw.drawImage(canvas, 0, 0);
+  const on = canvas.getBoundingClientRect();
+  draw.scale(width / on.width, height / on.height);
+  draw.translate(-on.x, -on.y);
+  draw.textBaseline = "middle";
+  for (const text of texts) {
+    const box = text.getBoundingClientRect();
+    const { fontWeight, fontSize, fontFamily, color, backgroundColor, borderBottomWidth } = getComputedStyle(text);
+    const [size, line] = [PRINTED_TEXT * parseFloat(fontSize), parseFloat(borderBottomWidth)];
+    draw.font = `${fontWeight} ${size}px ${fontFamily}`;
+    const wide = draw.measureText(text.textContent).width;
+    // A label begins at its place; scale bar and grid keep their middle, as far as the picture has room, and stand lower.
+    const isLabel = text.classList.contains("label");
+    const middle = Math.max(on.left + 8, Math.min(box.left + (box.width - wide) / 2, on.right - wide - 8));
+    const [left, y] = isLabel ? [box.left + 5, (box.top + box.bottom) / 2] : [middle, box.bottom - line - 0.65 * size];
+    draw.fillStyle = backgroundColor;
+    draw.fillRect(left - 4, y - 0.65 * size, wide + 8, 1.3 * size);
+    draw.fillStyle = color;
+    draw.fillRect(box.left, box.bottom - line, box.width, line);
+    draw.fillText(text.textContent, left, y);
+  }
+  return picture.toDataURL("image/png");
 }
 
 /** Unfolds all sections but the appendix while the page is printed. */
