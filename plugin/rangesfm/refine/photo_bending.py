@@ -22,12 +22,16 @@ from rangesfm.ranging.errors.bending import (
     bending_part,
     without_similarity,
 )
+from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
-# independent errors of features, as in simulations; 8 to 12 in three scenes of real photos (Strecha et al. 2008).
+# independent errors of features, as in simulations; 4 in a room of real photos, 8 to 12 in three scenes of others
+# (Strecha et al. 2008).
 _FACTOR, _SPREAD = 2.0, 0.8
+LARGEST_FACTOR = _FACTOR * float(np.exp(NORMAL_95 * _SPREAD))
+"""Largest such factor of a map whose lens fits."""
 # Standard deviation of the scale of one part of a map relative to another from which the photos do not hold them
 # together: parts of a map that share six points are held to 0.01, those that share five may have any scale.
 _HELD = 0.1

@@ -24,6 +24,7 @@ from rangesfm.diagnostics.finished_map import (
     why_broken,
 )
 from rangesfm.diagnostics.length_tests import diagnose_lengths
+from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.diagnostics.position_tests import diagnose_positions
@@ -456,13 +457,24 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     doubts += doubts_of_map(metric.kept_refinement, point_errors(metric.final))
     advice = "let the offset be searched for ([positions] time_offset)"
     doubts += [Doubt(reason, advice) for reason in metric.positions.doubts_of_clock()]
-    journal.warn(*(doubt.reason for doubt in doubts), *by_rivals)
+    of_lens = _doubts_of_lens(metric)
+    journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *by_rivals)
     doubts += known_doubts
-    against_place = (*of_place, *(doubt.reason for doubt in doubts))
+    against_place = (*(doubt.reason for doubt in of_lens), *of_place, *(doubt.reason for doubt in doubts))
     place = place_of_map(metric.estimate, metric.kept_refinement, path, against_place, bent_by_m)
     judged = replace(metric, place=place, diagnosis=diagnosis).doubted(by_rivals)
     judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
-    return judged.doubted(diagnosis.reasons)
+    # A lens that does not fit comes first, because it may look like other mistakes.
+    judged = judged.doubted(diagnosis.reasons)
+    return judged.doubted([doubt.reason for doubt in of_lens], [doubt.advice for doubt in of_lens])
+
+
+def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
+    """Return a doubt if the photos fit far better with another camera model, and lengths change with it."""
+    if not metric.final.num_points3D():
+        return ()
+    doubt = doubt_of_lens(fit_lens(metric.final), metric.estimate.uncertainty.half_width_95)
+    return () if doubt is None else (doubt,)
 
 
 def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array) -> Diagnosis:

@@ -1,0 +1,182 @@
+"""Test of the lens: whether the photos ask for a richer camera model, and lengths in the map change with it.
+
+A lens that does not fit its camera model bends the map, and the residuals of ranges or points hardly show it. So the
+photos are asked themselves: all of them are adjusted again, first with the cameras as they are, then with a camera
+model that has more parameters, all of them free.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.spatial.distance import pdist
+from scipy.stats import chi2
+
+from rangesfm import ceres
+from rangesfm.colmap.reprojection import point_errors
+from rangesfm.diagnostics.finished_map import Doubt
+from rangesfm.diagnostics.scale_bound import RISK
+from rangesfm.geometry.similarity import align_points
+from rangesfm.refine.bundle_adjustment import keyframe_centers
+from rangesfm.refine.photo_bending import LARGEST_FACTOR
+from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
+
+# For each of COLMAP's camera models one that contains it. All others are tested with other parameters of their own.
+_RICHER = {
+    "SIMPLE_PINHOLE": "OPENCV",
+    "PINHOLE": "OPENCV",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "OPENCV": "FULL_OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "OPENCV_FISHEYE": "THIN_PRISM_FISHEYE",
+}
+# Parameters that the richer models have more of: f is fx and fy, and a single k is k1.
+_ORIGIN = {"fx": "f", "fy": "f", "k1": "k"}
+_MAX_NUM_ITERATIONS = 30
+# Relative decrease of the cost at which an adjustment ends.
+_FUNCTION_TOLERANCE = 1e-4
+# Largest number of points between which lengths are compared.
+_MAX_NUM_POINTS = 300
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """The photos' fit with the cameras as they are and with richer ones.
+
+    Attributes:
+        models, richer_models: names of the camera models.
+        error_px, richer_error_px: medians of the points' reprojection errors.
+        gain: decrease of the sum of squares, over the variance with the richer ones.
+        num_params: parameters of the richer ones.
+        change_95: relative change of lengths in the map that 95 % of them do not exceed.
+    """
+
+    models: str
+    richer_models: str
+    error_px: float
+    richer_error_px: float
+    gain: float
+    num_params: int
+    change_95: float
+
+    @property
+    def is_by_chance(self) -> bool:
+        """Return whether so much may be gained with a lens that fits.
+
+        Errors of real features are alike in neighbouring photos, so that they bend a map by a multiple of what
+        independent errors would. The gain grows with its square.
+        """
+        return bool(self.gain < LARGEST_FACTOR**2 * chi2.isf(RISK, self.num_params))
+
+
+def fit_lens(model: pycolmap.Reconstruction) -> LensFit | None:
+    """Return the fit with richer cameras; None where the points are too few to tell, or the solver fails.
+
+    Args:
+        model: with points; it is not changed.
+    """
+    own = pycolmap.Reconstruction(model)
+    before = _adjust(own, lens_is_free=False)
+    richer = pycolmap.Reconstruction(own)
+    for camera in richer.cameras.values():
+        _enrich(camera)
+    num_params = sum(len(camera.params) for camera in richer.cameras.values())
+    after = _adjust(richer, lens_is_free=True)
+    if before is None or after is None:
+        return None
+    return LensFit(
+        _names_of_models(own),
+        _names_of_models(richer),
+        point_errors(own).median_px,
+        point_errors(richer).median_px,
+        gain=(before.final_cost - after.final_cost) * after.num_residuals / after.final_cost,
+        num_params=num_params,
+        change_95=_change_of_lengths(own, richer),
+    )
+
+
+def doubt_of_lens(fit: LensFit | None, half_width_95: float) -> Doubt | None:
+    """Return a doubt if the lens does not fit, and lengths are wrong by more than a good map's because of it.
+
+    They are if they change by more than the scale's interval, or by more than any good scale's.
+
+    Args:
+        half_width_95: of the scale's interval, relative.
+    """
+    if fit is None or fit.is_by_chance or fit.change_95 <= min(half_width_95, DOUBTFUL_ABOVE):
+        return None
+    is_richer = fit.models != fit.richer_models
+    other = fit.richer_models if is_richer else "other parameters"
+    reason = (
+        f"the lens is not as the camera model {fit.models} has it: with {other}, the map fits the photos to "
+        f"{fit.richer_error_px:.2f} px instead of {fit.error_px:.2f} px, and lengths in it change by up to "
+        f"{100 * fit.change_95:.1f} %"
+    )
+    calibrate = "calibrate the camera and give model and params in [camera]"
+    again = f"map the photos again with --camera_model {fit.richer_models}, or " if is_richer else ""
+    return Doubt(reason, again + calibrate)
+
+
+def _enrich(camera: pycolmap.Camera) -> None:
+    """Give a camera the model that contains its own, with parameters that mean the same."""
+    if (name := _RICHER.get(camera.model_name)) is None:
+        return
+    known = dict(zip(_names_of_params(camera), camera.params, strict=True))
+    other = pycolmap.Camera.create_from_model_name(camera.camera_id, name, 1.0, camera.width, camera.height)
+    params = [known.get(param, known.get(_ORIGIN.get(param, ""), 0.0)) for param in _names_of_params(other)]
+    camera.model, camera.params = other.model, params
+
+
+def _names_of_params(camera: pycolmap.Camera) -> list[str]:
+    return [name.strip() for name in camera.params_info.split(",")]
+
+
+def _names_of_models(model: pycolmap.Reconstruction) -> str:
+    return " and ".join(sorted({camera.model_name for camera in model.cameras.values()}))
+
+
+def _adjust(model: pycolmap.Reconstruction, *, lens_is_free: bool) -> Any:
+    """Adjust all photos of a model in place and return Ceres' summary.
+
+    None where hardly anything takes part, the photos fit without any error, or the solver fails.
+    """
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_sensor_from_rig=False)
+    options.refine_focal_length = options.refine_extra_params = options.refine_principal_point = lens_is_free
+    solver = options.ceres.solver_options
+    solver.max_num_iterations, solver.num_threads = _MAX_NUM_ITERATIONS, 1  # so that every run says the same
+    solver.function_tolerance, solver.gradient_tolerance = _FUNCTION_TOLERANCE, 0.0
+    options.ceres.solver_options = solver
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1  # wrong matches should not outweigh a lens
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    if adjuster.problem.num_residuals() <= adjuster.problem.num_parameters():
+        return None
+    summary = ceres.solve_adjuster(adjuster, lambda step: False)
+    return summary if summary.IsSolutionUsable() and summary.final_cost > 0 else None
+
+
+def _change_of_lengths(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> float:
+    """Return the relative change of lengths in the map that 95 % of the longer half do not exceed.
+
+    Lengths are between points, of those that many photos see. Keyframes alone would hide what pixels of another height
+    do to photos that were taken upright: the map becomes higher, and a level path stays as it was. The size of the
+    whole map does not count, because ranges or positions on the path give it.
+    """
+    to_model = align_points(keyframe_centers(other), keyframe_centers(model))
+    by_id = sorted(model.points3D.items())
+    lengths_of_tracks = np.array([point.track.length() for _, point in by_id])
+    often_seen = np.flatnonzero(lengths_of_tracks >= np.median(lengths_of_tracks))
+    some = often_seen[np.unique(np.linspace(0, len(often_seen) - 1, _MAX_NUM_POINTS).astype(np.int64))]
+    places = np.array([by_id[k][1].xyz for k in some])
+    others = to_model.apply(np.array([other.point3D(by_id[k][0]).xyz for k in some]))
+    lengths, other_lengths = pdist(places), pdist(others)
+    is_long = lengths >= np.median(lengths)
+    return float(np.quantile(np.abs(other_lengths[is_long] / lengths[is_long] - 1), 0.95))
