@@ -480,7 +480,8 @@ class ExportOptions(Options, table="export"):
     """Names of export formats; the message about an unknown name lists them all."""
     frame: Annotated[Literal["result", "level", "enu"], KeyMeta(flag="export_frame")] = "result"
     """Frame of the exported files. result: that of the result (site or first camera); level: z up, y along the first
-    camera's view unless it is in the site, same origin; enu: x east, y north, z up, which needs a georeferenced map."""
+    camera's view unless it is in the site, the origin near the cameras if it is far from them; enu: x east, y north,
+    z up, which needs a georeferenced map."""
     up: str = "auto"
     """Upward direction, for the frames level and enu. cameras: mean upward direction of the photos; path: perpendicular
     to the plane of the path; X,Y,Z: a direction in the result's frame; auto: z in a site frame, else as cameras."""

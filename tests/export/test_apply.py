@@ -15,7 +15,7 @@ from tests.export.models import synthesized
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
-from rangesfm.export import MetricMap, apply_to, best_similarity, export_map, refuse_metric
+from rangesfm.export import MetricMap, apply_to, best_similarity, export_map, sfm_from_files
 from rangesfm.export.ply import write_points
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.options import ExportOptions
@@ -27,7 +27,7 @@ FACES = b"\x03\x00\x00\x00\x00\x01\x00\x00\x00\x02\x00\x00\x00"
 
 
 def carry(path: Path, folder: Path) -> Path:
-    (written,) = apply_to([path], METRIC_FROM_SFM, folder)
+    (written,) = apply_to({path: METRIC_FROM_SFM}, folder)
     assert written == folder / path.name
     return written
 
@@ -91,7 +91,7 @@ def test_far_from_the_origin_a_mesh_becomes_double(tmp_path: Path) -> None:
     path = tmp_path / "mesh.ply"
     path.write_bytes(header("binary_little_endian") + vertices_as("<f4").tobytes() + FACES)
     far = Similarity(1.0, np.eye(3), np.array([2.6e6, 1.2e6, 400.0]))
-    (written,) = apply_to([path], far, tmp_path / "out")
+    (written,) = apply_to({path: far}, tmp_path / "out")
     head, _, body = written.read_bytes().partition(b"end_header\n")
     assert head.count(b"property double") == 3
     kind = np.dtype([*((n, "<f8") for n in "xyz"), *((n, "<f4") for n in ("nx", "ny", "nz")), ("red", "u1")])
@@ -197,7 +197,7 @@ def test_what_a_refinement_bent_is_said(sfm: pycolmap.Reconstruction) -> None:
 def test_what_cannot_be_carried_over_is_refused(name: str, content: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError) as refused:
-        apply_to([tmp_path / name], METRIC_FROM_SFM, tmp_path / "out")
+        apply_to({tmp_path / name: METRIC_FROM_SFM}, tmp_path / "out")
     assert said in str(refused.value)
     assert not list((tmp_path / "out").glob("*"))
 
@@ -206,7 +206,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text("v 1 2 3\n")
     with pytest.raises(InputError, match="would overwrite"):
-        apply_to([path], METRIC_FROM_SFM, tmp_path)
+        apply_to({path: METRIC_FROM_SFM}, tmp_path)
     assert path.read_text() == "v 1 2 3\n"
 
 
@@ -236,10 +236,10 @@ def test_a_file_that_lies_on_the_metric_map_is_not_scaled_again(
     scale: float, sfm: pycolmap.Reconstruction, tmp_path: Path
 ) -> None:
     metric = rescale(sfm, Similarity(scale, METRIC_FROM_SFM.rotation, METRIC_FROM_SFM.translation))
-    refuse_metric(written_from(sfm, tmp_path / "unscaled"), sfm, [metric])
+    sfm_from_files(written_from(sfm, tmp_path / "unscaled"), sfm, [metric])
     for path in written_from(metric, tmp_path / "metric"):
         with pytest.raises(InputError, match=r"in metres already: its .* lie on the metric map"):
-            refuse_metric([path], sfm, [metric])
+            sfm_from_files([path], sfm, [metric])
 
 
 def test_what_was_written_in_metres_says_so(sfm: pycolmap.Reconstruction, tmp_path: Path) -> None:
@@ -247,4 +247,91 @@ def test_what_was_written_in_metres_says_so(sfm: pycolmap.Reconstruction, tmp_pa
     (tmp_path / "mesh.obj").write_text("v 1 2 3\n")
     for path in (points, tmp_path / "mesh.obj"):
         with pytest.raises(InputError, match="says that it is in metres already"):
-            refuse_metric([carry(path, tmp_path / "out")], sfm, [])
+            sfm_from_files([carry(path, tmp_path / "out")], sfm, [])
+
+
+# What nerfstudio and gsplat do by default: they turn the scene, centre it and divide it by the largest coordinate.
+NORMALISED_FROM_SFM = Similarity(0.4, Rotation.from_rotvec([1.3, 0.2, -0.4]).as_matrix(), np.array([0.3, -0.6, 0.1]))
+
+
+@pytest.mark.parametrize("scale", [0.37, 4.0])
+def test_what_a_trainer_did_to_a_scene_is_undone_by_its_cameras(
+    scale: float, sfm: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    metric = rescale(sfm, Similarity(scale, METRIC_FROM_SFM.rotation, METRIC_FROM_SFM.translation))
+    paths = written_from(rescale(sfm, NORMALISED_FROM_SFM), tmp_path / "normalised")
+    named = json.loads(paths[0].read_text())
+    for camera, image in zip(named, rescale(sfm, NORMALISED_FROM_SFM).images.values(), strict=True):
+        pose = image.cam_from_world().inverse()
+        # Gaussian splatting leaves out the ending of the name.
+        camera |= {"img_name": Path(image.name).stem, "rotation": pose.rotation.matrix().tolist()}
+    paths[0].write_text(json.dumps(named))
+    nerfstudio = json.loads(paths[3].read_text())
+    for frame in nerfstudio["frames"]:
+        frame["file_path"] = f"./images/left/{frame['file_path'].removeprefix('images/')}"
+    paths[3].write_text(json.dumps(nerfstudio))
+    for path in (paths[0], paths[3], paths[4]):
+        found = sfm_from_files([path], sfm, [metric])[path]
+        assert found.scale == pytest.approx(1 / NORMALISED_FROM_SFM.scale, rel=1e-9)
+        np.testing.assert_allclose((found @ NORMALISED_FROM_SFM).apply(VERTICES), VERTICES, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.37, 4.0])
+def test_points_of_another_world_are_refused(scale: float, room: pycolmap.Reconstruction, tmp_path: Path) -> None:
+    metric = rescale(room, Similarity(scale, METRIC_FROM_SFM.rotation, METRIC_FROM_SFM.translation))
+    _, part, points, *_ = written_from(rescale(room, NORMALISED_FROM_SFM), tmp_path / "normalised")
+    larger = Similarity(1.33, np.eye(3), np.zeros(3))
+    _, _, stretched, *_ = written_from(rescale(room, larger), tmp_path / "stretched")
+    _, _, elsewhere, *_ = written_from(synthesized(6, 400, seed=9), tmp_path / "another")
+    for path in (part, points, stretched, elsewhere):
+        with pytest.raises(InputError, match="lies on neither the unscaled model nor the metric map"):
+            sfm_from_files([path], room, [metric])
+
+
+def test_cameras_of_photos_with_the_same_names_in_another_scene_are_refused(
+    sfm: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    other = synthesized(6, 40, seed=9)
+    assert {image.name for image in other.images.values()} == {image.name for image in sfm.images.values()}
+    *_, nerfstudio, model = written_from(other, tmp_path / "other")
+    for path in (nerfstudio, model):
+        with pytest.raises(InputError, match="lies on neither"):
+            sfm_from_files([path], sfm, [rescale(sfm, METRIC_FROM_SFM)])
+
+
+def walls(num: int, seed: int, noise: float = 0.0) -> Array:
+    """Places on the walls, the floor and the furniture of a room."""
+    rng = np.random.default_rng(seed)
+    boxes = np.array([[[0, 0, 0], [8, 6, 3]], [[1, 1, 0], [3, 2, 0.8]], [[5, 3, 0], [5.6, 5, 2]]], dtype=np.float64)
+    low, high = boxes[rng.choice(3, num, p=[0.8, 0.1, 0.1])].swapaxes(0, 1)
+    places = rng.uniform(low, high)
+    axis, side = rng.integers(0, 3, num), rng.integers(0, 2, num)
+    places[np.arange(num), axis] = np.where(side[:, None], high, low)[np.arange(num), axis]
+    return np.asarray(places + noise * rng.standard_normal((num, 3)))
+
+
+@pytest.fixture
+def room() -> pycolmap.Reconstruction:
+    """A model whose points are on surfaces, with the noise of reconstructed points."""
+    model = synthesized(6, 600, seed=2)
+    for point, at in zip(model.points3D.values(), walls(600, seed=1, noise=0.03), strict=True):
+        point.xyz = at
+    return model
+
+
+def test_a_mesh_of_the_scene_or_of_a_part_of_it_has_other_vertices_and_lies_on_the_model(
+    room: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    metric, dense = rescale(room, METRIC_FROM_SFM), walls(20_000, seed=5, noise=0.01)
+    clutter = np.random.default_rng(0).uniform(-8, 16, (8_000, 3))
+    corner = dense[(dense[:, 0] < 3) & (dense[:, 1] < 2)]
+    for name, vertices in {"all": dense, "part": corner, "more": np.vstack([dense, clutter])}.items():
+        path = tmp_path / f"{name}.obj"
+        for similarity, is_metric in ((IDENTITY, False), (METRIC_FROM_SFM, True)):
+            rows = similarity.apply(vertices).tolist()
+            path.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in rows))
+            if is_metric:
+                with pytest.raises(InputError, match="is in metres already"):
+                    sfm_from_files([path], room, [metric])
+            else:
+                assert sfm_from_files([path], room, [metric])[path] is IDENTITY

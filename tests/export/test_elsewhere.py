@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from tests.export.models import centers_of, read_ply, synthesized, xyz
 
 from rangesfm.errors import InputError
-from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, MetricMap, export_map
+from rangesfm.export import COVARIANCE_FORMATS, EXPORTERS, OFFSET_NAME, MetricMap, export_map
 from rangesfm.options import ExportOptions
 
 Array = npt.NDArray[np.float64]
@@ -127,6 +127,7 @@ def test_nerfstudio_projects_points_where_colmap_does(camera_model: str, tmp_pat
         image = model.find_image_with_name(frame["file_path"].removeprefix("images/"))
         assert image is not None
         world_from_gl = np.array(frame["transform_matrix"])
+        world_from_gl[:3, 3] += np.loadtxt(tmp_path / OFFSET_NAME)
         for point in itertools.islice(image.points2D, 5):
             if point.has_point3D():
                 xyz = model.point3D(point.point3D_id).xyz
@@ -281,7 +282,8 @@ def test_undistorted_photos_come_with_a_metric_model_in_sparse_0(tmp_path: Path)
     read = pycolmap.Reconstruction(folder / "sparse" / "0")
     assert {camera.model.name for camera in read.cameras.values()} == {"PINHOLE"}
     for name, center in centers_of(model).items():
-        np.testing.assert_allclose(centers_of(read)[name], center, rtol=1e-12)
+        offset_m = np.loadtxt(folder.parent / OFFSET_NAME)
+        np.testing.assert_allclose(centers_of(read)[name] + offset_m, center, rtol=1e-12)
         with Image.open(folder / "images" / name) as photo:
             camera = next(iter(read.cameras.values()))
             assert photo.size == (camera.width, camera.height)

@@ -20,6 +20,7 @@ from rangesfm.export import (
     COVARIANCE_FORMATS,
     EXPORTED_NAMES,
     EXPORTERS,
+    OFFSET_NAME,
     export_model,
     write_camera_positions,
     write_model,
@@ -247,7 +248,7 @@ def test_a_result_is_exported_in_its_best_form_in_every_format(
     np.testing.assert_array_equal(xyz(read_ply(paths["anchors.ply"])), [[1, 2, 3]])
     assert paths["transform_colmap_4.txt"].read_text().split()[0] == "2"
     expected_names = {name for format in formats for name in EXPORTED_NAMES[format]}
-    assert set(names_in(tmp_path / "exports")) == expected_names
+    assert set(names_in(tmp_path / "exports")) == expected_names | {OFFSET_NAME}
 
 
 def test_a_folder_without_a_metric_model_cannot_be_exported(tmp_path: Path) -> None:

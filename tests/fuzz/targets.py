@@ -154,9 +154,9 @@ def _carry(path: Path) -> Path:
     """Transform a file to another world and back, so that what is written is read again."""
     similarity = Similarity(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
     with tempfile.TemporaryDirectory() as folder:
-        (written,) = apply_to([path], similarity, Path(folder))
+        (written,) = apply_to({path: similarity}, Path(folder))
         with tempfile.TemporaryDirectory() as other_folder:
-            apply_to([written], similarity.inverse(), Path(other_folder))
+            apply_to({written: similarity.inverse()}, Path(other_folder))
     return path
 
 

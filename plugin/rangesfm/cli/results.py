@@ -121,7 +121,8 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm export out --formats tum,ply,nerfstudio --frame level \
         --output_path exported
     """
-    from rangesfm.export import NERFSTUDIO_IMAGES
+    from rangesfm.export import NERFSTUDIO_IMAGES, TRAINERS_FORMATS
+    from rangesfm.export.offset import offset_note
     from rangesfm.workflows.export_result import apply_result, export_result
 
     source = _result_path(args)
@@ -131,14 +132,14 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
         written = export_result(source, options.formats, destination, options=options, images_path=args.images)
         if "nerfstudio" in options.formats and not (destination / NERFSTUDIO_IMAGES).is_dir():
             notes = [f"the photos are not there: give --images, or copy them to {destination / NERFSTUDIO_IMAGES}"]
+        is_moved = options.frame == "level" or not {*TRAINERS_FORMATS}.isdisjoint(options.formats)
     else:
         if "formats" in options.model_fields_set:
             raise InputError("--apply_to writes files in their own formats: leave out --formats")
         destination = Path(args.output_path or source / "applied")
-        written, residual_m = apply_result(source, list(map(Path, args.apply_to)), destination, options=options)
-        fitted = f"{residual_m:.3f}"  # smaller bends than a millimetre are rounding
-        note = f"the similarity fits the cameras to {fitted} m (rms): the refinement has bent the map"
-        notes = [note] if float(fitted) else []
+        written, told = apply_result(source, list(map(Path, args.apply_to)), destination, options=options)
+        notes, is_moved = list(told), options.frame == "level"
+    notes += offset_note(destination) if is_moved else []
     return Outcome([*map(str, written), *_frame_note(options, source), *notes])
 
 

@@ -9,7 +9,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, RangesfmError, failure_of
-from rangesfm.export.apply import apply_to, best_similarity, refuse_metric
+from rangesfm.export.apply import apply_to, best_similarity, sfm_from_files
 from rangesfm.export.colmap import (
     write_camera_positions,
     write_model,
@@ -19,7 +19,8 @@ from rangesfm.export.colmap import (
     write_undistorted,
 )
 from rangesfm.export.gis import write_features, write_laz
-from rangesfm.export.metric_map import MetricMap, in_frame
+from rangesfm.export.metric_map import MetricMap, in_frame, near_origin
+from rangesfm.export.offset import OFFSET_NAME, write_offset
 from rangesfm.export.photogrammetry import NERFSTUDIO_IMAGES, write_nerfstudio, write_opensfm, write_opf
 from rangesfm.export.ply import write_anchor_vertices, write_cameras, write_points
 from rangesfm.export.trajectories import COVARIANCE_FORMATS, write_covariances, write_kitti, write_trajectory
@@ -33,13 +34,15 @@ __all__ = [
     "EXPORTED_NAMES",
     "EXPORTERS",
     "NERFSTUDIO_IMAGES",
+    "OFFSET_NAME",
+    "TRAINERS_FORMATS",
     "MetricMap",
     "apply_to",
     "best_similarity",
     "check_formats",
     "export_map",
     "export_model",
-    "refuse_metric",
+    "sfm_from_files",
     "write_camera_positions",
     "write_model",
     "write_points",
@@ -101,6 +104,9 @@ EXPORTED_NAMES: dict[str, tuple[str, ...]] = {
 }
 """Names of the files and folders that each format writes into the folder."""
 
+TRAINERS_FORMATS = ("nerfstudio", "undistorted")
+"""Formats for programs that compute with 32 bits, as trainers do. Their origin is near the cameras."""
+
 
 def export_model(
     reconstruction: pycolmap.Reconstruction,
@@ -134,20 +140,26 @@ def export_model(
 def export_map(map_: MetricMap, output_path: Path, options: ExportOptions) -> tuple[Path, ...]:
     """Write a map in the formats and the frame of the options. Otherwise as ``export_model``.
 
-    A format that cannot be written does not stop those after it; the error at the end names all that failed.
+    Where the origin is moved near the cameras, ``OFFSET_NAME`` beside the files has the offset. A format that cannot be
+    written does not stop those after it; the error at the end names all that failed.
     """
     chosen = list(dict.fromkeys(options.formats))
     check_formats(chosen)
     map_ = in_frame(map_, options)
+    for_trainers = near_origin(map_)
     make_output_folder(output_path)
     written: dict[str, list[Path]] = {}
     failures: dict[str, Exception] = {}
     for name in chosen:
         try:
-            paths = EXPORTERS[name](map_, output_path)
+            paths = EXPORTERS[name](for_trainers if name in TRAINERS_FORMATS else map_, output_path)
             written[name] = [paths] if isinstance(paths, Path) else [*paths]
         except (RangesfmError, OSError) as error:
             failures[name] = error
+    moved = [name for name in written if name in TRAINERS_FORMATS or options.frame == "level"]
+    if moved:
+        names = dict.fromkeys(file for name in moved for file in EXPORTED_NAMES[name] if file != NERFSTUDIO_IMAGES)
+        write_offset(for_trainers.offset_m, names, output_path)
     if failures:
         raise _not_all(failures, written, num_chosen=len(chosen))
     return tuple(dict.fromkeys(path for paths in written.values() for path in paths))

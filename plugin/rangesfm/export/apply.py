@@ -1,12 +1,13 @@
 """Transformation of files that other programs made from the unscaled model, into the metric world.
 
 These are meshes and point clouds (PLY, OBJ), camera files (``transforms.json`` of nerfstudio, ``cameras.json`` of
-Gaussian splatting) and COLMAP models. A file that is in metres already is recognized by where its content lies.
+Gaussian splatting) and COLMAP models. Where the content of a file lies shows whether it is in the unscaled model's
+world, in metres already, or in a world of its own, as trainers that move and rescale the scene have it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
@@ -23,6 +25,7 @@ from rangesfm.export.colmap import write_model
 from rangesfm.export.metric_map import colored_points, registered_images
 from rangesfm.export.ply import read_ply, says_metres, transform_ply
 from rangesfm.files.atomic import make_output_folder, require_apart, write_text
+from rangesfm.files.photo_names import rows_of_photos
 from rangesfm.files.records import read_json, write_json
 from rangesfm.files.text_tables import read_text
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, overflow_raised, rmse
@@ -49,67 +52,210 @@ def best_similarity(sfm: pycolmap.Reconstruction, metric: pycolmap.Reconstructio
     return similarity, rmse(similarity.apply(source) - target)
 
 
-def apply_to(paths: list[Path], metric_from_sfm: Similarity, folder: Path) -> tuple[Path, ...]:
+def apply_to(metric_from_files: Mapping[Path, Similarity], folder: Path) -> tuple[Path, ...]:
     """Write each file or model folder, transformed into the metric world, into ``folder`` under its own name.
 
     Raises:
         InputError: a file has none of the known formats, or would be overwritten.
     """
-    chosen = [(path, _kind_of(path)) for path in paths]
+    paths = list(metric_from_files)
+    kinds = [_kind_of(path) for path in paths]
     for path in paths:
         require_apart(paths, folder / path.name)
     if len({path.name for path in paths}) < len(paths):
         raise InputError("two of the files to transform have the same name, expected different names")
     make_output_folder(folder)
-    return tuple(kind.transform(path, metric_from_sfm, folder / path.name) for path, kind in chosen)
+    return tuple(kind.transform(path, metric_from_files[path], folder / path.name) for path, kind in zip(paths, kinds))
 
 
-def refuse_metric(
+def sfm_from_files(
     paths: Sequence[Path], sfm: pycolmap.Reconstruction, metric: Sequence[pycolmap.Reconstruction]
-) -> None:
-    """Refuse files that lie on a metric map rather than on the unscaled one: they must not be scaled a second time.
+) -> dict[Path, Similarity]:
+    """Return for each file the similarity from its world to that of the unscaled model; most lie in that world.
 
-    Cameras are compared with the cameras of the maps, vertices with their points. How far apart two sets of places are
-    is the median distance from each to the nearest of the other, both ways, over the size of the map.
+    Cameras of photos of the model are compared with theirs. If all of them are one similarity away, as a trainer has
+    moved and rescaled the scene, it is returned. Other content is compared by where it lies, cameras with the cameras
+    of the maps and vertices with their points.
 
     Args:
         sfm: the unscaled model. metric: the metric one, in all frames in which a file may be.
 
     Raises:
-        InputError: a file is in metres already, or cannot be read.
+        InputError: a file is in metres already, lies on no map, or cannot be read.
     """
-    for path in paths:
-        kind = _kind_of(path)
-        if kind.says_metres(path):
-            raise InputError(f"says that it is in metres already, {_UNSCALED}", path)
-        places = kind.places(path)
-        places = places[np.isfinite(places).all(axis=1)]
-        of_map = _centers if kind.has_cameras else _points
-        if not len(places) or not len(of_map(sfm)):
-            continue
-        from_sfm, from_metric = _apart(places, of_map(sfm)), min(_apart(places, of_map(each)) for each in metric)
-        if from_metric < from_sfm:
-            what = "cameras" if kind.has_cameras else "vertices"
-            where = f"on the metric map ({100 * from_metric:.2g} % of its size away), not on the unscaled one"
-            raise InputError(
-                f"is in metres already: its {what} lie {where} ({100 * from_sfm:.2g} %), {_UNSCALED}", path
-            )
+    return {path: _sfm_from_file(path, sfm, metric) for path in paths}
 
 
+# Cameras are the same if they are nearer to each other than this share of the size of the map (root mean square).
+_SAME = 0.01
+_MIN_NUM_CAMERAS = 3
 _UNSCALED = "expected a file made from the unscaled model"
-_MAX_NUM_COMPARED = 50_000
+_MAX_NUM_COMPARED, _MAX_NUM_MOVED = 50_000, 3000
+# Size of the motions that are tried to see whether a file lies on a map: radians, or shares of the map's size.
+_SMALL = 0.1
+# Distance from a place of the map, in spacings of these places, from which on a vertex is beside it.
+_REACH = 2.0
+
+
+def _sfm_from_file(path: Path, sfm: pycolmap.Reconstruction, metric: Sequence[pycolmap.Reconstruction]) -> Similarity:
+    kind = _kind_of(path)
+    if kind.says_metres(path):
+        raise InputError(f"says that it is in metres already, {_UNSCALED}", path)
+    if kind.cameras is not None:
+        cameras, of_sfm = kind.cameras(path), _cameras_of(sfm)
+        if len(pairs := cameras.pairs_with(of_sfm)) >= _MIN_NUM_CAMERAS:
+            return _by_cameras(path, cameras, of_sfm, pairs, [_cameras_of(each) for each in metric])
+        places, what = cameras.centers, "cameras"
+        of_unscaled, of_metric = of_sfm.centers, [_cameras_of(each).centers for each in metric]
+    else:
+        places, what = kind.vertices(path), "vertices"
+        of_unscaled, of_metric = _points(sfm), [_points(each) for each in metric]
+    places = places[np.isfinite(places).all(axis=1)]
+    if not len(places) or not len(of_unscaled):
+        return IDENTITY
+    from_unscaled = _apart(places, of_unscaled)
+    from_metric, on = min(((_apart(places, each), k) for k, each in enumerate(of_metric)), default=(np.inf, 0))
+    is_metric = from_metric < from_unscaled
+    if not _lies_on(places, of_metric[on] if is_metric else of_unscaled):
+        raise _on_neither(what, from_unscaled, from_metric, path)
+    if is_metric:
+        raise _in_metres(what, from_metric, from_unscaled, path)
+    return IDENTITY
+
+
+def _by_cameras(
+    path: Path, cameras: _Cameras, of_sfm: _Cameras, pairs: Indices, of_metric: Sequence[_Cameras]
+) -> Similarity:
+    """Return the similarity from the world of a file to the unscaled model, by the cameras of the same photos.
+
+    Args:
+        pairs: (k, 2) indices of the same photo in ``cameras`` and ``of_sfm``.
+    """
+    given, known = cameras.subset(pairs[:, 0]), of_sfm.subset(pairs[:, 1])
+    from_unscaled = rmse(given.centers - known.centers) / known.size
+    from_metric = np.inf
+    for each in of_metric:
+        common = given.pairs_with(each)
+        if len(common) >= _MIN_NUM_CAMERAS:
+            off = given.centers[common[:, 0]] - each.centers[common[:, 1]]
+            from_metric = min(from_metric, rmse(off) / each.size)
+    if min(from_unscaled, from_metric) <= _SAME:
+        if from_metric < from_unscaled:
+            raise _in_metres("cameras", from_metric, from_unscaled, path)
+        return IDENTITY
+    scale = known.size / max(given.size, np.finfo(np.float64).tiny)
+    scaled = _Cameras(given.names, scale * given.centers, given.world_from_cam)
+    known_from_scaled = align_points(scaled.marks(known.size), known.marks(known.size))
+    left = rmse(known_from_scaled.apply(scaled.marks(known.size)) - known.marks(known.size)) / known.size
+    if not left <= _SAME:
+        raise _on_neither("cameras", from_unscaled, from_metric, path)
+    return known_from_scaled @ Similarity(scale, np.eye(3), np.zeros(3))
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:{'.2g' if share < 0.1 else '.0f'}} %"
+
+
+def _in_metres(what: str, from_metric: float, from_unscaled: float, path: Path) -> InputError:
+    where = f"on the metric map ({_percent(from_metric)} of its size away), not on the unscaled one"
+    return InputError(f"is in metres already: its {what} lie {where} ({_percent(from_unscaled)}), {_UNSCALED}", path)
+
+
+def _on_neither(what: str, from_unscaled: float, from_metric: float, path: Path) -> InputError:
+    where = f"{_percent(from_unscaled)} of the map's size away from the one and {_percent(from_metric)} from the other"
+    return InputError(
+        f"lies on neither the unscaled model nor the metric map: its {what} are {where}; another program has moved, "
+        f"turned or rescaled the scene, or it is another scene; {_UNSCALED}, in the coordinates of that",
+        path,
+    )
 
 
 def _apart(places: Array, of_map: Array) -> float:
-    """Return how far apart two sets of places are, over the median distance of those of the map from their middle."""
-    places, of_map = (each[:: 1 + len(each) // _MAX_NUM_COMPARED] for each in (places, of_map))
-    size = float(np.median(np.linalg.norm(of_map - np.median(of_map, axis=0), axis=1)))
+    """Return how far apart two sets of places are, over the size of the map.
+
+    This is the sum of the median distances from each place to the nearest one of the other set, both ways.
+    """
+    places, of_map = _some(places, _MAX_NUM_COMPARED), _some(of_map, _MAX_NUM_COMPARED)
     both_ways = (KDTree(to).query(of)[0] for to, of in ((places, of_map), (of_map, places)))
-    return sum(float(np.median(distances)) for distances in both_ways) / max(size, np.finfo(np.float64).tiny)
+    return sum(float(np.median(distances)) for distances in both_ways) / _size(of_map)
 
 
-def _centers(model: pycolmap.Reconstruction) -> Array:
-    return np.array([image.projection_center() for image in registered_images(model)]).reshape(-1, 3)
+def _lies_on(places: Array, of_map: Array) -> bool:
+    """Return whether places lie on a map, or on a part of it.
+
+    They do if those of the map are as near to them as to each other. Otherwise, as with a part of the map, they do if
+    no small motion or change of size brings more of them near to those of the map.
+    """
+    places, of_map = _some(places, _MAX_NUM_COMPARED), _some(of_map, _MAX_NUM_COMPARED)
+    tree, middle, size = KDTree(of_map), np.median(of_map, axis=0), _size(of_map)
+    neighbours = tree.query(of_map, k=2)[0][:, 1] if len(of_map) > 1 else np.zeros(1)
+    spacing = max(float(np.median(neighbours)), 1e-3 * size)
+    if np.median(KDTree(places).query(of_map)[0]) <= spacing:
+        return True
+    from_middle, reach = _some(places, _MAX_NUM_MOVED) - middle, _REACH * spacing
+
+    def near(similarity: Similarity) -> float:
+        distances = tree.query(middle + similarity.apply(from_middle), distance_upper_bound=reach)[0]
+        return float(np.mean(np.maximum(1 - distances / reach, 0.0)))
+
+    as_it_is = near(IDENTITY)
+    return as_it_is > 0 and as_it_is >= max(map(near, _small_similarities(size)))
+
+
+def _small_similarities(size: float) -> Iterator[Similarity]:
+    for sign in (-1, 1):
+        yield Similarity((1 + _SMALL) ** sign, np.eye(3), np.zeros(3))
+        for axis in sign * _SMALL * np.eye(3):
+            yield Similarity(1.0, Rotation.from_rotvec(axis).as_matrix(), np.zeros(3))
+            yield Similarity(1.0, np.eye(3), size * axis)
+
+
+def _some(places: Array, num: int) -> Array:
+    return places[:: 1 + len(places) // num]
+
+
+def _size(places: Array) -> float:
+    """Return the median distance of places (n, 3) from their middle."""
+    size = np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1))
+    return max(float(size), np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True)
+class _Cameras:
+    """n cameras: names of their photos (empty where there is none), centres (n, 3) and rotations (n, 3, 3)."""
+
+    names: Sequence[str]
+    centers: Array
+    world_from_cam: Array
+
+    @property
+    def size(self) -> float:
+        """Root mean square distance of the cameras from their mean."""
+        return max(rmse(self.centers - self.centers.mean(axis=0)), np.finfo(np.float64).tiny)
+
+    def subset(self, rows: Indices) -> _Cameras:
+        return _Cameras([self.names[k] for k in rows.tolist()], self.centers[rows], self.world_from_cam[rows])
+
+    def marks(self, distance: float) -> Array:
+        """Return the centres, and points at a distance from each along its axes: together they show where it looks."""
+        ends = self.centers[:, None] + distance * np.swapaxes(self.world_from_cam, 1, 2)
+        return np.concatenate([self.centers, ends.reshape(-1, 3)])
+
+    def pairs_with(self, other: _Cameras) -> Indices:
+        """Return (k, 2) indices of cameras of the same photo."""
+        named = [row for row, name in enumerate(self.names) if name]
+        found = rows_of_photos([self.names[row] for row in named], other.names)
+        return np.column_stack([named, found])[found >= 0].astype(np.int64)
+
+
+def _cameras_of(model: pycolmap.Reconstruction) -> _Cameras:
+    images = registered_images(model)
+    world_from_cam = [image.cam_from_world().inverse() for image in images]
+    return _Cameras(
+        [image.name for image in images],
+        np.array([pose.translation for pose in world_from_cam]).reshape(-1, 3),
+        np.array([pose.rotation.matrix() for pose in world_from_cam]).reshape(-1, 3, 3),
+    )
 
 
 def _points(model: pycolmap.Reconstruction) -> Array:
@@ -118,11 +264,11 @@ def _points(model: pycolmap.Reconstruction) -> Array:
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of file: how to transform it, where its content lies (n, 3), and whether that is cameras or vertices."""
+    """A kind of file: how to transform it, and its cameras or else its vertices (n, 3)."""
 
     transform: Callable[[Path, Similarity, Path], Path]
-    places: Callable[[Path], Array]
-    has_cameras: bool
+    vertices: Callable[[Path], Array] = lambda path: np.zeros((0, 3))
+    cameras: Callable[[Path], _Cameras] | None = None
     says_metres: Callable[[Path], bool] = lambda path: False
 
 
@@ -182,11 +328,17 @@ def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Pa
     return target
 
 
-def _centers_of_json(path: Path) -> Array:
+def _cameras_of_json(path: Path) -> _Cameras:
     content = _moved_json(path, IDENTITY)
     if isinstance(content, dict):
-        return np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in content["frames"]]).reshape(-1, 3)
-    return np.array([camera["position"] for camera in content])
+        frames = content["frames"]
+        poses = np.array([frame["transform_matrix"] for frame in frames]).reshape(-1, 4, 4)
+        # Cameras of nerfstudio look along their -z axis, with y up.
+        rotations, names = poses[:, :3, :3] * [1.0, -1.0, -1.0], [str(frame.get("file_path", "")) for frame in frames]
+        return _Cameras(names, poses[:, :3, 3], rotations)
+    names = [str(camera.get("img_name", "")) for camera in content]
+    centers, rotations = (np.array([camera[name] for camera in content]) for name in ("position", "rotation"))
+    return _Cameras(names, centers, rotations)
 
 
 def _moved_json(path: Path, metric_from_sfm: Similarity) -> Json:
@@ -237,14 +389,11 @@ def _move_splatting(content: Json, metric_from_sfm: Similarity) -> None:
 
 
 _KINDS = {
-    ".ply": _Kind(transform_ply, read_ply, has_cameras=False, says_metres=says_metres),
-    ".obj": _Kind(
-        _transform_obj, _vertices_of_obj, has_cameras=False, says_metres=lambda path: _IN_METRES in read_text(path)
-    ),
-    ".json": _Kind(_transform_json, _centers_of_json, has_cameras=True),
+    ".ply": _Kind(transform_ply, vertices=read_ply, says_metres=says_metres),
+    ".obj": _Kind(_transform_obj, vertices=_vertices_of_obj, says_metres=lambda path: _IN_METRES in read_text(path)),
+    ".json": _Kind(_transform_json, cameras=_cameras_of_json),
 }
 _KIND_OF_FOLDER = _Kind(
     lambda path, similarity, target: write_model(rescale(read_model(path), similarity), target),
-    lambda path: _centers(read_model(path)),
-    has_cameras=True,
+    cameras=lambda path: _cameras_of(read_model(path)),
 )

@@ -6,7 +6,7 @@ import errno
 import os
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -30,6 +30,8 @@ _MAX_ROUGHNESS = 0.3
 _MIN_AGREEMENT = 0.3
 # Horizontal part of a unit viewing direction below which the direction counts as vertical.
 _NEARLY_VERTICAL = 0.1
+# Distance from the origin from which on 32-bit numbers lose a twentieth of a millimetre, and soon more, metres.
+_FAR_M = 500.0
 # Smallest part of that mean along the normal of the path's plane. It is 0 if the photos look straight along the normal.
 _MIN_LEAN = 0.01
 
@@ -49,6 +51,7 @@ class MetricMap:
         is_site: whether the world of the model is the site frame of the anchors, where z is up by convention.
         georeference: place of the model's world on the Earth; None if unknown.
         center_covariance_m2: covariance (3, 3) of each keyframe's projection centre by photo; None if unknown.
+        offset_m: (3,) what was subtracted from all coordinates, to have the origin near the cameras.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -61,6 +64,7 @@ class MetricMap:
     is_site: bool = False
     georeference: Georeference | None = None
     center_covariance_m2: Mapping[str, Array] | None = None
+    offset_m: Array = field(default_factory=lambda: np.zeros(3))
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -128,8 +132,20 @@ def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:
     if options.frame == "result":
         return map_
     if options.frame == "level":
-        return moved(map_, Similarity(1.0, _level_from_world(map_, options.up), np.zeros(3)))
+        return near_origin(moved(map_, Similarity(1.0, _level_from_world(map_, options.up), np.zeros(3))))
     return moved(map_, map_.georeference_for("the frame 'enu' needs a georeference").enu_from_world)
+
+
+def near_origin(map_: MetricMap) -> MetricMap:
+    """Return the map with its origin among the cameras, for programs with 32-bit numbers, if it is far from them.
+
+    The offset is in whole metres, so that adding it again restores every digit.
+    """
+    centers = map_.trajectory.centers
+    middle = np.round(np.median(centers, axis=0)) if len(centers) else np.zeros(3)
+    if np.linalg.norm(middle) <= _FAR_M:
+        return map_
+    return replace(moved(map_, Similarity(1.0, np.eye(3), -middle)), offset_m=map_.offset_m + middle)
 
 
 def moved(map_: MetricMap, new_from_old: Similarity) -> MetricMap:
@@ -217,15 +233,25 @@ def _unit(vector: Array) -> Array:
 
 
 def _level_from_world(map_: MetricMap, up: str) -> Array:
-    """Return the rotation (3, 3) into a level frame: z up, y along the view of the first camera.
+    """Return the rotation (3, 3) into a level frame.
 
-    Where the first camera looks almost straight up or down, y is along the upper edge of its image instead. A map in
-    the site is only tilted, not turned about z, because its heading is that of the site.
+    A map in the site is only tilted, not turned about z, because its heading is that of the site.
     """
     vertical = up_in_world(map_.trajectory, up, is_site=map_.is_site)
     if map_.is_site:
         return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [vertical])[0].as_matrix())
-    first = map_.trajectory.world_from_cam[0]
+    return level_axes(map_.trajectory, vertical)
+
+
+def level_axes(trajectory: Trajectory, vertical: Array) -> Array:
+    """Return the rotation (3, 3) of a path's world into a level frame: z up, y along the view of the first camera.
+
+    Where the first camera looks almost straight up or down, y is along the upper edge of its image instead.
+
+    Args:
+        vertical: (3,) upward unit vector.
+    """
+    first = trajectory.world_from_cam[0]
     for ahead in (first[:, 2], -first[:, 1]):
         level = ahead - (ahead @ vertical) * vertical
         if np.linalg.norm(level) > _NEARLY_VERTICAL:

@@ -14,7 +14,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import BAD_INPUT, InputError
-from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, MetricMap, export_map, write_model
+from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, OFFSET_NAME, MetricMap, export_map, write_model
 from rangesfm.files.atomic import path_of, scratch_folder, sole_writer
 from rangesfm.files.folders import real_path
 from rangesfm.geometry.georeference import Georeference
@@ -48,7 +48,7 @@ RESULT_NAMES = (*RESULT_FILES, *MODEL_NAMES)
 
 def result_names(survey: Survey) -> set[str]:
     """Return the names that a result of this survey takes in the output folder, export formats included."""
-    return set(RESULT_NAMES).union(*(EXPORTED_NAMES[name] for name in survey.export.formats))
+    return {*RESULT_NAMES, OFFSET_NAME}.union(*(EXPORTED_NAMES[name] for name in survey.export.formats))
 
 
 def refuse_to_overwrite(survey: Survey) -> None:

@@ -9,10 +9,12 @@ from pathlib import Path
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
-from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats, export_map, refuse_metric
-from rangesfm.export.metric_map import in_frame
+from rangesfm.export import MetricMap, apply_to, best_similarity, check_formats, export_map, sfm_from_files
+from rangesfm.export.metric_map import in_frame, near_origin
+from rangesfm.export.offset import write_offset
 from rangesfm.files.atomic import sole_writer
 from rangesfm.files.contents import AnyPath
+from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import ExportOptions
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
@@ -53,7 +55,7 @@ def export_result(
 
 def apply_result(
     output_path: Path, paths: Iterable[Path], destination: Path, *, options: ExportOptions | None = None
-) -> tuple[tuple[Path, ...], float]:
+) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Transform files that were made from the unscaled model of a run into the frame of its metric model.
 
     Args:
@@ -63,27 +65,39 @@ def apply_result(
         options: of the frame; None: the defaults.
 
     Returns:
-        Paths of the files written, and the root mean square distance in metres between the refined cameras and those of
-        the best similarity. It is not zero, because the refinement has bent the map, which a similarity cannot do.
+        Paths of the files written, and notes for the user.
 
     Raises:
-        InputError: a file cannot be transformed, or is in metres already; or the result lacks its models.
+        InputError: a file cannot be transformed, is in metres already, or lies on none of the maps; or the result lacks
+            its models.
     """
     options, paths = options or ExportOptions(), list(paths)
     result = read_result_folder(output_path)
     map_ = _read_map(result, None)
-    residual_m = 0.0
+    notes = list[str]()
     sfm = result.read_model("sparse")
     if result.read_model("sparse_metric") is not None and sfm is not None:
         similarity, residual_m = best_similarity(sfm, map_.reconstruction)
         map_ = replace(map_, metric_from_sfm=similarity)
+        # It is not zero, because the refinement has bent the map, which a similarity cannot do.
+        if float(fitted := f"{residual_m:.3f}"):  # smaller bends than a millimetre are rounding
+            notes.append(f"the similarity fits the cameras to {fitted} m (rms): the refinement has bent the map")
     wanted = in_frame(map_, options)
     if map_.metric_from_sfm is None or wanted.metric_from_sfm is None:
         raise InputError("the result has no similarity from the unscaled model to the metric one", output_path)
-    metric = [each.reconstruction for each in (map_, wanted, *_in_other_frames(map_, options))]
-    refuse_metric(paths, sfm or rescale(map_.reconstruction, map_.metric_from_sfm.inverse()), metric)
+    metric = [each.reconstruction for each in (map_, wanted, near_origin(map_), *_in_other_frames(map_, options))]
+    placed = sfm_from_files(paths, sfm or rescale(map_.reconstruction, map_.metric_from_sfm.inverse()), metric)
+    notes += [
+        f"{path}: the program that made it had moved the scene and rescaled it by {1 / found.scale:.6g}; its cameras "
+        "show how, and it is undone"
+        for path, found in placed.items()
+        if found is not IDENTITY
+    ]
     with sole_writer(destination):
-        return apply_to(paths, wanted.metric_from_sfm, destination), residual_m
+        written = apply_to({path: wanted.metric_from_sfm @ found for path, found in placed.items()}, destination)
+        if options.frame == "level":
+            write_offset(wanted.offset_m, (path.name for path in written), destination)
+        return written, tuple(notes)
 
 
 def _in_other_frames(map_: MetricMap, options: ExportOptions) -> Iterator[MetricMap]:
