@@ -38,8 +38,8 @@ def test_a_good_survey_is_told_with_its_counts_times_and_what_is_assumed(folder:
         "photos in images: 17 of 96 x 64 pixels, 3 of 64 x 96 pixels",
         "ranges: 60 of 1 tag (tag) to 4 anchors (A1, A2, A3, A4) in uwb.csv (canonical)",
         "anchors: 4 of 4 have positions in anchors.csv (frame site)",
-        f"times: 20 keyframes from {PHONE_START_S:.3f} to {PHONE_START_S + 19:.3f} s (exif), "
-        f"ranges from {PHONE_START_S + 5:.3f} to {PHONE_START_S + 34.5:.3f} s",
+        "times: 20 keyframes from 2026-05-04 10:00:00.000 to 10:00:19.000 UTC (exif), "
+        "ranges from 2026-05-04 10:00:05.000 to 10:00:34.500 UTC",
     ]
     camera, upright, clocks = checked.assumed
     assert camera == "camera SIMPLE_RADIAL for 17 photos, f 115 pixels, guessed from the size of the photos"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 from rangesfm.cli.arguments import Commands, Outcome, Parser
 from rangesfm.cli.survey_flags import add_flags, position, survey_from_arguments
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.files.clock_times import span_text
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
@@ -306,7 +307,7 @@ def _places(anchors: Sequence[Anchor]) -> list[str]:
 def _time(summary: RangeSummary) -> str:
     if summary.start_s is None or summary.end_s is None:
         return "by photo name"
-    span = f"{summary.start_s:.3f} to {summary.end_s:.3f} s, {summary.end_s - summary.start_s:.3f} s long"
+    span = f"{span_text(summary.start_s, summary.end_s)}, {summary.end_s - summary.start_s:.3f} s long"
     rate = f", {summary.rate_hz:.1f} ranges a second" if summary.rate_hz is not None else ""
     return span + rate + f", largest gap {_number(summary.largest_gap_s)} s"
 

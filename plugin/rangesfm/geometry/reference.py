@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
+from rangesfm.files.clock_times import span_text
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.photo_names import rows_of_photos
 from rangesfm.files.text_tables import (
@@ -130,9 +131,9 @@ class Reference:
         assert times_s is not None
         spacing = np.diff(self.timestamps_s)
         return (
-            f"{why}positions are known from {self.timestamps_s[0]:.3f} to {self.timestamps_s[-1]:.3f} s"
+            f"{why}positions are known from {span_text(self.timestamps_s[0], self.timestamps_s[-1])}"
             + (f", {np.median(spacing):.3f} s apart" if len(spacing) else "")
-            + f", the {of} are from {times_s.min():.3f} to {times_s.max():.3f} s; positions are interpolated between "
+            + f", the {of} are from {span_text(times_s.min(), times_s.max())}; positions are interpolated between "
             f"known times at most {max_gap_s:g} s apart"
         )
 

@@ -9,6 +9,7 @@ from scipy.sparse import coo_array, csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.files.clock_times import time_text
 from rangesfm.files.photo_names import rows_of_photos, told_none
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import align_points, are_apart
@@ -123,7 +124,7 @@ class AntennaTrack:
         if self.log.image_name is not None:
             return [*self.log.image_name]
         assert self.log.timestamp_s is not None, "positions by time"
-        return [f"{time:.3f} s" for time in self.log.timestamp_s.tolist()]
+        return [time_text(time_s) for time_s in self.log.timestamp_s.tolist()]
 
     def _places(self, path: Trajectory) -> tuple[Indices, Indices, Indices, Array]:
         """Return the rows of the log that have a place, and the keyframes before and after each with its fraction."""

@@ -7,11 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.report.content import Content
 from rangesfm.report.text import count, duration, fixed
-
-# Clocks that count seconds since 1970 show a time between these; others do not tell the date.
-_FIRST_S, _LAST_S = 1e9, 1e11
 
 
 class Fact(NamedTuple):
@@ -55,7 +53,7 @@ def _what(content: Content) -> str:
 def _when(content: Content) -> str:
     """Return date and times of the photos; empty where they have no times, or their clock does not tell the date."""
     times_s = [time for time in (content.result.timestamps_s or {}).values() if np.isfinite(time)]
-    if not times_s or not _FIRST_S < min(times_s) <= max(times_s) < _LAST_S:
+    if not times_s or not all(map(are_seconds_since_1970, times_s)):
         return ""
     begin, end = (datetime.fromtimestamp(time, timezone.utc) for time in (min(times_s), max(times_s)))
     if begin.date() != end.date():

@@ -7,6 +7,7 @@ import colorsys
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.files.clock_times import time_text
 from rangesfm.ranging.errors.radio_calibration import RadioCalibration
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
@@ -172,7 +173,7 @@ def plot_ranges(log: RangeLog) -> Figure:
         hue = colorsys.hsv_to_rgb(i / len(log.anchor_ids), 0.8, 0.75)
         color = "#" + "".join(f"{round(255 * part):02x}" for part in hue)
         series.append(Series(anchor_id, color, np.column_stack([x, log.range_m])[log.anchor_index == i]))
-    label = "range" if times is None else f"s since {times.min():.3f}"
+    label = "range" if times is None else f"s since {time_text(times.min())}"
     y_range = (0.0, 1.05 * float(log.range_m.max()))
     return figure_of("ranges", "", "Ranges over time", (label, "m"), series, y_range=y_range, size=_SIZE_ALONE)
 

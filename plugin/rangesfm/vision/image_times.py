@@ -16,6 +16,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import is_plain_name
+from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.folders import IMAGE_EXTENSIONS, natural_order, walk
 from rangesfm.files.photo_names import photos_meant
@@ -26,9 +27,6 @@ from rangesfm.vision.photo_list import read_photo_list
 
 _FINEST_RESOLUTION_S = 1e-3
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL = 0x9003, 0x9291, 0x9011
-# The years 2001 to 2096 in seconds since 1970. With this interval a time in ms, us or ns is never taken for a time in
-# another unit, and neither a frame number nor a date written as digits (20260131...) is taken for a time.
-_EPOCH_S = (1e9, 4e9)
 _UNITS_PER_SECOND = (1, 10**3, 10**6, 10**9)
 _MIN_DECIMALS = 3  # a number with fewer decimals, as in scan_1.2, is more likely a version than seconds
 
@@ -324,6 +322,6 @@ def _name_stamp(name: str) -> _Stamp | None:
     if len(decimals) >= _MIN_DECIMALS:
         return _Stamp(float(number[0]), _resolution(number[0])) if TIME_S.hold(float(number[0])) else None
     for units_per_second in _UNITS_PER_SECOND:
-        if not decimals and _EPOCH_S[0] <= whole / units_per_second < _EPOCH_S[1]:
+        if not decimals and are_seconds_since_1970(whole / units_per_second):
             return _Stamp(whole / units_per_second, 1 / units_per_second)
     return None

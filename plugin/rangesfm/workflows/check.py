@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rangesfm.errors import RangesfmError
+from rangesfm.files.clock_times import span_text
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.sources.source import is_source, open_source
@@ -187,7 +188,7 @@ def _tell_of_times(
     radio_s = inputs.log.timestamp_s
     if times is not None and radio_s is None and inputs.positions.needs_times:
         first_s, last_s = times.timestamps_s[[0, -1]]
-        checked.facts.append(f"times: {len(keyframes)} keyframes from {first_s:.3f} to {last_s:.3f} s ({times.source})")
+        checked.facts.append(f"times: {len(keyframes)} keyframes from {span_text(first_s, last_s)} ({times.source})")
         return
     if times is None or radio_s is None:
         why = "the ranges name their photos" if len(inputs.log) else "there are no ranges"
@@ -195,8 +196,8 @@ def _tell_of_times(
         return
     photos_s, offset_s = times.timestamps_s, survey.ranges.time_offset_s
     checked.facts.append(
-        f"times: {len(keyframes)} keyframes from {photos_s[0]:.3f} to {photos_s[-1]:.3f} s ({times.source}), "
-        f"ranges from {radio_s.min():.3f} to {radio_s.max():.3f} s"
+        f"times: {len(keyframes)} keyframes from {span_text(photos_s[0], photos_s[-1])} ({times.source}), "
+        f"ranges from {span_text(radio_s.min(), radio_s.max())}"
     )
     at_s = radio_s + (offset_s or 0.0)
     shared_s = max(min(at_s.max(), photos_s[-1]) - max(at_s.min(), photos_s[0]), 0.0)

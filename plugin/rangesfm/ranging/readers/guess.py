@@ -15,11 +15,12 @@ from itertools import count, pairwise, product, takewhile
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.counters import continued
 from rangesfm.ranging.readers.layout import ColumnSample, Layout
 from rangesfm.ranging.readers.reader import EndpointRoles
-from rangesfm.ranging.readers.times import are_seconds_since_1970, unit_by_digits
+from rangesfm.ranging.readers.times import unit_by_digits
 
 MAX_NUM_IDS = 64
 """Largest number of tags and anchors of a survey, where a table does not say what it holds."""

@@ -35,17 +35,11 @@ _NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.
 _DAY_S = 86400.0
 # The size of a time since 1970 tells its unit: 1e11 s are three thousand years, and 1e11 ms are three years.
 _UNIT_ABOVE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-_SECONDS_SINCE_1970 = (1e9, 4e9)  # the years 2001 to 2096
 
 
 def unit_by_digits(value: float) -> str | None:
     """Return the unit of a number if it is a time since 1970, or None if it is too small for ms, us or ns."""
     return next((unit for above, unit in _UNIT_ABOVE if abs(value) > above), None)
-
-
-def are_seconds_since_1970(value: float) -> bool:
-    """Return whether a number of seconds can be a present time since 1970."""
-    return _SECONDS_SINCE_1970[0] <= value < _SECONDS_SINCE_1970[1]
 
 
 def spelt_date(text: str) -> str | None:

@@ -8,8 +8,9 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
+from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.ranging.readers.measured import REACH_M
-from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, are_seconds_since_1970, unit_by_digits
+from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
 FOOT_M = 0.3048
