@@ -40,7 +40,10 @@ Command = Callable[..., "subprocess.CompletedProcess[str]"]
 
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 TIME_OFFSET_S = 2.0
-ANCHORS_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
+SITE_M = (1012.0, 5003.0, 413.0)
+"""Where the walk is in its site. As in a real one, it is not around zero: a text in any other frame would be wrong."""
+_AROUND_WALK_M = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
+ANCHORS_M = {name: (SITE_M[0] + x, SITE_M[1] + y, SITE_M[2] + z) for name, (x, y, z) in _AROUND_WALK_M.items()}
 
 
 # On a busy machine any example may take longer than the 0.2 s that hypothesis allows.
@@ -182,15 +185,16 @@ def make_walked_survey(folder: Path, *, rate_hz: float = 1.0) -> WalkedSurvey:
     radio = Radio(rate_hz=rate_hz, range_stddev_m=0.05, time_offset_s=TIME_OFFSET_S)
     (folder / "sparse" / "0").mkdir(parents=True)
     made.reconstruction.write(folder / "sparse" / "0")
-    write_ranges_csv(simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, radio, seed=5).log, folder / "uwb.csv")
+    write_ranges_csv(simulate_ranges(path, _AROUND_WALK_M, TAG_IN_CAM_M, radio, seed=5).log, folder / "uwb.csv")
     _write_anchors(folder / "anchors.csv", np.array(list(ANCHORS_M.values())))
-    in_first_camera = (np.array(list(ANCHORS_M.values())) - made.centers_m[0]) @ made.world_from_cam[0]
+    in_first_camera = (np.array(list(_AROUND_WALK_M.values())) - made.centers_m[0]) @ made.world_from_cam[0]
     _write_anchors(folder / "anchors_first_camera.csv", in_first_camera)
     lines = [f"{name},{time!r}\n" for name, time in made.timestamps_s.items()]
     (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(lines))
-    names = tuple(made.timestamps_s)
-    write_reference(Reference(made.centers_m, image_names=names), folder / "reference.csv")
-    return WalkedSurvey(folder, made.metric_from_sfm, made.centers_m, names)
+    names, centers_m = tuple(made.timestamps_s), made.centers_m + SITE_M
+    write_reference(Reference(centers_m, image_names=names), folder / "reference.csv")
+    site_from_sfm = Similarity(1.0, np.eye(3), np.array(SITE_M)) @ made.metric_from_sfm
+    return WalkedSurvey(folder, site_from_sfm, centers_m, names)
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,7 @@ import pycolmap
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from tests.conftest import SITE_M
 from tests.outputs import paths_below
 from tests.simulated.ranges import simulate_ranges_at
 
@@ -481,7 +482,8 @@ def test_log_may_name_photos_instead_of_times(
     own_survey: WalkedSurvey, rangesfm_command: Command, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(0)
-    anchors = {"near": np.array([2.0, 1.0, 3.0]), "far": np.array([-6.0, 5.0, 0.2]), "third": np.array([6.0, 4.0, 1.0])}
+    around_m = {"near": (2.0, 1.0, 3.0), "far": (-6.0, 5.0, 0.2), "third": (6.0, 4.0, 1.0)}
+    anchors = {name: SITE_M + np.array(at) for name, at in around_m.items()}
     lines = ["image_name,anchor_id,range_m"]
     for name, center in zip(own_survey.image_names, own_survey.centers_m, strict=True):
         for anchor_id, position in anchors.items():

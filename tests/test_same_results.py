@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from tests.conftest import ANCHORS_M, TAG_IN_CAM_M, Command, WalkedSurvey
+from tests.conftest import ANCHORS_M, SITE_M, TAG_IN_CAM_M, Command, WalkedSurvey
 
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
@@ -116,7 +116,7 @@ CASES = {
     ),
     "a slipped clock": Case("scale", SITE, slipping, "doubtful", "probably the clocks' offset jumped by about"),
     "an anchor typed wrong": Case(
-        "refine", ("--anchors", "typed.csv"), erring, "doubtful", "probably anchor A3's y is given as 5.600"
+        "refine", ("--anchors", "typed.csv"), erring, "doubtful", "probably anchor A3's y is given as 5008.600"
     ),
     "two candidates": Case(
         "scale", (*IN_CAMERA, "--scale_method", "two-candidate"), erring, "doubtful", "two-candidate, as asked for"
@@ -151,8 +151,9 @@ def walked_survey(dense_survey: WalkedSurvey) -> WalkedSurvey:
 def survey(own_survey: WalkedSurvey) -> WalkedSurvey:
     folder = own_survey.folder
     write_anchors(folder / "some.csv", A4=None)
-    write_anchors(folder / "typed.csv", A3=(6.0, 5.6, 0.7))
-    write_anchors(folder / "flat.csv", **{name: (x, y, 0.5) for name, (x, y, _) in ANCHORS_M.items()})
+    x, y, z = ANCHORS_M["A3"]
+    write_anchors(folder / "typed.csv", A3=(x, y + 0.6, z))
+    write_anchors(folder / "flat.csv", **{name: (x, y, SITE_M[2] + 0.5) for name, (x, y, _) in ANCHORS_M.items()})
     (folder / "taped.csv").write_text("from,to,distance_m,stddev_m\nA1,A2,12.17,0.02\n")
     return own_survey
 
@@ -194,7 +195,7 @@ def numbers_of(result: dict[str, Any]) -> Iterator[tuple[str, Number]]:
 def compare(name: str, found: Numbers) -> None:
     known = json.loads(FILE.read_text()) if FILE.exists() else {}
     if os.environ.get("WRITE_RESULTS"):
-        known[name] = {key: [float(f"{x:.5g}") for x in number] for key, number in found.items()}
+        known[name] = {key: [round(x, 5) for x in number] for key, number in found.items()}
         lines = [f"{json.dumps(key)}: {json.dumps(known[key])}" for key in sorted(known)]
         FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
         return

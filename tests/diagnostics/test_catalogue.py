@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from rangesfm.arrays import Array
 from rangesfm.diagnostics import catalogue
 from rangesfm.diagnostics.hypothesis import Hypothesis, corrected
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized
+from rangesfm.ranging.anchors.site import Site
 
 NUM = 120
 
@@ -82,6 +85,12 @@ def test_a_correction_takes_from_the_residuals_what_the_mistake_has_added(
         assert not each.effect.priors.size
 
 
+def in_grid(problem: Linearized, offset_m: tuple[float, float, float]) -> Linearized:
+    """The same problem of a site whose coordinates were given in a grid."""
+    posed: Any = SimpleNamespace(**(vars(problem.on_map.posed) | {"site": Site(np.array(offset_m))}))
+    return replace(problem, on_map=replace(problem.on_map, posed=posed))
+
+
 class TestAnchorPlaces:
     """An anchor may be elsewhere than where its coordinates say."""
 
@@ -121,6 +130,10 @@ class TestAnchorPlaces:
             told = coordinate.words(np.array([0.5]))
             assert told.startswith(f"anchor B's {words}")
             assert told.endswith(" fits (+0.50 m)")
+            surveyed = in_grid(problem, (2_600_000.0, 1_200_000.0, 450.0))
+            (_, there, _) = catalogue.anchor_places(surveyed)
+            assert ("2599995.000", "1200007.000", "451.500")[axis] in there.sub_hypotheses[axis].words(np.array([0.5]))
+            assert ("2599995.50", "1200007.50", "452.00")[axis] in there.sub_hypotheses[axis].words(np.array([0.5]))
             assert f"check its {'xyz'[axis]}, or " in coordinate.remedy
             np.testing.assert_allclose(known(coordinate.correction(np.array([0.5])).anchors_m["B"]), corrected_m)
 
@@ -260,6 +273,8 @@ class TestHeights:
         assert heights.words(size) == (
             "all anchors are given the same height, 2.5 m, but the ranges fit heights that differ by 1.5 m"
         )
+        (heights,) = self.found(in_grid(problem, (1012.0, 5003.0, 413.5)), ANCHORS_M * [1, 1, 0] + [0, 0, 2.5])
+        assert "the same height, 416 m" in heights.words(size)
         moved_m = heights.correction(size).anchors_m
         np.testing.assert_allclose([known(moved_m[name])[2] for name in "ABC"], [2.1, 2.7, 3.6])
         np.testing.assert_allclose([known(moved_m[name])[:2] for name in "ABC"], ANCHORS_M[:, :2])

@@ -139,7 +139,9 @@ class TestEvidence:
     def test_a_single_anchor_is_not_mixed_up(self, problem: Linearized) -> None:
         outlying = with_weights(problem, np.ones(NUM), weights_of_a([0.1] * 20))
         on_map = outlying.on_map
-        ids: Any = SimpleNamespace(observations=SimpleNamespace(log=SimpleNamespace(anchor_ids=("A",))))
+        ids: Any = SimpleNamespace(
+            observations=SimpleNamespace(log=SimpleNamespace(anchor_ids=("A",))), site=on_map.posed.site
+        )
         index = np.where(on_map.problem.anchor_index == 0, 0, 0)
         alone = replace(on_map, posed=ids, problem=replace(on_map.problem, anchor_index=index))
         assert "anchor mixed up" not in {row.name for row in _evidence(replace(outlying, on_map=alone))}

@@ -24,6 +24,7 @@ from rangesfm.diagnostics.linearized import (
     ranges_on_map,
 )
 from rangesfm.geometry.similarity import Similarity
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.range_observations import OnPath
 from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, state_after
 
@@ -80,6 +81,7 @@ def small_map(
         rows=np.arange(num),
         curve_stddev_m=None,
         placing_stddev_m=lambda scale: np.full(num, 0.01 * scale),
+        site=Site(),
     )
     return RangesOnMap(
         posed=posed,

@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
-from tests.conftest import WalkedSurvey
+from tests.conftest import SITE_M, WalkedSurvey
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
@@ -40,7 +40,7 @@ class Marked:
         at_m = self.true_m + STDDEV_M * np.random.default_rng(seed).standard_normal(self.true_m.shape)
         at_m = at_m if wrong_m is None else at_m + wrong_m
         points = tuple(ControlPoint(f"M{k}", at, STDDEV_M, kind, k + 2) for k, at in enumerate(at_m))
-        placed = Placed(placed_stddev**2 * np.eye(7), np.zeros(3), 0.0)
+        placed = Placed(placed_stddev**2 * np.eye(7), np.array(SITE_M), 0.0)
         return diagnose_points(ControlPoints(points, self.markers), self.model, None, 0.0, placed)
 
 
@@ -96,7 +96,7 @@ def test_what_the_stated_errors_explain_is_not_named(marked: Marked) -> None:
 
 def test_a_single_point_is_tested_and_no_point_is_none(marked: Marked) -> None:
     alone = ControlPoint("M0", marked.true_m[0] + [0, 0, 3.0], STDDEV_M, "control", 2)
-    placed = Placed(1e-6 * np.eye(7), np.zeros(3), 0.0)
+    placed = Placed(1e-6 * np.eye(7), np.array(SITE_M), 0.0)
     found = diagnose_points(ControlPoints((alone,), marked.markers), marked.model, None, 0.0, placed)
     assert [test.rejected for test in found.tests] == [True]
     assert found.tests[0].effect_on_scale is None

@@ -28,6 +28,7 @@ from rangesfm.diagnostics.preflight import (
 )
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
@@ -86,7 +87,7 @@ def test_an_anchor_that_was_left_out_on_purpose_is_not_told_to_have_no_ranges(co
 def test_heights_that_are_all_the_same_are_told(complete: Survey, height_m: float) -> None:
     level = with_heights(read_ranging_inputs(complete), [height_m] * 4)
     (note,) = notes_before_work(complete, level)
-    assert note.startswith(f"all 4 anchors have one height, {height_m:g} m")
+    assert note.startswith(f"all 4 anchors have one height, {level.site.offset_m[2] + height_m:g} m")
     assert not list(notes_before_work(complete, replace(level, anchor_frame="first_camera")))
     assert not list(notes_before_work(complete, with_heights(level, [1.5, 1.5, 1.5, 1.51])))
 
@@ -213,11 +214,11 @@ def log_of(anchors: Sequence[str], ranges_m: npt.ArrayLike, **columns: Any) -> R
 
 def inputs_of(log: RangeLog, arms_m: npt.ArrayLike | None = None, **attributes: Any) -> Any:
     arms = np.zeros((len(log.tag_ids), 3)) if arms_m is None else np.array(arms_m)
-    return SimpleNamespace(
-        **{"log": log, "tag_in_cam_m": arms, "anchors": (), "anchor_frame": "unknown", "tape": None, **attributes}
-    )
+    usual = {"log": log, "tag_in_cam_m": arms, "anchors": (), "anchor_frame": "unknown", "site": AS_GIVEN, "tape": None}
+    return SimpleNamespace(**(usual | attributes))
 
 
+AS_GIVEN = Site()
 PLACED = Survey().changed({"tag.tag_in_cam_m": (0.0, 0.0, 0.0)})
 
 
@@ -334,23 +335,25 @@ def test_lengths_of_marks_and_of_anchors_without_coordinates_are_not_compared() 
     assert "from A to B" in note
 
 
-def notes_on_heights(*heights_m: float, is_site: bool = True) -> list[str]:
+def notes_on_heights(*heights_m: float, site: Site | None = AS_GIVEN) -> list[str]:
     at_m = {f"A{k}": np.array([9.0 * k, 0.0, height_m]) for k, height_m in enumerate(heights_m)}
-    return list(preflight._on_positions(at_m, is_site=is_site))
+    return list(preflight._on_positions(at_m, site))
 
 
 def test_one_height_of_three_anchors_is_told_where_heights_have_a_meaning() -> None:
     (note,) = notes_on_heights(1.25, 1.25, 1.25)
     assert note.startswith("all 3 anchors have one height, 1.25 m: if nobody measured it")
     assert notes_on_heights(1.25, 1.25) == []
-    assert notes_on_heights(1.25, 1.25, 1.25, is_site=False) == []
+    assert notes_on_heights(1.25, 1.25, 1.25, site=None) == []
+    (note,) = notes_on_heights(1.25, 1.25, 1.25, site=Site(np.array([2.6e6, 1.2e6, 450.0])))
+    assert note.startswith("all 3 anchors have one height, 451.25 m")
     assert notes_on_heights(1.25, 1.2509, 1.25) != []
     assert notes_on_heights(1.25, 1.2511, 1.25) == []
 
 
 def test_anchors_within_a_centimetre_are_in_one_place() -> None:
     at_m = {"A": np.zeros(3), "B": np.array([9.0, 0, 1]), "C": np.array([9.0, 0.009, 1]), "D": np.array([0, 0.011, 0])}
-    (note,) = preflight._on_positions(at_m, is_site=True)
+    (note,) = preflight._on_positions(at_m, AS_GIVEN)
     assert note.startswith("anchors B and C have the same position: one of them stands elsewhere")
 
 

@@ -1,6 +1,6 @@
 """A paved yard between old walls, with crates, a container and a shed: the place of the demo.
 
-Site frame: metres, x east, y north, z up, origin on the ground in the south-west corner.
+Frame of the yard: metres, x east, y north, z up, origin on the ground in the south-west corner.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tests.rendering.canvas import Canvas, Material, smooth_step
 from tests.rendering.light import Light, Panel, light_panels
 from tests.rendering.scene import Rectangle, Scene, Sky
 
-from rangesfm.demo.survey import ANCHORS_M
+from rangesfm.demo.survey import IN_YARD_M
 
 WIDTH_M = 14.0
 DEPTH_M = 11.0
@@ -218,5 +218,5 @@ def _sign(canvas: Canvas) -> Material:
 def _radios() -> Iterator[Panel]:
     """A small white case around each anchor's antenna."""
     case: Paint = partial(materials.smooth_paint, colour=(226, 226, 222))
-    for x, y, z in ANCHORS_M.values():
+    for x, y, z in IN_YARD_M.values():
         yield from box(x, y, (0.08, 0.08, 0.12), case, base_m=z - 0.06)

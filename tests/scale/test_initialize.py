@@ -538,7 +538,7 @@ def test_lengths_that_agree_with_known_positions_make_the_scale_more_certain_and
     bending = WalkBending(in_first_camera(turned_path()))
     given = initialize._Given(
         no_ranges(), turned_path(), [], "unknown", ScaleOptions(), RangeModelOptions(), None, alone.positions, (3.0,),
-        bending, ("a remark",), 0,
+        bending, ("a remark",), None, 0,
     )  # fmt: skip
     without = given.without_ranges(left_out)
     assert without.positions is alone.positions

@@ -21,8 +21,8 @@ def joined(walked_survey: WalkedSurvey, rangesfm_command: Command, tmp_path_fact
     rangesfm_command("scale", *flags, "--output_path", folder / "left", cwd=walked_survey.folder)
     shutil.copytree(folder / "left", folder / "right")
     anchors = (walked_survey.folder / "anchors.csv").read_text()
-    assert "A1,-6.0," in anchors
-    (folder / "anchors.csv").write_text(anchors.replace("A1,-6.0,", "A1,-5.0,"))
+    assert "A1,1006.0," in anchors
+    (folder / "anchors.csv").write_text(anchors.replace("A1,1006.0,", "A1,1007.0,"))
     rangesfm_command("join", "left", "right", "--anchors", "anchors.csv", "--output_path", "site", cwd=folder)
     return folder
 

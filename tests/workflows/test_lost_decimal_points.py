@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from tests.conftest import Command, WalkedSurvey
+from tests.conftest import SITE_M, Command, WalkedSurvey
 
 
 @pytest.mark.parametrize("anchor_id", ["A1", "A2", "A3", "A4"])
@@ -17,7 +17,7 @@ def test_a_lost_decimal_point_is_named_and_does_not_change_the_scale(
     rows = [line.split(",") for line in lines]
     for row in rows:
         if row[0] == anchor_id:
-            row[1] = str(100 * float(row[1]))
+            row[1] = str(SITE_M[0] + 100 * (float(row[1]) - SITE_M[0]))
     anchors.write_text("\n".join([header, *map(",".join, rows)]) + "\n", encoding="utf-8")
     flags = (*own_survey.flags, "--anchors", "anchors.csv", "--no_report", "--output_path", "out")
     rangesfm_command("scale", *flags, cwd=own_survey.folder)

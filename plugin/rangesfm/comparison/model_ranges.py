@@ -106,15 +106,14 @@ def ranges_of_map(run: SurveyRun, metric: MetricResult, image_times_s: Mapping[s
         offset = metric.time_offset
         offset_s = (metric.time_offset_s or 0.0) if offset is None else offset.at(log.timestamp_s)
         log = replace(log, timestamp_s=log.timestamp_s + offset_s)
-    to_site = inputs.site.offset_m if estimate.frame == "site" else np.zeros(3)
     anchors = {anchor.anchor_id: anchor for anchor in metric.anchors if np.isfinite(anchor.position_m).all()}
     scaled = estimate.metric_from_sfm
     return ModelRanges(
         log=log.subset(np.isin(metric.observations.status, USED)),
         tags_in_cam_m=dict(zip(log.tag_ids, inputs.tag_in_cam_m, strict=True)),
-        anchors_m={id_: anchor.position_m + to_site for id_, anchor in anchors.items()},
+        anchors_m={id_: anchor.position_m for id_, anchor in anchors.items()},
         biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
         image_times_s=image_times_s,
-        metric_path=metric.trajectory.transformed(scaled.scale, scaled.rotation, scaled.translation + to_site),
+        metric_path=metric.trajectory.transformed(scaled.scale, scaled.rotation, scaled.translation),
         association=run.survey.ranges,
     )

@@ -1,8 +1,9 @@
 """A complete survey to try the pipeline on: photos of a yard, a range log, surveyed anchors, the truth, a survey file.
 
 The photos ship with the package. The camera's path, along which the radio is simulated, is in ``path.csv``: its poses
-at each photo, and at three times before the first and after the last photo. The path is in the site frame, in metres:
-x east, y north, z up, with the origin on the ground in the south-west corner of the yard.
+at each photo, and at three times before the first and after the last photo. It is in the frame of the yard, in metres:
+x east, y north, z up, with the origin on the ground in the south-west corner of the yard. In the frame of the site, in
+which the anchors are surveyed, that corner is not at zero, as in few real sites.
 """
 
 from __future__ import annotations
@@ -30,13 +31,15 @@ NUM_PHOTOS = 40
 
 CAMERA_MODEL = "SIMPLE_RADIAL"
 CAMERA_PARAMS = (748.8, 480.0, 320.0, -0.04)
-ANCHORS_M = {  # on the walls and on a container; not in one plane
+CORNER_IN_SITE_M = (1012.0, 5003.0, 413.0)
+IN_YARD_M = {  # anchors on the walls and on a container; not in one plane
     "A1": (0.05, 6.90, 2.55),
     "A2": (4.60, 9.60, 2.15),
     "A3": (13.95, 9.60, 2.90),
     "A4": (9.60, 0.05, 0.62),
     "A5": (13.95, 2.10, 1.15),
 }
+ANCHORS_M = {name: (CORNER_IN_SITE_M + np.array(at)).tolist() for name, at in IN_YARD_M.items()}
 ANCHOR_STDDEV_M = 0.01
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 TIME_OFFSET_S = 2.35
@@ -157,9 +160,9 @@ def _plan(folder: Path, num_photos: int, seed: int) -> DemoSurvey:
         folder=folder,
         image_names=tuple(row["image_name"] for row in rows[taken]),
         timestamps_s=times[taken],
-        centers_m=centers[taken],
+        centers_m=centers[taken] + CORNER_IN_SITE_M,
         world_from_cam=world_from_cam[taken],
-        ranges=simulate_ranges(path, ANCHORS_M, TAG_IN_CAM_M, _RADIO, seed),
+        ranges=simulate_ranges(path, IN_YARD_M, TAG_IN_CAM_M, _RADIO, seed),
     )
 
 
@@ -201,7 +204,7 @@ path = "uwb.csv"                # timestamp_s,anchor_id,range_m
 time_offset = "auto"            # radio and camera have different clocks: image time = range time + offset
 
 [anchors]
-path = "anchors.csv"            # surveyed in the yard: x east, y north, z up
+path = "anchors.csv"            # surveyed in the site: x east, y north, z up
 frame = "site"
 
 [tag]

@@ -49,6 +49,7 @@ def anchor_places(problem: Linearized) -> Iterator[Hypothesis]:
 
 def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
     name, at = problem.on_map.anchor_ids[k], problem.on_map.problem.anchor_mean_m[k]
+    site = problem.on_map.posed.site
     # The anchor must be within its ranges of the path, wherever its coordinates put it.
     most_m = longest_m(problem, k) + float(np.max(problem.gradient.distance_m[problem.bins.anchor_index == k]))
 
@@ -64,8 +65,8 @@ def _anchor_place(problem: Linearized, k: int) -> Hypothesis:
             of_anchor_place(problem, k, direction[:, None]),
             subject=f"{name} {letter}",
             words=lambda size: (
-                f"anchor {name}'s {letter} is given as {at[axis]:.3f} where about "
-                f"{at[axis] + size[0]:.2f} fits ({size[0]:+.2f} m)"
+                f"anchor {name}'s {letter} is given as {site.coordinate_text(at, axis, 3)} where about "
+                f"{site.coordinate_text(at + size[0] * direction, axis, 2)} fits ({size[0]:+.2f} m)"
             ),
             remedy=f"check its {letter}, or {MEASURE_AGAIN}",
             correction=lambda size: Correction({name: at + size[0] * direction}),
@@ -191,13 +192,13 @@ def heights_never_measured(problem: Linearized) -> Iterator[Hypothesis]:
     known = [k for k in problem.heard if np.isfinite(given_m[k]).all()]
     if len(known) < 3 or np.ptp(given_m[known, 2]) > SAME_HEIGHT_M or not all(is_given(problem, k) for k in known):
         return
-    up = np.array([0.0, 0.0, 1.0])
+    up, site = np.array([0.0, 0.0, 1.0]), problem.on_map.posed.site
     yield Hypothesis(
         "anchor heights",
         Effect.of_all([of_anchor_place(problem, k, up[:, None]) for k in known]),
         words=lambda size: (
-            f"all anchors are given the same height, {given_m[known[0], 2]:g} m, but the ranges fit heights that "
-            f"differ by {np.ptp(size):.1f} m"
+            f"all anchors are given the same height, {site.height_text(given_m[known[0]])} m, but the ranges "
+            f"fit heights that differ by {np.ptp(size):.1f} m"
         ),
         remedy="measure the heights of the antennas",
         correction=lambda size: Correction(

@@ -15,7 +15,9 @@ from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_erro
 from rangesfm.diagnostics.catalogue import LARGEST_RIG_M, SAME_HEIGHT_M
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import number_text
+from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers.units import UNITS_PER_METRE
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE
@@ -32,8 +34,6 @@ FAR_M, _FAR_SHARE = 300.0, 0.95
 _STUCK_SHARE, _MOVING_SHARE, _MIN_RANGES = 0.5, 0.2, 20
 # A gap between photos longer than this many median gaps is a pause between two walks.
 _PAUSE = 30.0
-# Clocks that count seconds since 1970 show more than this.
-_SINCE_1970_S = 1e9
 # Time between two logs, seconds, from which on they are of different walks or time zones.
 _LONG_GAP_S = 60.0
 # Least duration of the ranges, of that of the photos; largest share of the time between keyframes that are far apart.
@@ -67,7 +67,7 @@ def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     if inputs.anchor_frame == "unknown":
         return
     surveyed = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors if anchor.position_m is not None}
-    yield from _on_positions(surveyed, is_site=inputs.anchor_frame == "site")
+    yield from _on_positions(surveyed, inputs.site if inputs.anchor_frame == "site" else None)
     yield from notes_on_distances(inputs.log, inputs.anchors)
     if inputs.tape is not None:
         yield from _on_taped_anchors(inputs.tape, inputs.anchors)
@@ -93,13 +93,14 @@ def _on_taped_anchors(tape: Tape, anchors: Sequence[Anchor]) -> Iterator[str]:
             )
 
 
-def _on_positions(positions_m: Mapping[str, Array], *, is_site: bool) -> Iterator[str]:
-    heights_m = np.array([at[2] for at in positions_m.values()])
+def _on_positions(positions_m: Mapping[str, Array], site: Site | None) -> Iterator[str]:
+    places_m = list(positions_m.values())
     # A map gets its height and its tilt from three anchors or more.
-    if is_site and len(heights_m) >= MIN_NUM_POSITIONS and np.ptp(heights_m) < SAME_HEIGHT_M:
+    if site is not None and len(places_m) >= MIN_NUM_POSITIONS and np.ptp([at[2] for at in places_m]) < SAME_HEIGHT_M:
         yield (
-            f"all {len(heights_m)} anchors have one height, {heights_m[0]:g} m: if nobody measured it, the map's "
-            "height and tilt rest on a guess, and the ranges cannot show it; measure the heights of the antennas"
+            f"all {len(places_m)} anchors have one height, {site.height_text(places_m[0])} m: if nobody "
+            "measured it, the map's height and tilt rest on a guess, and the ranges cannot show it; measure the "
+            "heights of the antennas"
         )
     for one, other in combinations(positions_m, 2):
         if np.linalg.norm(positions_m[one] - positions_m[other]) < SAME_PLACE_M:
@@ -151,7 +152,7 @@ def notes_on_times(radio_s: Array, photos_s: Array) -> Iterator[str]:
             "that log and photos are of one walk, and the unit of the times ([ranges] timestamp_unit)"
         )
     gap_s = max(radio[0] - photos[1], photos[0] - radio[1])
-    if min(radio[0], photos[0]) > _SINCE_1970_S and gap_s > _LONG_GAP_S:
+    if all(map(are_seconds_since_1970, (*radio, *photos))) and gap_s > _LONG_GAP_S:
         yield (
             f"by their clocks, ranges and photos are {gap_s / 3600:.2g} h apart: another time zone, or another walk; "
             "the offset is searched for, check what is found"

@@ -19,18 +19,20 @@ from rangesfm.options import PointOptions
 from rangesfm.planning.expected import Expected, expect_roughly
 from rangesfm.planning.paths import NUM_WAVES, way_along
 from rangesfm.planning.placement import LEAST_GAIN, spread_places
-from rangesfm.planning.plan_checks import coordinates_text
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.walls import AT_WALL_M, lead_through
 from rangesfm.positions.control_points import ControlPoint
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import coordinates_text
 from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.scale.scale_verdict import CALIBRATE, FEW_RANGES
 
 # Changes of an anchor's height that are tried, metres.
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)
+# A camera is carried no higher above the ground than this, metres: on a pole.
+_CARRIED_M = 3.0
 # Amplitude, metres, of a path that goes up and down.
 _UP_AND_DOWN_M = 0.5
 # Factor by which a path or the anchors are spread out.
@@ -218,21 +220,28 @@ def _farther_out(path: Trajectory, places_m: Array, factor: float) -> Array:
 
 
 def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
-    lowest_m, highest_m = planned.heights_m or (min(0.0, float(planned.places_m[:, 2].min())), np.inf)
+    lowest_m, highest_m = planned.heights_m or (_ground_m(planned), np.inf)
     for k, anchor in enumerate(planned.anchors):
         for by_m in _RAISED_M:
             place = planned.anchors_m[k] + [0.0, 0.0, by_m]
             if lowest_m <= place[2] <= highest_m:
                 verb = "raise" if by_m > 0 else "lower"
-                words = f"{verb} anchor {anchor.anchor_id} by {abs(by_m):g} m, to {place[2]:g} m"
+                height = f"{coordinates_text(place[2:])} m{planned.level}"
+                words = f"{verb} anchor {anchor.anchor_id} by {abs(by_m):g} m, to {height}"
                 yield "anchor height", anchor.anchor_id, words, planned.with_anchor_at(k, place)
+
+
+def _ground_m(planned: PlannedSurvey) -> float:
+    """Return the height of the ground: 0, unless something is lower, or all is higher than a camera is carried."""
+    lowest_m = float(planned.places_m[:, 2].min())
+    return lowest_m if lowest_m > _CARRIED_M else min(0.0, lowest_m)
 
 
 def _moved(planned: PlannedSurvey, places: Sequence[Array]) -> Iterator[_Change]:
     """Yield the plan with each anchor moved to each of some allowed places."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
         for place in places:
-            words = f"move anchor {anchor.anchor_id} to {coordinates_text(place)}"
+            words = f"move anchor {anchor.anchor_id} to {coordinates_text(place)}{planned.axes}"
             yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
@@ -244,7 +253,7 @@ def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
     name = next(name for name in (f"new{number or ''}" for number in range(len(taken) + 1)) if name not in taken)
     for place in _free_places(planned):
         more = (*planned.anchors, Anchor(name, place, stddev_m))
-        words = f"add an anchor at {coordinates_text(place)}"
+        words = f"add an anchor at {coordinates_text(place)}{planned.axes}"
         yield "one more anchor", "", words, replace(planned, anchors=more)
 
 
@@ -267,7 +276,7 @@ def _with_control_points(planned: PlannedSurvey) -> Iterator[_Change]:
     spread = spread_places(MIN_NUM_POSITIONS, places[outermost_first])
     stddev_m = PointOptions().stddev_m
     more = tuple(ControlPoint(name, at, stddev_m, CONTROL, 0) for name, at in zip(names, spread, strict=False))
-    where = "; ".join(map(coordinates_text, spread))
+    where = "; ".join(map(coordinates_text, spread)) + planned.axes
     words = f"survey three control points that the photos show, such as {where}, to {stddev_m:g} m"
     anchor_frame = "site" if planned.anchor_frame == "site" else "unknown"
     with_points = replace(planned, points=(*planned.points, *more), anchor_frame=anchor_frame)

@@ -13,6 +13,7 @@ from rangesfm.diagnostics.preflight import FAR_M, SAME_PLACE_M
 from rangesfm.errors import OptionError
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.walls import are_outside, lead_through
+from rangesfm.ranging.anchors.site import coordinates_text
 
 # Difference of height between camera and anchor, metres, that only masts and drones reach.
 _TALL_M = 20.0
@@ -101,8 +102,3 @@ def oddities(
     if planned.heights_m is not None and planned.heights_m[1] - camera_m > max(_TALL_M, wide_m):
         found = f"[anchors] heights_m lets anchors be up to {planned.heights_m[1] - camera_m:.3g} m above the camera"
         yield OptionError(f"{found}, {in_site}", "anchors", "heights_m")
-
-
-def coordinates_text(place: Array) -> str:
-    """Return the coordinates of a place for people, metres."""
-    return ", ".join(f"{x:.3g}" for x in place)

@@ -27,7 +27,7 @@ from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
 from rangesfm.survey.survey_reader import absolute_value, parse_toml, refuse_unknown_tables
 
-_Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
+_Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]  # national grids go up to 1e7
 _Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
 _Spot = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False)]
 # A plan with more anchors, or of a longer survey (seconds), would take minutes.

@@ -70,7 +70,7 @@ class PlannedSurvey:
         curve_stddev_m: standard deviation of the radio's error curve after a calibration; None: it is not calibrated.
         component_stddevs: standard deviations of components of the range errors that are known better, by name.
         taped: taped lengths between points of the map, as pairs of length and standard deviation.
-        heights_m: lowest and highest height for anchors; None: not below the ground, which is 0 or the lowest point.
+        heights_m: lowest and highest height for anchors; None: not below the ground.
         path_is_level: whether the camera cannot go up and down, as on a rover.
         photos: field of view and features of the camera; None: the map bends as maps of poses usually do.
         points: control and check points in the site. antenna: positions of an antenna on the camera; None without any.
@@ -80,6 +80,8 @@ class PlannedSurvey:
         is_placed: whether the anchors' places are fixed; else they may be moved to any allowed place.
         max_num_ranges: largest number of simulated ranges; if there are more, each stands for several.
         warnings: what is odd about the plan, a line each.
+        axes: words after coordinates that say where they are, if that is not the site; empty: it is.
+        level: words after a height, likewise.
     """
 
     trajectory: Trajectory
@@ -102,6 +104,8 @@ class PlannedSurvey:
     is_placed: bool = True
     max_num_ranges: int = 2000
     warnings: tuple[str, ...] = ()
+    axes: str = ""
+    level: str = ""
 
     @property
     def anchors_m(self) -> Array:

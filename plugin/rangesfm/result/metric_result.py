@@ -23,6 +23,7 @@ from rangesfm.join.join_models import ModelVerdict
 from rangesfm.loops.loop_closure import LoopClosure
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.clock.time_offset import TimeOffset
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
@@ -183,9 +184,10 @@ class MetricResult:
             return self.refined_with_ranges.metric_from_model.scale
         return align_points(self.trajectory.centers, self.trajectory.as_in(self.refined).centers).scale
 
-    def moved(self, offset_m: Array) -> MetricResult:
-        """Return the same result in a world whose coordinates are larger by ``offset_m`` (3,)."""
-        if not offset_m.any():
+    def in_site(self, site: Site) -> MetricResult:
+        """Return the same result in the coordinates of a site in whose local frame it is, if they are metres."""
+        offset_m = site.offset_m
+        if self.estimate.frame != "site" or not offset_m.any():
             return self
         shift = Similarity(1.0, np.eye(3), offset_m)
         estimate = replace(

@@ -17,6 +17,7 @@ from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.processes.threads import both, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.range_errors import RangeErrors
@@ -47,6 +48,7 @@ def initialize_scale(
     positions: KnownPositions | None = None,
     lasting_s: Sequence[float] = LASTING_S,
     bending: MapBending | None = None,
+    site: Site | None = None,
     seed: int = 0,
 ) -> ScaleEstimate:
     """Estimate scale and frame of an unscaled path from ranges, measured lengths, known positions, or several of them.
@@ -62,6 +64,7 @@ def initialize_scale(
         positions: known in the site and located in the model of ``trajectory``.
         lasting_s: for how long errors of an antenna's positions last.
         bending: how the map is bent; None: it drifts as a map of poses does.
+        site: frame of the anchors' positions; None: that in which they were given.
 
     Raises:
         InputError: an anchor of the log is not among ``anchors``.
@@ -79,7 +82,7 @@ def initialize_scale(
         remarks = (f"the known positions are not used: {error}",)
     given = _Given(
         observations, trajectory, anchors, anchor_frame, options, range_model, distances, by_positions, lasting_s,
-        bending, remarks, seed,
+        bending, remarks, site, seed,
     )  # fmt: skip
     others = [] if by_positions is None else [by_positions.alone]
     lengths = scale_by_lengths(distances, trajectory.centers, others)
@@ -112,6 +115,7 @@ class _Given:
     lasting_s: Sequence[float]
     bending: MapBending
     remarks: tuple[str, ...]
+    site: Site | None
     seed: int
 
     def without_ranges(self, lengths: LengthScale | None) -> ScaleEstimate:
@@ -160,12 +164,12 @@ class _Given:
         gravity = gravity_of(options.up_in_first_camera)
         placement = None if by_positions is None else by_positions.prior(trajectory, first_camera_from(trajectory))
         posing = (observations, trajectory, self.anchors, self.anchor_frame, self.range_model, distances, gravity)
-        problem, open_place = scale_problem(*posing, placement), tuple[str, ...]()
+        problem, open_place = scale_problem(*posing, placement, site=self.site), tuple[str, ...]()
         try:
             solution = solve_scale(problem, camera_side=options.camera_side, seed=self.seed)
         except OpenPlaceError as error:
             open_place = (f"scale only, in the first camera's frame: {error}",)
-            problem = scale_problem(*posing, placement, place_is_open=True)
+            problem = scale_problem(*posing, placement, place_is_open=True, site=self.site)
             solution = solution_from(problem, error.in_first_camera)
         table = _paper_table(solution)
         by_kind = _by_kind(lengths, by_positions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of
 from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.anchors.trilateration import MIN_NUM_RANGES, walking_times_s
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.range_errors import RangeErrors
@@ -43,6 +44,7 @@ class ScaleProblem:
         notes: why the map has no place in the site frame, for the user.
         left_out: anchors with too few ranges on the path to be placed.
         order_given: ids of the anchors in the order of their file.
+        site: frame of their positions here, from which texts get the coordinates in that file.
     """
 
     ranges: RangeProblem
@@ -55,6 +57,7 @@ class ScaleProblem:
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
     order_given: tuple[str, ...]
+    site: Site = field(default_factory=Site)
 
     @property
     def first_camera_from_sfm(self) -> Similarity:
@@ -114,6 +117,7 @@ def scale_problem(
     placement: PlacementPrior | None = None,
     *,
     place_is_open: bool = False,
+    site: Site | None = None,
 ) -> ScaleProblem:
     """Set up the range problem.
 
@@ -124,6 +128,7 @@ def scale_problem(
         placement: what known positions say of the map's place, for the first camera's frame; None without any.
         place_is_open: whether the map has more than one possible place in the site. Then only the distances between
             surveyed anchors are used, not their positions.
+        site: frame of the anchors' positions; None: that in which they were given.
 
     Raises:
         InputError: an anchor of the log is not among ``anchors``.
@@ -178,6 +183,7 @@ def scale_problem(
         tuple(notes),
         left_out,
         tuple(anchor.anchor_id for anchor in anchors),
+        site or Site(),
     )
 
 

@@ -12,6 +12,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.errors import InputError
+from rangesfm.files.clock_times import span_text
 from rangesfm.files.photo_names import told_none, told_unknown
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.progress import Journal
@@ -139,6 +140,7 @@ class SurveyRun:
             positions=inputs.positions.located(path.sfm, path.trajectory),
             lasting_s=inputs.positions.lasting_s,
             bending=bending,
+            site=inputs.site,
             seed=survey.output.seed,
         )
 
@@ -149,7 +151,7 @@ def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory,
         return told_none("the log", placed.log.image_name or ("",), trajectory.image_names)
     if np.all(placed.status[placed.log.kind == RangeKind.TAG_ANCHOR] == RangeStatus.OUTSIDE_PATH):
         return (
-            f"the log's times ({times.min():.3f} to {times.max():.3f} s, plus an offset of {offset_s:g} s) do not "
-            f"overlap the photos' ({photo_times[0]:.3f} to {photo_times[-1]:.3f} s): give another time offset, or auto"
+            f"the log's times ({span_text(times.min(), times.max())}, plus an offset of {offset_s:g} s) do not "
+            f"overlap the photos' ({span_text(photo_times[0], photo_times[-1])}): give another time offset, or auto"
         )
     return "no range is near enough to a keyframe in time: use more photos, or a larger max_interpolation_gap_s"

@@ -7,13 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.export.metric_map import colored_points, up_in_world
+from rangesfm.export.metric_map import colored_points, level_axes, up_in_world
 from rangesfm.files.contents import AnyPath
-from rangesfm.geometry.gravity import UP_IN_SITE
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect
@@ -32,6 +30,8 @@ _PHOTO_RATE_HZ = 2.0
 _MOST_OF_POINTS = (0.01, 0.99)
 # Largest number of points of the map that are tried as places for anchors.
 _NUM_SURFACES = 500
+# A map without a place in a site has no coordinates that anybody knows: these are about its first photo.
+_AXES, _LEVEL = " (metres right of, ahead of and above the first photo)", " above the first photo"
 # An anchor on a wall is in front of it: distance of the wall behind it, metres.
 _BEHIND_M = 0.05
 
@@ -113,16 +113,18 @@ def _planned(
     Args:
         points_m: (n, 3) points of the map.
     """
-    up = up_in_world(trajectory, "auto", is_site=frame == "site")
-    level = Rotation.align_vectors(UP_IN_SITE[None], up[None])[0].as_matrix()
+    is_site = frame == "site"
+    level = np.eye(3) if is_site else level_axes(trajectory, up_in_world(trajectory, "auto"))
     times = np.arange(len(trajectory)) / _PHOTO_RATE_HZ if trajectory.timestamps_s is None else trajectory.timestamps_s
     planned = PlannedSurvey(
         trajectory=replace(trajectory.transformed(1.0, level, np.zeros(3)), timestamps_s=times),
-        anchors=tuple(Anchor(a.anchor_id, level @ a.position_m, a.position_stddev_m) for a in anchors),
+        anchors=tuple(replace(a, position_m=level @ np.array(a.position_m)) for a in anchors),
         anchor_frame=frame,
         rate_hz=1.0,
         tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
         component_stddevs=component_stddevs,
+        axes="" if is_site else _AXES,
+        level="" if is_site else _LEVEL,
     )
     return _inside(planned.ranging(num_ranges), points_m @ level.T)
 

@@ -149,7 +149,8 @@ def map_in_metres(
         must_join: whether it is an error if all others are left out.
 
     Returns:
-        The survey, with the lengths that are in the map, and corrected if a mistake was adopted; and the map.
+        The survey, with the lengths that are in the map, and corrected if a mistake was adopted; and the map, no longer
+        in the local frame of the inputs but in the coordinates that were given, where these are metres.
     """
     with run.journal.stage("scale"):
         path, verdicts = join_by_survey(run, paths, must_join=must_join)
@@ -162,7 +163,9 @@ def map_in_metres(
         run = replace(run, inputs=replace(run.inputs, tape=tape_in_map, positions=positions))
     # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(run, path, refine=refine), models=verdicts)
-    return with_likeliest_cause(run, path, made) if run.survey.scale.adopt else (run, made)
+    if run.survey.scale.adopt:
+        run, made = with_likeliest_cause(run, path, made)
+    return run, made.in_site(run.inputs.site)
 
 
 def with_results(run: SurveyRun, made: MetricResult) -> RunResult:

@@ -63,8 +63,6 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
     survey, inputs, journal = run.survey, run.inputs, run.journal
     if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
-    if metric.estimate.frame == "site":
-        metric = metric.moved(inputs.site.offset_m)
     distances = _distances(metric)
     disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical, BENDING))
     journal.warn(*disagreeing)

@@ -89,6 +89,24 @@ def test_further_points_of_a_coordinate_system_are_where_anchors_there_are() -> 
     assert np.linalg.norm(local[1] - local[0]) == pytest.approx(np.linalg.norm(places[1] - places[0]), rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("given", "crs", "texts"),
+    [
+        ((1012.0, 5003.9791, 413.0), None, ("1012.000", "5003.979", "413.000")),
+        ((0.0, -0.0001, 3.0), None, ("0.000", "0.000", "3.000")),
+        ((2_600_000.1234, 1_200_000.0, 450.0), "EPSG:2056", ("2600000.123", "1200000.000", "450.000")),
+        ((7.43863242, 46.95108277, 500.25), "EPSG:4326", ("7.43863242", "46.95108277", "500.250")),
+    ],
+)
+def test_texts_have_the_coordinates_that_were_given(
+    given: tuple[float, float, float], crs: str | None, texts: tuple[str, str, str]
+) -> None:
+    site, (anchor, _) = local_site(anchors_at([*given], [given[0] + 1e-4, given[1], given[2] + 7.0]), "site", crs)
+    assert anchor.position_m is not None
+    assert tuple(site.coordinate_text(anchor.position_m, axis, 3) for axis in range(3)) == texts
+    assert site.height_text(anchor.position_m) == f"{given[2]:g}"
+
+
 def test_no_anchors_have_no_coordinate_system_and_the_file_is_named() -> None:
     with pytest.raises(InputError) as caught:
         local_site((), "site", "EPSG:2056", Path("anchors.csv"))

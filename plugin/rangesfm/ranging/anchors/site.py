@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.errors import InputError
-from rangesfm.geometry.georeference import Georeference, georeference_at
+from rangesfm.errors import InputError, number_text
+from rangesfm.geometry.georeference import Georeference, georeference_at, is_geographic
 from rangesfm.ranging.anchors.anchor import Anchor
+
+# The fifth decimal of a degree is about a metre.
+_DECIMALS_OF_DEGREES = 5
+
+
+def coordinates_text(coordinates_m: Array) -> str:
+    """Return coordinates (k,) in metres for the user: to the centimetre, however far from zero they are."""
+    return ", ".join(number_text(round(x, 2), ".15g") for x in coordinates_m.tolist())
 
 
 @dataclass(frozen=True)
 class Site:
-    """Local frame of a survey's anchors.
+    """Local frame of a survey's anchors. No user knows its coordinates: texts have those that were given.
 
     Attributes:
         offset_m: (3,) given coordinates minus local coordinates.
         georeference: place of the local frame on the Earth; None without a coordinate system.
     """
 
-    offset_m: Array
+    offset_m: Array = field(default_factory=lambda: np.zeros(3))
     georeference: Georeference | None = None
 
     def local(self, coordinates: Array, crs: str | None, path: Path | None = None) -> Array:
@@ -42,6 +50,24 @@ class Site:
         if crs is None or self.georeference is None:
             return coordinates - self.offset_m
         return self.georeference.local(coordinates, crs)
+
+    def given(self, positions_m: Array) -> Array:
+        """Return positions (n, 3) of the local frame in the coordinates in which the site was given."""
+        return positions_m + self.offset_m if self.georeference is None else self.georeference.projected(positions_m)
+
+    def coordinate_text(self, position_m: Array, axis: int, decimals: int) -> str:
+        """Return one of the coordinates in which a position (3,) of the local frame was given, for the user.
+
+        Args:
+            axis: 0 to 2. decimals: of a metre; degrees get as many more as say the same.
+        """
+        is_angle = axis < 2 and self.georeference is not None and is_geographic(self.georeference.crs)
+        decimals += _DECIMALS_OF_DEGREES if is_angle else 0
+        return number_text(float(self.given(position_m[None])[0, axis]), f".{decimals}f")
+
+    def height_text(self, position_m: Array) -> str:
+        """Return the height with which a position (3,) of the local frame was given, metres, for the user."""
+        return coordinates_text(self.given(position_m[None])[0, 2:])
 
 
 def local_site(
@@ -65,7 +91,7 @@ def local_site(
         if crs is not None:
             what = "no anchor has a position" if frame == "site" or not known.any() else f"the frame is {frame!r}"
             raise InputError(f"[anchors] crs is {crs}, which is for anchors surveyed in a site frame, but {what}", path)
-        return Site(np.zeros(3)), anchors
+        return Site(), anchors
     site, local = site_of(given, crs, path)
     return site, _at(anchors, local)
 
@@ -81,9 +107,9 @@ def site_of(coordinates: Array, crs: str | None, path: Path | None = None) -> tu
             georeference, local = georeference_at(coordinates, crs)
         except InputError as error:
             raise InputError(str(error), path) from None
-        return Site(np.zeros(3), georeference), local
+        return Site(georeference=georeference), local
     known = coordinates[np.isfinite(coordinates).all(axis=1)]
-    middle = known.mean(axis=0)
+    middle = np.median(known, axis=0)  # of most of them, even if one lacks its decimal point
     # Far from the origin, measured in the size of the site, least squares lose digits: a turn of the map about the
     # origin is then nearly a shift. The offset is in whole metres, so that adding it again restores every digit.
     is_far = np.linalg.norm(middle) > np.linalg.norm(np.ptp(known, axis=0))
