@@ -442,9 +442,11 @@ def test_ranges_within_a_record_by_anchor_are_read(tmp_path: Path) -> None:
         )
         return f'{{"ts": {rows[0][0]:.3f}, {by_anchor}, "est_pos": {{"x": 1.0, "y": 2.0}}}}'
 
-    log = read_ranges(write(tmp_path, "\n".join(record(ROWS[k : k + 4]) for k in range(0, len(ROWS), 4)) + "\n"))
-    assert len(log) == len(ROWS)
-    assert len(log.anchor_ids) == len(ANCHORS)
+    content = "\n".join(record(ROWS[k : k + 4]) for k in range(0, len(ROWS), 4)) + "\n"
+    for written in (content, content.replace('"', "'")):  # as JSON, and as Python prints it
+        log = read_ranges(write(tmp_path, written))
+        assert len(log) == len(ROWS)
+        assert len(log.anchor_ids) == len(ANCHORS)
 
 
 @pytest.mark.parametrize("prompt", [False, True])

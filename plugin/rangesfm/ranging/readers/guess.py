@@ -71,7 +71,9 @@ def guess_columns(layout: Layout) -> Guess:
 def find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     """Find the time by the names of columns, or else names of photos, and return the other columns."""
     ranked = sorted((rank, k) for k, column in enumerate(free) if (rank := _time_rank(column)) is not None)
-    finest = max((free[k].num_distinct for _, k in ranked), default=0)
+    fractions = [column for column in free if terms.NANOSECONDS & {*column.words} and column.is_whole]
+    # The column for the finest times; those of whole seconds may have their fractions in another column.
+    finest = max((free[k].num_distinct for _, k in ranked if not fractions), default=0)
     if any(_is_since_1970(free[k]) and 2 * free[k].num_distinct > finest for _, k in ranked):
         ranked.sort(key=lambda one: free[one[1]].is_without_zone)  # civil times without a zone leave hours open
     if not ranked:
@@ -81,7 +83,6 @@ def find_time(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:
     time, *others = (free[k] for _, k in ranked)
     guess.columns["timestamp"] = time.name
     dates = [column for column in free if column.kind == "dates"]
-    fractions = [column for column in free if terms.NANOSECONDS & {*column.words} and column.is_whole]
     if time.kind == "times" and dates and ":" in time.cells[0][:3]:
         guess.columns["date"] = dates[0].name
     elif time.is_whole and fractions and float(np.median(time.numbers)) < 1e11:
@@ -352,7 +353,8 @@ def _find_by_values(free: list[ColumnSample], guess: Guess, has_names: bool) -> 
         return
     ids = [column for column in free if _is_id(column)]
     reals = [column for column in free if column.kind == "numbers" and column not in ids and _is_positive(column)]
-    reals = [column for column in reals if not terms.NO_RANGE & {*column.words} and column.num_distinct > 1] or reals
+    reals = [column for column in reals if not terms.NO_RANGE & {*column.words}]
+    reals = [column for column in reals if column.num_distinct > 1] or reals
     if alike := sorted(_groups(reals), key=len):
         reals = [column for column, _ in alike[-1]] if has_names else reals
     # If there are columns of decimals, a column of whole numbers is no range but for example a count or a power.
@@ -413,7 +415,10 @@ def is_rising(column: ColumnSample) -> bool:
 
 
 def _is_positive(column: ColumnSample) -> bool:
-    return bool(np.mean(column.numbers > 0) > 0.5 and np.mean(column.numbers < 0) < 0.05)
+    """Return whether the numbers of a column are positive; a few other ones, or one such as -1, are no measurements."""
+    negative = column.numbers[column.numbers < 0]
+    is_code = len(np.unique(negative)) < 2
+    return bool(np.mean(column.numbers > 0) > 0.5 and (is_code or len(negative) < 0.05 * len(column.numbers)))
 
 
 def _is_id(column: ColumnSample) -> bool:

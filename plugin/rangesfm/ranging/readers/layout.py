@@ -6,9 +6,11 @@ GSI files of surveying instruments.
 
 from __future__ import annotations
 
+import ast
 import csv
 import json
 import re
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +25,7 @@ from rangesfm.errors import InputError
 from rangesfm.files.folders import IMAGE_EXTENSIONS
 from rangesfm.files.text_tables import TextTable, read_head, read_text
 from rangesfm.ranging.readers.gsi import gsi_records, is_gsi
-from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_alone
+from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_in_front
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
 
 # fmt: off
@@ -431,17 +433,31 @@ def _value(text: str) -> Any:
 
 
 def _json_records(text: str) -> Iterator[tuple[int, NamedValues]]:
-    """Yield each record with its line number. A time in front of an object comes first in its records, as "time"."""
+    """Yield each record with its line number. A time in front of an object is in its records as "received_time".
+
+    Objects may also be written as Python writes them, with single quotes.
+    """
     decoder, at, line, counted = json.JSONDecoder(), 0, 1, 0
     while (begin := text.find("{", at)) >= 0:
         line, counted = line + text.count("\n", counted, begin), begin
-        time = time_alone(text[max(at, text.rfind("\n", 0, begin) + 1) : begin])
+        time = time_in_front(text[at:begin].rpartition("\n")[2])
         try:
-            value, at = decoder.raw_decode(text, begin)
-        except (ValueError, RecursionError):  # a truncated line, or not a record
+            if text.startswith("{'", begin):
+                end = (text.find("\n", begin) + 1 or len(text) + 1) - 1
+                value, at = _python_literal(text[begin:end].rstrip()), end
+            else:
+                value, at = decoder.raw_decode(text, begin)
+        except (ValueError, SyntaxError, MemoryError, RecursionError):  # a truncated line, or not a record
             at = begin + 1
             continue
-        yield from ((line, {"time": time, **record} if time else record) for record in _flat(value))
+        records = _flat(value) if isinstance(value, dict) else []
+        yield from ((line, {**record, "received_time": time} if time else record) for record in records)
+
+
+def _python_literal(text: str) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SyntaxWarning)  # of escapes in the texts
+        return ast.literal_eval(text)
 
 
 def _flat(value: Any) -> list[NamedValues]:

@@ -78,13 +78,18 @@ def _seconds_from_civil(text: str, order: str) -> float:
     return seconds - (-1 if zone[0] == "-" else 1) * (hours * 3600.0 + minutes * 60.0)
 
 
-def time_alone(text: str) -> str | None:
-    """Return the time in a text that holds nothing else but marks such as brackets, or None."""
-    civil = CIVIL_TIME.search(text) or TIME_OF_DAY.search(text)
+def time_in_front(text: str) -> str | None:
+    """Return the civil time in a text, or else the number if there is nothing beside it but marks such as brackets.
+
+    A whole number counts only if it is a time since 1970; others number the lines.
+    """
+    if civil := CIVIL_TIME.search(text) or TIME_OF_DAY.search(text):
+        return civil[0]
     number = _NUMBER.search(text)
-    if civil is None and number is not None and not re.search("[A-Za-z0-9]", text.replace(number[0], "", 1)):
-        return number[0]
-    return civil and civil[0]
+    if number is None or re.search("[A-Za-z0-9]", text.replace(number[0], "", 1)):
+        return None
+    is_time = "." in number[0] or unit_by_digits(float(number[0])) or are_seconds_since_1970(float(number[0]))
+    return number[0] if is_time else None
 
 
 class CivilClock:

@@ -31,10 +31,10 @@ _DAYS_OF_1970 = {(3e4, 6e4): 25569.0, (7e5, 8e5): 719529.0}
 _FASTEST_M_PER_S = 30.0
 _LARGEST_M = {"m": 1000.0, "cm": 300.0, "mm": 300.0}
 _NOISE_M = {"m": 3.0, "cm": 0.6, "mm": 0.6}
-# Percentile that tells how long the ranges are; more than a few may be garbage. Ranges in cm or mm must exceed the
-# first length at this percentile, or the second one if they have decimals, because decimals without the name of a unit
-# usually mean metres.
-_MOST = 80.0
+# Percentile that tells how long the ranges are, of those up to a multiple of the median; some may be garbage. Ranges in
+# cm or mm must exceed the first length at this percentile, or the second one if they have decimals, because decimals
+# without the name of a unit usually mean metres.
+_MOST, _FARTHEST = 80.0, 100.0
 _NEAR_M, _NEAR_WITH_DECIMALS_M = 0.6, 2.0
 # Largest share of ranges that differ from the one before by more than noise and motion allow.
 _MAX_SHARE_OF_JUMPS = 0.25
@@ -98,7 +98,8 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, not
     named = named_length_unit(name)
     if named is not None or len(ranges) < _MIN_NUM:
         return named or "m"
-    most, are_whole = float(np.percentile(ranges, _MOST)), bool(np.all(ranges == np.round(ranges)))
+    most = float(np.percentile(ranges[ranges <= _FARTHEST * np.median(ranges)], _MOST))
+    are_whole = bool(np.all(ranges == np.round(ranges)))
     can_be = [
         unit
         for unit, per_metre in UNITS_PER_METRE.items()

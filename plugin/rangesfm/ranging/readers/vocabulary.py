@@ -64,7 +64,7 @@ POSE = _words(
 # Words in the names of processed ranges, which are used only if there is no other range.
 SECOND_RANGE = _words("calib calibrated corr corrected filtered filter smoothed smooth mean avg average median last")
 TIME = _words(
-    "time times timestamp timestamps timestep stamp datetime epoch unix unixtime utime posix elapsed clock zeit "
+    "time times timestamp timestamps timestep stamp datetime epoch unix unixtime utime posix utc elapsed clock zeit "
     "zeitstempel uhrzeit aufnahmezeit heure horodatage temps hora tiempo 时间"
 )
 TIME_IN_SHORT = frozenset({"t", "ts", *TIMES} - {"d", "h"})
