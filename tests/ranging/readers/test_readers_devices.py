@@ -224,6 +224,14 @@ def test_mauwb_with_blanks_is_read(tmp_path: Path) -> None:
         assert ranges_by_anchor(read_ranges(write(tmp_path, f"1 {line}\n"))) == {"0": [2.32], "1": [4.01]}
 
 
+@pytest.mark.parametrize(("first", "per_s", "bits"), [(12345, 1000, 32), (2**32 - 2 * 10**6, 10**6, 32)])
+def test_counts_of_the_board_in_front_of_lines_are_times(tmp_path: Path, first: int, per_s: int, bits: int) -> None:
+    times = [(first + k * per_s // 10) % 2**bits for k in range(60)]
+    log = read_ranges(write(tmp_path, "".join(f"{time} {ARDUINO}\n" for time in times)))
+    assert log.timestamp_s is not None
+    np.testing.assert_allclose(log.timestamp_s - log.timestamp_s[0], 0.1 * np.arange(60), atol=1e-6)
+
+
 def test_lines_that_are_not_understood_are_not_said_to_be_no_measurements(tmp_path: Path) -> None:
     path = write(tmp_path, "1 AT+RANGE=tid:0;mask:03;range:(232;401)\n" * 5)
     with pytest.raises(InputError, match=r"begins as a line of mauwb, and is not understood: .* expected such as AT"):

@@ -19,7 +19,8 @@ from rangesfm.errors import InputError, printable
 from rangesfm.files.text_tables import read_text
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID
-from rangesfm.ranging.readers.reader import EndpointRoles, Reader, Reading, ReadOptions, reader_of_readings
+from rangesfm.ranging.readers.reader import EndpointRoles, Reader, ReadOptions
+from rangesfm.ranging.readers.readings import Reading, reader_of_readings
 from rangesfm.ranging.readers.times import HostClock
 
 LOST = Reading(0.0, "", math.nan)

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from itertools import compress
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
 
 from rangesfm.errors import InputError
 from rangesfm.options import LogOptions
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
-from rangesfm.ranging.readers.counters import continued
-from rangesfm.ranging.readers.measured import which_are_measured, which_are_within_reach
+from rangesfm.ranging.range_log import RangeLog
 
 
 class ReadOptions(LogOptions):
@@ -74,68 +67,6 @@ class Reader:
     read: Callable[[Path, ReadOptions], RangeLog]
     read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: ()
     roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR
-
-
-class Reading(NamedTuple):
-    """A range as a radio reports it (see RangeLog); one that is not a positive number means no measurement."""
-
-    timestamp_s: float
-    anchor_id: str
-    range_m: float
-    line: int = 0
-    tag_id: str = DEFAULT_TAG_ID
-    range_stddev_m: float = math.nan
-    los: int = -1
-
-
-def refuse_options_of_tables(options: ReadOptions, path: Path) -> None:
-    """Raise InputError if options are given that only tables have."""
-    if options.columns or options.range_unit is not None or options.separator is not None:
-        message = "the log's format is not a table: columns, range_unit and separator cannot be given"
-        raise InputError(message, path)
-
-
-def log_of_readings(found: Sequence[Reading], path: Path, format: str, notes: Sequence[str] = ()) -> RangeLog:
-    """Return the log of some ranges, without those that are no measurements.
-
-    Raises:
-        InputError: there is no measurement.
-    """
-    ranges = np.array([reading.range_m for reading in found], np.float64)
-    measured, of_codes = which_are_measured(ranges, path)
-    measured[measured], of_far = which_are_within_reach(ranges[measured], path)
-    times, anchor_ids, ranges_m, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
-    times_s, counter = continued(np.array(times, np.float64))
-    of_times = () if counter is None else (f"the time {counter}: the times are continued",)
-    return RangeLog.from_arrays(
-        anchor_ids,
-        ranges_m,
-        timestamp_s=times_s,
-        range_stddev_m=[stddev if 0 < stddev < math.inf else math.nan for stddev in stddevs],
-        tag_id=tag_ids,
-        los=los,
-        line=lines,
-        source=path,
-        format=format,
-        num_no_measurement=len(found) - len(ranges_m),
-        notes=(*notes, *of_codes, *of_far, *of_times),
-    )
-
-
-def reader_of_readings(
-    name: str,
-    recognizes: Callable[[str], bool],
-    readings: Callable[[Path, ReadOptions], Iterable[Reading]],
-    read_anchors: Callable[[Path], tuple[Anchor, ...]] = lambda path: (),
-    roles: EndpointRoles = EndpointRoles.TAG_AND_ANCHOR,
-) -> Reader:
-    """Make the reader of a format that is not a table, from a function that yields its ranges."""
-
-    def read(path: Path, options: ReadOptions) -> RangeLog:
-        refuse_options_of_tables(options, path)
-        return log_of_readings(list(readings(path, options)), path, name)
-
-    return Reader(name, recognizes, read, read_anchors, roles)
 
 
 def tell_roles(

@@ -9,7 +9,8 @@ from typing import Any
 
 from rangesfm.errors import InputError
 from rangesfm.files.bags import SQLITE_HEAD, messages_of, open_bag, stamp_s, type_name
-from rangesfm.ranging.readers.reader import EndpointRoles, Reading, ReadOptions, reader_of_readings
+from rangesfm.ranging.readers.reader import EndpointRoles, ReadOptions
+from rangesfm.ranging.readers.readings import Reading, reader_of_readings
 
 _BEGINS = ("#ROSBAG V", SQLITE_HEAD)
 _MCAP = "MCAP0"

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.errors import InputError
+from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.ranging.readers.reader import ReadOptions
 from rangesfm.ranging.twr import SECONDS_PER_STAMP
 

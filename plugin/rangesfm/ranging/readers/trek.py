@@ -14,14 +14,8 @@ from pathlib import Path
 
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers.printed import LOST, numbered_lines
-from rangesfm.ranging.readers.reader import (
-    EndpointRoles,
-    Reader,
-    Reading,
-    ReadOptions,
-    log_of_readings,
-    refuse_options_of_tables,
-)
+from rangesfm.ranging.readers.reader import EndpointRoles, Reader, ReadOptions
+from rangesfm.ranging.readers.readings import Reading, log_of_readings, refuse_options_of_tables
 from rangesfm.ranging.readers.times import HostClock
 
 _LINE = re.compile(
@@ -76,7 +70,7 @@ def _read(path: Path, options: ReadOptions) -> RangeLog:
     used = {(kind, slot) for kind, slot, reading in readings if reading.range_m > 0}
     found = [reading for kind, slot, reading in readings if (kind, slot) in used]
     found += [LOST] * (len(all_reports) - len(whole))
-    log = log_of_readings(found, path, _NAME, notes)
+    log = log_of_readings(found, path, options, _NAME, notes)
     ends = {*log.tag_ids, *log.anchor_ids}
     return log.with_anchors({node for node in ends if node.startswith("A")})
 
