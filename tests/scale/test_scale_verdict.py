@@ -111,6 +111,24 @@ def test_anchors_in_wrong_places_disagree(make_survey: MakeSurvey) -> None:
     assert any("check the anchors' positions" in advice for advice in estimate.advice)
 
 
+@pytest.mark.parametrize(("off_m", "is_said"), [(0.0, False), (0.8, True)])
+def test_anchors_that_make_the_scale_less_certain_than_unknown_ones_are_said_to_do_so(
+    off_m: float, is_said: bool, make_survey: MakeSurvey
+) -> None:
+    survey = make_survey(radio=NOISE, num_epochs=3)
+    anchors = [
+        replace(anchor, position_m=np.asarray(anchor.position_m) + off_m * np.roll([1.0, 0.0, 0.0], k))
+        for k, anchor in enumerate(survey.anchors("first_camera", "ABCDE"))
+    ]
+    found, unknown = (
+        initialize_scale(survey.observations(), survey.trajectory, anchors, anchor_frame=frame)
+        for frame in ("first_camera", "unknown")
+    )
+    said = [reason for reason in found.reasons if "with the anchors unknown it would be known to" in reason]
+    assert bool(said) == is_said
+    assert (found.uncertainty.half_width_95 > 1.1 * unknown.uncertainty.half_width_95) == is_said
+
+
 def test_a_refusal_says_what_to_do(make_survey: MakeSurvey) -> None:
     survey = make_survey(anchors_m=ONE_ANCHOR_M, radio=Radio(range_stddev_m=0.1))
     with pytest.raises(

@@ -312,7 +312,10 @@ class _Drawing:
         """Write positions of an antenna on the camera, by time or by photo."""
         rng = self.rng
         by_photo = self.happens(0.4, "positions by photo")
-        receiver = Receiver(self.between(0.01, 0.3), self.between(0.01, 0.3), self.between(3.0, 60.0))
+        # Nothing in a short survey tells an error that lasts longer, so it is part of what a file states.
+        noise_m = self.between(0.01, 0.3)
+        receiver = Receiver(noise_m, noise_m * self.between(0.2, 1.5), self.between(3.0, 60.0))
+        stated_m = float(np.hypot(receiver.noise_m, receiver.lasting_m))
         at_s = (
             times if by_photo else np.arange(times[0] - 3.0, times[-1] + 3.0, self.choose((0.2, 1.0), "positions each"))
         )
@@ -330,7 +333,7 @@ class _Drawing:
             row |= {
                 axis: f"{x:.4f}" if is_fixed else "nan" for axis, x in zip(("x_m", "y_m", "z_m"), place_m, strict=True)
             }
-            rows.append(row | ({"stddev_m": f"{receiver.noise_m:.4f}"} if with_stddev else {}))
+            rows.append(row | ({"stddev_m": f"{stated_m:.4f}"} if with_stddev else {}))
         self.write("positions.csv", rows)
         self.flags += ["--positions", "positions.csv", f"--antenna_in_cam={','.join(map(str, arm_m))}"]
         if not by_photo and self.happens(0.4, "offset given"):

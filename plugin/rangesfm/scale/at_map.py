@@ -18,10 +18,10 @@ from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeState, fit_at, predicted_ranges
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import PositionScale
-from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from
 from rangesfm.scale.scale_verdict import judge, judge_positions
-from rangesfm.scale.solution import Solution, weighted
+from rangesfm.scale.solution import Solution, weighted, with_unknown_anchors
 from rangesfm.scale.uncertainty import KnownMap, bending_of_bins, known_map, learned_errors
 
 
@@ -120,6 +120,14 @@ class MapWithRanges:
         shared_m = shared_errors_m[self.posed.rows]
         return known_map(self.posed, self.solution, learned, self._bending_of(learned.bins), shared_m)
 
+    def with_unknown_anchors(self, shared_errors_m: Array) -> ScaleUncertainty | None:
+        """Return the uncertainty if no anchor were known; None where none is. Arguments as for ``known``."""
+        if not np.isfinite(self.posed.ranges.anchor_stddev_m).any():
+            return None
+        posed, solution = with_unknown_anchors(self.posed, self.solution.fit.state)
+        unknown = replace(self, posed=posed, solution=solution)
+        return unknown.known(unknown.learned(), shared_errors_m).uncertainty
+
     def _bending_of(self, bins: RangeBins) -> BendingOfBins | None:
         return bending_of_bins(self.bending, bins, self.posed, self.solution.fit.state)
 
@@ -145,7 +153,8 @@ def estimate_at(
         GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
     """
     known, moved = half_way(on_map, learned, start)
-    judged = judge(moved.posed, moved.solution, known.uncertainty, {}, start.anchors, options)
+    unplaced = on_map.with_unknown_anchors(start.shared_errors_m)
+    judged = judge(moved.posed, moved.solution, known.uncertainty, {}, start.anchors, options, unplaced)
     estimate = start.judged(
         judged,
         refined_value=moved.metric_from_model.scale,

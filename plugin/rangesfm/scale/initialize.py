@@ -30,7 +30,7 @@ from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from, scale_problem
 from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, levelled_places
 from rangesfm.scale.sensitivity import scale_sensitivity
-from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
+from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale, with_unknown_anchors
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.scale.uncertainty import known_map, learned_errors, shared_errors_m
 
@@ -186,7 +186,8 @@ class _Given:
         uncertainty = known.uncertainty
         moved = known.moved(solution)
         found = anchor_estimates(moved, observations.log.anchor_ids, known.covariance)
-        judged = judge(problem, solution, uncertainty, per_anchor, found, options)
+        unplaced = self._with_unknown_anchors(posed, solution)
+        judged = judge(problem, solution, uncertainty, per_anchor, found, options, unplaced)
         verdict, remarks = judged.verdict, (*open_place, *self.remarks)
         if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
             remarks = (*remarks, *levelled_places(gravity, self.anchors, found))
@@ -225,6 +226,13 @@ class _Given:
             if by_kind and errors.learned
             else np.zeros((len(observations.log), 0)),
         )
+
+    def _with_unknown_anchors(self, posed: ScaleProblem, solution: Solution) -> ScaleUncertainty | None:
+        """Return the uncertainty if no place of an anchor were known; None where none is."""
+        if not np.isfinite(solution.problem.anchor_stddev_m).any():
+            return None
+        unknown = with_unknown_anchors(posed, solution.fit.state)
+        return known_map(*unknown, learned_errors(*unknown, self.bending)).uncertainty
 
 
 def _bent(problem: ScaleProblem, lengths: LengthScale) -> ScaleProblem:

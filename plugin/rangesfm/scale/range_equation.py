@@ -277,7 +277,8 @@ def solve(
         method="trf",
         ftol=tolerance,
         xtol=tolerance,
-        gtol=None,
+        # Only a start at the very minimum is below this; without it, the solver would divide zero by zero there.
+        gtol=float(np.finfo(np.float64).eps),
         max_nfev=max_num_evaluations,
     )
     x = _settled(system, result.x) if tolerance <= ROUNDING else result.x

@@ -31,6 +31,8 @@ NOTHING_KNOWN = 1.0
 """Relative standard deviation of the scale from which nothing is known about it: it may as well be zero."""
 # Scatter of the scales from single anchors above which they disagree. Antennas and short paths alone cause less.
 _MAX_ANCHOR_SPREAD = 0.05
+# How much wider the interval is with the anchors' coordinates, where that is said; less is chance.
+_WIDENED = 1.1
 CALIBRATE = "calibrate the radio at the distances of this survey (rangesfm ranges calibrate)"
 
 
@@ -61,15 +63,20 @@ def judge(
     per_anchor: dict[str, float],
     anchors: Sequence[AnchorEstimate],
     options: ScaleOptions,
+    with_unknown_anchors: ScaleUncertainty | None = None,
 ) -> Verdict:
     """Return the verdict by the 95 % interval, and by faults that make the interval itself doubtful.
+
+    Args:
+        with_unknown_anchors: uncertainty if no place of an anchor were known; None where none is.
 
     Raises:
         GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
     """
     half_width = uncertainty.half_width_95
     doubts = [*_doubts_of_survey(problem, solution, uncertainty), *_doubts_of_ranges(solution.fit, per_anchor)]
-    return _verdict(doubts, _remarks(solution, anchors), half_width, options)
+    remarks = [*_remarks(solution, anchors), *_remarks_on_places(half_width, with_unknown_anchors)]
+    return _verdict(doubts, remarks, half_width, options)
 
 
 def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: ScaleOptions) -> Verdict:
@@ -186,6 +193,18 @@ def _remarks(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Dou
         "the path is nearly flat: it is open on which side of it the unknown anchors stand; the scale is not affected"
     )
     return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
+
+
+def _remarks_on_places(half_width: float, with_unknown_anchors: ScaleUncertainty | None) -> Iterator[_Doubt]:
+    """Yield that the anchors' coordinates widen the interval, as they do where they contradict the ranges."""
+    if with_unknown_anchors is None or not half_width > _WIDENED * with_unknown_anchors.half_width_95:
+        return
+    yield _Doubt(
+        "the anchors' coordinates do not quite fit the ranges, which makes the scale less certain: with the anchors "
+        f"unknown it would be known to {100 * with_unknown_anchors.half_width_95:.1f} %",
+        "measure the coordinates of the anchors' antennas, not of their stands or housings, and give their stddev "
+        "(position_stddev_m)",
+    )
 
 
 def levelled_places(gravity: Gravity, surveyed: Sequence[Anchor], found: Sequence[AnchorEstimate]) -> tuple[str, ...]:

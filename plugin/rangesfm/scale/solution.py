@@ -223,6 +223,16 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
     return Solution(problem, fitted, replace(used, inflation=last.inflation), last.noise_m)
 
 
+def with_unknown_anchors(posed: ScaleProblem, start: RangeState) -> tuple[ScaleProblem, Solution]:
+    """Return the problem as it would be if no place of an anchor were known, and its solution from a start.
+
+    The map then stays in a frame of its own, unless known positions place it.
+    """
+    unknown, is_placed = np.full(posed.ranges.num_anchors, np.inf), posed.ranges.placement is not None
+    posed = replace(posed, ranges=replace(posed.ranges, anchor_stddev_m=unknown, frame_is_free=is_placed))
+    return posed, solution_from(posed, start)
+
+
 def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
     """Return the problem weighted by the errors.
 

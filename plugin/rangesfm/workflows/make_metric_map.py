@@ -460,8 +460,8 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     of_lens = _doubts_of_lens(metric)
     journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *by_rivals)
     doubts += known_doubts
-    against_place = (*(doubt.reason for doubt in of_lens), *of_place, *(doubt.reason for doubt in doubts))
-    place = place_of_map(metric.estimate, metric.kept_refinement, path, against_place, bent_by_m)
+    against = (*(doubt.reason for doubt in of_lens), *of_place, *by_rivals, *(doubt.reason for doubt in doubts))
+    place = place_of_map(metric.estimate, metric.kept_refinement, path, against, bent_by_m)
     judged = replace(metric, place=place, diagnosis=diagnosis).doubted(by_rivals)
     judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])
     # A lens that does not fit comes first, because it may look like other mistakes.
