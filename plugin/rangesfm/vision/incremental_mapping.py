@@ -1,4 +1,7 @@
-"""COLMAP's incremental mapping, which goes on after any photo as if it had not been interrupted."""
+"""COLMAP's incremental mapping, which goes on after any photo much as if it had not been interrupted.
+
+It has forgotten only which photos and points COLMAP has tried in vain, and tries them again.
+"""
 
 from __future__ import annotations
 
