@@ -19,8 +19,10 @@ from rangesfm import ceres
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.diagnostics.finished_map import Doubt
 from rangesfm.diagnostics.scale_bound import RISK
+from rangesfm.errors import SolverError
 from rangesfm.geometry.similarity import align_points
-from rangesfm.refine.bundle_adjustment import keyframe_centers
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.refine.bundle_adjustment import bundle_adjustment, keyframe_centers
 from rangesfm.refine.photo_bending import LARGEST_FACTOR
 from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
@@ -81,14 +83,15 @@ def fit_lens(model: pycolmap.Reconstruction) -> LensFit | None:
         model: with points; it is not changed.
     """
     own = pycolmap.Reconstruction(model)
-    before = _adjust(own, lens_is_free=False)
-    richer = pycolmap.Reconstruction(own)
-    for camera in richer.cameras.values():
-        _enrich(camera)
-    num_params = sum(len(camera.params) for camera in richer.cameras.values())
-    after = _adjust(richer, lens_is_free=True)
-    if before is None or after is None:
+    try:
+        before = _adjust(own, lens_is_free=False)
+        richer = pycolmap.Reconstruction(own)
+        for camera in richer.cameras.values():
+            _enrich(camera)
+        after = _adjust(richer, lens_is_free=True)
+    except SolverError:
         return None
+    num_params = sum(len(camera.params) for camera in richer.cameras.values())
     return LensFit(
         _names_of_models(own),
         _names_of_models(richer),
@@ -143,24 +146,24 @@ def _names_of_models(model: pycolmap.Reconstruction) -> str:
 def _adjust(model: pycolmap.Reconstruction, *, lens_is_free: bool) -> Any:
     """Adjust all photos of a model in place and return Ceres' summary.
 
-    None where hardly anything takes part, the photos fit without any error, or the solver fails.
+    Raises:
+        SolverError: too little takes part, the photos fit without any error, or the solver fails.
     """
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_sensor_from_rig=False)
-    options.refine_focal_length = options.refine_extra_params = options.refine_principal_point = lens_is_free
-    solver = options.ceres.solver_options
-    solver.max_num_iterations, solver.num_threads = _MAX_NUM_ITERATIONS, 1  # so that every run says the same
-    solver.function_tolerance, solver.gradient_tolerance = _FUNCTION_TOLERANCE, 0.0
-    options.ceres.solver_options = solver
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1  # wrong matches should not outweigh a lens
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    lens = dict.fromkeys(("refine_focal_length", "refine_extra_params", "refine_principal_point"), lens_is_free)
+    # By this loss, wrong matches do not outweigh a lens.
+    ceres_options = {"loss_function_type": "SOFT_L1", "solver_options": {"function_tolerance": _FUNCTION_TOLERANCE}}
+    options = RefineOptions(
+        max_num_iterations=_MAX_NUM_ITERATIONS,
+        bundle_adjustment={**lens, "refine_sensor_from_rig": False, "ceres": ceres_options},
+    )
+    frame_id = min(model.reg_frame_ids())
+    adjuster = bundle_adjustment(model, CameraOptions(), options, fixed_frame_id=frame_id, num_threads=1).adjuster
     if adjuster.problem.num_residuals() <= adjuster.problem.num_parameters():
-        return None
+        raise SolverError("the photos see too few points to tell anything of the lens")
     summary = ceres.solve_adjuster(adjuster, lambda step: False)
-    return summary if summary.IsSolutionUsable() and summary.final_cost > 0 else None
+    if not (summary.IsSolutionUsable() and summary.final_cost > 0):
+        raise SolverError(f"the adjustment for the lens failed: {summary.message}")
+    return summary
 
 
 def _change_of_lengths(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> float:
