@@ -289,7 +289,7 @@ def test_anchors_that_cannot_hold_the_site_frame_still_give_the_scale_with_a_war
     flags = ("--anchors", "anchors.csv", "--use_anchors", ids, "--anchor_frame", "site", "--output_path", "out")
     assert main(["scale", *own_survey.flags, *flags]) == 0
     warning = next(line for line in capfd.readouterr().err.splitlines() if said in line)
-    assert "scale only, in the first camera's frame" in warning
+    assert "the map gets metres, but no place in the site" in warning
     result = json.loads((own_survey.folder / "out" / "result.json").read_text())
     assert result["frame"] == "first_camera"
     assert warning in result["warnings"]

@@ -320,6 +320,14 @@ def test_the_policy_allows_the_pages_own_script_and_no_other(make_result: MakeRe
     assert html.count("<script") == 3  # the other scripts hold data
 
 
+def test_a_doubtful_place_has_its_reason_also_if_the_scale_has_the_same(make_result: MakeResult) -> None:
+    reason = "anchor A3 stands elsewhere"
+    changes = {"place": doubtful_place(reason, [0.0, 0.0, 0.0]), "scale": {"verdict": "doubtful", "reasons": [reason]}}
+    texts = page_of(make_result(num_keyframes=5, num_ranges_per_anchor=5, changes=changes)).texts
+    begin = texts.index("Place: doubtful")
+    assert "For the same reasons as the scale." in texts[begin : begin + 30]
+
+
 def test_notes_on_how_the_inputs_were_read_are_no_warnings(make_result: MakeResult) -> None:
     note, warning = "uwb.csv: columns taken: range = d", "no ranges to anchor A9"
     texts = page_of(make_result(changes={"notes": [note], "warnings": [warning]})).texts

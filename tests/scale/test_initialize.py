@@ -269,7 +269,7 @@ class TestOpenButNotFatal:
         estimate = survey.scale("site", anchors_m)
         assert estimate.frame == "first_camera"
         assert estimate.verdict == "doubtful"
-        assert any(why in reason and "scale only" in reason for reason in estimate.reasons)
+        assert any(why in reason and "no place in the site" in reason for reason in estimate.reasons)
         assert survey.relative_error(estimate) == pytest.approx(0.0, abs=1e-6)
 
     def test_a_straight_path_past_unknown_anchors_is_named(self, make_survey: MakeSurvey) -> None:

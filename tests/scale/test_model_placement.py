@@ -177,7 +177,7 @@ def test_the_ranges_of_all_choose_the_place_that_fits_best(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("share", "gap", "stddev_share", "refused"),
     [
-        (0.11, 4.4, 0.0, "it can be laid in two ways, {apart:.2g} m apart, that fit all ranges alike"),
+        (0.11, 4.4, 0.0, "two places of it, {apart:.2g} m apart, fit all ranges equally well"),
         (0.11, 4.6, 0.0, None),
         (0.09, 1.0, 0.24, None),
         (0.09, 1.0, 0.26, "the anchors place it only to {stddev:.2g} m, of an extent of {extent:.2g} m"),

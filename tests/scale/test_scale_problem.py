@@ -266,7 +266,7 @@ def test_one_surveyed_anchor_leaves_every_turn_open(with_gravity: bool) -> None:
     known_, (note,) = usable([None, (1, 2, 3)], with_gravity=with_gravity)
     assert known_ == [False, False]
     assert note == (
-        "1 surveyed anchor leaves every turn of the map about it open: scale only, in the first camera's frame; "
+        "1 surveyed anchor lets the map turn about it freely: the map gets metres, but no place in the site; "
         f"three anchors not on a line would fix it{'' if with_gravity else HELP}"
     )
 
@@ -283,7 +283,7 @@ def test_anchors_on_a_line_leave_a_turn_open_that_gravity_fixes(places_m: list[l
     known_, (note,) = usable(places_m)
     assert known_ == [False] * len(places_m)
     assert note == (
-        f"{which} leave the turn of the map about their line open: scale only, in the first camera's frame; "
+        f"{which} let the map turn about their line freely: the map gets metres, but no place in the site; "
         f"a third anchor off it would fix it{HELP}"
     )
 

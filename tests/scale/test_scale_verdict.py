@@ -162,7 +162,7 @@ def test_known_positions_that_leave_the_scale_open_are_too_close_together() -> N
     assert doubted.verdict == "doubtful"
     assert doubted.reasons == (
         "the scale is known to 5.9 % (95 % interval), worse than 4 %",
-        "the known positions are close together for their standard deviations",
+        "the known positions are too close together for their standard deviations",
     )
     with pytest.raises(
         GeometryError, match=r"only known to 21.6 % .*, worse than the 19.6 % allowed .* close together"
@@ -181,7 +181,7 @@ def test_short_lengths_are_said_to_be_short() -> None:
     doubted = judge_lengths(two, wide, options)
     assert (doubted.verdict, doubted.reasons[1:]) == (
         "doubtful",
-        ("the lengths are short for their standard deviations",),
+        ("the measured lengths are too short for their standard deviations",),
     )
     assert doubted.advice == ("measure more and longer lengths",)
 
@@ -328,7 +328,7 @@ def test_the_side_of_unknown_anchors_is_open_on_a_path_below_five_percent_in_hei
     ):
         solution: Any = SimpleNamespace(problem=SimpleNamespace(centers=centers))
         remarks = scale_verdict._remarks(solution, anchors)
-        assert [each.reason.startswith("the path is nearly flat: it is open on which") for each in remarks] == [
+        assert [each.reason.startswith("the path is nearly flat: nothing tells on which") for each in remarks] == [
             True
         ] * is_open
 
@@ -363,7 +363,7 @@ def test_a_refusal_gives_one_reason_and_one_piece_of_advice_and_else_the_plan() 
         "the scale is only known to 19.6 % (95 % interval), worse than the 19.6 % allowed (1.96 times "
         "max_relative_stddev): first; next time: do this"
     )
-    with pytest.raises(GeometryError, match=r"times max_relative_stddev\); next time: plan it first"):
+    with pytest.raises(GeometryError, match=r"times max_relative_stddev\); next time: plan the survey first"):
         refuse_unknown(0.5, [], [], options)
 
 

@@ -323,7 +323,7 @@ def test_a_nearly_straight_path_is_said_to_be_turned_about_itself(share: float, 
     nearly = np.stack([along, share * across, 0.0 * along], axis=1)
     why = solution._another_place(found(problem_of(nearly), state_of(2.0)))
     assert isinstance(why, OpenPlaceError) != is_turned
-    assert ("turned about the path, which is nearly straight: walk a bend" in str(why)) == is_turned
+    assert ("fits the ranges as well if it is turned about it: walk a bend" in str(why)) == is_turned
 
 
 def posed_of(problem: RangeProblem, placing_m: float = 0.0, *, anchors_are_known: bool = True) -> Any:

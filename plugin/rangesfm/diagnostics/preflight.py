@@ -187,8 +187,8 @@ def notes_on_model(model: pycolmap.Reconstruction) -> Iterator[str]:
         worst = max(off_px, key=lambda name: off_px[name])
         others = f" and {len(off_px) - 1} more" if len(off_px) > 1 else ""
         yield (
-            f"photo {worst}{others}: in the model most of its points are farther than {errors.max_median_px:.3g} px "
-            "from where it shows them: its pose is wrong; take it out of the model, or map anew"
+            f"photo {worst}{others}: most of its points lie more than {errors.max_median_px:.3g} px from where the "
+            "photo shows them, so that its pose is wrong; take it out of the model, or reconstruct anew"
         )
 
 
@@ -239,7 +239,7 @@ def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor]) -> Iterator[str
     if not bad.any():
         return
     num = len(ids) * (len(ids) - 1) // 2
-    found = f"the ranges do not allow the distances between anchors in {bad.sum()} of {num} pairs"
+    found = f"in {bad.sum()} of {num} pairs of anchors, their coordinates and the ranges contradict each other"
     causes = list(_causes(triangles, ids, positions_m, bad))
     named = " and ".join(f"{ids[i]} and {ids[k]}" for i, k in np.argwhere(bad)[:_MAX_NUM_NAMED].tolist())
     likeliest = f"probably {' or '.join(causes)}" if causes else f"look at {named} first"

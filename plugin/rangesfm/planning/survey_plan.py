@@ -219,7 +219,7 @@ def _place(expected: Expected) -> PlannedPlace | None:
     if expected.refusal:
         verdict, reasons = OPEN_PLACE, ["a run will not place the map: it will refuse its scale"]
     elif (open_place := expected.mirror_image()) is not None:
-        verdict, reasons = OPEN_PLACE, [f"a run will give the scale only: {open_place}", words]
+        verdict, reasons = OPEN_PLACE, [f"a run will give metres, but no place in the site: {open_place}", words]
     x_m, y_m, z_m = of_map[4:].tolist()
     return PlannedPlace(
         verdict=verdict,
@@ -280,8 +280,8 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
     x, y, z = (_half_width_95(stddev_m) for stddev_m in place.stddev_m)
     yield f"place: {place.verdict}" + (
         f"; x {x}, y {y}, z {z}, heading {_half_width_95(place.heading_stddev_deg, 'deg')}, tilt "
-        f"{_half_width_95(place.tilt_stddev_deg, 'deg')}; keyframe {place.worst_keyframe + 1} is known least, to "
-        f"{_half_width_95(place.worst_keyframe_stddev_m)} (95 %)"
+        f"{_half_width_95(place.tilt_stddev_deg, 'deg')}; the least certain keyframe is number "
+        f"{place.worst_keyframe + 1}, with {_half_width_95(place.worst_keyframe_stddev_m)} (95 %)"
         if np.isfinite(place.stddev_m).any()
         else ""
     )
@@ -293,7 +293,9 @@ def _alone(plan: SurveyPlan) -> Iterator[str]:
     for kind, alone in plan.by_kind.items():
         scale = f"scale +-{_rough(100 * NORMAL_95 * alone.scale_stddev, '%')}"
         is_placed = not np.isnan(alone.worst_keyframe_stddev_m)
-        place = f", keyframe known least {_half_width_95(alone.worst_keyframe_stddev_m)}" if is_placed else ", no place"
+        place = (
+            f", least certain keyframe {_half_width_95(alone.worst_keyframe_stddev_m)}" if is_placed else ", no place"
+        )
         yield f"{words[kind]} (95 %): {scale}{place}"
 
 
@@ -322,7 +324,10 @@ def _advised(plan: SurveyPlan) -> Iterator[str]:
     for_place = [f"{each.words}: {_half_width_95(each.place_stddev_m)}" for each in plan.advice_for_place]
     now_m = np.inf if plan.place is None else plan.place.worst_keyframe_stddev_m
     scale, place = f"+-{_rough(100 * NORMAL_95 * plan.scale_stddev, '%')}", _half_width_95(now_m)
-    purposes = {f"the scale, now {scale}": for_scale, f"the place of the keyframe known least, now {place}": for_place}
+    purposes = {
+        f"the scale, now {scale}": for_scale,
+        f"the place of the least certain keyframe, now {place}": for_place,
+    }
     for what, best in purposes.items():
         if best:
             yield f"what would gain most for {what} (95 %):"

@@ -26,7 +26,7 @@ def loops_figure(content: Content) -> Figure | None:
 
     along = np.arange(1.0, len(path) + 1)
     series = (
-        Series("neighbours in time, as before", "before", np.column_stack([along, along]), "line", is_data=False),
+        Series("neighbours in time", "before", np.column_stack([along, along]), "line", is_data=False),
         Series("closed a loop", "after", dots("closed")),
         Series("contradict the ranges", "reference", dots("contradicted")),
     )

@@ -55,8 +55,13 @@ def local_scale(content: Content) -> Figure | None:
         return None
     known = [content.reference_by_photo.get(name, [np.nan] * 3) for name in path.image_names]
     series = [
-        Series("refined over scaled", "after", _local_scales(path, content.refined.centers), "line"),
-        Series("reference over scaled", "reference", _local_scales(path, np.array(known, dtype=np.float64)), "dashed"),
+        Series("refined, relative to scaled", "after", _local_scales(path, content.refined.centers), "line"),
+        Series(
+            "reference, relative to scaled",
+            "reference",
+            _local_scales(path, np.array(known, dtype=np.float64)),
+            "dashed",
+        ),
     ]
     series = [one for one in series if len(one.points)]
     if not series:

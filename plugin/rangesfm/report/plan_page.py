@@ -45,7 +45,7 @@ def render_plan(plan: SurveyPlan) -> str:
     anchors = "1 anchor" if len(plan.anchors_m) == 1 else f"{len(plan.anchors_m)} anchors"
     title = f"{anchors}, {count(len(plan.keyframe_stddevs_m))} keyframes"
     now = {"scale": percent(NORMAL_95 * plan.scale_stddev), "place": _keyframe_known_least(plan)}
-    of_place = f"What would gain most for the place of the keyframe known least, now ± {now['place']}"
+    of_place = f"What would gain most for the place of the least certain keyframe, now ± {now['place']}"
     advice = [
         _advice(f"What would gain most for the scale, now ± {now['scale']}", plan.advice_for_scale),
         _advice(of_place, plan.advice_for_place),
@@ -87,7 +87,7 @@ def _tiles(plan: SurveyPlan) -> list[tuple[str, str, str]]:
     worst = int(np.argmax(plan.keyframe_stddevs_m))
     return [
         *of_place,
-        ("Keyframe known least", _keyframe_known_least(plan), f"number {worst + 1} on the path"),
+        ("Least certain keyframe", _keyframe_known_least(plan), f"number {worst + 1} on the path"),
         ("Ranges", count(plan.num_ranges if plan.anchors_m else 0), f"in {duration(plan.duration_s)}"),
     ]
 
@@ -226,7 +226,7 @@ def _by_kind(plan: SurveyPlan) -> ReportTable:
     ]
     if rows:
         rows.append(["all together", percent(NORMAL_95 * plan.scale_stddev), _keyframe_known_least(plan)])
-    header = ["", "scale ± (95 %)", "keyframe known least ± (95 %)"]
+    header = ["", "scale ± (95 %)", "least certain keyframe ± (95 %)"]
     return ReportTable("What each kind of measurement would give", header, rows, kind="worded")
 
 
@@ -249,9 +249,9 @@ def _mistakes(plan: SurveyPlan) -> ReportTable:
         ]
         for each in plan.largest_mistakes
     ]
-    header = ["mistake", "found from", "would change the scale by", "places by"]
+    header = ["mistake", "smallest size found", "changes the scale by", "changes places by"]
     note = (
         "For each kind of mistake the one with the largest effect: the smallest size that will be found, and how much "
-        "that size changes at most. A share of 1 % is 1 cm at 1 m and 10 cm at 10 m."
+        "a mistake of that size changes at most. A scale error of 1 % is 1 cm at 1 m and 10 cm at 10 m."
     )
     return ReportTable("Mistakes just too small to be found", header, rows, note, kind="worded")

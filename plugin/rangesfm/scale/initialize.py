@@ -168,7 +168,7 @@ class _Given:
         try:
             solution = solve_scale(problem, camera_side=options.camera_side, seed=self.seed)
         except OpenPlaceError as error:
-            open_place = (f"scale only, in the first camera's frame: {error}",)
+            open_place = (f"the map gets metres, but no place in the site: {error}",)
             problem = scale_problem(*posing, placement, place_is_open=True, site=self.site)
             solution = solution_from(problem, error.in_first_camera)
         table = _paper_table(solution)

@@ -144,7 +144,7 @@ class _World:
         for rival in fits[1:]:
             apart = placed.apply(path) - rival.state.similarities[-1].apply(path)
             if rmse(apart) > SAME_SHARE * extent and rival.cost - best.cost < MIN_COST_GAP:
-                raise GeometryError(f"it can be laid in two ways, {rmse(apart):.2g} m apart, that fit all ranges alike")
+                raise GeometryError(f"two places of it, {rmse(apart):.2g} m apart, fit all ranges equally well")
         stddev = _path_stddev_m(best, path)
         if stddev > _MAX_OPEN * extent:
             raise GeometryError(

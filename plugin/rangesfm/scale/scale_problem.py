@@ -253,14 +253,14 @@ def _usable_positions(
     if num >= 2 and (not are_on_line(positions_m) or levelled):
         return given, []
     if num == 1:
-        why = "1 surveyed anchor leaves every turn of the map about it open"
+        why = "1 surveyed anchor lets the map turn about it freely"
     else:
         which = "2 surveyed anchors" if num == 2 else "surveyed anchors on one line"
-        why = f"{which} leave the turn of the map about their line open"
+        why = f"{which} let the map turn about their line freely"
     fix = "a third anchor off it" if num > 1 else "three anchors not on a line"
     # Gravity does not fix the turn about a vertical line, and with one anchor it does not fix the heading.
     help_of_gravity = "" if gravity_is_known else " (two not above each other, with up_in_first_camera)"
-    note = f"{why}: scale only, in the first camera's frame; {fix} would fix it{help_of_gravity}"
+    note = f"{why}: the map gets metres, but no place in the site; {fix} would fix it{help_of_gravity}"
     return np.zeros(len(anchors), dtype=bool), [note]
 
 

@@ -87,7 +87,11 @@ def judge_lengths(lengths: LengthScale, uncertainty: ScaleUncertainty, options: 
         reason = "the scale depends on one length that nothing checks: a mistake in it changes the whole map"
         doubts.append(_Doubt(reason, another))
     if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
-        doubts.append(_Doubt("the lengths are short for their standard deviations", "measure more and longer lengths"))
+        doubts.append(
+            _Doubt(
+                "the measured lengths are too short for their standard deviations", "measure more and longer lengths"
+            )
+        )
     return _verdict(doubts, [], uncertainty.half_width_95, options)
 
 
@@ -102,7 +106,7 @@ def judge_positions(num_used: int, uncertainty: ScaleUncertainty, options: Scale
         reason = f"the map rests on {num_used} known positions, so that nothing tells which of them is wrong if one is"
         doubts.append(_Doubt(reason, "survey a fourth control point, far from the others"))
     if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
-        reason = "the known positions are close together for their standard deviations"
+        reason = "the known positions are too close together for their standard deviations"
         doubts.append(_Doubt(reason, "survey control points at the ends of the site, or walk farther"))
     return _verdict(doubts, [], uncertainty.half_width_95, options)
 
@@ -114,7 +118,7 @@ def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[s
         half_width: half of the 95 % interval of the scale, relative.
     """
     if half_width > NORMAL_95 * options.max_relative_stddev:
-        planned = "plan it first, which says what would narrow it (rangesfm plan)"
+        planned = "plan the survey first (rangesfm plan), to see what would make the scale more certain"
         if half_width > NORMAL_95 * NOTHING_KNOWN:
             known = "the scale is not determined"
         else:
@@ -189,9 +193,7 @@ def _remarks(solution: Solution, anchors: Sequence[AnchorEstimate]) -> list[_Dou
     stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[2] >= NEARLY_FLAT * stddevs[0] or all(a.mirror_position_m is None for a in anchors):
         return []
-    reason = (
-        "the path is nearly flat: it is open on which side of it the unknown anchors stand; the scale is not affected"
-    )
+    reason = "the path is nearly flat: nothing tells on which side of it the unknown anchors stand (the scale is right)"
     return [_Doubt(reason, "raise and lower the camera on the way, or survey the anchors")]
 
 

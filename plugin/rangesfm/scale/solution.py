@@ -284,7 +284,9 @@ def _another_place(solution: Solution) -> GeometryError:
     """Return the error for two maps of the same scale that fit in the site frame."""
     stddevs = path_shape(solution.problem.centers).stddevs
     if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
-        return GeometryError("the map fits the ranges turned about the path, which is nearly straight: walk a bend")
+        return GeometryError(
+            "the path is nearly straight, and the map fits the ranges as well if it is turned about it: walk a bend"
+        )
     return OpenPlaceError(
         "the map and its mirror image in the anchors' plane fit the ranges equally well, as the path is flat too: "
         "add an anchor at another height, or say on which side of that plane the camera went (camera_side)",

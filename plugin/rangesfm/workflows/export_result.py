@@ -81,7 +81,7 @@ def apply_result(
         map_ = replace(map_, metric_from_sfm=similarity)
         # It is not zero, because the refinement has bent the map, which a similarity cannot do.
         if float(fitted := f"{residual_m:.3f}"):  # smaller bends than a millimetre are rounding
-            notes.append(f"the similarity fits the cameras to {fitted} m (rms): the refinement has bent the map")
+            notes.append(f"they fit the refined cameras to {fitted} m (rms), as the refinement changed the map's shape")
     wanted = in_frame(map_, options)
     if map_.metric_from_sfm is None or wanted.metric_from_sfm is None:
         raise InputError("the result has no similarity from the unscaled model to the metric one", output_path)
