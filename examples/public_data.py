@@ -57,7 +57,7 @@ def main() -> None:
 def convert_inrol(clone: Path, output: Path) -> Iterator[Path]:
     """Convert the sets of one camera with one tag in a motion-capture room.
 
-    The positions in ``anchor.txt`` are those of the antennas: the authors' programs take them as they are.
+    ``anchor.txt`` has the poses of the tracked bodies. The antennas are elsewhere on them, at ``T_mocap_anchor``.
     """
     parameters = YAML(typ="safe").load(clone / "example" / "config" / "parameter.yaml")
     extrinsics = {name: np.array(rows) for name, rows in parameters["extrinsics"].items()}
@@ -72,7 +72,10 @@ def convert_inrol(clone: Path, output: Path) -> Iterator[Path]:
         if not source.is_dir():
             continue
         write(target / "uwb.csv", RANGES, (row[1:] for row in words(source / "uwb.txt") if float(row[3]) > 0))
-        write(target / "anchors_surveyed.csv", ANCHORS, (row[:4] for row in words(source / "anchor.txt")))
+        bodies = list(words(source / "anchor.txt"))
+        antennas = moved(bodies, extrinsics["T_mocap_anchor"])
+        positions = ([body[0], *antenna[1:4]] for body, antenna in zip(bodies, antennas, strict=True))
+        write(target / "anchors_antennas.csv", ANCHORS, positions)
         if (source / "tag_pose.txt").is_file():
             write(target / "tag_groundtruth.csv", POSES, words(source / "tag_pose.txt"))
         elif (source / "imu_pose.txt").is_file():
@@ -218,7 +221,10 @@ def seconds(civil: str) -> str:
 
 
 def moved(poses: Iterable[Sequence[str]], body_from_other: Array) -> Iterator[list[str]]:
-    """Return the poses of another frame that is fixed to the body, as rows of time, position and quaternion."""
+    """Return the poses of another frame that is fixed to the body, as rows of time, position and quaternion.
+
+    What stands in place of the time, such as a number, is kept as a number.
+    """
     table = np.array(list(poses), dtype=np.float64)
     world_from_body = Rotation.from_quat(table[:, 4:])
     positions = table[:, 1:4] + world_from_body.apply(body_from_other[:3, 3])

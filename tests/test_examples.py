@@ -140,10 +140,11 @@ INROL = {
 extrinsics:
   T_mocap_tag: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]
   T_mocap_cam: [[0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+  T_mocap_anchor: [[0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0.25], [0, 0, 0, 1]]
   T_cam_imu: [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0.25], [0, 0, 0, 1]]
 """,
     "anchor_self_calibration1/parsed_dataset/uwb.txt": "# index timestamp anchor_id r\n0 0.1 7 2.83\n1 0.2 8 0.0\n",
-    "anchor_self_calibration1/parsed_dataset/anchor.txt": "# anchor_id tx ty tz qx qy qz qw\n7 1.25 -2.5 0.5 0 0 0 1\n",
+    "anchor_self_calibration1/parsed_dataset/anchor.txt": "# anchor_id tx ty tz qx qy qz qw\n7 1.25 -2.5 0.5 1 0 0 1\n",
     "anchor_self_calibration1/parsed_dataset/cam_pose.txt": "# timestamp tx ty tz qx qy qz qw\n0.5 1 2 3 0 0 0 1\n",
     "anchor_self_calibration1/parsed_dataset/images.txt": "# index timestamp image_name\n0 0.25 img/a00.png \n",
     "anchor_self_calibration1/parsed_dataset/img/a00.png": "a photo",
@@ -172,9 +173,10 @@ def test_a_public_room_becomes_what_its_survey_file_names(tmp_path: Path) -> Non
     tables, _ = parse_toml(EXAMPLES / "handheld_room.toml")
     assert all((room / tables[table][key]).is_file() for table, keys in FILES_OF.items() for key in keys)
     assert read_ranges(room / "uwb.csv").range_m.tolist() == [2.83]  # the zero is no measurement
-    (anchor,) = read_anchors(room / "anchors_surveyed.csv")
+    (anchor,) = read_anchors(room / "anchors_antennas.csv")
     assert anchor.anchor_id == "7"
-    np.testing.assert_array_equal(anchor.position_m, [1.25, -2.5, 0.5])
+    # The body is turned by a right angle about x: its z, along which the antenna is 0.25 m away, is the site's -y.
+    np.testing.assert_allclose(anchor.position_m, [1.25, -2.75, 0.5], atol=1e-8)
     assert rows_of(room / "images.csv") == [["a00.png", "0.25"]]
     assert (room / "images" / "a00.png").read_text() == (
         clone / "example" / "anchor_self_calibration1" / "parsed_dataset" / "img" / "a00.png"

@@ -65,7 +65,7 @@ class Given:
     """A map with its ranges, as files, and the truth.
 
     Attributes:
-        folder: with images.csv, uwb.csv, anchors_surveyed.csv and groundtruth.csv. model: the unscaled map.
+        folder: with images.csv, uwb.csv, anchors_antennas.csv and groundtruth.csv. model: the unscaled map.
         tag_in_cam_m: (3,).
         centers_m: true keyframe centres by name; those without truth are missing.
     """
@@ -108,7 +108,7 @@ def simulated_room(folder: Path) -> Given:
     )
     write_ranges_csv(simulate_ranges(path, anchors, SIMULATED_TAG_M, radio).log, folder / "uwb.csv")
     rows = [f"{name},{','.join(map(str, place.tolist()))}\n" for name, place in anchors.items()]
-    (folder / "anchors_surveyed.csv").write_text("anchor_id,x_m,y_m,z_m\n" + "".join(rows))
+    (folder / "anchors_antennas.csv").write_text("anchor_id,x_m,y_m,z_m\n" + "".join(rows))
     lines = [f"{name},{at!r}\n" for name, at in made.timestamps_s.items()]
     (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(lines))
     write_reference(Reference(made.centers_m, image_names=tuple(made.timestamps_s)), folder / "groundtruth.csv")
@@ -133,7 +133,7 @@ def by_command(given: Given, *words: str) -> Found:
     """Run a command of rangesfm on the map."""
     with tempfile.TemporaryDirectory() as scratch:
         tag = ",".join(map(str, given.tag_in_cam_m))
-        files = ["--ranges", "uwb.csv", "--anchors", "anchors_surveyed.csv", "--images", "images.csv"]
+        files = ["--ranges", "uwb.csv", "--anchors", "anchors_antennas.csv", "--images", "images.csv"]
         command = [*words, "--input_path", str(given.model.resolve()), *files, "--tag_in_cam", tag]
         command += ["--ranges_time_offset", "0", "--no_report", "--quiet", "--output_path", f"{scratch}/out"]
         subprocess.run([sys.executable, "-m", "rangesfm", *command], cwd=given.folder, check=True, capture_output=True)
@@ -162,7 +162,7 @@ class Trilaterated:
     @classmethod
     def of(cls, given: Given) -> Trilaterated:
         log = read_ranges(given.folder / "uwb.csv")
-        position = {a.anchor_id: np.asarray(a.position_m) for a in read_anchors(given.folder / "anchors_surveyed.csv")}
+        position = {a.anchor_id: np.asarray(a.position_m) for a in read_anchors(given.folder / "anchors_antennas.csv")}
         anchors_m = np.array([position[name] for name in log.anchor_ids])[log.anchor_index]
         assert log.timestamp_s is not None
         model, times, places = pycolmap.Reconstruction(given.model), given.times, {}

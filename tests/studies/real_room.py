@@ -35,7 +35,7 @@ def real_room(folder: Path, model: Path, seed: int) -> Given:
     tag_in_cam_m = np.array(json.loads((folder / "camera.json").read_text(encoding="utf-8"))["tag_in_cam_m"])
     turned = rotations(time_s).as_matrix()
     anchors_m = {
-        anchor.anchor_id: np.asarray(anchor.position_m) for anchor in read_anchors(folder / "anchors_surveyed.csv")
+        anchor.anchor_id: np.asarray(anchor.position_m) for anchor in read_anchors(folder / "anchors_antennas.csv")
     }
     anchors_m = {name: anchors_m[name] for name in log.anchor_ids}
     at_photos = interpolated(times, centers_m, np.asarray(trajectory.timestamps_s))
