@@ -395,7 +395,12 @@ def main() -> None:
         for seed in range(args.seed, args.seed + max(args.num_seeds, args.num_clean)):
             for name, frame, ids, make in sites:
                 if name.startswith(args.surveys):
-                    for line in runs_of_seed(name, kinds(ids if frame != "unknown" else []), make, seed, args, done):
+                    wanted = [
+                        (number, kind)
+                        for number, kind in enumerate(kinds(ids if frame != "unknown" else []))
+                        if args.kinds in kind.name and seed < args.seed + args.num_seeds
+                    ]
+                    for line in runs_of_seed(name, wanted, make, seed, done):
                         out.write(json.dumps(line) + "\n")
                         out.flush()
 
@@ -405,15 +410,15 @@ def outcome(given: Given, seed: int) -> Run:
 
 
 def runs_of_seed(
-    survey: str, all_kinds: list[Kind], make: Callable[[int], Given], seed: int, args: argparse.Namespace, done: Lines
+    survey: str, numbered_kinds: Sequence[tuple[int, Kind]], make: Callable[[int], Given], seed: int, done: Lines
 ) -> Iterator[Line]:
-    """Yield the runs of a seed that are not done yet."""
+    """Yield the runs of a seed that are not done yet; a kind's number and the seed decide on the mistake's size."""
     clean = done.get((survey, CLEAN, seed))
     if clean is None:
         clean = told(outcome(make(seed), seed), survey, CLEAN, seed)
         yield clean
-    for number, kind in enumerate(all_kinds):
-        if args.kinds not in kind.name or (survey, kind.name, seed) in done or seed >= args.seed + args.num_seeds:
+    for number, kind in numbered_kinds:
+        if (survey, kind.name, seed) in done:
             continue
         factor, size = FACTORS[(seed + number) % len(FACTORS)], 1.0
         if kind.of is not None:

@@ -1,0 +1,109 @@
+"""Measure accuracy, honesty and speed of this state in one table, and compare it with the stored one.
+
+    python -m tests.accuracy [--data DIR] [--quick] [--groups NAME ...] [--workers 2] [--store]
+
+DIR holds the data sets that ``examples/public_data.md`` describes; groups that need what is not there are left out, and
+named. ``tests/accuracy/groups.py`` lists the groups: what each runs, and its figures. ``--quick`` runs a part of the
+cases of each group. The same cases have the same seeds, so that two runs on one state give the same figures, apart from
+times.
+
+Each figure is compared with the stored one over the cases that both have. It is worse if the cases are worse on the
+average by more than the scatter of their changes allows for. Prints the table; exit status 1 if a figure is worse.
+
+``--store`` stores the cases, and writes the table into ``examples/measured.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+from tests.accuracy.figures import Cases, Loss, Values
+from tests.accuracy.groups import GROUPS, Group, Task, cases_of
+
+STORED = Path(__file__).with_name("stored.json")
+PAGE = Path(__file__).parents[2] / "examples" / "measured.md"
+BEGIN, END = "<!-- written by python -m tests.accuracy --store -->\n", "<!-- end -->\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--groups", nargs="+", choices=[group.name for group in GROUPS])
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--store", action="store_true")
+    args = parser.parse_args()
+    if args.store and args.quick:
+        parser.error("--store is for all cases")
+    groups = [group for group in GROUPS if args.groups is None or group.name in args.groups]
+    found = measured(groups, args.data, quick=args.quick, num_workers=args.workers)
+    stored = json.loads(STORED.read_text(encoding="utf-8"))["groups"] if STORED.exists() else {}
+    losses = [loss for name, cases in found.items() for loss in losses_of(name, cases, stored.get(name, {}))]
+    print("\n".join(rows(found)))
+    for name, loss in losses:
+        if loss.is_real:
+            print(f"WORSE: {name}, {loss.figure.words}: {loss.by:.3g} on the average, scatter {loss.allowed:.3g}")
+    if args.store:
+        store({**stored, **found})
+    return int(any(loss.is_real for _, loss in losses))
+
+
+def measured(groups: list[Group], data: Path | None, *, quick: bool, num_workers: int) -> dict[str, Cases]:
+    """Run all cases side by side, those that take longest first, and return their values by group."""
+    # Each process has one thread for linear algebra; it is read when numpy is loaded, hence before the processes begin.
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    tasks = [task for group in groups for task in group.tasks(data, quick)]
+    for group in groups:
+        if not any(task.group == group.name for task in tasks):
+            print(f"left out, without its data: {group.name}", file=sys.stderr)
+    found: dict[str, dict[str, Values]] = {group.name: {} for group in groups}
+    start = time.perf_counter()
+    with ProcessPoolExecutor(num_workers, mp_context=get_context("spawn")) as pool:
+        running = {pool.submit(cases_of, task): task for task in sorted(tasks, key=lambda task: -task.seconds)}
+        for number, future in enumerate(as_completed(running), 1):
+            task: Task = running[future]
+            found[task.group] |= future.result()
+            print(f"{time.perf_counter() - start:5.0f} s, {number} of {len(tasks)}: {task.name}", file=sys.stderr)
+    return {name: dict(sorted(cases.items())) for name, cases in found.items() if cases}
+
+
+def losses_of(name: str, cases: Cases, stored: Cases) -> Iterator[tuple[str, Loss]]:
+    """Yield the name of the group with each comparison."""
+    group = next(group for group in GROUPS if group.name == name)
+    for figure in group.figures:
+        if (loss := figure.loss(cases, stored)) is not None:
+            yield name, loss
+
+
+def rows(found: dict[str, Cases]) -> Iterator[str]:
+    """Yield the table in Markdown."""
+    yield "| what | cases | measured |"
+    yield "|---|---|---|"
+    for group in GROUPS:
+        if cases := found.get(group.name):
+            figures = "; ".join(f"{figure.words} {figure.text(cases)}" for figure in group.figures)
+            yield f"| {group.words} (`{group.name}`) | {len(cases)} | {figures} |"
+
+
+def store(found: dict[str, Cases]) -> None:
+    """Store the cases, and write the table into the page of what is measured."""
+    state = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True)
+    content = {"state": state.stdout.strip(), "groups": found}
+    STORED.write_text(json.dumps(content, indent=0, sort_keys=True) + "\n", encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
+    before, rest = page.split(BEGIN)
+    table = "\n".join([f"\nMeasured on `{state.stdout.strip()}`:\n", *rows(found), "\n"])
+    PAGE.write_text(before + BEGIN + table + END + rest.split(END, 1)[1], encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,418 @@
+"""Groups of surveys in the table of accuracy: what each runs, and the figures that it gives."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from tests.accuracy.figures import Figure, Values
+from tests.benchmarks import reconstruction
+from tests.studies import drifting_maps, growth, known_positions, mistakes, real_logs
+from tests.studies.erring_surveys import SITES, surveyed
+from tests.studies.measured_distances import KINDS, simulated
+
+from rangesfm.demo.survey import PHOTOS
+from rangesfm.options import CameraOptions
+from rangesfm.vision.image_times import list_images
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+# Metres per unit of the models in DIR/starloc_tags and of those that the study of real logs makes.
+STARLOC_SCALE = 1.48788
+STARLOC_ANCHORS = ("unknown", "site")
+
+Cases = dict[str, Values]
+
+
+@dataclass(frozen=True)
+class Task:
+    """Some cases of a group that are run together.
+
+    Attributes:
+        group, name: of the group and of these cases.
+        run: returns values by case.
+        seconds: how long it takes, roughly.
+    """
+
+    group: str
+    name: str
+    run: Callable[[], Cases]
+    seconds: float
+
+
+def cases_of(task: Task) -> Cases:
+    """Run a task without what its study prints."""
+    with redirect_stdout(io.StringIO()):
+        return task.run()
+
+
+@dataclass(frozen=True)
+class Group:
+    """Surveys of one kind.
+
+    Attributes:
+        words: description for people.
+        tasks: lists what is to be run, given the folder of data, if any, and whether a part is enough.
+    """
+
+    name: str
+    words: str
+    figures: tuple[Figure, ...]
+    tasks: Callable[[Path | None, bool], list[Task]]
+
+
+def scale_figures(*, named: str = "mistake named") -> tuple[Figure, ...]:
+    """Figures that all groups have which state an interval of the scale."""
+    return (
+        Figure("scale covered", "covered", "mean", "%", "lower"),
+        Figure("error", "error", "rms", "%", "higher"),
+        Figure("in stated stddevs", "in_stddevs", "rms", "", "higher"),
+        Figure("half width", "half_width", "median", "%", "higher"),
+        Figure(named, "named", "mean", "%", "higher"),
+        Figure("refused", "refused", "mean", "%", "higher"),
+    )
+
+
+def of_interval(error: float, low: float, high: float, num_named: int) -> Values:
+    """Return the values of ``scale_figures`` from the error and the interval about the estimate, as logarithms."""
+    half_width = (high - low) / 2
+    return {
+        "covered": float(low <= -error <= high),
+        "error": error,
+        "in_stddevs": 1.96 * (error + (low + high) / 2) / half_width,
+        "half_width": half_width,
+        "named": float(num_named > 0),
+        "refused": 0.0,
+    }
+
+
+REFUSED: Values = {"refused": 1.0}
+
+
+def one_log(data: Path, name: str, with_single_anchors: bool) -> Cases:
+    described = json.loads((Path(real_logs.__file__).with_suffix(".json")).read_text(encoding="utf-8"))[name]
+    log, anchors, reference = real_logs.read_set(data, described)
+    path, found = real_logs.path_of(reference), Cases()
+    for case in real_logs.cases(log, anchors, path):
+        if with_single_anchors or not case.name.startswith("only"):
+            observations = real_logs.placed(log, case, path, described, by_photo=False)
+            row = real_logs.one_survey(name, case, observations, path)
+            found[f"{name}, {case.name}"] = REFUSED if row is None else of_interval(*row)
+    return found
+
+
+def log_tasks(data: Path | None, quick: bool) -> list[Task]:
+    sets = json.loads((Path(real_logs.__file__).with_suffix(".json")).read_text(encoding="utf-8"))
+    return [
+        Task("real logs", name, partial(one_log, data, name, not quick), 40.0)
+        for name, described in sets.items()
+        if data is not None and (data / described["ranges"]).is_file()
+    ]
+
+
+def one_drifting_map(kind: str, seed: int, data: Path | None) -> Cases:
+    line = drifting_maps.told(drifting_maps.surveys(data)[kind](seed), kind, seed)
+    if line["refused"]:
+        return {f"{kind} {seed}": REFUSED}
+    is_nearer = line["refined_m"] is not None and line["refined_m"] < line["scaled_m"]
+    low, high = -line["half_width"], line["half_width"]
+    values = of_interval(line["log_error"], low, high, len(line["causes"]))
+    values = {**values, "covered": float(line["covered"]), "in_stddevs": line["log_error"] / line["stddev"]}
+    of_map = {
+        "rmse": line["final_m"],
+        "kept": float(line["kept"]) if is_nearer else None,
+        "places": line["places_covered"],
+    }
+    return {f"{kind} {seed}": {**values, **of_map}}
+
+
+def lap_tasks(_: Path | None, quick: bool) -> list[Task]:
+    kinds = ("lap", "lap_unknown", "lap_site", "lap_radio", "hall", "poses")
+    return [
+        Task("drifting maps", f"{kind} {seed}", partial(one_drifting_map, kind, seed, None), 20.0)
+        for k, kind in enumerate(kinds)
+        for seed in range(k, k + (1 if quick else 5))
+    ]
+
+
+def desk_tasks(data: Path | None, quick: bool) -> list[Task]:
+    if data is None or not (data / "slam_keyframes").is_dir():
+        return []
+    seeds = range(2 if quick else 6)
+    return [
+        Task("real keyframes", f"desk {seed}", partial(one_drifting_map, "desk", seed, data), 5.0) for seed in seeds
+    ]
+
+
+def one_known_survey(known: str, kind: str, seed: int) -> Cases:
+    truth, survey = simulated(replace(KINDS[kind], frame="site"), seed)
+    of_survey = known_positions.Known.of(known.split("+"), truth, survey, KINDS[kind].path(seed), seed)
+    line = known_positions.told(of_survey, "none", KINDS[kind].pixel_stddev, seed)
+    name = f"{known}, {kind} {seed}"
+    if line["refused"]:
+        return {name: REFUSED}
+    off, in_stddevs, _ = line["scale"]
+    return {
+        name: {
+            "covered": float(line["covered"]),
+            "error": off,
+            "in_stddevs": in_stddevs,
+            "half_width": line["half"],
+            "named": float(bool(line["named"])),
+            "refused": 0.0,
+            "rmse": line["rmse_m"],
+            "places": line["placed"],
+        }
+    }
+
+
+def known_tasks(_: Path | None, quick: bool) -> list[Task]:
+    return [
+        Task("known positions", f"{known}, {kind} {seed}", partial(one_known_survey, known, kind, seed), 8.0)
+        for known, num in (("points", 6), ("positions", 6), ("positions+ranges+anchors", 3))
+        for kind in known_positions.KINDS_OF_SURVEY
+        for seed in range(1 if quick else num)
+    ]
+
+
+def mistakes_of_survey(site_number: int, seed: int, num: int) -> Cases:
+    """Run a clean survey, and some kinds of mistakes drawn for this seed."""
+    site = SITES[site_number]
+    all_kinds = mistakes.kinds(list(site.anchors_m) if site.frame != "unknown" else [])
+    drawn = np.random.default_rng([seed, site_number]).choice(len(all_kinds), num, replace=False)
+    made = mistakes.runs_of_seed(site.name, [(int(k), all_kinds[k]) for k in drawn], partial(surveyed, site), seed, {})
+    return {f"{site.name}, {line['kind']} {seed}": of_mistake(line) for line in made}
+
+
+def of_mistake(line: dict[str, Any]) -> Values:
+    is_clean = line["kind"] == mistakes.CLEAN
+    if line["refused"]:
+        return {"refused": 1.0} if is_clean else {}
+    is_good = not line["doubts"]
+    good_and_wrong = float(is_good and (line["wrong"] or line["place"] > 3))
+    if is_clean:
+        return {
+            "clean_named": float(line["found"]),
+            "clean_doubted": float(not is_good),
+            "good_and_wrong": good_and_wrong,
+        }
+    large = line["factor"] in (None, 2.0, 5.0)
+    return {
+        "found": float(line["found"]) if large else None,
+        "first": float(line["is_first"]) if large else None,
+        "good_and_wrong": good_and_wrong,
+    }
+
+
+def mistake_tasks(_: Path | None, quick: bool) -> list[Task]:
+    return [
+        Task("mistakes", f"{SITES[k].name} {seed}", partial(mistakes_of_survey, k, seed, 3), 15.0)
+        for seed in range(2 if quick else 7)
+        for k in range(len(SITES))
+    ]
+
+
+MISTAKE_FIGURES = (
+    Figure("found", "found", "mean", "%", "lower"),
+    Figure("named first", "first", "mean", "%", "lower"),
+    Figure("good with a wrong scale or place", "good_and_wrong", "mean", "%", "higher"),
+    Figure("clean ones with a mistake named", "clean_named", "mean", "%", "higher"),
+    Figure("doubted", "clean_doubted", "mean", "%", "higher"),
+)
+
+
+def run_command(*words: str) -> dict[str, Any] | None:
+    """Run a command of the package that writes a result; return ``result.json``, or None if it is refused."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "rangesfm", *words, "--no_report", "--quiet", "--output_path", f"{folder}/out"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode not in (0, 3):
+            raise RuntimeError(f"{' '.join(words)}: {done.stderr}")
+        return (
+            None if done.returncode else json.loads((Path(folder) / "out" / "result.json").read_text(encoding="utf-8"))
+        )
+
+
+def of_result(result: dict[str, Any] | None) -> Values:
+    """Return the values of a result that was compared with a reference."""
+    if result is None:
+        return REFUSED
+    row, scale = result["comparison"][-1], result["scale"]
+    error = float(np.log1p(row["scale_error_percent"] / 100))
+    low, high = (float(np.log(end / scale["value"])) for end in scale["interval_95"])
+    named = [test for test in result["tests"] or () if test["rejected"]]
+    of_map = {name: row[f"{name}_m"] for name in ("rmse", "rmse_se3", "rmse_sim3")}
+    return {**of_interval(error, low, high, len(named)), **of_map}
+
+
+def room(data: Path, seed: int, with_single_anchors: bool) -> Cases:
+    """Map the room from its photos, with all anchors surveyed, and refine that map with them unknown."""
+    folder = data / "room_env1"
+    with tempfile.TemporaryDirectory() as scratch:
+        survey = [str(EXAMPLES / "handheld_room.toml"), "--base_path", str(folder), "--seed", str(seed)]
+        subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "rangesfm",
+                "run",
+                *survey,
+                "--quiet",
+                "--no_report",
+                "--output_path",
+                f"{scratch}/out",
+            ],
+            check=True,
+            capture_output=True,
+        )
+        result = json.loads((Path(scratch) / "out" / "result.json").read_text(encoding="utf-8"))
+        seconds = result["seconds"]
+        before = sum(seconds.get(stage, 0.0) for stage in ("features", "matching", "mapping"))
+        after = sum(seconds.values()) - before
+        found: Cases = {f"surveyed {seed}": {**of_result(result), "after_mapping": after / before}}
+        files = ["--ranges", "uwb.csv", "--images", "images.csv", "--reference", "groundtruth.csv"]
+        files = [str(folder / word) if "." in word else word for word in files]
+        unknown = ["--anchor_frame", "unknown", "--ranges_time_offset", "0", "--tag_in_cam", "-0.0012,-0.09,-0.0663"]
+        refine = ["refine", "--input_path", f"{scratch}/out/sparse/0", *files, *unknown]
+        found[f"unknown {seed}"] = of_result(run_command(*refine))
+        with (folder / "anchors_antennas.csv").open(encoding="utf-8") as file:
+            ids = [row["anchor_id"] for row in csv.DictReader(file)] if with_single_anchors else []
+        for name in ids:
+            found[f"only {name}, {seed}"] = of_result(run_command(*refine, "--use_anchors", name))
+    return found
+
+
+def room_tasks(data: Path | None, quick: bool) -> list[Task]:
+    if quick or data is None or not (data / "room_env1").is_dir():
+        return []
+    return [
+        Task("room", f"seed {seed}", partial(room, data, seed, seed == 0), 300.0 if seed == 0 else 200.0)
+        for seed in range(3)
+    ]
+
+
+def tag_map(data: Path, stage: str, anchors: str | None, offset: str) -> Cases:
+    folder = data / "starloc_tags"
+    words = [stage, "--input_path", str(folder / "sparse" / "0"), "--tag_in_cam", "T1:0.0402,0.1402,-0.1812"]
+    for flag, name in (("ranges", "ranges.csv"), ("images", "images.csv"), ("reference", "truth.csv")):
+        words += [f"--{flag}", str(folder / name)]
+    words += ["--ranges_time_offset", offset]
+    words += ["--anchor_frame", "unknown"] if anchors is None else ["--anchors", str(folder / "anchors.csv")]
+    if anchors not in (None, "all"):
+        words += ["--anchor_frame", "unknown", "--use_anchors", str(anchors)]
+    return {f"{stage}, anchors {anchors or 'unknown'}, offset {offset}": of_result(run_command(*words))}
+
+
+def tag_tasks(data: Path | None, quick: bool) -> list[Task]:
+    if data is None or not (data / "starloc_tags").is_dir():
+        return []
+    with (data / "starloc_tags" / "anchors.csv").open(encoding="utf-8") as file:
+        ids = [row["anchor_id"] for row in csv.DictReader(file)]
+    return [
+        Task("camera and tags", f"{stage} {anchors} {offset}", partial(tag_map, data, stage, anchors, offset), 6.0)
+        for stage in ("scale", "refine")
+        for anchors in (None, "all", *([] if quick else ids))
+        for offset in (("-0.039",) if quick else ("-0.039", "auto"))
+    ]
+
+
+def grown(num: int) -> Cases:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        growth.simulate(folder, num, 20, 200, 0)
+        seconds, _, _ = growth.refined(folder, with_profile=False)
+        result = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
+    return {f"{num} keyframes": {**of_result(result), "seconds_each": seconds / num}}
+
+
+def growth_tasks(_: Path | None, quick: bool) -> list[Task]:
+    return [
+        Task("growth", f"{num} keyframes", partial(grown, num), 0.1 * num) for num in ((500,) if quick else (500, 2000))
+    ]
+
+
+def beside_pycolmap() -> Cases:
+    """Take the demo's photos to a model by pycolmap's calls and by rangesfm in turn; the first round warms up."""
+    names, camera = list_images(PHOTOS), CameraOptions()
+    ratios: list[list[float]] = []
+    for number in range(3):
+        clocks = []
+        for program in (reconstruction.by_pycolmap, reconstruction.by_rangesfm):
+            with tempfile.TemporaryDirectory() as folder:
+                efforts = program(PHOTOS, names, Path(folder), camera, 2, number)
+            clocks.append([effort.processor_s for effort in efforts])
+        ratios.append([ours / theirs for theirs, ours in zip(*clocks, strict=True)])
+    stages = (*reconstruction.STAGES, "all")
+    return {"demo": {stage: median(ratio[k] for ratio in ratios) for k, stage in enumerate(stages)}}
+
+
+def speed_tasks(_: Path | None, quick: bool) -> list[Task]:
+    return [] if quick else [Task("speed", "demo", beside_pycolmap, 90.0)]
+
+
+RMSE = Figure("RMSE", "rmse", "median", "m", "higher")
+PLACES = Figure("place covered", "places", "mean", "%", "lower")
+
+GROUPS: Sequence[Group] = (
+    Group(
+        "real logs",
+        "Real logs with truth, each with its anchors surveyed, known, unknown, and one alone",
+        scale_figures(),
+        log_tasks,
+    ),
+    Group(
+        "room",
+        "The hand-held room, photos and all, by three seeds; one anchor alone by one",
+        (
+            *scale_figures(),
+            RMSE,
+            Figure("after SE(3)", "rmse_se3", "median", "m", "higher"),
+            Figure("after Sim(3)", "rmse_sim3", "median", "m", "higher"),
+            Figure("time after the mapping, of that up to it", "after_mapping", "median", "%", None),
+        ),
+        room_tasks,
+    ),
+    Group(
+        "camera and tags",
+        "Maps of printed tags with real ranges, scaled and refined",
+        (*scale_figures(), RMSE),
+        tag_tasks,
+    ),
+    Group(
+        "drifting maps",
+        "Clean surveys whose maps drift: laps, halls, paths without points",
+        (*scale_figures(), RMSE, PLACES, Figure("better refinements kept", "kept", "mean", "%", "lower")),
+        lap_tasks,
+    ),
+    Group("real keyframes", "Real monocular keyframes with simulated ranges", (*scale_figures(), RMSE), desk_tasks),
+    Group(
+        "known positions",
+        "Control points, positions, and positions with ranges",
+        (*scale_figures(), RMSE, PLACES),
+        known_tasks,
+    ),
+    Group("mistakes", "Surveys with a mistake, and clean ones", MISTAKE_FIGURES, mistake_tasks),
+    Group(
+        "growth",
+        "500 and 2000 keyframes with loops, refined",
+        (*scale_figures(), RMSE, Figure("time for a keyframe", "seconds_each", "mean", "s", None)),
+        growth_tasks,
+    ),
+    Group(
+        "speed",
+        "Photos to model, processor time over that of pycolmap's own calls",
+        tuple(Figure(stage, stage, "median", "", None) for stage in ("features", "matching", "mapping", "all")),
+        speed_tasks,
+    ),
+)
