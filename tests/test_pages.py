@@ -230,10 +230,16 @@ def test_flags_in_the_text_exist() -> None:
 
 # These need no page: the help says all.
 OF_THE_HELP = {"--num_photos", "--quiet"}
-OF_OTHER_PROGRAMS = {"--auto_scale_poses", "--center_method", "--csv", "--ref_images_path", "--transform_path"}
+OF_OTHER_PROGRAMS = {
+    "--auto_scale_poses",
+    "--center_method",
+    "--csv",
+    "--orientation_method",
+    "--ref_images_path",
+    "--transform_path",
+}
 OF_STUDIES = {
     "--kinds",
-    "--num",
     "--num_clean",
     "--num_keyframes",
     "--num_ranges_each",
