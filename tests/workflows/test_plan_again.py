@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from tests.conftest import SITE_M
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.planning.advice import advise
 from rangesfm.planning.expected import expect
 from rangesfm.planning.survey_plan import plan_survey
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.scale.scale_verdict import CALIBRATE
 from rangesfm.workflows.plan_again import _planned, plan_of_result
 
@@ -76,7 +80,7 @@ def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None
     room = rng.uniform((-4.0, -3.0, 0.0), (4.0, 3.0, 2.6), size=(500, 3))
     yard = rng.uniform((-40.0, -40.0, 0.0), (40.0, 40.0, 0.4), size=(500, 3))
     for name, points, highest_m in (("room", room, 2.65), ("yard", yard, 1.85)):
-        planned = _planned(path, points, anchors, "site", np.zeros(3), 2000, {})
+        planned = _planned(path, points, anchors, "site", np.zeros(3), 2000, {}, Site())
         assert planned.walls_are == "edge of what the photos show"
         advice = advise(expect(planned))
         assert any(each.kind == "anchor place" for each in advice), name
@@ -87,6 +91,30 @@ def test_advice_on_a_finished_survey_stays_inside_what_its_photos_show() -> None
             assert np.count_nonzero(away_m < 1e-9) == 1
         assert max(each.planned.anchors_m[:, 2].max() for each in advice) <= highest_m
         assert not any(each.kind == "wider anchors" for each in advice)
+
+
+def test_advice_has_the_coordinates_of_the_site_or_says_of_what_they_are(
+    own_survey: WalkedSurvey, rangesfm_command: Command
+) -> None:
+    anchors = own_survey.folder / "anchors.csv"
+    typed = anchors.read_text().replace("A3,1018.0,5008.0", "A3,1018.0,5009.5")
+    assert typed != anchors.read_text()
+    anchors.write_text(typed)
+    flags = (*own_survey.flags, "--no_report", "--output_path", "out")
+    triple = re.compile(r"(-?[\d.]+), (-?[\d.]+), (-?[\d.]+)")
+
+    def places_m(lines: list[str], words: str) -> Array:
+        told = [line for line in lines if triple.search(line)]
+        assert any("survey three control points" in line and words in line for line in told)
+        assert all(words in line for line in told)
+        return np.array([place for line in told for place in triple.findall(line)], dtype=np.float64)
+
+    rangesfm_command("scale", *flags, "--anchors", "anchors.csv", cwd=own_survey.folder)
+    scale = json.loads((own_survey.folder / "out" / "result.json").read_text())["scale"]
+    assert np.abs(places_m(scale["advice"], "") - SITE_M).max() < 25
+    rangesfm_command("scale", *flags, "--anchor_frame", "unknown", "--use_anchors", "A1", cwd=own_survey.folder)
+    planned = rangesfm_command("plan", "--from", "out", cwd=own_survey.folder).stdout.splitlines()
+    assert np.abs(places_m(planned, "metres right of, ahead of and above the first photo")).max() < 25
 
 
 def test_a_folder_that_holds_no_result_is_refused(tmp_path: Path, rangesfm_command: Command) -> None:

@@ -24,7 +24,6 @@ from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.walls import AT_WALL_M, lead_through
 from rangesfm.positions.control_points import ControlPoint
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.site import coordinates_text
 from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.scale.scale_verdict import CALIBRATE, FEW_RANGES
@@ -226,7 +225,7 @@ def _raised(planned: PlannedSurvey) -> Iterator[_Change]:
             place = planned.anchors_m[k] + [0.0, 0.0, by_m]
             if lowest_m <= place[2] <= highest_m:
                 verb = "raise" if by_m > 0 else "lower"
-                height = f"{coordinates_text(place[2:])} m{planned.level}"
+                height = f"{planned.site.height_text(place)} m{planned.level}"
                 words = f"{verb} anchor {anchor.anchor_id} by {abs(by_m):g} m, to {height}"
                 yield "anchor height", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
@@ -241,7 +240,7 @@ def _moved(planned: PlannedSurvey, places: Sequence[Array]) -> Iterator[_Change]
     """Yield the plan with each anchor moved to each of some allowed places."""
     for k, anchor in enumerate(planned.anchors if planned.allowed_m is not None else ()):
         for place in places:
-            words = f"move anchor {anchor.anchor_id} to {coordinates_text(place)}{planned.axes}"
+            words = f"move anchor {anchor.anchor_id} to {planned.site.place_text(place)}{planned.axes}"
             yield "anchor place", anchor.anchor_id, words, planned.with_anchor_at(k, place)
 
 
@@ -253,7 +252,7 @@ def _with_one_more(planned: PlannedSurvey) -> Iterator[_Change]:
     name = next(name for name in (f"new{number or ''}" for number in range(len(taken) + 1)) if name not in taken)
     for place in _free_places(planned):
         more = (*planned.anchors, Anchor(name, place, stddev_m))
-        words = f"add an anchor at {coordinates_text(place)}{planned.axes}"
+        words = f"add an anchor at {planned.site.place_text(place)}{planned.axes}"
         yield "one more anchor", "", words, replace(planned, anchors=more)
 
 
@@ -276,7 +275,7 @@ def _with_control_points(planned: PlannedSurvey) -> Iterator[_Change]:
     spread = spread_places(MIN_NUM_POSITIONS, places[outermost_first])
     stddev_m = PointOptions().stddev_m
     more = tuple(ControlPoint(name, at, stddev_m, CONTROL, 0) for name, at in zip(names, spread, strict=False))
-    where = "; ".join(map(coordinates_text, spread)) + planned.axes
+    where = "; ".join(map(planned.site.place_text, spread)) + planned.axes
     words = f"survey three control points that the photos show, such as {where}, to {stddev_m:g} m"
     anchor_frame = "site" if planned.anchor_frame == "site" else "unknown"
     with_points = replace(planned, points=(*planned.points, *more), anchor_frame=anchor_frame)

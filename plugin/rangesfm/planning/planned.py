@@ -18,6 +18,7 @@ from rangesfm.positions.control_points import ControlPoint
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions, joined_positions
 from rangesfm.positions.position_log import PositionLog
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
@@ -80,8 +81,8 @@ class PlannedSurvey:
         is_placed: whether the anchors' places are fixed; else they may be moved to any allowed place.
         max_num_ranges: largest number of simulated ranges; if there are more, each stands for several.
         warnings: what is odd about the plan, a line each.
-        axes: words after coordinates that say where they are, if that is not the site; empty: it is.
-        level: words after a height, likewise.
+        site: frame of all positions, from which texts get the coordinates that the user knows.
+        axes, level: words after coordinates, and after a height, that say of what they are, if not of the site.
     """
 
     trajectory: Trajectory
@@ -104,6 +105,7 @@ class PlannedSurvey:
     is_placed: bool = True
     max_num_ranges: int = 2000
     warnings: tuple[str, ...] = ()
+    site: Site = field(default_factory=Site)
     axes: str = ""
     level: str = ""
 

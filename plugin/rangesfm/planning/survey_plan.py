@@ -19,7 +19,6 @@ from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.ranging.anchors.site import coordinates_text
 from rangesfm.ranging.errors.components import component_words
 from rangesfm.ranging.errors.noise import NORMAL_95
 
@@ -268,8 +267,9 @@ def _known(plan: SurveyPlan) -> Iterator[str]:
     of_anchors = f"{plan.num_ranges} ranges in {plan.duration_s:.0f} s, " if plan.anchors_m else ""
     yield f"{of_anchors}result in the {plan.frame.replace('_', ' ')}'s frame"
     if plan.anchors_m:
-        places = (f"{name} {coordinates_text(np.array(place))}" for name, place in plan.anchors_m.items())
-        yield f"anchors at {'; '.join(places)}{plan.expected.planned.axes}"
+        planned = plan.expected.planned
+        places = (f"{name} {planned.site.place_text(np.array(place))}" for name, place in plan.anchors_m.items())
+        yield f"anchors at {'; '.join(places)}{planned.axes}"
     interval = f"{low:+.2g} to {high:+.2g} % (95 %)" if np.isfinite(high) else "open"
     yield f"scale: {plan.verdict}; {interval}"
     yield from (f"  {reason}" for reason in plan.reasons)

@@ -12,11 +12,13 @@ from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.metric_map import colored_points, level_axes, up_in_world
 from rangesfm.files.contents import AnyPath
+from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.model_path import path_in_result
@@ -60,15 +62,18 @@ def plan_of_result(path: AnyPath) -> PlannedSurvey:
     anchors = [Anchor(name, at, stddevs[name]) for name, at in heard.items()]
     is_known = any(anchor.surveyed_position_m is not None for anchor in folder.summary.anchors.values())
     frame, stddevs_m = _frame(folder.summary.frame, is_known=is_known), folder.summary.scale.error_stddevs
-    return _planned(trajectory, colored_points(model)[0], anchors, frame, arm, len(used), stddevs_m)
+    on_earth = folder.summary.georeference
+    site = Site(georeference=None if on_earth is None else on_earth.georeference)
+    return _planned(trajectory, colored_points(model)[0], anchors, frame, arm, len(used), stddevs_m, site)
 
 
-def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
+def with_advice(metric: MetricResult, tag_in_cam_m: Array, georeference: Georeference | None) -> MetricResult:
     """Add advice on what to change next time, where the scale or the place is doubtful.
 
     Args:
         metric: the result.
         tag_in_cam_m: (num_tags, 3) lever arms.
+        georeference: of the site; None without one.
     """
     doubtful = metric.estimate.verdict == "doubtful", metric.place is not None and metric.place.verdict == "doubtful"
     observations = metric.observations
@@ -89,7 +94,8 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array) -> MetricResult:
         frame, learned = _frame(estimate.frame, is_known=is_known), estimate.errors.learned
         stddevs = {} if learned is None else learned.stddev_of_component
         points_m = colored_points(metric.final)[0]
-        planned = _planned(trajectory, points_m, anchors, frame, arm, int(used.sum()), stddevs)
+        site = Site(georeference=georeference)
+        planned = _planned(trajectory, points_m, anchors, frame, arm, int(used.sum()), stddevs, site)
         expected = expect(planned)
     except (InputError, GeometryError):  # the upward direction is unknown, or a survey like this one would be refused
         return metric
@@ -107,6 +113,7 @@ def _planned(
     tag_in_cam_m: Array,
     num_ranges: int,
     component_stddevs: Mapping[str, float],
+    site: Site,
 ) -> PlannedSurvey:
     """Return the plan with z up, inside what the photos show, and with assumed times where the photos have none.
 
@@ -123,6 +130,7 @@ def _planned(
         rate_hz=1.0,
         tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
         component_stddevs=component_stddevs,
+        site=site if is_site else Site(),
         axes="" if is_site else _AXES,
         level="" if is_site else _LEVEL,
     )

@@ -171,5 +171,5 @@ def map_in_metres(
 def with_results(run: SurveyRun, made: MetricResult) -> RunResult:
     """Add advice for the next survey to a map, compare it with the reference, and write all results."""
     with run.journal.stage("advice"):
-        advised = with_advice(made, run.inputs.tag_in_cam_m)
+        advised = with_advice(made, run.inputs.tag_in_cam_m, run.inputs.site.georeference)
     return write_results(run, advised)

@@ -90,21 +90,32 @@ def test_further_points_of_a_coordinate_system_are_where_anchors_there_are() -> 
 
 
 @pytest.mark.parametrize(
-    ("given", "crs", "texts"),
+    ("given", "crs", "texts", "place"),
     [
-        ((1012.0, 5003.9791, 413.0), None, ("1012.000", "5003.979", "413.000")),
-        ((0.0, -0.0001, 3.0), None, ("0.000", "0.000", "3.000")),
-        ((2_600_000.1234, 1_200_000.0, 450.0), "EPSG:2056", ("2600000.123", "1200000.000", "450.000")),
-        ((7.43863242, 46.95108277, 500.25), "EPSG:4326", ("7.43863242", "46.95108277", "500.250")),
+        ((1012.0, 5003.9791, 413.0), None, ("1012.000", "5003.979", "413.000"), "1012, 5003.98, 413"),
+        ((0.0, -0.0001, 3.0), None, ("0.000", "0.000", "3.000"), "0, 0, 3"),
+        (
+            (2_600_000.1234, 1_200_000.0, 450.0),
+            "EPSG:2056",
+            ("2600000.123", "1200000.000", "450.000"),
+            "2600000.12, 1200000, 450",
+        ),
+        (
+            (7.43863242, 46.95108277, 500.25),
+            "EPSG:4326",
+            ("7.43863242", "46.95108277", "500.250"),
+            "7.4386324, 46.9510828, 500.25",
+        ),
     ],
 )
 def test_texts_have_the_coordinates_that_were_given(
-    given: tuple[float, float, float], crs: str | None, texts: tuple[str, str, str]
+    given: tuple[float, float, float], crs: str | None, texts: tuple[str, str, str], place: str
 ) -> None:
     site, (anchor, _) = local_site(anchors_at([*given], [given[0] + 1e-4, given[1], given[2] + 7.0]), "site", crs)
     assert anchor.position_m is not None
     assert tuple(site.coordinate_text(anchor.position_m, axis, 3) for axis in range(3)) == texts
     assert site.height_text(anchor.position_m) == f"{given[2]:g}"
+    assert site.place_text(anchor.position_m) == place
 
 
 def test_no_anchors_have_no_coordinate_system_and_the_file_is_named() -> None:

@@ -61,9 +61,18 @@ class Site:
         Args:
             axis: 0 to 2. decimals: of a metre; degrees get as many more as say the same.
         """
-        is_angle = axis < 2 and self.georeference is not None and is_geographic(self.georeference.crs)
-        decimals += _DECIMALS_OF_DEGREES if is_angle else 0
+        decimals += _DECIMALS_OF_DEGREES if axis < 2 and self._has_degrees else 0
         return number_text(float(self.given(position_m[None])[0, axis]), f".{decimals}f")
+
+    def place_text(self, position_m: Array) -> str:
+        """Return the coordinates in which a position (3,) of the local frame is given, to the centimetre or as fine."""
+        *plan, height = self.given(position_m[None])[0].tolist()
+        decimals = 2 + (_DECIMALS_OF_DEGREES if self._has_degrees else 0)
+        return ", ".join(number_text(round(x, k), ".15g") for x, k in zip((*plan, height), (decimals, decimals, 2)))
+
+    @property
+    def _has_degrees(self) -> bool:
+        return self.georeference is not None and is_geographic(self.georeference.crs)
 
     def height_text(self, position_m: Array) -> str:
         """Return the height with which a position (3,) of the local frame was given, metres, for the user."""
