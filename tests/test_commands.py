@@ -554,6 +554,13 @@ class TestResultFolder:
         (anchor,) = (f for f in features if f["properties"]["name"] == "A1")
         assert anchor["geometry"]["coordinates"] == pytest.approx([8.5, 47.4, 430.0], abs=1e-6)
 
+    def test_says_what_to_add_to_coordinates_of_trainers(self, out: Path, rangesfm_command: Command) -> None:
+        done = rangesfm_command("export", out, "--formats", "nerfstudio,ply", "--output_path", "trained", cwd=out)
+        offset_m = np.loadtxt(out / "trained" / "offset.txt")
+        assert np.abs(offset_m - SITE_M).max() < 3
+        assert f"add {', '.join(f'{x:.0f}' for x in offset_m)} m to their coordinates" in done.stdout
+        assert "transforms.json, transforms_points.ply: the origin is moved" in done.stdout
+
     def test_carries_over_what_was_made_from_the_unscaled_model(
         self, out: Path, walked_survey: WalkedSurvey, rangesfm_command: Command
     ) -> None:

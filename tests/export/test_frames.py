@@ -17,13 +17,14 @@ import pycolmap
 import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.export.models import read_ply, xyz
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
-from rangesfm.export import MetricMap, export_map
-from rangesfm.export.metric_map import in_frame, up_in_world
+from rangesfm.export import OFFSET_NAME, MetricMap, export_map
+from rangesfm.export.metric_map import colored_points, in_frame, moved, up_in_world
 from rangesfm.geometry.georeference import Georeference, georeference_at
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
@@ -88,6 +89,59 @@ def test_in_a_site_frame_z_is_up(map_: MetricMap) -> None:
 def test_what_is_up_is_across_a_flat_path(map_: MetricMap) -> None:
     flat = replace(map_.trajectory, centers=map_.trajectory.centers * [1.0, 1.0, 0.0])
     np.testing.assert_allclose(up_in_world(flat, "path"), [0, 0, 1], atol=1e-9)
+
+
+IN_GRID_M = np.array([2_600_000.0, 1_200_000.0, 432.0])
+
+
+@pytest.fixture(scope="module")
+def in_grid(map_: MetricMap) -> MetricMap:
+    """The same map in a site with the coordinates of a national grid."""
+    return replace(moved(map_, Similarity(1.0, np.eye(3), IN_GRID_M)), is_site=True)
+
+
+def nerfstudio_centers(path: Path) -> Array:
+    return np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in json.loads(path.read_text())["frames"]])
+
+
+def test_trainers_with_32_bits_get_a_map_near_its_origin_and_its_offset(in_grid: MetricMap, tmp_path: Path) -> None:
+    nerfstudio, tum = export_map(in_grid, tmp_path, ExportOptions(formats=("nerfstudio", "tum")))
+    centers, true_m = nerfstudio_centers(nerfstudio), in_grid.trajectory.centers
+    offset_m = np.loadtxt(tmp_path / OFFSET_NAME)
+    np.testing.assert_array_equal(offset_m, np.round(offset_m))
+    np.testing.assert_allclose(centers.astype(np.float32).astype(np.float64) + offset_m, true_m, rtol=0, atol=1e-5)
+    assert (tmp_path / OFFSET_NAME).read_text().splitlines()[0].endswith("in transforms.json, transforms_points.ply")
+    points = xyz(read_ply(tmp_path / "transforms_points.ply"))
+    np.testing.assert_allclose(points + offset_m, colored_points(in_grid.reconstruction)[0], rtol=0, atol=1e-5)
+    # Formats with 64 bits keep the coordinates of the site.
+    np.testing.assert_allclose(np.loadtxt(tum)[:, 1:4], true_m, rtol=0, atol=1e-6)
+
+
+def test_a_level_map_far_from_the_sites_zero_is_near_its_own_in_all_formats(in_grid: MetricMap, tmp_path: Path) -> None:
+    formats = ("nerfstudio", "tum", "colmap", "transform")
+    nerfstudio, tum, colmap, transform, _ = export_map(in_grid, tmp_path, ExportOptions(formats=formats, frame="level"))
+    offset_m, true_m = np.loadtxt(tmp_path / OFFSET_NAME), in_grid.trajectory.centers
+    model = pycolmap.Reconstruction(colmap)
+    of_colmap = np.array(
+        [model.find_image_with_name(name).projection_center() for name in in_grid.trajectory.image_names]
+    )
+    for centers in (nerfstudio_centers(nerfstudio), np.loadtxt(tum)[:, 1:4], of_colmap):
+        np.testing.assert_allclose(centers + offset_m, true_m, rtol=0, atol=1e-6)
+    assert in_grid.metric_from_sfm is not None
+    found, expected = np.loadtxt(transform)[5:], in_grid.metric_from_sfm.translation
+    np.testing.assert_allclose(found + offset_m, expected, rtol=0, atol=1e-6)
+
+
+def test_a_map_near_its_origin_stays_where_it_is_and_corrects_the_offset_of_an_earlier_one(
+    map_: MetricMap, in_grid: MetricMap, tmp_path: Path
+) -> None:
+    options = ExportOptions(formats=("nerfstudio",), frame="level")
+    (path,) = export_map(replace(map_, is_site=True), tmp_path, options)
+    np.testing.assert_allclose(nerfstudio_centers(path), map_.trajectory.centers, rtol=0, atol=1e-9)
+    assert not (tmp_path / OFFSET_NAME).exists()
+    export_map(in_grid, tmp_path, options)
+    export_map(replace(map_, is_site=True), tmp_path, options)
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / OFFSET_NAME), np.zeros(3))
 
 
 @pytest.mark.parametrize("up", ["sideways", "1,2", "0,0,0", "nan,0,1"])
