@@ -39,6 +39,7 @@ def known_positions(is_mark: list[bool], num_poses: int = 1, stddev_m: float = 0
         position_m=np.zeros((k, 3)),
         covariance_m2=np.tile(stddev_m**2 * np.eye(3), (k, 1, 1)),
         is_stated=np.ones(k, dtype=bool),
+        is_geodetic=np.zeros(k, dtype=bool),
         places=np.zeros((k, 3)),
         arms_m=np.zeros((k, 3)),
         own_covariance=np.zeros((k, 3, 3)),

@@ -246,7 +246,7 @@ def test_an_antenna_errs_by_its_arm_and_its_own_words_are_only_believed_within_l
     positions = survey([False, False, True])
     positions = replace(positions, arm_stddev_m=np.array([0.02, 0.03, 0.5]))
     parts = parts_of(positions)
-    assert [*parts] == ["marks", "points", "places", "positions"]
+    assert [*parts][:4] == ["marks", "points", "places", "positions"]
     np.testing.assert_allclose(parts["places"].alike, np.diag(np.repeat([0.0004, 0.0009, 0.0], 3)))
     np.testing.assert_allclose(parts["positions"].alike, np.diag(np.repeat([0.01, 0.01, 0.0], 3)))
     np.testing.assert_allclose(parts["points"].alike, np.diag(np.repeat([0.0, 0.0, 0.01], 3)))
@@ -266,7 +266,7 @@ def test_a_wrong_clock_moves_all_positions_along_their_ways_together() -> None:
 def test_errors_that_last_are_alike_over_their_time_and_not_in_marks() -> None:
     positions = replace(survey([False, True, False]), time_s=np.array([4.0, np.nan, 7.0]))
     parts = parts_of(positions, (3.0, 0.5))
-    assert [*parts][-2:] == ["positions_3s", "positions_0.5s"]
+    assert [*parts][-4:] == ["positions_3s", "positions_0.5s", "positions_warp", "frame"]
     for name, lasting_s in (("positions_3s", 3.0), ("positions_0.5s", 0.5)):
         alike = np.exp(-3.0 / lasting_s)
         expected = 0.01 * np.array([[1.0, 0.0, alike], [0.0, 0.0, 0.0], [alike, 0.0, 1.0]])
@@ -282,7 +282,7 @@ def test_errors_that_last_are_averaged_over_the_times_of_a_group() -> None:
     positions = replace(survey([False] * 4), time_s=np.array([0.0, 7.0, 20.0, 27.0]))
     grouping = csr_array(np.kron([[0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]], np.eye(3)))
     bent = BendingOfBins((), np.zeros((6, 6)), np.zeros(6))
-    *_, last = problem(positions, lasting_s=(10.0,))._parts(SITE_FROM_MODEL, grouping, np.ones(4), bent)
+    *_, last, _, _ = problem(positions, lasting_s=(10.0,))._parts(SITE_FROM_MODEL, grouping, np.ones(4), bent)
     within = np.mean([np.exp(-abs(a - b) / 10) for a in range(8) for b in range(8)])
     between = np.mean([np.exp(-abs(a - b - 20) / 10) for a in range(8) for b in range(8)])
     expected = 0.01 * np.array([[within, between], [between, within]])
@@ -452,8 +452,10 @@ def test_the_scale_is_half_way_between_the_robust_and_the_best_weights() -> None
     is_antenna = np.repeat(~positions.is_mark[order], 3)
     by_antenna = np.where(is_antenna, gains[0], 0.0)
     parts = dict(zip(errors.names, errors.covariances_m2, strict=True))
-    alone, lasting = (by_antenna @ parts[name] @ by_antenna for name in ("positions", "positions_3s"))
-    assert found.inflation == pytest.approx(np.sqrt(1 + lasting / alone), rel=1e-6)
+    alone, *lasting = (
+        by_antenna @ parts[name] @ by_antenna for name in ("positions", "positions_3s", "positions_warp")
+    )
+    assert found.inflation == pytest.approx(np.sqrt(1 + sum(lasting) / alone), rel=1e-6)
     assert found.value == found.site_from_model.scale
     assert found.alone.stddev == pytest.approx(found.value * found.uncertainty.empirical)
     np.testing.assert_allclose(found.bending_m2, np.zeros((30, 30)))
@@ -551,6 +553,7 @@ def test_planned_positions_have_the_errors_to_expect() -> None:
     found = expected_positions(planned, path(), Bending(path()), (3.0,))
     np.testing.assert_allclose(found.linear.residual_m, 0.0, atol=1e-12)
     np.testing.assert_array_equal(found.is_used, np.repeat(np.arange(5) != 1, 3))
-    assert found.errors.names == ("marks", "points", "places", "positions", "positions_3s")
+    expected = ("marks", "points", "places", "positions", "positions_3s", "positions_warp", "frame")
+    assert found.errors.names == expected
     with pytest.raises(GeometryError, match="2 known positions"):
         expected_positions(replace(planned, is_check=np.arange(5) < 3), path(), Bending(path()))

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.clock.search import CostCurve
 from rangesfm.ranging.clock.time_offset import Rival, TimeOffset
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.survey.survey_run import PathOfModel
 from rangesfm.workflows.make_metric_map import scale_by_rivals
 
 VALUE_S, RIVAL_S = 1.0, 4.0
@@ -24,23 +23,25 @@ class Scales:
     """A scale stage whose result depends on the time offset alone."""
 
     by_offset_s: dict[float, float | None]
+    frame: str = "first_camera"
 
-    def by_rivals(self, probability: float) -> tuple[tuple[str, ...], float]:
-        log = RangeLog.from_arrays(["A"] * 3, [1.0] * 3, timestamp_s=[0.0, 1.0, 2.0])
-        run: Any = SimpleNamespace(
-            inputs=SimpleNamespace(log=log),
-            ranges_on=lambda path, offset_s: float(np.mean(offset_s)),
-            estimate_scale=self.estimate,
-        )
+    def by_rivals(self, probability: float, rival_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Any:
         offset = time_offset(probability, (Rival(RIVAL_S, 1 - probability),))
-        unused: Any = None
-        return scale_by_rivals(run, PathOfModel("", unused, unused, unused), offset, 2.0)
+        path: Any = SimpleNamespace(centers=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
 
-    def estimate(self, path: Any) -> SimpleNamespace:
-        scale = self.by_offset_s[path.observations]
-        if scale is None:
-            raise GeometryError("no scale")
-        return SimpleNamespace(value=scale)
+        def estimate_at(other: TimeOffset) -> Any:
+            assert not other.drift_is_followed, "the drift is that of the offset it was found at"
+            scale = self.by_offset_s[other.value_s]
+            if scale is None:
+                raise GeometryError("no scale")
+            return estimate(scale, rival_m, self.frame)
+
+        return scale_by_rivals(estimate(2.0, (0.0, 0.0, 0.0), self.frame), path, offset, estimate_at, "", "give it")
+
+
+def estimate(scale: float, at_m: tuple[float, float, float], frame: str) -> Any:
+    placed = Similarity(scale, np.eye(3), np.array(at_m))
+    return SimpleNamespace(value=scale, frame=frame, metric_from_sfm=placed)
 
 
 def time_offset(probability: float, rivals: tuple[Rival, ...]) -> TimeOffset:
@@ -52,6 +53,12 @@ def test_a_rival_of_nearly_the_same_scale_is_told_with_its_probability_and_its_s
     said, stddev = Scales({RIVAL_S: 2.04}).by_rivals(probability=0.6)
     assert stddev == pytest.approx(np.sqrt(0.4) * np.log(1.02))
     assert said == ("the time offset may also be +4.00 s (40%), which gives a scale of 2.04 (+2.0%)",)
+
+
+def test_in_a_site_a_rival_is_told_with_how_far_it_puts_the_photos_elsewhere() -> None:
+    (said,), stddev = Scales({RIVAL_S: 2.0}, "site").by_rivals(0.9, rival_m=(0.0, 3.0, 4.0))
+    assert said.endswith("which gives a scale of 2 (+0.0%) and puts photos up to 5 m elsewhere")
+    assert stddev == 0
 
 
 def test_the_interval_holds_the_scale_of_a_rival_however_unlikely() -> None:

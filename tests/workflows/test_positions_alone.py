@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from tests.known import assert_scale, known
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
@@ -52,6 +53,20 @@ class Walk:
         at_m[:num_wrong, 0] += 5.0
         path = where / "positions.csv"
         rows = (f"{t + clock_ahead_s:.3f},{x:.4f},{y:.4f},{z:.4f}\n" for t, (x, y, z) in zip(times, at_m, strict=True))
+        path.write_text(f"timestamp_s,x_m,y_m,z_m\n{''.join(rows)}")
+        return path
+
+    def radio_positions(self, where: Path, stretch: float) -> Path:
+        """Write positions at 10 Hz of a radio system: errors that last for a second, in a frame of another size."""
+        rng = np.random.default_rng(5)
+        times = np.arange(0.4, self.path.end_s - 1.0, 0.1)
+        at_m = self.path.centers(times) + self.path.world_from_cam(times) @ ANTENNA_IN_CAM_M
+        off_m = 0.12 * rng.standard_normal(at_m.shape)
+        for k in range(1, len(times)):
+            off_m[k] = 0.9 * off_m[k - 1] + np.sqrt(1 - 0.9**2) * off_m[k]
+        at_m = stretch * at_m + off_m
+        rows = (f"{t:.3f},{x:.4f},{y:.4f},{z:.4f}\n" for t, (x, y, z) in zip(times, at_m, strict=True))
+        path = where / "positions.csv"
         path.write_text(f"timestamp_s,x_m,y_m,z_m\n{''.join(rows)}")
         return path
 
@@ -115,6 +130,40 @@ def test_positions_with_a_lever_arm_and_another_clock_place_the_map(walk: Walk, 
     assert ResultSummary.read(survey.output.path / "result.json") == summary
 
 
+@pytest.mark.parametrize("run", [scale_model, refine_model])
+def test_a_radio_system_that_measures_its_site_too_small_is_no_good_scale_and_its_interval_says_so(
+    walk: Walk, tmp_path: Path, run: Callable[..., RunResult]
+) -> None:
+    survey = walk.survey(
+        tmp_path,
+        positions__path=walk.radio_positions(tmp_path, 0.97),
+        positions__antenna_in_cam_m=tuple(ANTENNA_IN_CAM_M.tolist()),
+    )
+    scale = run(survey, progress=QUIET).summary.scale
+    low, high = known(scale.interval_95)
+    true = walk.made.metric_from_sfm.scale
+    assert low < true < high
+    assert scale.value < 0.99 * true
+    assert scale.verdict == "doubtful"
+    assert "may also measure the whole site too large or too small" in "; ".join(scale.reasons)
+    assert "tape a long distance in the map" in "; ".join(scale.advice)
+
+
+@pytest.mark.parametrize("stddev_m", [0.02, None])
+def test_accurate_positions_keep_a_narrow_interval(walk: Walk, tmp_path: Path, stddev_m: float | None) -> None:
+    path, rng = tmp_path / "positions.csv", np.random.default_rng(6)
+    times = np.arange(0.4, walk.path.end_s - 1.0, 0.2)
+    at_m = walk.path.centers(times) + 0.02 * rng.standard_normal((len(times), 3))
+    rows = (f"{t:.3f},{x:.4f},{y:.4f},{z:.4f}\n" for t, (x, y, z) in zip(times, at_m, strict=True))
+    path.write_text(f"timestamp_s,x_m,y_m,z_m\n{''.join(rows)}")
+    survey = walk.survey(tmp_path, positions__path=path, positions__stddev_m=stddev_m)
+    scale = scale_model(survey, progress=QUIET).summary.scale
+    low, high = known(scale.interval_95)
+    assert low < walk.made.metric_from_sfm.scale < high
+    assert (high - low) / 2 / scale.value < 0.015
+    assert scale.verdict == "good"
+
+
 def test_a_lever_arm_that_is_off_is_found_with_its_size(walk: Walk, tmp_path: Path) -> None:
     positions = walk.positions(tmp_path)
     # Upward of a camera held level it could not be told from the height of the whole map.
@@ -130,6 +179,37 @@ def test_a_lever_arm_that_is_off_is_found_with_its_size(walk: Walk, tmp_path: Pa
     assert found.rejected
     assert known(found.size) == pytest.approx(0.5, abs=0.2)
     assert "probably the antenna sits elsewhere on the camera, by +0.3" in " ".join(summary.scale.reasons)
+
+
+@pytest.mark.parametrize("laps", [1.7, 3.0])
+def test_a_circle_at_even_speed_has_no_good_place_by_positions_of_another_clock(tmp_path: Path, laps: float) -> None:
+    """The camera and the positions are exactly level, as those of robots are."""
+    times, end_s = np.arange(0.0, 60.0, 1.0), 60.0
+    angle_of = 2 * np.pi * laps / end_s
+
+    def at(times_s: Array) -> Array:
+        turned = angle_of * times_s
+        return np.column_stack([2 * np.cos(turned), 2 * np.sin(turned), np.full(len(times_s), 1.5)])
+
+    level = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    ahead = Rotation.from_rotvec(np.outer(angle_of * times, [0.0, 0.0, 1.0])).as_matrix() @ level
+    made = synthetic_model(times, at(times), ahead, num_observations=60, pixel_stddev=0.5, seed=2)
+    (tmp_path / "sparse").mkdir()
+    made.reconstruction.write(tmp_path / "sparse")
+    rows = "".join(f"{name},{time:.3f}\n" for name, time in made.timestamps_s.items())
+    (tmp_path / "images.csv").write_text(f"image_name,timestamp_s\n{rows}")
+    known_s = np.arange(0.0, end_s, 0.1)
+    at_m = at(known_s) + 0.03 * np.random.default_rng(3).standard_normal((len(known_s), 3)) * [1.0, 1.0, 0.0]
+    rows = "".join(f"{t:.3f},{x:.4f},{y:.4f},{z:.4f}\n" for t, (x, y, z) in zip(known_s, at_m, strict=True))
+    (tmp_path / "positions.csv").write_text(f"timestamp_s,x_m,y_m,z_m\n{rows}")
+    walk = Walk(tmp_path, made, CameraPath.through(times, at(times), ahead))
+    survey = walk.survey(tmp_path, positions__path=tmp_path / "positions.csv")
+    with pytest.raises(GeometryError, match="--positions_time_offset"):
+        scale_model(survey, progress=QUIET)
+    given = survey.changed({"positions.time_offset": 0.0})
+    summary = scale_model(given, progress=QUIET).summary
+    assert_scale(summary, made.metric_from_sfm.scale, 0.02)
+    assert (summary.scale.verdict, known(summary.place).verdict) == ("good", "good")
 
 
 def test_clocks_that_are_apart_by_leap_seconds_are_named(walk: Walk, tmp_path: Path) -> None:

@@ -12,23 +12,15 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.clock_times import time_text
 from rangesfm.files.photo_names import rows_of_photos, told_none
 from rangesfm.geometry.rotations import cross_matrices
-from rangesfm.geometry.similarity import align_points, are_apart
 from rangesfm.geometry.trajectory import Trajectory, keyframes_around
 from rangesfm.options import AssociationOptions
+from rangesfm.positions.clock import POSITIONS, TimedPositions, residual_stddev_at
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.positions.position_log import PositionLog
+from rangesfm.progress import SilentProgress
 from rangesfm.ranging.association import is_too_long, places_on_path
-from rangesfm.ranging.errors.noise import STRETCH_S
+from rangesfm.ranging.clock.time_offset import Rival, TimeOffset, offset_of_motion, path_to_search, require_enough
 
-# An offset that puts fewer positions on the path than this share of the largest possible number is not tried.
-_MIN_COVERAGE = 0.5
-_MIN_NUM = 5
-# Largest number of positions for the search, and of offsets that are tried; the best is then refined with all.
-_NUM_SEARCHED, _MAX_NUM_TRIED = 200, 4000
-# Step between offsets, as a share of the median time between keyframes: the motion hardly changes within it.
-_STEP = 0.25
-_MOST_OUTLYING = 0.2
-_NUM_REFINED = 12
 # A given offset is wrong if the residuals with it are at least so many times those with another one.
 _MUCH_WORSE = 3.0
 
@@ -43,6 +35,7 @@ class AntennaTrack:
         offset_s: image time minus time of the positions; None: not known yet. offset_stddev_s: its standard deviation.
         association: how positions are placed between keyframes.
         other_offset_s: offset with which the positions fit the path much better than with the given one; None: none.
+        search: how the offset was found, with other likely offsets; None where it was given or is not needed.
     """
 
     log: PositionLog
@@ -51,13 +44,14 @@ class AntennaTrack:
     association: AssociationOptions
     offset_stddev_s: float = 0.0
     other_offset_s: float | None = None
+    search: TimeOffset | None = None
 
     def with_offset(self, path: Trajectory) -> AntennaTrack:
         """Return the track with its time offset, which is searched for if it is not given.
 
         Raises:
             InputError: the positions are by time and the photos have none, or they are of other photos.
-            GeometryError: too few positions and keyframes have a moment in common.
+            GeometryError: the motion does not determine the offset.
         """
         if self.log.timestamp_s is None:
             listed = self.log.image_name or ()
@@ -66,18 +60,23 @@ class AntennaTrack:
             return self
         if path.timestamps_s is None:
             raise InputError("the positions have times but the photos have none: give image times", self.log.path)
-        given_s, times_s, at_m = self.offset_s, self.log.timestamp_s, self.log.position_m
+        positions = TimedPositions(self.log.timestamp_s, self.log.position_m)
         try:
-            moving = _MovingAntenna(path.timestamps_s, path.centers, path.world_from_cam @ self.antenna_in_cam_m)
-            offset_s, stddev_s = _search(times_s, at_m, moving)
+            require_enough(path, len(self.log), POSITIONS)
+            samples = path_to_search(path, self.antenna_in_cam_m[None], self.association)
+            found = offset_of_motion(positions, samples, POSITIONS, seed=0, progress=SilentProgress())
         except GeometryError:
-            if given_s is None:
+            if self.offset_s is None:
                 raise
             return self
-        if given_s is None:
-            return replace(self, offset_s=offset_s, offset_stddev_s=stddev_s)
-        misfits = [moving.misfit_m(times_s + each_s, at_m) for each_s in (given_s, offset_s)]
-        return replace(self, other_offset_s=offset_s) if misfits[0] > _MUCH_WORSE * misfits[1] else self
+        if self.offset_s is None:
+            return replace(self, offset_s=found.value_s, offset_stddev_s=found.stddev_s, search=found)
+        off_m = [residual_stddev_at(positions, samples, each_s) for each_s in (self.offset_s, found.value_s)]
+        return replace(self, other_offset_s=found.value_s) if off_m[0] > _MUCH_WORSE * off_m[1] else self
+
+    def of_rival(self, rival: Rival) -> AntennaTrack:
+        """Return the track with another likely time offset."""
+        return replace(self, offset_s=rival.value_s, search=self.search and self.search.of_rival(rival))
 
     def located(self, path: Trajectory) -> KnownPositions:
         """Return the positions that have a place on a path; the others are left out."""
@@ -89,7 +88,7 @@ class AntennaTrack:
         if times_s is None or len(path) < 2:
             at_s = before.astype(np.float64)
         else:
-            velocity = _velocities(times_s, path.centers, before)
+            velocity = _velocities(times_s, path.centers, before, after, fraction)
             at_s = times_s[before] if self.log.timestamp_s is None else self._times_s[rows]
         names = self._names
         return KnownPositions(
@@ -99,6 +98,7 @@ class AntennaTrack:
             position_m=self.log.position_m[rows],
             covariance_m2=self.log.covariance_m2[rows],
             is_stated=np.asarray(np.isfinite(self.log.covariance_m2[rows]).all(axis=(1, 2))),
+            is_geodetic=np.full(k, self.log.crs is not None),
             places=on_path.centers,
             arms_m=on_path.arms_m,
             own_covariance=on_path.stddev[:, None, None] ** 2 * np.eye(3),
@@ -145,10 +145,11 @@ class AntennaTrack:
         return rows, before[rows], after[rows], np.where(is_at, 0.0, fraction)[rows]
 
 
-def _velocities(times_s: Array, centers: Array, before: Indices) -> Array:
-    """Return (k, 3) velocities along the path from each keyframe to the next; of the last two at the end."""
-    steps = np.diff(centers, axis=0) / np.diff(times_s)[:, None]
-    return np.asarray(steps[np.minimum(before, len(steps) - 1)])
+def _velocities(times_s: Array, centers: Array, before: Indices, after: Indices, fraction: Array) -> Array:
+    """Return (k, 3) velocities along the path, between those at the keyframes before and after."""
+    at_keyframes = np.gradient(centers, times_s, axis=0, edge_order=2 if len(times_s) > 2 else 1)
+    share = fraction[:, None]
+    return np.asarray((1 - share) * at_keyframes[before] + share * at_keyframes[after])
 
 
 def _by_shifts(before: Indices, after: Indices, fraction: Array, num: int) -> csr_array:
@@ -170,77 +171,3 @@ def _by_turns(path: Trajectory, arm_m: Array, before: Indices, after: Indices, f
         columns.append((6 * pose[:, None, None] + np.zeros((3, 1), dtype=np.int64) + np.arange(3)).ravel())
     shape = (3 * len(before), 6 * len(path))
     return coo_array((np.concatenate(values), (np.tile(rows.ravel(), 2), np.concatenate(columns))), shape=shape).tocsr()
-
-
-@dataclass(frozen=True)
-class _MovingAntenna:
-    """The path of an antenna in a model: times, (n, 3) centres in its unit, and (n, 3) lever arms in metres."""
-
-    times_s: Array
-    centers: Array
-    arms_m: Array
-
-    def num_on(self, times_s: Array) -> int:
-        """Return how many times are within those of the path."""
-        return int(np.count_nonzero(self._is_on(times_s)))
-
-    def _is_on(self, times_s: Array) -> Mask:
-        return np.asarray((times_s >= self.times_s[0]) & (times_s <= self.times_s[-1]))
-
-    def misfit_m(self, times_s: Array, position_m: Array) -> float:
-        """Return the root mean square distance of positions from a similar path, without a share of the farthest."""
-        on = self._is_on(times_s)
-        if on.sum() < _MIN_NUM:
-            return np.inf
-        places, arms_m = (self._at(values, times_s[on]) for values in (self.centers, self.arms_m))
-        fit, targets = align_points(places, position_m[on]), position_m[on]
-        near = np.ones(len(targets), dtype=bool)
-        for _ in range(2):
-            targets = position_m[on] - arms_m @ fit.rotation.T
-            fit = align_points(places[near], targets[near])
-            off = np.linalg.norm(fit.apply(places) - targets, axis=1)
-            near = off <= np.quantile(off, 1 - _MOST_OUTLYING)
-            near = near if near.sum() >= _MIN_NUM else np.ones(len(targets), dtype=bool)
-        return float(np.sqrt(np.mean(off[near] ** 2)))
-
-    def _at(self, values: Array, times_s: Array) -> Array:
-        return np.column_stack([np.interp(times_s, self.times_s, values[:, axis]) for axis in range(3)])
-
-
-def _search(times_s: Array, position_m: Array, antenna: _MovingAntenna) -> tuple[float, float]:
-    """Return the time offset with the best fit of a similarity, and its standard deviation.
-
-    Raises:
-        GeometryError: too few positions and keyframes have a moment in common, or the antenna did not move.
-    """
-    photo_times_s, num = antenna.times_s, len(times_s)
-    if min(num, len(photo_times_s)) < _MIN_NUM or not (are_apart(antenna.centers) and are_apart(position_m)):
-        raise GeometryError(
-            f"the time offset of the positions is not determined: {num} positions, {len(photo_times_s)} keyframes"
-        )
-    some = np.unique(np.linspace(0, num - 1, min(num, _NUM_SEARCHED)).astype(np.int64))
-    low, high = photo_times_s[0] - times_s[-1], photo_times_s[-1] - times_s[0]
-    step = max(_STEP * float(np.median(np.diff(photo_times_s))), (high - low) / _MAX_NUM_TRIED)
-    offsets = np.arange(low, high, step)
-    nums = np.array([antenna.num_on(times_s[some] + offset) for offset in offsets.tolist()])
-    enough = max(_MIN_COVERAGE * float(nums.max(initial=0)), _MIN_NUM)
-    costs = np.array(
-        [
-            antenna.misfit_m(times_s[some] + offset, position_m[some]) if on >= enough else np.inf
-            for offset, on in zip(offsets.tolist(), nums.tolist(), strict=True)
-        ]
-    )
-    if not np.isfinite(costs).any():
-        why = "hardly any lie within the photos' times"
-        raise GeometryError(f"the time offset of the positions is not determined: {why}")
-    best = float(offsets[int(np.argmin(costs))])
-    for _ in range(_NUM_REFINED):
-        before, now, after = (antenna.misfit_m(times_s + best + by, position_m) for by in (-step, 0.0, step))
-        curvature = before - 2 * now + after
-        moved = 0.5 * step * (before - after) / curvature if curvature > 0 else 0.0
-        best, step = best + float(np.clip(moved, -step, step)), step / 2
-    # An error of the offset shifts all positions along the path, by the speed. Errors that last for seconds leave one
-    # independent position in each stretch of time.
-    speed = float(np.median(np.linalg.norm(np.diff(position_m, axis=0), axis=1) / np.diff(times_s)))
-    stretches = max(float(times_s[-1] - times_s[0]) / STRETCH_S, 1.0)
-    return best, antenna.misfit_m(times_s + best, position_m) / max(speed, 1e-6) / np.sqrt(min(stretches, num))

@@ -35,6 +35,7 @@ class KnownPositions:
         is_check: (k,) positions that do not take part in the estimate.
         position_m: (k, 3) in the site. covariance_m2: (k, 3, 3) of these; NaN where it is unknown.
         is_stated: (k,) whether the covariance was given with the position, and not assumed.
+        is_geodetic: (k,) whether it was given in a coordinate system of the Earth, whose scale is right.
         places: (k, 3) in the model's world and unit. arms_m: (k, 3) lever arms in the axes of the model's world.
         own_covariance: (k, 3, 3) of the places, in the model's world and unit, without errors of the poses.
         arm_stddev_m: (k,) of each coordinate of the arms.
@@ -54,6 +55,7 @@ class KnownPositions:
     position_m: Array
     covariance_m2: Array
     is_stated: Mask
+    is_geodetic: Mask
     places: Array
     arms_m: Array
     own_covariance: Array
@@ -119,6 +121,7 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         position_m=np.array([point.position_m for point in seen]).reshape(-1, 3),
         covariance_m2=stddev_m[:, None, None] ** 2 * np.eye(3),
         is_stated=np.full(k, points.stddevs_are_given),
+        is_geodetic=np.full(k, points.crs is not None),
         places=np.array([each.position_m for each in found]).reshape(-1, 3),
         arms_m=np.zeros((k, 3)),
         own_covariance=np.array([each.errors.own_m2 for each in found]).reshape(-1, 3, 3),

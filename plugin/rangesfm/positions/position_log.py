@@ -50,7 +50,7 @@ class PositionLog:
         image_name: names of the n photos; or None.
         line: (n,) lines in the file.
         path: the file, for messages. format: name of its format.
-        crs: coordinate system of the positions by the format; None if it does not say.
+        crs: coordinate system of the positions as they were read; None if neither their format nor the user says it.
         notes: lines for the user about how the file was read.
     """
 

@@ -96,6 +96,12 @@ class SurveyedPositions:
                 f"{'ahead' if ahead_s > 0 else 'behind'}, as by leap seconds, or a time zone; they are not used"
             )
 
+    def doubts_of_found_clock(self) -> Iterator[str]:
+        """Yield the reason to doubt the time offset that was found, which moves the map along the path."""
+        search = None if self.antenna is None else self.antenna.search
+        if search is not None and not search.is_certain and search.note is not None:
+            yield search.note
+
     def notes_on(self, model: pycolmap.Reconstruction) -> Iterator[str]:
         """Yield a line for the user about points that a model does not show."""
         if self.points is None:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import block_diag, csr_array, kron
+from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.ranging.errors.bending import ErrorPart
-from rangesfm.ranging.errors.learned import ComponentLikelihood, ErrorParts
+from rangesfm.ranging.errors.components import FRAME
+from rangesfm.ranging.errors.learned import ComponentLikelihood, ErrorParts, independent_unknowns
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.linear_map import EstimatedMistake, LinearMap
 from rangesfm.scale.scale_by_lengths import NUM_WITHIN
+
+LASTING = "positions_"
+"""Start of the names of errors of an antenna's positions that last for some time."""
+WARP = f"{LASTING}warp"
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,55 @@ def times_of_groups(grouping: csr_array, known: KnownPositions, size_m: Array, r
     return of_groups @ (is_timed * size_m), times
 
 
+def errors_by_place(
+    grouping: csr_array, position_m: Array, size_m: Array, median: float, spread: float, *, is_geodetic: bool
+) -> Iterator[ErrorPart]:
+    """Yield the components of the errors of an antenna's positions that are the same whenever it is at a place.
+
+    Args:
+        position_m: (k, 3) positions by the map. size_m: (g,) standard deviations of the groups; 0 for marks.
+        median, spread: of the size of the warp, in those standard deviations.
+        is_geodetic: whether the frame is one of the Earth, whose scale is right.
+    """
+    of_groups_m: Array = grouping[::3, ::3] @ position_m
+    has_frame = (size_m > 0).astype(np.float64)
+    from_middle = has_frame[:, None] * (of_groups_m - has_frame @ of_groups_m / has_frame.sum())
+    extent_m = float(np.sqrt(np.sum(from_middle**2) / has_frame.sum()))
+    if not extent_m > 0:
+        return
+    warp = np.exp(-cdist(of_groups_m, of_groups_m) / extent_m) * np.outer(size_m, size_m)
+    yield ErrorPart(WARP, np.asarray(np.kron(warp, np.eye(3))), median, spread)
+    stretch = (0.0 if is_geodetic else 1.0) / extent_m * from_middle.ravel()
+    shift = np.kron(np.outer(has_frame, has_frame), np.eye(3))
+    yield ErrorPart(FRAME, np.asarray(shift + np.outer(stretch, stretch)))
+
+
+def expected_sizes(parts: Sequence[ErrorPart], linear: LinearMap) -> dict[str, float]:
+    """Return the size of each component before anything is measured."""
+    sizes = {part.name: part.median_m * float(np.exp(part.spread**2)) for part in parts}
+    return _with_frame(parts, sizes, linear, np.ones(len(linear.residual_m), dtype=bool))
+
+
+def _with_frame(
+    parts: Sequence[ErrorPart], sizes: Mapping[str, float], linear: LinearMap, rows: Mask
+) -> dict[str, float]:
+    """Return the sizes with that of the place and the scale of the positions' frame.
+
+    No survey shows it, as place and scale of the map are no other. A system is taken to shift and to stretch its frame
+    (as a root mean square over the path) by as much as a coordinate errs for some time, or at some place: by what of
+    these errors a similarity does not take up.
+    """
+    if FRAME not in sizes:
+        return dict(sizes)
+    similarity, _ = independent_unknowns(linear.design[rows], np.zeros((0, linear.design.shape[1])))
+    left_m2 = 0.0
+    for part in parts:
+        if part.name.startswith(LASTING):
+            alike = sizes[part.name] ** 2 * part.alike[np.ix_(rows, rows)]
+            left_m2 += float(np.trace(alike) - np.sum(similarity * (alike @ similarity)))
+    return {**sizes, FRAME: float(np.sqrt(max(left_m2, 0.0) / rows.sum()))}
+
+
 def learnt_sizes(parts: Sequence[ErrorPart], linear: LinearMap, rows: Mask) -> dict[str, float]:
     """Return the size of each component, by restricted likelihood over some coordinates (3 g,)."""
     learnt = [part for part in parts if part.spread > 0]
@@ -116,18 +171,19 @@ def learnt_sizes(parts: Sequence[ErrorPart], linear: LinearMap, rows: Mask) -> d
     if not learnt:
         return sizes
     at = np.ix_(rows, rows)
-    known_m2 = [part.alike[at] for part in parts if part.spread == 0]
+    known_m2 = [part.alike[at] for part in parts if part.spread == 0 and part.name != FRAME]
     likelihood = ComponentLikelihood(
         np.array([part.alike[at] for part in learnt]),
         np.log([part.median_m for part in learnt]),
         np.array([part.spread for part in learnt]),
         np.sum([np.zeros((rows.sum(),) * 2), *known_m2], axis=0),
         -linear.residual_m[rows],
-        linear.design[rows],
-        linear.prior_design,
+        # A mistake may have no effect of its own, such as an antenna too high above a camera that is always level.
+        *independent_unknowns(linear.design[rows], linear.prior_design),
     )
     found = likelihood.mean_stddevs(likelihood.most_likely())
-    return sizes | dict(zip((part.name for part in learnt), found.tolist(), strict=True))
+    sizes |= dict(zip((part.name for part in learnt), found.tolist(), strict=True))
+    return _with_frame(parts, sizes, linear, rows)
 
 
 def errors_of_sizes(parts: Sequence[ErrorPart], sizes: Mapping[str, float]) -> ErrorParts:

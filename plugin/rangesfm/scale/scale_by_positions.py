@@ -34,10 +34,13 @@ from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, LinearMap
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.position_equations import (
+    LASTING,
     PositionEquations,
     at_point,
     covariance_of_groups,
+    errors_by_place,
     errors_of_sizes,
+    expected_sizes,
     grouped_by_time,
     learnt_sizes,
     times_of_groups,
@@ -236,7 +239,7 @@ class _Problem:
         linear = self._linear(similarity, grouping, bending)
         parts = tuple(self._parts(similarity, grouping, stddev_m, bending))
         takes_part = (abs(grouping) @ np.repeat(used & (weights >= OUTLIER_BELOW) | used & self.known.is_mark, 3)) > 0
-        errors = errors_of_sizes(parts, {part.name: part.median_m * float(np.exp(part.spread**2)) for part in parts})
+        errors = errors_of_sizes(parts, expected_sizes(parts, linear))
         return PositionEquations(linear, parts, errors, takes_part, grouping), bending
 
     def robust(self, used: Mask, start: Similarity | None) -> tuple[Similarity, Array, Array]:
@@ -330,7 +333,15 @@ class _Problem:
                 apart = np.exp(-np.abs(times_s.reshape(-1, 1) - times_s.ravel()) / lasting_s)
                 alike = apart.reshape(len(times_s), NUM_WITHIN, -1, NUM_WITHIN).mean(axis=(1, 3))
                 own = np.kron(alike * np.outer(of_groups, of_groups), np.eye(3))
-                yield ErrorPart(f"positions_{lasting_s:g}s", own, _LASTING_SHARE, _SPREAD_GUESSED)
+                yield ErrorPart(f"{LASTING}{lasting_s:g}s", own, _LASTING_SHARE, _SPREAD_GUESSED)
+            yield from errors_by_place(
+                grouping,
+                known.predicted_m(similarity),
+                of_groups,
+                _LASTING_SHARE,
+                _SPREAD_GUESSED,
+                is_geodetic=bool(known.is_geodetic[rows].all()),
+            )
 
     def worst(self, fit: _Fit, threshold: float) -> _Fit | None:
         """Return the fit without the control point that contradicts the others most; None if none does.

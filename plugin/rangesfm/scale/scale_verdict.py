@@ -13,7 +13,7 @@ from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
-from rangesfm.ranging.errors.components import BENDS
+from rangesfm.ranging.errors.components import BENDS, FRAME
 from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.range_equation import RangeFit
@@ -105,7 +105,16 @@ def judge_positions(num_used: int, uncertainty: ScaleUncertainty, options: Scale
     if num_used == MIN_NUM_POSITIONS and not has_check:
         reason = f"the map rests on {num_used} known positions, so that nothing tells which of them is wrong if one is"
         doubts.append(_Doubt(reason, "survey a fourth control point, far from the others"))
-    if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+    by_frame = uncertainty.components.get(FRAME, 0.0)
+    if NORMAL_95 * by_frame > DOUBTFUL_ABOVE:
+        reason = (
+            "a system whose positions err as these do may also measure the whole site too large or too small, by up to "
+            f"{100 * NORMAL_95 * by_frame:.1f} % (95 %): its positions alone cannot show that"
+        )
+        doubts.append(
+            _Doubt(reason, "tape a long distance in the map (--distances), or survey control points (--points)")
+        )
+    elif uncertainty.half_width_95 > DOUBTFUL_ABOVE:
         reason = "the known positions are too close together for their standard deviations"
         doubts.append(_Doubt(reason, "survey control points at the ends of the site, or walk farther"))
     return _verdict(doubts, [], uncertainty.half_width_95, options)

@@ -228,7 +228,8 @@ def _surveyed_positions(
         return site, SurveyedPositions(points)
     if asked.stddev_m is not None:
         log = replace(log, covariance_m2=np.tile(asked.stddev_m**2 * np.eye(3), (len(log), 1, 1)))
-    log = log.moved_to(local(log.position_m, asked.crs or log.crs, log.path))
+    log = replace(log, crs=asked.crs or log.crs)
+    log = log.moved_to(local(log.position_m, log.crs, log.path))
     antenna = AntennaTrack(log, np.array(asked.antenna_in_cam_m), asked.time_offset_s, survey.ranges)
     return site, SurveyedPositions(points, antenna, (asked.lasting_s,) if asked.lasting_s else LASTING_S)
 

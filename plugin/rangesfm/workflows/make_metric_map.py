@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -33,8 +34,9 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY
-from rangesfm.geometry.trajectory import in_first_camera
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.join.join_models import ModelVerdict, join_models
+from rangesfm.positions.clock import POSITIONS
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
@@ -141,13 +143,12 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
         if doubts := "; ".join(inputs.positions.doubts_of_clock()):
             raise GeometryError(f"{error}; {doubts}") from None
         raise _refused_with_cause(error, run, path) from None
-    on_map, rivals = None, None
+    on_map = None
     if not is_a_start and (on_map := _ranges_on_scaled(estimate, bending)) is not None:
         sides = likelier_sides(on_map)
         on_map, estimate = sides.on_map, estimate_by_bent(estimate, sides.on_map, survey.scale)
         estimate = replace(estimate, anchors=sides.of(estimate.anchors))
-    if offset is not None and offset.rivals:
-        rivals = scale_by_rivals(run, path, offset, estimate.value)
+    rivals = _by_rivals(run, path, estimate)
     scaled = rescale(path.sfm, estimate.metric_from_sfm)
     predicted = ranges_predicted_by_model(
         scaled,
@@ -208,14 +209,50 @@ def _diagnose(survey: Survey, on_map: RangesOnMap | None) -> Diagnosis | None:
     return None if on_map is None else diagnose_ranges(on_map, seed=survey.output.seed)
 
 
-def scale_by_rivals(run: SurveyRun, path: PathOfModel, offset: TimeOffset, scale: float) -> Rivals:
+def _by_rivals(run: SurveyRun, path: PathOfModel, estimate: ScaleEstimate) -> Rivals | None:
+    """Return what other likely time offsets of ranges or positions would change; None without any."""
+    found, offset, track = [], path.time_offset, run.inputs.positions.antenna
+
+    def at_ranges_offset(other: TimeOffset) -> ScaleEstimate:
+        timestamp_s = run.inputs.log.timestamp_s
+        assert timestamp_s is not None, "clocks belong to a log with times"
+        return run.estimate_scale(replace(path, observations=run.ranges_on(path.trajectory, other.at(timestamp_s))))
+
+    def at_positions_offset(other: TimeOffset) -> ScaleEstimate:
+        antenna = track and replace(track, offset_s=other.value_s)
+        positions = replace(run.inputs.positions, antenna=antenna)
+        return replace(run, inputs=replace(run.inputs, positions=positions)).estimate_scale(path)
+
+    if offset is not None and offset.rivals:
+        found.append(scale_by_rivals(estimate, path.trajectory, offset, at_ranges_offset, "", REMEDY))
+    if track is not None and track.search is not None and track.search.rivals:
+        found.append(
+            scale_by_rivals(
+                estimate, path.trajectory, track.search, at_positions_offset, " of the positions", POSITIONS.remedy
+            )
+        )
+    return (
+        Rivals(sum((each.doubts for each in found), ()), math.hypot(*(each.stddev for each in found)))
+        if found
+        else None
+    )
+
+
+def scale_by_rivals(
+    estimate: ScaleEstimate,
+    path: Trajectory,
+    offset: TimeOffset,
+    estimate_at: Callable[[TimeOffset], ScaleEstimate],
+    whose: str,
+    remedy: str,
+) -> Rivals:
     """Estimate the scale for every other likely time offset.
 
     Args:
-        run: the survey; its log has times.
-        path: model with the ranges on its path.
-        offset: estimate of the time offset, with its rivals.
-        scale: at this offset, metres per SfM unit.
+        estimate: at this offset. path: of the unscaled model.
+        offset: of the clocks, with its rivals.
+        estimate_at: returns the estimate at another offset, or raises GeometryError.
+        whose: the offset is, in words. remedy: what the user can do.
 
     Returns:
         Doubts in words, and the relative stddev of the scale that comes from the choice among the offsets: the larger
@@ -225,32 +262,32 @@ def scale_by_rivals(run: SurveyRun, path: PathOfModel, offset: TimeOffset, scale
     Raises:
         GeometryError: a very different scale follows from other offsets, and they are not unlikely.
     """
-    timestamp_s = run.inputs.log.timestamp_s
-    assert timestamp_s is not None, "clocks belong to a log with times"
     doubts, far_apart = [], []
     far_probability, variance, farthest = 0.0, 0.0, 0.0
     for rival in offset.rivals:
         said = f"{rival.value_s:+.2f} s ({rival.probability:.0%})"
-        offsets_s = offset.of_rival(rival).at(timestamp_s)
         try:
-            observations = run.ranges_on(path.trajectory, offsets_s)
-            other = run.estimate_scale(replace(path, observations=observations)).value
+            other = estimate_at(offset.of_rival(rival))
         except GeometryError:
-            doubts.append(f"the time offset may also be {said}, which gives no scale")
+            doubts.append(f"the time offset{whose} may also be {said}, which gives no scale")
             continue
-        change = other / scale - 1
-        doubts.append(f"the time offset may also be {said}, which gives a scale of {other:.6g} ({change:+.1%})")
+        change = other.value / estimate.value - 1
+        doubt = f"the time offset{whose} may also be {said}, which gives a scale of {other.value:.6g} ({change:+.1%})"
+        if "site" == estimate.frame == other.frame:
+            apart_m = other.metric_from_sfm.apply(path.centers) - estimate.metric_from_sfm.apply(path.centers)
+            doubt += f" and puts photos up to {np.linalg.norm(apart_m, axis=1).max():.2g} m elsewhere"
+        doubts.append(doubt)
         if abs(change) > _MAX_SPREAD:
-            far_apart.append(f"{said} gives {other:.6g} ({change:+.1%})")
+            far_apart.append(f"{said} gives {other.value:.6g} ({change:+.1%})")
             far_probability += rival.probability
         else:
             apart = abs(float(np.log1p(change)))
             variance, farthest = variance + rival.probability * apart**2, max(farthest, apart)
     if far_probability > _HARDLY_LIKELY:
         raise GeometryError(
-            "the motion does not determine the time offset, nor the scale that depends on it: "
-            f"{offset.value_s:+.2f} s ({offset.probability:.0%}) gives {scale:.6g} m per unit, "
-            f"{', '.join(far_apart)}: {REMEDY}"
+            f"the motion does not determine the time offset{whose}, nor the scale that depends on it: "
+            f"{offset.value_s:+.2f} s ({offset.probability:.0%}) gives {estimate.value:.6g} m per unit, "
+            f"{', '.join(far_apart)}: {remedy}"
         )
     return Rivals(tuple(doubts), max(float(np.sqrt(variance)), farthest / NORMAL_95))
 
@@ -458,9 +495,10 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     advice = "let the offset be searched for ([positions] time_offset)"
     doubts += [Doubt(reason, advice) for reason in metric.positions.doubts_of_clock()]
     of_lens = _doubts_of_lens(metric)
-    journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *by_rivals)
+    of_clocks = (*metric.positions.doubts_of_found_clock(), *by_rivals)
+    journal.warn(*(doubt.reason for doubt in (*of_lens, *doubts)), *of_clocks)
     doubts += known_doubts
-    against = (*(doubt.reason for doubt in of_lens), *of_place, *by_rivals, *(doubt.reason for doubt in doubts))
+    against = (*(doubt.reason for doubt in of_lens), *of_place, *of_clocks, *(doubt.reason for doubt in doubts))
     place = place_of_map(metric.estimate, metric.kept_refinement, path, against, bent_by_m)
     judged = replace(metric, place=place, diagnosis=diagnosis).doubted(by_rivals)
     judged = judged.doubted([doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts])

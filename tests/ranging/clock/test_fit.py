@@ -71,7 +71,7 @@ def test_of_two_offsets_one_is_as_much_likelier_as_the_other_is_less_likely(path
     """Each offset puts other ranges on the path; only the ranges that both put there are compared."""
     ranges = ranges_at(path, 0.0, 0.02)
     best, rival = (fit_at_offset(ranges, path, offset_s) for offset_s in (0.0, -60.0))
-    assert len(rival.losses) < len(best.losses)
+    assert len(rival.losses()) < len(best.losses())
     odds = time_offset._log_odds(best, rival, path)
     assert odds > 0
     assert odds == pytest.approx(-time_offset._log_odds(rival, best, path), rel=1e-9)

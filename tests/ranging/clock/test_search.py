@@ -15,7 +15,7 @@ from rangesfm.ranging.clock.search import (
     PathSamples,
     TimedRanges,
     moving_path,
-    ranges_at_offset,
+    on_path,
     scan_offsets,
 )
 
@@ -216,6 +216,6 @@ def test_a_log_is_split_at_pauses_longer_than_the_path(pause_s: float, num: int)
 def test_the_first_ranges_on_the_path_are_taken_up_to_a_number() -> None:
     path = winding(100)
     ranges = TimedRanges(np.array([9.0, 1.0, 2.0, 3.0]), np.arange(4.0), np.arange(4), np.arange(4))
-    np.testing.assert_array_equal(ranges_at_offset(ranges, path, 1.0, 2).range_m, [1.0, 2.0])
-    np.testing.assert_array_equal(ranges_at_offset(ranges, path, 1.0, 9).range_m, [1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(ranges_at_offset(ranges, path, -8.0, 9).anchor, [0])
+    np.testing.assert_array_equal(on_path(ranges, path, 1.0, 2).range_m, [1.0, 2.0])
+    np.testing.assert_array_equal(on_path(ranges, path, 1.0, 9).range_m, [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(on_path(ranges, path, -8.0, 9).anchor, [0])

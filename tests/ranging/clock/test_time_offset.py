@@ -20,7 +20,7 @@ from rangesfm.progress import SilentProgress
 from rangesfm.ranging.clock import time_offset
 from rangesfm.ranging.clock.bursts import BurstPairing, Bursts
 from rangesfm.ranging.clock.fit import Timing
-from rangesfm.ranging.clock.search import CostCurve, TimedRanges
+from rangesfm.ranging.clock.search import CostCurve, TimedRanges, moving_path
 from rangesfm.ranging.clock.time_offset import TimeOffset, estimate_time_offset
 from rangesfm.ranging.range_log import RangeLog
 
@@ -494,8 +494,11 @@ def a_fit(offset_s: float, score: float = 1.0, *, stddev_s: float = 0.01, drift:
         "score": score,
         "is_testable": True,
         "num_independent": 10.0,
-        "ranges": HUNDRED,
-        "losses": np.full(100, -score),
+        "observed": HUNDRED,
+        "times_s": HUNDRED.times_s,
+        "weights": np.ones(100),
+        "losses": lambda *_: np.full(100, -score),
+        "residual_stddev_m": 1.0,
         "timing": lambda: Timing(stddev_s, drift, 1e-5),
         "explains": lambda: True,
     }
@@ -517,7 +520,7 @@ def test_fits_that_end_at_the_same_offset_count_once(
     monkeypatch.setattr(time_offset, "_log_odds", lambda *_: 0.0)
     monkeypatch.setattr(time_offset, "_MAX_NUM_LIKELY", 9)
     fits = [a_fit(offset_s, 9 - offset_s, stddev_s=stddev_s) for offset_s in (5.1, 0.26, 0.0, 0.24, 4.9, 0.6)]
-    found = time_offset._likely_fits(fits, HUNDRED, KNOWN)
+    found = time_offset._likely_fits(fits, HUNDRED.times_s, KNOWN, "give it")
     assert [fit.offset_s for fit, _ in found] == kept
 
 
@@ -527,27 +530,28 @@ def test_an_offset_that_puts_fewer_ranges_on_the_path_is_less_likely_from_the_st
     """Seven tenths of the ranges of the best offset are enough; with fewer, its prior is a twentieth."""
     monkeypatch.setattr(time_offset, "_log_odds", lambda best, fit, path: 1.0 if fit.offset_s > 0 else 0.0)
     fits = [a_fit(31.0, 2.7), a_fit(0.0, 2.0), a_fit(30.0, 2.8), a_fit(-20.0, 9.0, is_testable=False)]
-    found = time_offset._likely_fits(fits, HUNDRED, KNOWN)
+    found = time_offset._likely_fits(fits, HUNDRED.times_s, KNOWN, "give it")
     weights = np.array([1.0, np.exp(-1), 0.05 * np.exp(-1)])
     assert [fit.offset_s for fit, _ in found] == [0.0, 30.0, 31.0]
     assert [probability for _, probability in found] == pytest.approx((weights / weights.sum()).tolist())
 
 
 def test_two_offsets_are_compared_by_the_ranges_they_share_or_else_by_their_scores() -> None:
-    losses = np.where(np.arange(100) < 40, 5.0, -1.0)
+    def of(values: Array) -> Any:
+        return lambda *_: values
+
+    losses = of(np.where(np.arange(100) < 40, 5.0, -1.0))
     best = a_fit(0.0, 3.0, losses=losses, num_independent=30.0)
     # At 40 s, the ranges from 0 to 60 s are on the path; of those that were there, all are at 0 s.
-    rival = a_fit(40.0, 2.5, losses=np.full(100, 7.0), num_independent=20.0)
+    rival = a_fit(40.0, 2.5, losses=of(np.full(100, 7.0)), num_independent=20.0)
     own = (40 * 5.0 - 20 * 1.0) / 60
     assert time_offset._log_odds(best, rival, KNOWN) == pytest.approx(20 * 0.6 * (7.0 - own))
-    half = a_fit(50.0, 2.5, losses=np.full(100, 7.0))
-    assert time_offset._log_odds(best, half, KNOWN) == pytest.approx(10 * 0.5 * (7.0 - (40 * 5.0 - 10) / 50))
-    far = a_fit(51.0, 2.5, losses=np.full(100, 7.0), num_independent=50.0)
+    quarter = a_fit(75.0, 2.5, losses=of(np.full(100, 7.0)))
+    assert time_offset._log_odds(best, quarter, KNOWN) == pytest.approx(10 * 0.25 * (7.0 - 5.0))
+    far = a_fit(76.0, 2.5, losses=of(np.full(100, 7.0)), num_independent=50.0)
     assert time_offset._log_odds(best, far, KNOWN) == pytest.approx(30 * 0.5)
     # Ranges of the rival that are off the path at the best offset do not count.
-    early = a_fit(
-        0.0, ranges=HUNDRED._replace(times_s=HUNDRED.times_s - 30), losses=np.where(np.arange(100) < 30, 9, 2)
-    )
+    early = a_fit(0.0, times_s=HUNDRED.times_s - 30, losses=of(np.where(np.arange(100) < 30, 9, 2)))
     assert time_offset._log_odds(a_fit(0.0, 1.0), early, KNOWN) == pytest.approx(10 * 0.7 * (2 + 1))
 
 
@@ -648,21 +652,18 @@ def offset_of_motion(
         around=lambda best_s: CostCurve(np.array([best_s]), np.ones(1)),
     )
     left = iter(fits)
-    path = SimpleNamespace(knows=KNOWN.knows, is_known=np.arange(100) < num_known, step_s=0.5)
+    path: Any = SimpleNamespace(knows=KNOWN.knows, is_known=np.arange(100) < num_known, step_s=0.5)
     final = a_fit(
         2.0,
         rates=np.tile([3.0, -4.0], 50),  # of root mean square sqrt(12.5)
         residual_stddev_m=0.1 * np.sqrt(12.5),
-        squares=SimpleNamespace(weights=np.ones(100)),
     )
     timing = Timing(final_stddev_s, drift, 2e-5)
-    monkeypatch.setattr(time_offset, "moving_path", lambda *_: path)
-    monkeypatch.setattr(time_offset, "scan_offsets", lambda *_: curve)
-    monkeypatch.setattr(time_offset, "ranges_at_offset", lambda *_: HUNDRED.take(np.arange(num_near)))
+    monkeypatch.setattr(time_offset, "on_path", lambda *_: HUNDRED.take(np.arange(num_near)))
     monkeypatch.setattr(time_offset, "refine_offset", lambda *_: next(left))
-    monkeypatch.setattr(time_offset, "fit_clocks", lambda *_: (final, timing, followed, 50.0))
-    photos: Any = None
-    return time_offset._offset_of_motion(HUNDRED, photos, np.zeros((1, 3)), AssociationOptions(), 0, SilentProgress())
+    scan: Any = lambda *_: curve  # noqa: E731
+    ranges = time_offset._RANGES._replace(scan=scan, fit_clocks=lambda *_: (final, timing, followed, 50.0))
+    return time_offset.offset_of_motion(HUNDRED, path, ranges, seed=0, progress=SilentProgress())
 
 
 def test_an_offset_from_motion_is_told_with_its_rivals_and_the_curve_about_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -728,13 +729,18 @@ def test_bursts_are_looked_for_where_photos_are_far_apart_and_then_motion(
     """The motion is interpolated across one and a half times the usual gap."""
     given: list[Any] = []
 
-    def offset_of_motion(*arguments: Any) -> str:
-        given.append(arguments)
+    def path_to_search(*arguments: Any) -> Any:
+        given.extend(arguments)
+        return moving_path(*arguments)
+
+    def offset_of_motion(ranges: TimedRanges, *_: Any, seed: int, progress: Any) -> str:
+        given.extend([ranges, seed])
         return "motion"
 
     monkeypatch.setattr(time_offset, "find_bursts", lambda *_: bursts)
     monkeypatch.setattr(time_offset, "_offset_of_bursts", lambda *_: found)
-    monkeypatch.setattr(time_offset, "_offset_of_motion", offset_of_motion)
+    monkeypatch.setattr(time_offset, "moving_path", path_to_search)
+    monkeypatch.setattr(time_offset, "offset_of_motion", offset_of_motion)
     walk = Walk(still, no_turn)
     log = walk.log(range_times(0, 9), 0.0)
     answer: Any = estimate(log, walk.photos(gap_s * np.arange(4, dtype=np.float64)))
@@ -742,7 +748,7 @@ def test_bursts_are_looked_for_where_photos_are_far_apart_and_then_motion(
         assert (answer, given) == ("found", [])
         return
     assert answer == "motion"
-    ranges, _, arms_m, association, seed, _ = given[0]
+    _, arms_m, association, ranges, seed = given
     assert association.max_interpolation_gap_s == pytest.approx(max_gap_s)
     assert seed == 0
     np.testing.assert_array_equal(arms_m, [TAG_IN_CAM_M])

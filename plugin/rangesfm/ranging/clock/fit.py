@@ -1,19 +1,22 @@
-"""Robust fit of ranges to the path at one time offset, with the offset's uncertainty and the drift of the clocks."""
+"""Robust fit of observations to the path at one time offset, with the offset's uncertainty and the drift of the clocks.
+
+The observations are ranges here; ``rangesfm.positions.clock`` fits the coordinates of positions in the same way.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS, UNDETERMINED
-from rangesfm.ranging.clock.search import MIN_COVERAGE, PathSamples, TimedRanges
-from rangesfm.ranging.clock.squares import SquaresFit, fit_squares, residual_stddev
+from rangesfm.ranging.clock.search import MIN_COVERAGE, AnyObserved, Observed, PathSamples, TimedRanges
+from rangesfm.ranging.clock.squares import fit_squares, residual_stddev
 from rangesfm.ranging.errors.noise import NORMAL_95, STRETCH_S
 
 # Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
@@ -46,27 +49,97 @@ class Timing(NamedTuple):
     drift_stddev: float
 
 
-@dataclass(frozen=True)
-class OffsetFit:
-    """Fit of ranges to the path at one time offset.
+class RobustFit(Protocol):
+    """Robust fit of n numbers by linear unknowns.
 
     Attributes:
-        offset_s: image time minus range time.
-        ranges: the n ranges on the path.
-        squares: fit of their squares.
+        weights: (n,) in [0, 1]. scale: metres per model unit; infinite if it is not determined.
+        num_unknowns: their number. weighted_residuals: (n,) measured minus fitted, times the roots of the weights.
+        basis: (n, p) orthonormal weighted columns of all unknowns.
+    """
+
+    @property
+    def weights(self) -> Array: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def num_unknowns(self) -> int: ...
+    @property
+    def weighted_residuals(self) -> Array: ...
+    @property
+    def basis(self) -> Array: ...
+
+    def unexplained(self, values: Array) -> Array:
+        """Return weighted changes of the numbers (n, k) without the parts that the unknowns can explain."""
+        ...
+
+
+FitAt = Callable[[AnyObserved, PathSamples, float, float], "OffsetFit"]
+"""Fit of observations at an offset, given the metres per model unit (infinity leaves the lever arm out)."""
+
+
+@dataclass(frozen=True)
+class OffsetFit:
+    """Fit of observations to the path at one time offset. Each of them is one of n numbers, or several: coordinates.
+
+    Attributes:
+        offset_s: image time minus the time of the observations.
+        observed: those on the path.
+        solved: fit of the n numbers by the other unknowns.
         residuals_m: (n,) residuals of that fit, enlarged to account for its number of unknowns.
-        num_spare: number of independent ranges beyond the unknowns.
-        deviations_m: (n,) deviations of the ranges from the median of their anchor's ranges.
-        rates: (n,) derivative of each predicted range by the offset, m/s.
+        num_spare: number of independent observations beyond the unknowns.
+        deviations_m: (n,) deviations from the median of all that are alike, such as the ranges to one anchor.
+        rates: (n,) derivative of each predicted number by the offset, m/s.
     """
 
     offset_s: float
-    ranges: TimedRanges
-    squares: SquaresFit
+    observed: Observed
+    solved: RobustFit
     residuals_m: Array
     num_spare: int
     deviations_m: Array
     rates: Array
+
+    @classmethod
+    def of(
+        cls,
+        offset_s: float,
+        observed: Observed,
+        measured_m: Array,
+        alike: Indices,
+        solved: RobustFit,
+        residuals_m: Array,
+        rates: Array,
+    ) -> OffsetFit:
+        """Make a fit from its solution.
+
+        Args:
+            measured_m: (n,) observed numbers. alike: (n,) index of the series that each belongs to, such as its anchor.
+            residuals_m: (n,) measured minus fitted.
+        """
+        deviations = measured_m.copy()
+        for rows in rows_by_key(alike):
+            deviations[rows] -= np.median(deviations[rows])
+        times_s = np.repeat(observed.times_s, len(measured_m) // max(len(observed.times_s), 1))
+        cells = np.floor(times_s / _CELL_S).astype(np.int64) * (alike.max(initial=0) + 1) + alike
+        num_cells = len(np.unique(cells))
+        num_spare = num_cells - solved.num_unknowns - 1
+        residuals = residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
+        return cls(offset_s, observed, solved, residuals, num_spare, deviations, rates)
+
+    @property
+    def _num_each(self) -> int:
+        return len(self.residuals_m) // max(len(self.observed.times_s), 1)
+
+    @property
+    def times_s(self) -> Array:
+        """Times of the numbers (n,)."""
+        return np.repeat(self.observed.times_s, self._num_each)
+
+    @property
+    def weights(self) -> Array:
+        """Robust weights of the observations."""
+        return self.solved.weights[:: self._num_each]
 
     @property
     def residual_stddev_m(self) -> float:
@@ -75,17 +148,20 @@ class OffsetFit:
     @property
     def is_testable(self) -> bool:
         """Return whether there are enough ranges to tell a fit from a coincidence."""
-        return self.num_spare >= self.squares.num_unknowns
+        return self.num_spare >= self.solved.num_unknowns
 
-    @cached_property
-    def losses(self) -> Array:
-        """Negative log-likelihood of each residual (n,), up to a constant."""
-        return _losses(self.residuals_m)
+    def losses(self, stddev_m: float | None = None) -> Array:
+        """Return the negative log-likelihood of each residual (n,), up to a constant.
+
+        Args:
+            stddev_m: of the residuals; None: their own.
+        """
+        return _losses(self.residuals_m, self.residual_stddev_m if stddev_m is None else stddev_m)
 
     @cached_property
     def gains(self) -> Array:
         """Gain in each range's log-likelihood over a camera that stands still (n,)."""
-        return _losses(self.deviations_m) - self.losses
+        return _losses(self.deviations_m, residual_stddev(self.deviations_m)) - self.losses()
 
     @property
     def score(self) -> float:
@@ -98,12 +174,13 @@ class OffsetFit:
 
         It is found from the variation of the losses between blocks of time, which is larger for correlated errors.
         """
-        variance = _variance_of_mean(self.losses, self.ranges.times_s)
-        return min(self.num_spare, float(np.var(self.losses)) / max(variance, 1e-300))
+        losses = self.losses()
+        variance = _variance_of_mean(losses, self.times_s)
+        return min(self.num_spare, float(np.var(losses)) / max(variance, 1e-300))
 
     def explains(self) -> bool:
         """Return whether the path explains the ranges better than no motion at all."""
-        least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.ranges.times_s))
+        least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.times_s))
         return bool(self.score > least)
 
     def is_hopeless_beside(self, rival: OffsetFit) -> bool:
@@ -113,11 +190,11 @@ class OffsetFit:
 
     def timing(self) -> Timing:
         """Return the drift, and standard deviations that account for residuals correlated within blocks of time."""
-        times = self.ranges.times_s - self.ranges.times_s.mean()
-        own = self.squares.unexplained(np.stack([self.rates, self.rates * times], axis=1))
+        times = self.times_s - self.times_s.mean()
+        own = self.solved.unexplained(np.stack([self.rates, self.rates * times], axis=1))
         if not _is_determined(own[:, 0], self.rates):
             return Timing(np.inf, 0.0, np.inf)
-        residuals = self.squares.weighted_residuals
+        residuals = self.solved.weighted_residuals
         change = np.linalg.lstsq(own, residuals, rcond=None)[0]
         alone = self._variances(own[:, :1], residuals, times)
         both = self._variances(own, residuals - own @ change, times)
@@ -129,36 +206,9 @@ class OffsetFit:
         # and four stretches; short logs have the smallest number of blocks, half of it, and twice as many.
         usual = max(_MIN_NUM_BLOCKS, float(np.ptp(times)) / (2 * STRETCH_S))
         blocks = [_blocks(times, round(num)) for num in (usual / 2, usual, 2 * usual)]
-        by_chance = _jackknife_variances(own, residuals, self.squares, blocks)
-        by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.squares.weights), rcond=None)[0]
+        by_chance = _jackknife_variances(own, residuals, self.solved, blocks)
+        by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.solved.weights), rcond=None)[0]
         return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
-
-
-def refine_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, rival: OffsetFit | None = None) -> OffsetFit:
-    """Refine an offset by Gauss-Newton steps to the nearest one that fits the ranges best.
-
-    Args:
-        ranges: ranges that are (nearly) all on the path at the given offset.
-        path: the path.
-        offset_s: the offset to start from.
-        rival: the refinement stops early if it is far behind this fit; None: there is none.
-    """
-    # The lever arm comes in only after the scale has been estimated.
-    found = fit_at_offset(ranges, path, offset_s, fit_at_offset(ranges, path, offset_s).squares.scale)
-    for _ in range(MAX_NUM_ROUNDS):
-        if rival is not None and found.is_hopeless_beside(rival):
-            break
-        own = found.squares.unexplained(found.rates[:, None])[:, 0]
-        if not _is_determined(own, found.rates):
-            break
-        step_s = float(own @ found.squares.weighted_residuals / (own @ own))
-        if abs(step_s) * np.linalg.norm(own) < NEGLIGIBLE_STDDEVS * found.residual_stddev_m:
-            break
-        offset_s = found.offset_s + float(np.clip(step_s, -SEPARATION_S, SEPARATION_S))
-        if np.mean(path.knows(ranges.times_s + offset_s)) < MIN_COVERAGE:
-            break
-        found = fit_at_offset(ranges, path, offset_s, found.squares.scale)
-    return found
 
 
 def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
@@ -170,23 +220,48 @@ def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale
     ranges = ranges.take(path.knows(ranges.times_s + offset_s))
     points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
     squares = fit_squares(points, ranges.range_m, ranges.anchor)
-    deviations = ranges.range_m.copy()
-    for rows in rows_by_key(ranges.anchor):
-        deviations[rows] -= np.median(deviations[rows])
-    cells = np.floor(ranges.times_s / _CELL_S).astype(np.int64) * (ranges.anchor.max(initial=0) + 1) + ranges.anchor
-    num_cells = len(np.unique(cells))
-    num_spare = num_cells - squares.num_unknowns - 1
-    residuals = squares.residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
     rates = np.einsum("ni,ni->n", squares.gradient, velocities)
-    return OffsetFit(offset_s, ranges, squares, residuals, num_spare, deviations, rates)
+    return OffsetFit.of(offset_s, ranges, ranges.range_m, ranges.anchor, squares, squares.residuals_m, rates)
 
 
-def _losses(errors_m: Array) -> Array:
-    """Return the negative log-likelihoods (n,) of errors by a Cauchy distribution of the errors' own size.
+def refine_offset(
+    observed: AnyObserved,
+    path: PathSamples,
+    offset_s: float,
+    rival: OffsetFit | None = None,
+    fit_at: FitAt[Any] = fit_at_offset,
+) -> OffsetFit:
+    """Refine an offset by Gauss-Newton steps to the nearest one that fits the observations best.
 
-    Errors that are twice as large lose log 2.
+    Args:
+        observed: ranges, or what else ``fit_at`` fits, that are (nearly) all on the path at the given offset.
+        path: the path.
+        offset_s: the offset to start from.
+        rival: the refinement stops early if it is far behind this fit; None: there is none.
     """
-    stddev_m = residual_stddev(errors_m)
+    # The lever arm comes in only after the scale has been estimated.
+    found = fit_at(observed, path, offset_s, fit_at(observed, path, offset_s, np.inf).solved.scale)
+    for _ in range(MAX_NUM_ROUNDS):
+        if rival is not None and found.is_hopeless_beside(rival):
+            break
+        own = found.solved.unexplained(found.rates[:, None])[:, 0]
+        if not _is_determined(own, found.rates):
+            break
+        step_s = float(own @ found.solved.weighted_residuals / (own @ own))
+        if abs(step_s) * np.linalg.norm(own) < NEGLIGIBLE_STDDEVS * found.residual_stddev_m:
+            break
+        offset_s = found.offset_s + float(np.clip(step_s, -SEPARATION_S, SEPARATION_S))
+        if np.mean(path.knows(observed.times_s + offset_s)) < MIN_COVERAGE:
+            break
+        found = fit_at(observed, path, offset_s, found.solved.scale)
+    return found
+
+
+def _losses(errors_m: Array, stddev_m: float) -> Array:
+    """Return the negative log-likelihoods (n,) of errors by a Cauchy distribution.
+
+    Errors that are twice as large, as is their standard deviation, lose log 2.
+    """
     return np.asarray(np.log(stddev_m) + np.log1p((errors_m / stddev_m) ** 2))
 
 
@@ -207,7 +282,7 @@ def _blocks(times: Array, num_blocks: int) -> Indices:
     return np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
 
 
-def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, blocks: Sequence[Indices]) -> list[Array]:
+def _jackknife_variances(own: Array, residuals: Array, solved: RobustFit, blocks: Sequence[Indices]) -> list[Array]:
     """Return the variances (k,) of an M-estimate with residuals correlated within blocks, for each set of blocks.
 
     This is the delete-one-block jackknife, with one Newton step of all unknowns of the fit for each block (Bell and
@@ -217,13 +292,13 @@ def _jackknife_variances(own: Array, residuals: Array, squares: SquaresFit, bloc
 
     Args:
         own: (n, k) columns of the unknowns, without the parts that other unknowns explain.
-        residuals: (n,) weighted residuals of the fit ``squares``, metres.
-        squares: the fit.
+        residuals: (n,) weighted residuals of the fit ``solved``, metres.
+        solved: the fit.
         blocks: divisions, each the index (n,) of each range's block.
     """
     sizes = np.linalg.norm(own, axis=0)
-    columns = np.column_stack([squares.basis, own / sizes])
-    curving = (2 * squares.weights - 1)[:, None]
+    columns = np.column_stack([solved.basis, own / sizes])
+    curving = (2 * solved.weights - 1)[:, None]
     curvature = columns.T @ (curving * columns)
 
     def variances(block: Indices) -> Array:

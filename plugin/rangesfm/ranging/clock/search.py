@@ -7,9 +7,10 @@ pass.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +35,22 @@ MIN_COVERAGE = 0.5
 """Fraction of the largest possible number of ranges on the path; an offset that puts fewer there is not tried."""
 # Number of offsets in the curve for the report that are taken from all, and of those nearest to the best one.
 _NUM_SHOWN = 200
+
+
+class Observed(Protocol):
+    """What was observed at n times, such as ranges."""
+
+    @property
+    def times_s(self) -> Array:
+        """(n,) times on the clock of the observing system."""
+        ...
+
+    def take(self: AnyObserved, rows: Indices | Mask) -> AnyObserved:
+        """Return some of the observations."""
+        ...
+
+
+AnyObserved = TypeVar("AnyObserved", bound=Observed)
 
 
 class TimedRanges(NamedTuple):
@@ -117,9 +134,9 @@ def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: Associati
     return PathSamples(start_s, step_s, np.where(known, places.centers, 0.0), tag_from_center, is_known)
 
 
-def ranges_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, max_num: int) -> TimedRanges:
-    """Return the first ranges that are on the path at an offset, at most ``max_num``."""
-    return ranges.take(np.flatnonzero(path.knows(ranges.times_s + offset_s))[:max_num])
+def on_path(observed: AnyObserved, path: PathSamples, offset_s: float, max_num: int) -> AnyObserved:
+    """Return the first observations that are on the path at an offset, at most ``max_num``."""
+    return observed.take(np.flatnonzero(path.knows(observed.times_s + offset_s))[:max_num])
 
 
 @dataclass(frozen=True)
@@ -177,17 +194,29 @@ def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None =
         weights: (n,) weights of the ranges; None: equal weights.
     """
     weights = np.ones(len(ranges.range_m)) if weights is None else weights
-    scanned: list[tuple[Array, Array, Array, Array]] = []
+    return scan_parts(ranges.times_s, path, lambda rows: _scan(ranges.take(rows), weights[rows], path))
+
+
+def scan_parts(times_s: Array, path: PathSamples, scan: Callable[[Indices], Scanned]) -> OffsetCurve:
+    """Join what was computed for the parts of a log, without the offsets that put few observations on the path.
+
+    Args:
+        times_s: (n,) of the observations. scan: returns the result for some of them.
+    """
+    scanned: list[Scanned] = []
     most = 0.0
-    for rows in sorted(_parts(ranges.times_s, len(path) * path.step_s), key=len, reverse=True):
+    for rows in sorted(_parts(times_s, len(path) * path.step_s), key=len, reverse=True):
         if len(rows) < MIN_COVERAGE * most:
             break
-        scanned.append(_scan(ranges.take(rows), weights[rows], path))
-        most = max(most, float(scanned[-1][0].max()))
-    num_on_path, offsets, scores, costs = (np.concatenate(column) for column in zip(*scanned))
+        scanned.append(scan(rows))
+        most = max(most, float(scanned[-1].num_on_path.max()))
+    num_on_path, offsets, variation, residual = (np.concatenate(column) for column in zip(*scanned))
     tried = np.flatnonzero(num_on_path >= max(1.0, MIN_COVERAGE * most))
     order = tried[np.argsort(offsets[tried], kind="stable")]
-    return OffsetCurve(offsets[order], costs[order], scores[order])
+    floor = 1e-12 * max(float(variation.max()), 1e-300)
+    left, whole = np.maximum(residual[order], floor), np.maximum(variation[order], floor)
+    costs = np.sqrt(left / np.maximum(num_on_path[order], 1.0))
+    return OffsetCurve(offsets[order], costs, 0.5 * np.log(whole / left))
 
 
 def _parts(times: Array, path_span_s: float) -> list[Indices]:
@@ -199,30 +228,69 @@ def _parts(times: Array, path_span_s: float) -> list[Indices]:
     return np.split(order, np.flatnonzero(np.diff(times[order]) > path_span_s) + 1)
 
 
-def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> tuple[Array, Array, Array, Array]:
-    """Return sums of weights on the path, offsets, scores and costs, (m,) each, of one part of the log."""
-    first_s, last_s = float(ranges.times_s.min()), float(ranges.times_s.max())
-    span_s = len(path) * path.step_s + last_s - first_s
-    stride = max(1, round(span_s / (_MAX_NUM_STEPS * path.step_s)))
-    step_s = stride * path.step_s
-    columns = _columns(path, stride)
-    cell = np.rint((ranges.times_s - first_s) / step_s).astype(np.int64)
-    correlate = _Correlation(len(columns), int(cell.max()) + 1)
-    pairs = combinations_with_replacement(range(columns.shape[1]), 2)
-    products = {(i, j): correlate.transform(columns[:, i] * columns[:, j]) for i, j in pairs}
+class Scanned(NamedTuple):
+    """Sums over the observations on the path at m offsets, with the best fit at each.
 
-    sums = np.zeros((5, correlate.num_offsets))
+    Attributes:
+        num_on_path: (m,) sums of weights. offsets_s: (m,).
+        variation, residual: (m,) sums of squares of what is to be explained, and of what is left of it, square metres.
+    """
+
+    num_on_path: Array
+    offsets_s: Array
+    variation: Array
+    residual: Array
+
+
+class Cells(NamedTuple):
+    """The times of n observations as cells of a grid that samples of the path share, to correlate them.
+
+    Attributes:
+        cell: (n,) index of each observation's cell. stride: every so many samples are on the grid.
+        correlate: correlations of samples with cells. offsets_s: (m,) of these.
+    """
+
+    cell: Indices
+    stride: int
+    correlate: Correlation
+    offsets_s: Array
+
+    @classmethod
+    def of(cls, times_s: Array, path: PathSamples) -> Cells:
+        """Lay a grid that is as fine as the samples of the path, or coarser for very long logs."""
+        first_s, last_s = float(times_s.min()), float(times_s.max())
+        span_s = len(path) * path.step_s + last_s - first_s
+        stride = max(1, round(span_s / (_MAX_NUM_STEPS * path.step_s)))
+        step_s, num = stride * path.step_s, len(range(0, len(path), stride))
+        cell = np.rint((times_s - first_s) / step_s).astype(np.int64)
+        correlate = Correlation(num, int(cell.max()) + 1)
+        offsets = path.start_s - first_s + step_s * np.arange(1.0 - correlate.num_cells, num)
+        return cls(cell, stride, correlate, offsets)
+
+    def transform(self, values: Array) -> npt.NDArray[np.complex128]:
+        """Return the transform of the sums of (n,) values in the cells."""
+        sums = np.bincount(self.cell, values, minlength=self.correlate.num_cells)
+        return self.correlate.transform(sums.astype(np.float64))
+
+
+def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> Scanned:
+    """Return the result for one part of the log."""
+    cells = Cells.of(ranges.times_s, path)
+    columns = centred_columns(path, cells.stride)
+    pairs = combinations_with_replacement(range(columns.shape[1]), 2)
+    products = {(i, j): cells.correlate.transform(columns[:, i] * columns[:, j]) for i, j in pairs}
+
+    sums = np.zeros((5, cells.correlate.num_offsets))
     for rows in rows_by_key(ranges.anchor):
-        sums += _sums_of_anchor(ranges.range_m[rows], weights[rows], cell[rows], products, correlate)
+        of_anchor = cells._replace(cell=cells.cell[rows])
+        sums += _sums_of_anchor(ranges.range_m[rows], weights[rows], of_anchor, products)
     num, variation, without, column, cross = sums
     scale_squared = np.maximum(cross, 0.0) / np.maximum(column, 1e-12)
-    floor = 1e-12 * max(float(variation.max()), 1e-300)
-    residual = np.maximum(without - 2 * scale_squared * cross + scale_squared**2 * column, floor)
-    offsets = path.start_s - first_s + step_s * np.arange(1.0 - correlate.num_cells, len(columns))
-    return num, offsets, 0.5 * np.log(np.maximum(variation, floor) / residual), np.sqrt(residual / np.maximum(num, 1.0))
+    residual = without - 2 * scale_squared * cross + scale_squared**2 * column
+    return Scanned(num, cells.offsets_s, variation, residual)
 
 
-def _columns(path: PathSamples, stride: int) -> Array:
+def centred_columns(path: PathSamples, stride: int) -> Array:
     """Return the columns (m, 5) in which the squared range is linear: |c|^2, c and 1, with c centred and scaled.
 
     Rows off the path are 0.
@@ -237,7 +305,7 @@ def _columns(path: PathSamples, stride: int) -> Array:
     return np.column_stack([np.sum(centers**2, axis=1, keepdims=True), centers, known])
 
 
-class _Correlation:
+class Correlation:
     """Correlations in time of cells of the log with samples of the path, at every shift at which they overlap."""
 
     def __init__(self, num_samples: int, num_cells: int):
@@ -260,9 +328,8 @@ class _Correlation:
 def _sums_of_anchor(
     range_m: Array,
     weights: Array,
-    cell: Indices,
+    cells: Cells,
     products: dict[tuple[int, int], npt.NDArray[np.complex128]],
-    correlate: _Correlation,
 ) -> Array:
     """Return five weighted sums over the ranges of one anchor on the path (5, num_offsets).
 
@@ -273,17 +340,15 @@ def _sums_of_anchor(
     # Division by the derivative of rho^2 converts residuals back to metres.
     weight = weights / (2 * np.maximum(range_m, MIN_RANGE_M)) ** 2
 
-    def cells(values: Array) -> npt.NDArray[np.complex128]:
-        return correlate.transform(np.bincount(cell, values, minlength=correlate.num_cells).astype(np.float64))
-
-    own_weights, weighted = cells(weight), cells(weight * squared)
+    correlate = cells.correlate
+    own_weights, weighted = cells.transform(weight), cells.transform(weight * squared)
     ones = max(products)[0]  # the last of the columns, from 0
     normal = np.empty((correlate.num_offsets, ones + 1, ones + 1))
     for (i, j), product in products.items():
         normal[:, i, j] = normal[:, j, i] = correlate(product, own_weights)
     right = np.stack([correlate(products[i, ones], weighted) for i in range(ones + 1)], axis=1)
-    total = correlate(products[ones, ones], cells(weight * squared**2))
-    num = correlate(products[ones, ones], cells(weights))
+    total = correlate(products[ones, ones], cells.transform(weight * squared**2))
+    num = correlate(products[ones, ones], cells.transform(weights))
 
     # The anchor's own unknowns are eliminated, and the unexplained parts are summed over the anchors.
     own = normal[:, 1:, 1:] + (1e-6 * normal[:, ones, ones] + 1e-9 * weight.sum())[:, None, None] * np.eye(ones)

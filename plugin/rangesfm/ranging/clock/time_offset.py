@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +18,24 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.progress import Progress, SilentProgress
 from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
-from rangesfm.ranging.clock.fit import SEPARATION_S, OffsetFit, drift_note, fit_clocks, refine_offset
+from rangesfm.ranging.clock.fit import (
+    SEPARATION_S,
+    FitAt,
+    OffsetFit,
+    Timing,
+    drift_note,
+    fit_at_offset,
+    fit_clocks,
+    refine_offset,
+)
 from rangesfm.ranging.clock.search import (
     CostCurve,
+    Observed,
+    OffsetCurve,
     PathSamples,
     TimedRanges,
     moving_path,
-    ranges_at_offset,
+    on_path,
     scan_offsets,
 )
 from rangesfm.ranging.errors.noise import NORMAL_95
@@ -35,17 +46,17 @@ from rangesfm.ranging.range_observations import RangeStatus
 REMEDY = "give the time offset (--ranges_time_offset)"
 # With more likely offsets than this the estimate fails.
 _MAX_NUM_LIKELY = 3
-# Log and photos usually cover the same time. An offset that puts fewer ranges on the path than this fraction of the
-# best offset's number gets this prior probability, relative to the others.
+# Log and photos usually cover the same time. An offset that puts fewer observations on the path than this fraction of
+# the best offset's number gets this prior probability, relative to the others.
 _COVERING_SHARE = 0.7
 _PRIOR_OF_THE_OTHERS = 0.05
-# Two offsets with a smaller fraction of ranges in common are compared by all ranges that each puts on the path.
-_MIN_SHARED = 0.5
+# Two offsets with a smaller fraction of observations in common are compared by all that each puts on the path.
+_MIN_SHARED = 0.25
 # Largest number of candidates from the scan.
 _MAX_NUM_CANDIDATES = 12
-# Numbers of ranges that suffice to compare candidates, and for the final estimate.
-_NUM_RANGES_PER_CANDIDATE = 3000
-_NUM_RANGES_OF_FINAL = 40000
+# Numbers of observations that suffice to compare candidates, and for the final estimate.
+_NUM_PER_CANDIDATE = 3000
+_NUM_OF_FINAL = 40000
 # The offset does not matter if this fraction of the ranges in bursts stays at the same photos.
 _MIN_SAME_SHARE = 0.95
 # An offset with a larger standard deviation is refused.
@@ -135,76 +146,111 @@ def estimate_time_offset(
         raise InputError("the log has no timestamps, so that no time offset can be found", log.source)
     if trajectory.timestamps_s is None:
         raise InputError("the photos have no times, so that no time offset can be found: give image times")
-    if len(trajectory) < MIN_NUM_KEYFRAMES or not len(log):
-        raise GeometryError(
-            f"{len(trajectory)} photos and {len(log)} ranges are too few to find the time offset: {REMEDY}"
-        )
+    require_enough(trajectory, len(log), _RANGES)
     association = association or AssociationOptions()
     tags = lever_arms(log, tag_in_cam_m)
     ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
     ranges = ranges.take(log.own_order[log.kind[log.own_order] == RangeKind.TAG_ANCHOR])
-    gap_s = float(np.median(np.diff(trajectory.timestamps_s)))
-    if is_too_long(gap_s, association):
+    if is_too_long(float(np.median(np.diff(trajectory.timestamps_s))), association):
         bursts = find_bursts(ranges, trajectory.timestamps_s)
         if bursts is not None:
             found = _offset_of_bursts(bursts, log, trajectory, tags, association)
             if found is not None:
                 return found
-    gap_s = max(_MAX_GAPS * gap_s, association.max_interpolation_gap_s)
-    association = association.model_copy(update={"max_interpolation_gap_s": gap_s})
-    return _offset_of_motion(ranges, trajectory, tags, association, seed, progress or SilentProgress())
+    path = path_to_search(trajectory, tags, association)
+    return offset_of_motion(ranges, path, _RANGES, seed=seed, progress=progress or SilentProgress())
 
 
-def _offset_of_motion(
-    ranges: TimedRanges,
-    trajectory: Trajectory,
-    tags_in_cam_m: Array,
-    association: AssociationOptions,
-    seed: int,
-    progress: Progress,
+class ObservedKind(NamedTuple):
+    """A kind of observations that a time offset is found from.
+
+    Attributes:
+        name: in words. remedy: what the user can do where the motion does not determine the offset.
+        scan: computes cost and score of all offsets, given weights or None. fit_at: fits one offset.
+        fit_clocks: refines an offset with all that was observed, and returns the fit, its timing, a drift that it found
+            and the time at which the offset is valid.
+    """
+
+    name: str
+    remedy: str
+    scan: Callable[[Any, PathSamples, Array | None], OffsetCurve]
+    fit_at: FitAt[Any]
+    fit_clocks: Callable[[Any, PathSamples, float], tuple[OffsetFit, Timing, float, float]]
+
+
+_RANGES = ObservedKind("ranges", REMEDY, scan_offsets, fit_at_offset, fit_clocks)
+
+
+def require_enough(trajectory: Trajectory, num: int, kind: ObservedKind) -> None:
+    """Raise GeometryError if there are too few photos to compare with, or no observation."""
+    if len(trajectory) < MIN_NUM_KEYFRAMES or not num:
+        raise GeometryError(
+            f"{len(trajectory)} photos and {num} {kind.name} are too few to find the time offset: {kind.remedy}"
+        )
+
+
+def path_to_search(trajectory: Trajectory, antennas_in_cam_m: Array, association: AssociationOptions) -> PathSamples:
+    """Sample the path of keyframes with times, also across longer gaps than those in which observations are used.
+
+    Args:
+        antennas_in_cam_m: (num, 3) lever arms, metres.
+    """
+    assert trajectory.timestamps_s is not None, "a path in time needs times"
+    gap_s = max(_MAX_GAPS * float(np.median(np.diff(trajectory.timestamps_s))), association.max_interpolation_gap_s)
+    return moving_path(trajectory, antennas_in_cam_m, association.model_copy(update={"max_interpolation_gap_s": gap_s}))
+
+
+def offset_of_motion(
+    observed: Observed, path: PathSamples, kind: ObservedKind, *, seed: int, progress: Progress
 ) -> TimeOffset:
-    """Estimate the offset from motion: scan all offsets, refine the best few, and find out which of them are likely."""
-    path = moving_path(trajectory, tags_in_cam_m, association)
+    """Estimate the offset from motion: scan all offsets, refine the best few, and find out which of them are likely.
+
+    Args:
+        observed: of this kind, with times. path: to search.
+        seed, progress: as for ``estimate_time_offset``.
+
+    Raises:
+        GeometryError: the motion does not determine the offset, not even up to a few alternatives.
+    """
+    name, remedy, times_s = kind.name, kind.remedy, observed.times_s
     if np.count_nonzero(path.is_known) < 2:
-        raise GeometryError(f"no part of the path can be compared with the log to find the time offset: {REMEDY}")
-    scanned = scan_offsets(ranges, path)
-    # All offsets use ranges in the same random order, so that different offsets are compared by the same ranges.
-    ranges = ranges.take(np.random.default_rng(seed).permutation(len(ranges.times_s)))
-    candidates = scanned.peaks(SEPARATION_S, _MAX_NUM_CANDIDATES)
+        raise GeometryError(f"no part of the path can be compared with the log to find the time offset: {remedy}")
+    # All offsets use observations in the same random order, so that different offsets are compared by the same ones.
+    mixed = observed.take(np.random.default_rng(seed).permutation(len(times_s)))
+    candidates = kind.scan(observed, path, None).peaks(SEPARATION_S, _MAX_NUM_CANDIDATES)
     fits: list[OffsetFit] = []
     for num_done, offset_s in enumerate(candidates):
         progress.update(num_done, len(candidates))
-        near = ranges_at_offset(ranges, path, offset_s, _NUM_RANGES_PER_CANDIDATE)
-        if len(near.range_m):
+        near = on_path(mixed, path, offset_s, _NUM_PER_CANDIDATE)
+        if len(near.times_s):
             best = max((fit for fit in fits if fit.is_testable), key=lambda fit: fit.score, default=None)
-            fits.append(refine_offset(near, path, offset_s, best))
+            fits.append(refine_offset(near, path, offset_s, best, kind.fit_at))
     progress.update(len(candidates), len(candidates))
     if not any(fit.is_testable for fit in fits):
-        log_s, photos_s = np.ptp(ranges.times_s), path.step_s * (len(path.is_known) - 1)
+        log_s, photos_s = np.ptp(times_s), path.step_s * (len(path.is_known) - 1)
         raise GeometryError(
-            f"too few ranges along the camera's path to find the time offset (the log lasts {log_s:.4g} s, the photos "
-            f"{photos_s:.4g} s): {REMEDY}"
+            f"too few {name} along the camera's path to find the time offset (the log lasts {log_s:.4g} s, the photos "
+            f"{photos_s:.4g} s): {remedy}"
         )
-    (best, probability), *rivals = _likely_fits(fits, ranges, path)
+    (best, probability), *rivals = _likely_fits(fits, times_s, path, remedy)
     if not best.explains():
         raise GeometryError(
-            "at no time offset do the ranges follow the camera's path (it hardly moves, its photos are "
-            f"too far apart, or the log belongs to other photos): {REMEDY}"
+            f"at no time offset do the {name} follow the camera's path (it hardly moves, its photos are "
+            f"too far apart, or the log belongs to other photos): {remedy}"
         )
-    near = ranges_at_offset(ranges, path, best.offset_s, _NUM_RANGES_OF_FINAL)
-    final, timing, drift, reference_s = fit_clocks(near, path, best.offset_s)
+    near = on_path(mixed, path, best.offset_s, _NUM_OF_FINAL)
+    final, timing, drift, reference_s = kind.fit_clocks(near, path, best.offset_s)
     is_certain = bool(timing.stddev_s * np.sqrt(np.mean(final.rates**2)) < final.residual_stddev_m)
     found = f"(about {final.offset_s:+.2f} s, within {NORMAL_95 * timing.stddev_s:.2g} s, 95 %)"
     if not is_certain and not timing.stddev_s < _MOST_UNCERTAIN_S:
-        raise GeometryError(f"the motion is too even to tell the time offset {found}: {REMEDY}")
+        raise GeometryError(f"the motion is too even to tell the time offset {found}: {remedy}")
     notes = [drift_note(drift, timing.drift_stddev, near.times_s)] if drift else []
     if not is_certain:
-        notes.append(f"the motion is too even to tell the time offset well {found}: {REMEDY} if you know it better")
-    weighed = scan_offsets(final.ranges, path, final.squares.weights)
+        notes.append(f"the motion is too even to tell the time offset well {found}: {remedy} if you know it better")
     return TimeOffset(
         value_s=final.offset_s,
         stddev_s=timing.stddev_s,
-        curve=weighed.around(final.offset_s),
+        curve=kind.scan(final.observed, path, final.weights).around(final.offset_s),
         drift=drift or timing.drift,
         drift_stddev=timing.drift_stddev,
         drift_is_followed=drift != 0,
@@ -260,7 +306,9 @@ def _num_at_same_photo(
     return int(np.count_nonzero(np.all([photo == photos[0] for photo in photos], axis=0) & (photos[0] >= 0)))
 
 
-def likely_offsets(offsets_s: Sequence[float], log_likelihoods: Sequence[float]) -> list[tuple[int, float]]:
+def likely_offsets(
+    offsets_s: Sequence[float], log_likelihoods: Sequence[float], remedy: str = REMEDY
+) -> list[tuple[int, float]]:
     """Return the indices and probabilities of the offsets that cannot be ruled out, the most likely first.
 
     Raises:
@@ -272,21 +320,23 @@ def likely_offsets(offsets_s: Sequence[float], log_likelihoods: Sequence[float])
     probabilities = weights[likely] / weights[likely].sum()
     if len(likely) > _MAX_NUM_LIKELY:
         some = ", ".join(f"{offsets_s[k]:+.2f} s ({share:.0%})" for k, share in zip(likely[:3], probabilities))
-        raise GeometryError(f"the motion does not distinguish {len(likely)} time offsets, such as {some}: {REMEDY}")
+        raise GeometryError(f"the motion does not distinguish {len(likely)} time offsets, such as {some}: {remedy}")
     return list(zip(likely.tolist(), probabilities.tolist()))
 
 
-def _likely_fits(fits: list[OffsetFit], ranges: TimedRanges, path: PathSamples) -> list[tuple[OffsetFit, float]]:
+def _likely_fits(
+    fits: list[OffsetFit], times_s: Array, path: PathSamples, remedy: str
+) -> list[tuple[OffsetFit, float]]:
     """Return the fits that cannot be ruled out, with their probabilities, the most likely first.
 
     Args:
         fits: fits of which at least one is testable.
-        ranges: ranges of the whole log.
+        times_s: (n,) times of the whole log. remedy: what the user can do about too many of them.
 
     Raises:
         GeometryError: there are too many of them.
     """
-    num_on_path = np.array([np.count_nonzero(path.knows(ranges.times_s + fit.offset_s)) for fit in fits])
+    num_on_path = np.array([np.count_nonzero(path.knows(times_s + fit.offset_s)) for fit in fits])
     order = [k for k in np.argsort([-fit.score for fit in fits] * num_on_path) if fits[k].is_testable]
     best, most = fits[order[0]], num_on_path[order[0]]
     same_s = max(SEPARATION_S, SIGNIFICANT_STDDEVS * min(best.timing().stddev_s, 1.0))
@@ -297,16 +347,21 @@ def _likely_fits(fits: list[OffsetFit], ranges: TimedRanges, path: PathSamples) 
         if all(abs(fit.offset_s - other.offset_s) > same_s for other in distinct):
             distinct.append(fit)
             log_likelihoods.append(-_log_odds(best, fit, path) + np.log(1.0 if covers else _PRIOR_OF_THE_OTHERS))
-    likely = likely_offsets([fit.offset_s for fit in distinct], log_likelihoods)
+    likely = likely_offsets([fit.offset_s for fit in distinct], log_likelihoods, remedy)
     return [(distinct[number], probability) for number, probability in likely]
 
 
 def _log_odds(fit: OffsetFit, rival: OffsetFit, path: PathSamples) -> float:
-    """Return the logarithm of the likelihood ratio of two fits, for the number of ranges with independent errors."""
+    """Return the logarithm of the likelihood ratio of two fits, for the number of observations with independent errors.
+
+    What both put on the path has the same noise, so that its residuals are compared in one unit. A unit for each, from
+    some hundred residuals, differs by chance by more than the residuals do.
+    """
     num = min(fit.num_independent, rival.num_independent)
-    mine = path.knows(fit.ranges.times_s + rival.offset_s)
-    theirs = path.knows(rival.ranges.times_s + fit.offset_s)
+    mine = path.knows(fit.times_s + rival.offset_s)
+    theirs = path.knows(rival.times_s + fit.offset_s)
     shared = float(min(mine.mean(), theirs.mean()))
     if shared < _MIN_SHARED:
         return num * (fit.score - rival.score)
-    return num * shared * float(rival.losses[theirs].mean() - fit.losses[mine].mean())
+    stddev_m = min(fit.residual_stddev_m, rival.residual_stddev_m)
+    return num * shared * float(rival.losses(stddev_m)[theirs].mean() - fit.losses(stddev_m)[mine].mean())

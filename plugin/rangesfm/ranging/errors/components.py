@@ -232,6 +232,10 @@ PLACES = "places"
 """Uncertainty of the camera's positions at and between keyframes; not a component of the ranges' errors."""
 
 
+FRAME = "frame"
+"""Error of the frame of known positions, in its place and its scale; not a component of the ranges' errors."""
+
+
 def component_words(names: Iterable[str]) -> dict[str, str]:
     """Return descriptions of components for people, by name."""
     words = {component.name: component.words for component in COMPONENTS} | BENDS
@@ -243,6 +247,8 @@ def component_words(names: Iterable[str]) -> dict[str, str]:
         PLACES: "positions of the camera at and between the photos",
         "points": "coordinates of the control points",
         "positions": "noise of the known positions",
+        "positions_warp": "errors of the positions that belong to a place",
+        FRAME: "size of the site as the positions have it",
         "tape": "errors of the measured lengths",
         "marks": "marking of points in the photos",
     }

@@ -1,0 +1,169 @@
+"""The time offset of an antenna's positions: their fit to the camera's path at every offset, and at one of them.
+
+The rule by which offsets are found, compared and doubted is that of ranges (``rangesfm.ranging.clock``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
+from rangesfm.geometry.similarity import Similarity, align_points, similarity_motions
+from rangesfm.ranging.clock.fit import OffsetFit, Timing, refine_offset
+from rangesfm.ranging.clock.search import Cells, OffsetCurve, PathSamples, Scanned, centred_columns, scan_parts
+from rangesfm.ranging.clock.squares import residual_stddev
+from rangesfm.ranging.clock.time_offset import ObservedKind
+from rangesfm.ranging.errors.robust_loss import CAUCHY
+
+
+class TimedPositions(NamedTuple):
+    """n positions in metres, with times on their clock."""
+
+    times_s: Array
+    position_m: Array
+
+    def take(self, rows: Indices | Mask) -> TimedPositions:
+        """Return some of the positions."""
+        return TimedPositions(self.times_s[rows], self.position_m[rows])
+
+
+@dataclass(frozen=True)
+class SimilarityFit:
+    """Robust fit of a similarity from points on a path to n positions.
+
+    Attributes:
+        site_from_model: the similarity.
+        predicted_m, residuals_m: (n, 3) fitted positions, and measured minus fitted.
+        weights_of_positions: (n,) in [0, 1].
+    """
+
+    site_from_model: Similarity
+    predicted_m: Array
+    residuals_m: Array
+    weights_of_positions: Array
+    num_unknowns: int = 7
+
+    @property
+    def scale(self) -> float:
+        """Metres per model unit."""
+        return self.site_from_model.scale
+
+    @property
+    def weights(self) -> Array:
+        """Weights of the coordinates (3 n,)."""
+        return np.repeat(self.weights_of_positions, 3)
+
+    @property
+    def weighted_residuals(self) -> Array:
+        """Residuals times the roots of their weights (3 n,), metres."""
+        return np.asarray(np.sqrt(self.weights) * self.residuals_m.ravel())
+
+    @cached_property
+    def basis(self) -> Array:
+        """Orthonormal weighted columns (3 n, p) of the similarity; p is smaller if the path leaves a turn open."""
+        motions = similarity_motions(self.predicted_m - self.predicted_m.mean(axis=0)).reshape(-1, self.num_unknowns)
+        columns = np.sqrt(self.weights)[:, None] * motions
+        lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        basis, strengths, _ = np.linalg.svd(columns / lengths, full_matrices=False)
+        return np.asarray(basis[:, strengths > UNDETERMINED * strengths[0]])
+
+    def unexplained(self, values: Array) -> Array:
+        """Return weighted changes of the coordinates (3 n, k) without the parts that a similarity can explain."""
+        weighted = np.sqrt(self.weights)[:, None] * values
+        return np.asarray(weighted - self.basis @ (self.basis.T @ weighted))
+
+
+def fit_similarity(points: Array, position_m: Array) -> SimilarityFit:
+    """Fit a similarity from (n, 3) points to (n, 3) positions by iteratively reweighted least squares."""
+    weights = _weights_by_place(position_m)
+    for _ in range(NUM_REWEIGHTINGS + 1):
+        found = align_points(points, position_m, weights=weights)
+        predicted_m = found.apply(points)
+        residuals_m = position_m - predicted_m
+        away = np.sqrt(np.mean(residuals_m**2, axis=1)) / residual_stddev(residuals_m.ravel())
+        weights = CAUCHY.weights(away)
+    return SimilarityFit(found, predicted_m, residuals_m, weights)
+
+
+def fit_positions(positions: TimedPositions, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
+    """Fit the positions that are on the path at one offset.
+
+    Args:
+        scale: metres per model unit, for the lever arm; infinity leaves the lever arm out.
+    """
+    positions = positions.take(path.knows(positions.times_s + offset_s))
+    num = len(positions.times_s)
+    points, velocities = path.tag(positions.times_s + offset_s, np.zeros(num, dtype=np.int64), scale)
+    solved = fit_similarity(points, positions.position_m)
+    rates = solved.scale * velocities @ solved.site_from_model.rotation.T
+    axes = np.tile(np.arange(3), num)
+    measured_m = positions.position_m.ravel()
+    return OffsetFit.of(offset_s, positions, measured_m, axes, solved, solved.residuals_m.ravel(), rates.ravel())
+
+
+def residual_stddev_at(positions: TimedPositions, path: PathSamples, offset_s: float) -> float:
+    """Return the robust stddev of a coordinate's residuals at one offset, metres; infinite with too few positions."""
+    if not path.knows(positions.times_s + offset_s).any():
+        return np.inf
+    fit = fit_positions(positions, path, offset_s, fit_positions(positions, path, offset_s).solved.scale)
+    return fit.residual_stddev_m if fit.is_testable else np.inf
+
+
+def scan_positions(positions: TimedPositions, path: PathSamples, weights: Array | None = None) -> OffsetCurve:
+    """Compute cost and score of every offset at which positions and path overlap, without the lever arm.
+
+    Args:
+        positions: n positions in any order. path: a path with at least one known pose.
+        weights: (n,) of the positions; None: less for those far from most others.
+    """
+    weights = _weights_by_place(positions.position_m) if weights is None else weights
+    return scan_parts(positions.times_s, path, lambda rows: _scan(positions.take(rows), weights[rows], path))
+
+
+def _weights_by_place(position_m: Array) -> Array:
+    """Return (n,) weights that keep positions far away from most others from deciding."""
+    far_m = np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1)
+    return CAUCHY.weights(far_m / max(float(np.median(far_m)), 1e-300))
+
+
+def _scan(positions: TimedPositions, weights: Array, path: PathSamples) -> Scanned:
+    """Return the result for one part of the log, by the similarity that fits best at each offset.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991. Its
+    sums over pairs of points are correlations in time.
+    """
+    cells = Cells.of(positions.times_s, path)
+    correlate = cells.correlate
+    squared, *centers, known = centred_columns(path, cells.stride).T
+    of_path = [correlate.transform(values) for values in (known, *centers, squared)]
+    position_m = positions.position_m - np.median(positions.position_m, axis=0)
+    of_log = [cells.transform(weights * values) for values in (np.ones(len(weights)), *position_m.T)]
+    square_m2 = np.sum(position_m**2, axis=1)
+    num = correlate(of_path[0], of_log[0])
+    total = np.maximum(num, 1e-12 * weights.sum())
+    mean_of_path = np.stack([correlate(values, of_log[0]) for values in of_path[1:4]], axis=1) / total[:, None]
+    mean_m = np.stack([correlate(of_path[0], values) for values in of_log[1:]], axis=1) / total[:, None]
+    products = np.array([[correlate(own, values) for own in of_path[1:4]] for values in of_log[1:]]) / total
+    cross = np.moveaxis(products, 2, 0) - mean_m[:, :, None] * mean_of_path[:, None, :]
+    of_places = np.maximum(correlate(of_path[4], of_log[0]) / total - np.sum(mean_of_path**2, axis=1), 0.0)
+    variation = correlate(of_path[0], cells.transform(weights * square_m2)) / total - np.sum(mean_m**2, axis=1)
+    strengths = np.linalg.svd(cross, compute_uv=False)
+    strengths[:, 2] *= np.sign(np.linalg.det(cross))  # a reflection is no answer
+    explained = strengths.sum(axis=1) ** 2 / np.maximum(of_places, 1e-12)
+    return Scanned(num, cells.offsets_s, total * variation, total * (variation - explained))
+
+
+def _fit_clock(positions: TimedPositions, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:
+    """Refine an offset; a drift of the clocks is not looked for."""
+    fit = refine_offset(positions, path, offset_s, fit_at=fit_positions)
+    return fit, fit.timing(), 0.0, float(positions.times_s.mean())
+
+
+POSITIONS = ObservedKind(
+    "positions", "give the time offset (--positions_time_offset)", scan_positions, fit_positions, _fit_clock
+)
