@@ -114,7 +114,7 @@ CASES = {
         "doubtful",
         "either the ranges to anchor A2 jumped 23 s after the first range: since then they read about",
     ),
-    "a slipped clock": Case("scale", SITE, slipping, "doubtful", "probably the clocks' offset jumped by about"),
+    "a slipped clock": Case("scale", SITE, slipping, "doubtful", "probably the clocks' offset jumped "),
     "an anchor typed wrong": Case(
         "refine", ("--anchors", "typed.csv"), erring, "doubtful", "probably anchor A3's y is given as 5008.600"
     ),

@@ -106,7 +106,7 @@ class TestEvidence:
         assert not row.rejected
         row = shown(with_weights(problem, weights_of_a([0.05] * 25), ones), "anchor hardly used", "A")
         assert row.rejected
-        assert row.words == "only 15 of 40 ranges to anchor A fit the map"
+        assert row.words == "15 of 40 ranges to anchor A fit the map"
         assert row.statistic == pytest.approx(25 / 40)
         assert not shown(with_weights(problem, weights_of_a([0.15] * 25), ones), "anchor hardly used", "A").rejected
         assert not shown(with_weights(problem, weights_of_a([0.05] * 25), ones), "anchor hardly used", "B").rejected

@@ -225,7 +225,7 @@ class TestMoves:
     def test_what_moved_is_told(self, of_kind: dict[str, list[Hypothesis]]) -> None:
         told = {name: of_kind[name][0].words(self.SIZE_M) for name in ("anchor moved", "map break", "tag slipped")}
         assert told == {
-            "anchor moved": "anchor A was moved by about 1.30 m 4 s after the first range "
+            "anchor moved": "anchor A was moved 4 s after the first range, by about 1.30 m "
             "(+0.30, -0.40, +1.20 m in x, y, z)",
             # Where the map should be is back from where it is.
             "map break": "the map breaks 1 s after the first range: its later part lies about 1.30 m from where it "
@@ -329,7 +329,7 @@ class TestSteps:
 
 def test_a_clock_that_jumps_moves_the_later_ranges(problem: Linearized, of_kind: dict[str, list[Hypothesis]]) -> None:
     first = of_kind["clock jump"][0]
-    assert first.words(np.array([-0.25])) == ("the clocks' offset jumped by about -0.25 s 1 s after the first range")
+    assert first.words(np.array([-0.25])) == "the clocks' offset jumped 1 s after the first range, by about -0.25 s"
     assert first.most == pytest.approx(LASTS_S)
     assert first.unit == "s"
     shift_s = np.asarray(first.correction(np.array([-0.25])).time_shift_s)

@@ -401,7 +401,7 @@ def test_the_run_of_a_solver_is_summarised() -> None:
     assert run.is_still
     assert run.converged
     assert not run.is_stuck
-    assert run.message == "What is left to gain moves nothing that matters (0.013 m)."
+    assert run.message == "Converged: further steps would move the keyframes by less than 0.013 m."
     assert run.initial_cost == pytest.approx(before)
     assert run.final_cost == pytest.approx(0.5 * bundle.num_reprojections / 2 * bundle.reprojection_rms_px**2)
     assert run.final_cost < run.initial_cost
@@ -458,4 +458,4 @@ def test_a_solver_that_cannot_take_the_steps_it_needs_says_so(monkeypatch: pytes
     run = solve_bundle_adjustment(a_bundle(), tolerance_m=0.1)
     assert run.is_stuck
     assert not run.is_still
-    assert run.message == "Some points or the lens allow small steps only, which do not get there."
+    assert run.message == "Some points or the lens allow only small steps, too small to reach the best map."

@@ -156,7 +156,7 @@ def _evidence(problem: Linearized) -> Iterator[MistakeTest]:
         is_of, name = index == k, on_map.anchor_ids[k]
         unused = float(np.mean(weights[is_of] < OUTLIER_BELOW))
         num = int(np.count_nonzero(is_of))
-        words = f"only {round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
+        words = f"{round((1 - unused) * num)} of {num} ranges to anchor {name} fit the map"
         remedy = "check the anchor's id and its position"
         yield _seen("anchor hardly used", name, unused, 1 - LEAST_USED, words, remedy)
         rows = np.flatnonzero(is_of & (bins.robust_weight < DOWN_WEIGHTED_BELOW))

@@ -35,7 +35,7 @@ _MIN_NUM_BINS = 3
 _MOVES: dict[str, tuple[Callable[[str, str, Array], str], str, float]] = {
     "anchor moved": (
         lambda whose, when, size: (
-            f"anchor {whose} was moved by about {np.linalg.norm(size):.2f} m {when} ({in_axes(size)} in x, y, z)"
+            f"anchor {whose} was moved {when}, by about {np.linalg.norm(size):.2f} m ({in_axes(size)} in x, y, z)"
         ),
         "fix anchors so that nobody bumps into them, and use its ranges from before only",
         UNSEEN_MOVE_M,
@@ -186,7 +186,7 @@ def clock_jumps(problem: Linearized) -> Iterator[Hypothesis]:
         return Hypothesis(
             "clock jump",
             of_bins(problem, -by_time * after),
-            words=lambda size: f"the clocks' offset jumped by about {size[0]:+.2f} s {when}",
+            words=lambda size: f"the clocks' offset jumped {when}, by about {size[0]:+.2f} s",
             remedy="see whether a logger was restarted then, and run the parts before and after as two surveys",
             correction=lambda size: Correction(time_shift_s=np.where(later(), size[0], 0.0)),
             most=duration_s(problem),

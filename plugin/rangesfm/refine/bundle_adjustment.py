@@ -229,9 +229,9 @@ def solve_bundle_adjustment(problem: BundleAdjustment, tolerance_m: float) -> So
 
 def _message(monitor: ConvergenceMonitor, tolerance_m: float, summary: Any) -> str:
     if monitor.is_still:
-        return f"What is left to gain moves nothing that matters ({tolerance_m:.2g} m)."
+        return f"Converged: further steps would move the keyframes by less than {tolerance_m:.2g} m."
     if monitor.is_stuck:
-        return "Some points or the lens allow small steps only, which do not get there."
+        return "Some points or the lens allow only small steps, too small to reach the best map."
     if summary.termination_type.name == "USER_SUCCESS":
         return "The last steps were kept small, so that the keyframes may have farther to go."
     return str(summary.message)

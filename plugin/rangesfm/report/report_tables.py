@@ -344,7 +344,7 @@ def refinement(content: Content) -> ReportTable:
     rows = [
         [words, keyed(f"refine.{name}", values[name], plain(values[name]))]
         for name, words in _REFINEMENT.items()
-        if values.get(name) not in (None, "", {})
+        if values.get(name) not in (None, "", {}, [])
     ]
     return ReportTable("Refinement", [], rows, is_narrow=True)
 
