@@ -55,3 +55,12 @@ def test_a_clock_that_was_restarted_is_not_continued_and_said_once(tmp_path: Pat
     assert log.timestamp_s is not None
     np.testing.assert_allclose(log.timestamp_s, times, atol=1e-3)
     assert log.num_restarts == 1  # of one clock, not one for each of three anchors
+
+
+def test_one_anchor_after_the_other_is_no_counter(tmp_path: Path) -> None:
+    times = 0.01 + np.arange(0, 65.4, 0.3)
+    rows = [f"{1000 * time:.0f},A{k},{5 + k + time / 50:.3f}" for k in range(3) for time in times]
+    (tmp_path / "uwb.csv").write_text("\n".join(["time_ms,anchor_id,range_m", *rows]) + "\n")
+    log = read_ranges(tmp_path / "uwb.csv")
+    assert log.timestamp_s is not None
+    np.testing.assert_allclose(log.timestamp_s, np.tile(times, 3), atol=1e-3)

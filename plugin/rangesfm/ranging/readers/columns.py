@@ -98,14 +98,18 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
             table = table.where([cell != "" for cell in table.text(named["range"], empty="")])
     name = {key: column for key, column in named.items() if column in table}
     units = layout.units if layout else {}
+    anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
     timestamps = None
     if "timestamp" in name:
         ask = partial(options.which_unit, path, "timestamp")
-        timestamps, _ = read_timestamps(table, name, units, options.timestamp_unit, notes, ask)
+        # One anchor after the other in a file: the times go back to the log's beginning, whatever the clock is.
+        in_turn = columns.wide or np.count_nonzero(np.diff(anchor.index)) >= len(anchor.names)
+        timestamps, _ = read_timestamps(
+            table, name, units, options.timestamp_unit, notes, ask, may_wrap=bool(in_turn or len(anchor.names) < 2)
+        )
     image_name = table.text(name["image_name"]) if timestamps is None else None
     num_ends = max(1, len(columns.wide))
     row = np.repeat(np.arange(len(table)), num_ends)
-    anchor, tag = _anchors(table, name, columns), _tags(table, name, columns)
     ranges = _ranges(table, name, columns, options)
     measured, of_codes = which_are_measured(ranges, path)
     notes += of_codes
@@ -231,6 +235,7 @@ def read_timestamps(
     ask: Ask,
     *,
     slowest_s: float = SLOWEST_S,
+    may_wrap: bool = True,
 ) -> tuple[Array, str]:
     """Return the times (n,) of the rows of a table in seconds, and the unit in which they are written.
 
@@ -242,6 +247,7 @@ def read_timestamps(
         notes: gets a line for the user on what was assumed.
         ask: returns the error about an ambiguous unit.
         slowest_s: largest plausible median step between times.
+        may_wrap: whether times that go back may be those of a counter that begins again.
 
     Raises:
         InputError: a cell is not a time, or the unit is ambiguous.
@@ -249,7 +255,8 @@ def read_timestamps(
     column = name["timestamp"]
     if said in CIVIL_UNITS or "date" in name or (said is None and not table.begins_with_number(column)):
         return _civil_times(table, name, said, notes, ask), "s"
-    times, counter = continued(table.numbers(column, expected=f"a time in {said or 's'}"))
+    times = table.numbers(column, expected=f"a time in {said or 's'}")
+    times, counter = continued(times) if may_wrap else (times, None)
     is_in_ticks = counter is not None and counter.counts_dw1000_ticks
     if counter is not None:
         taken = ", taken for the ticks of a DW1000" * (said is None and is_in_ticks)

@@ -23,7 +23,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.folders import IMAGE_EXTENSIONS
-from rangesfm.files.text_tables import TextTable, read_head, read_text
+from rangesfm.files.text_tables import MAX_NUMBER, TextTable, read_head, read_text
 from rangesfm.ranging.readers.gsi import gsi_records, is_gsi
 from rangesfm.ranging.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_in_front
 from rangesfm.ranging.readers.vocabulary import LENGTHS, TIMES, words_of
@@ -111,9 +111,9 @@ class ColumnSample:
 
     @cached_property
     def numbers(self) -> Array:
-        """Values of the cells that are finite numbers."""
+        """Values of the cells that are numbers of a size with which one can calculate."""
         values = np.array([float(cell) for cell in self.cells if _NUMBER.fullmatch(cell)], np.float64)
-        return values[np.isfinite(values)]
+        return values[np.abs(values) <= MAX_NUMBER]
 
     @cached_property
     def filled(self) -> list[str]:

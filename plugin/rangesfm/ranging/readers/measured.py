@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
+from rangesfm.files.text_tables import MAX_NUMBER
 
 REACH_M = 2000.0
 """Range that no UWB radio measures; the farthest reach somewhat more than one kilometre."""
@@ -33,7 +33,7 @@ def which_are_measured(ranges: Array, path: Path) -> tuple[Mask, tuple[str, ...]
     Raises:
         InputError: there is no measurement.
     """
-    measured: Mask = (ranges > _NOTHING) & (ranges < math.inf)
+    measured: Mask = (ranges > _NOTHING) & (ranges <= MAX_NUMBER)
     codes, counts = _failure_codes(ranges[measured])
     measured &= ~np.isin(ranges, codes)
     if not measured.any():

@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rangesfm.arrays import Array
 from rangesfm.errors import InputError
+from rangesfm.options import TIME_S
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.counters import continued
@@ -52,14 +54,7 @@ def log_of_readings(
     measured, of_codes = which_are_measured(ranges, path)
     measured[measured], of_far = which_are_within_reach(ranges[measured], path)
     times, anchor_ids, ranges_m, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
-    times_s, counter = continued(np.array(times, np.float64))
-    of_times = [] if counter is None else [f"the time {counter}: the times are continued"]
-    distinct = np.unique(times_s)
-    is_slow = len(distinct) > 1 and np.median(np.diff(distinct)) > SLOWEST_S
-    if is_slow and options.timestamp_unit is None and np.all(distinct == np.round(distinct)):
-        # Whole numbers in front of the lines are ms or us since the board was started.
-        ask = partial(options.which_unit, path, "timestamp")
-        times_s *= SECONDS_PER_UNIT[time_unit("the time", times_s, of_times, ask)]
+    times_s, of_times = _times(np.array(times, np.float64), path, options)
     return RangeLog.from_arrays(
         anchor_ids,
         ranges_m,
@@ -73,6 +68,23 @@ def log_of_readings(
         num_no_measurement=len(found) - len(ranges_m),
         notes=(*notes, *of_codes, *of_far, *of_times),
     )
+
+
+def _times(times_s: Array, path: Path, options: ReadOptions) -> tuple[Array, list[str]]:
+    """Return times (n,) in seconds, continued where a counter begins again, and notes.
+
+    Whole numbers without a unit that are too far apart for seconds are ms or us since the board was started.
+    """
+    if not TIME_S.hold(times_s).all():  # they are refused later, with the line
+        return times_s, []
+    times_s, counter = continued(times_s)
+    notes = [] if counter is None else [f"the time {counter}: the times are continued"]
+    distinct = np.unique(times_s)
+    is_slow = len(distinct) > 1 and np.median(np.diff(distinct)) > SLOWEST_S
+    if is_slow and options.timestamp_unit is None and np.all(distinct == np.round(distinct)):
+        ask = partial(options.which_unit, path, "timestamp")
+        times_s = times_s * SECONDS_PER_UNIT[time_unit("the time", times_s, notes, ask)]
+    return times_s, notes
 
 
 def reader_of_readings(

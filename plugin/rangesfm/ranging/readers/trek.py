@@ -31,7 +31,7 @@ _BETWEEN_ANCHORS = {1: ("A0", "A1"), 2: ("A0", "A2"), 3: ("A1", "A2")}
 
 @dataclass(frozen=True)
 class _Report:
-    """One line, with the text in front of it."""
+    """One line, with the text in front of it; "" if another report is in front, as in JSON without line ends."""
 
     number: int
     prefix: str
@@ -47,9 +47,9 @@ def _reports(path: Path) -> Iterator[_Report | None]:
     for number, text in numbered_lines(path):
         found = list(_LINE.finditer(text))
         yield from [None] * (len(_BEGIN.findall(text)) - len(found))
-        for one in found:
+        for k, one in enumerate(found):
             ranges_mm = tuple(int(digits, 16) for digits in one["ranges"].split())
-            prefix = text[: one.start()]
+            prefix = "" if k else text[: one.start()]
             yield _Report(number, prefix, one["kind"], int(one["mask"], 16), ranges_mm, one["clock"], one["tag"])
 
 
@@ -93,10 +93,10 @@ def _times(
     The time in front of the lines is that of the host. Without one, the radio's count of milliseconds is the time.
     """
     host = HostClock(path, options)
-    has_host_time = all(host.find_seconds(report.prefix) is not None for report in reports)
-    counted = [report for report in reports if report.kind != "r"]
-    are_distinct = len({report.clock for report in counted}) > 1
-    if has_host_time or len(counted) < len(reports) or not are_distinct:
+    host_s = {host.find_seconds(report.prefix) for report in reports}
+    counts = {report.clock for report in reports if report.kind != "r"}
+    is_counted = len(counts) > 1 and all(report.kind != "r" for report in reports)
+    if not is_counted or (len(host_s) > 1 and None not in host_s):
         clock = HostClock(path, options)
         return lambda report: clock.seconds(report.prefix, report.number), ()
     # Some firmware prints the count in decimals.
