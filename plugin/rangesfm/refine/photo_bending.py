@@ -29,8 +29,8 @@ from rangesfm.refine.vision_information import misplaced_points, model_observati
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
 # independent errors of features, as in simulations; 4 in a room of real photos, 8 to 12 in three scenes of others
 # (Strecha et al. 2008).
-_FACTOR, _SPREAD = 2.0, 0.8
-LARGEST_FACTOR = _FACTOR * float(np.exp(NORMAL_95 * _SPREAD))
+MEDIAN_FACTOR, _SPREAD = 2.0, 0.8
+LARGEST_FACTOR = MEDIAN_FACTOR * float(np.exp(NORMAL_95 * _SPREAD))
 """Largest such factor of a map whose lens fits."""
 # Standard deviation of the scale of one part of a map relative to another from which the photos do not hold them
 # together: parts of a map that share six points are held to 0.01, those that share five may have any scale.
@@ -62,7 +62,7 @@ class PhotoBending:
         parts = functions.reshape(len(by_pose), len(self.path), 6)
         by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
         covariance, shift_m = self.photos.of_functions(self.frame_ids, parts[:, :, :3], by_center)
-        found = bending_part("bending", covariance, _FACTOR, _SPREAD)
+        found = bending_part("bending", covariance, MEDIAN_FACTOR, _SPREAD)
         shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else shift_m
         return BendingOfBins(() if found is None else (found,), covariance, shift_m)
 

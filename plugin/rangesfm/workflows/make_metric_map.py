@@ -511,7 +511,10 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     """Return a doubt if the photos fit far better with another camera model, and lengths change with it."""
     if not metric.final.num_points3D():
         return ()
-    doubt = doubt_of_lens(fit_lens(metric.final), metric.estimate.uncertainty.half_width_95)
+    estimate, refinement = metric.estimate, metric.kept_refinement
+    is_learnt = estimate.problem is not None or estimate.positions is not None
+    factor = refinement.bending_factor if refinement is not None and is_learnt else None
+    doubt = doubt_of_lens(fit_lens(metric.final), factor, estimate.uncertainty.half_width_95)
     return () if doubt is None else (doubt,)
 
 
