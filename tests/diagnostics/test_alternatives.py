@@ -62,10 +62,14 @@ def of_coordinates(given: dict[str, Array]) -> dict[str, Alternative]:
 @pytest.mark.parametrize(
     ("words", "of_first"),
     [
-        ("in the anchors' coordinates x and y are swapped", [2.0, 1.0, 3.0]),
+        ("in the anchors' coordinates x and y (east and north) are swapped, or heights are depths", [2.0, 1.0, 3.0]),
         ("in the anchors' coordinates y and z are swapped", [1.0, 3.0, 2.0]),
         ("in the anchors' coordinates x has the wrong sign", [-1.0, 2.0, 3.0]),
-        ("in the anchors' coordinates heights have the wrong sign (they are depths)", [1.0, 2.0, -3.0]),
+        (
+            "in the anchors' coordinates heights have the wrong sign (they are depths), or x and y (east and north) "
+            "are swapped",
+            [1.0, 2.0, -3.0],
+        ),
     ],
 )
 def test_axes_of_the_anchors_are_changed_as_the_words_say(words: str, of_first: list[float]) -> None:

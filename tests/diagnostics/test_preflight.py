@@ -20,13 +20,16 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.diagnostics import preflight
 from rangesfm.diagnostics.preflight import (
+    check_units,
     notes_before_work,
     notes_on_distances,
     notes_on_gaps,
     notes_on_model,
+    notes_on_silence,
     notes_on_times,
 )
 from rangesfm.distances.tape import Tape, TapedDistance
+from rangesfm.errors import InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.range_log import RangeLog
@@ -132,10 +135,16 @@ def test_an_anchor_that_repeats_one_value_is_told_and_a_tag_that_stands_still_is
     assert not any("same value" in note for note in notes_before_work(complete, replace(inputs, log=still)))
 
 
-def test_ranges_beyond_any_radio_are_told(complete: Survey) -> None:
+def test_ranges_beyond_any_radio_end_the_run_unless_their_unit_is_said(complete: Survey) -> None:
     inputs = read_ranging_inputs(complete)
     in_mm = replace(inputs, log=replace(inputs.log, range_m=1e3 * inputs.log.range_m))
-    assert any(note.startswith("nearly all ranges are longer than") for note in notes_before_work(complete, in_mm))
+    with pytest.raises(InputError, match=r"uwb\.csv: nearly all ranges are longer than .* insist on --range_unit m"):
+        check_units(complete, in_mm)
+    printed = replace(in_mm, log=replace(in_mm.log, format="mauwb"))  # its unit cannot be given
+    for survey, inputs in ((complete.changed({"ranges.range_unit": "m"}), in_mm), (complete, printed)):
+        notes = notes_before_work(survey, replace(inputs, anchor_frame="unknown"))
+        assert any(note.startswith("nearly all ranges are longer than") for note in notes)
+        check_units(survey, replace(inputs, anchor_frame="unknown"))
 
 
 def test_positions_that_are_not_used_are_not_looked_at(complete: Survey) -> None:
@@ -159,6 +168,26 @@ def test_times_an_hour_apart_by_clocks_that_know_the_date_are_told() -> None:
 def test_ranges_that_last_a_fraction_of_the_walk_are_told() -> None:
     (note,) = notes_on_times(1e-3 * WALK_S, WALK_S)
     assert note.startswith("the ranges last 0.12 s, the photos 120 s")
+
+
+@pytest.mark.parametrize("is_one_clock", [False, True])
+def test_time_without_ranges_is_told(is_one_clock: bool) -> None:
+    radio_s = np.arange(0.0, 193.0, 0.05)
+    photos_s = np.arange(0.0, 193.0, 0.33)
+
+    def told(radio_s: Array, photos_s: Array = photos_s) -> list[str]:
+        return list(notes_on_silence(radio_s, photos_s, is_one_clock=is_one_clock))
+
+    assert told(radio_s) == []
+    (note,) = told(radio_s[(radio_s < 40) | (radio_s > 100)])
+    assert note.startswith("for 60 of the 193 s of the photos there are no ranges (such as from 40.0 to 100.1 s of")
+    (note,) = told(radio_s[radio_s < 133])
+    assert note.startswith("for 60 of the 193 s of the photos there are no ranges: there the map rests on")
+    assert told(radio_s[(radio_s < 40) | (radio_s > 50)]) == []  # a twentieth
+    pause = (photos_s < 40) | (photos_s > 100)
+    assert told(radio_s[(radio_s < 40) | (radio_s > 100)], photos_s[pause]) == []  # nobody walked then
+    assert told(radio_s[:1]) == []
+    assert told(radio_s[::400]) == []  # a range each 20 s
 
 
 @pytest.mark.parametrize(("num_ranges", "num_photos"), [(1, 400), (400, 1), (0, 400)])
@@ -608,3 +637,22 @@ def test_of_many_triangles_every_second_or_third_is_enough(monkeypatch: pytest.M
     log = log_of("AB" * 25, np.full(50, 3.0), timestamp_s=np.repeat(np.arange(25.0), 2))
     assert len(preflight._triangles(log, ["A", "B"]).pair) == 13
     assert len(preflight._triangles(log.subset(np.arange(38)), ["A", "B"]).pair) == 19
+
+
+@pytest.mark.parametrize(
+    ("of_anchors", "of_ranges", "said"),
+    [(1 / 0.3048, 1.0, "anchors are in feet"), (1.0, 1 / 0.3048, "ranges are in feet"), (1.0, 1.0, "")],
+)
+def test_a_unit_that_most_distances_between_anchors_show_ends_the_run(
+    of_anchors: float, of_ranges: float, said: str
+) -> None:
+    log = between_anchors(dict(zip("ABCD", ODD_SITE_M, strict=True)))
+    anchors = tuple(Anchor(name, of_anchors * at) for name, at in zip("ABCD", ODD_SITE_M, strict=True))
+    log = replace(log, range_m=of_ranges * log.range_m, format="table")
+    inputs = inputs_of(log, anchors=anchors, anchor_frame="site")
+    if not said:
+        check_units(Survey(), inputs)
+        return
+    with pytest.raises(InputError, match=f"in 6 of 6 pairs of anchors, .* contradict each other; they would not if {said}: give the unit"):
+        check_units(Survey(), inputs)
+    check_units(Survey().changed({"ranges.range_unit": "m", "anchors.unit": "m"}), inputs)

@@ -30,12 +30,13 @@ _UNITS_M = {
 }
 # Factors on the scale of the map that are tried, as with ranges in feet or of both ways.
 _SCALE_FACTORS = np.geomspace(1 / 4, 4, 7)
-# Directions of the three given coordinates, as _turned reads them.
+# Directions of the three given coordinates, as _turned reads them. Each is a mirror image, and a turn of the others:
+# where nothing but ranges ties the map to the site, nothing tells them apart, so that the words name the likely ones.
 _AXES_OF_ANCHORS = {
-    "x and y are swapped": "y x z",
+    "x and y (east and north) are swapped, or heights are depths": "y x z",
     "y and z are swapped": "x z y",
     "x has the wrong sign": "-x y z",
-    "heights have the wrong sign (they are depths)": "x y -z",
+    "heights have the wrong sign (they are depths), or x and y (east and north) are swapped": "x y -z",
 }
 _AXES_OF_LEVER_ARM = {
     "has the wrong sign (from the tag to the camera, not from the camera to the tag)": "left up back",

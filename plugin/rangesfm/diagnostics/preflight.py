@@ -14,11 +14,12 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
 from rangesfm.diagnostics.catalogue import LARGEST_RIG_M, SAME_HEIGHT_M
 from rangesfm.distances.tape import Tape
-from rangesfm.errors import number_text
+from rangesfm.errors import InputError, number_text
 from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.range_log import RangeKind, RangeLog
+from rangesfm.ranging.readers.table import CANONICAL, MAPPED, TABLE
 from rangesfm.ranging.readers.units import UNITS_PER_METRE
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
@@ -34,6 +35,8 @@ FAR_M, _FAR_SHARE = 300.0, 0.95
 _STUCK_SHARE, _MOVING_SHARE, _MIN_RANGES = 0.5, 0.2, 20
 # A gap between photos longer than this many median gaps is a pause between two walks.
 _PAUSE = 30.0
+# A log is silent for a while if it has no range for so many seconds; share of the photos' time that it may be silent.
+_SILENT_S, _MAX_SILENT_SHARE = 5.0, 0.1
 # Time between two logs, seconds, from which on they are of different walks or time zones.
 _LONG_GAP_S = 60.0
 # Least duration of the ranges, of that of the photos; largest share of the time between keyframes that are far apart.
@@ -46,6 +49,8 @@ _MAX_ERROR_M, _MAX_ERROR_SHARE = 0.5, 0.1
 _MAX_SPOILT, _MIN_TRIANGLES = 0.3, 10
 # Most triangles that are checked, and most pairs or swaps that are named.
 _MAX_NUM_TRIANGLES, _MAX_NUM_NAMED = 20_000, 2
+# Formats of logs for which the user may give the unit of the ranges.
+_WITH_UNIT = (CANONICAL.name, MAPPED.name, TABLE.name)
 # Units that are taken for metres.
 _UNITS = {"mm": "millimetres", "cm": "centimetres", "ft": "feet"}
 
@@ -71,6 +76,41 @@ def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     yield from notes_on_distances(inputs.log, inputs.anchors)
     if inputs.tape is not None:
         yield from _on_taped_anchors(inputs.tape, inputs.anchors)
+
+
+def check_units(survey: Survey, inputs: RangingInputs) -> None:
+    """Check that ranges and anchors are in metres, unless the user says in which unit they are.
+
+    Raises:
+        InputError: nearly all ranges are farther than radios reach, or only another unit explains why the ranges
+            contradict most distances between anchors.
+    """
+    log = inputs.log
+    are_said = survey.anchors.unit is not None and (survey.ranges.range_unit or log.format not in _WITH_UNIT)
+    far = _beyond_reach(log) if log.format in _WITH_UNIT and survey.ranges.range_unit is None else None
+    if far is not None:
+        raise InputError(f"{far}, or insist on --range_unit m", survey.ranges.path)
+    if inputs.anchor_frame == "unknown" or are_said:
+        return
+    contradictions = find_contradictions(log, inputs.anchors)
+    if contradictions is not None and contradictions.are_of_unit:
+        raise InputError(
+            f"{contradictions.found}; they would not if {' or '.join(contradictions.causes)}: give the unit "
+            "(--anchor_unit, --range_unit), or insist with both in m",
+            survey.anchors.path or survey.ranges.path,
+        )
+
+
+def _beyond_reach(log: RangeLog) -> str | None:
+    """Return what is to be said if nearly all ranges are farther than radios reach, else None."""
+    rows = log.kind == RangeKind.TAG_ANCHOR
+    long_m = float(np.quantile(log.range_m[rows], 1 - _FAR_SHARE)) if rows.any() else 0.0
+    if long_m <= FAR_M:
+        return None
+    return (
+        f"nearly all ranges are longer than {long_m:.4g} m, farther than UWB radios reach: their unit is probably not "
+        "the metre; give it (--range_unit)"
+    )
 
 
 def _on_taped_anchors(tape: Tape, anchors: Sequence[Anchor]) -> Iterator[str]:
@@ -111,13 +151,9 @@ def _on_positions(positions_m: Mapping[str, Array], site: Site | None) -> Iterat
 
 
 def _on_ranges(log: RangeLog) -> Iterator[str]:
+    if (far := _beyond_reach(log)) is not None:
+        yield far
     rows = log.kind == RangeKind.TAG_ANCHOR
-    long_m = float(np.quantile(log.range_m[rows], 1 - _FAR_SHARE)) if rows.any() else 0.0
-    if long_m > FAR_M:
-        yield (
-            f"nearly all ranges are longer than {long_m:.4g} m, farther than UWB radios reach: their unit is probably "
-            "not the metre; give it ([ranges] range_unit)"
-        )
     of_anchors = [log.range_m[rows & (log.anchor_index == k)] for k in range(len(log.anchor_ids))]
     shares = np.array([_share_of_one_value(ranges_m) for ranges_m in of_anchors])
     for k in np.flatnonzero(shares > _STUCK_SHARE):
@@ -156,6 +192,39 @@ def notes_on_times(radio_s: Array, photos_s: Array) -> Iterator[str]:
         yield (
             f"by their clocks, ranges and photos are {gap_s / 3600:.2g} h apart: another time zone, or another walk; "
             "the offset is searched for, check what is found"
+        )
+
+
+def notes_on_silence(radio_s: Array, photos_s: Array, *, is_one_clock: bool) -> Iterator[str]:
+    """Return a note if there are no ranges for a good part of the time in which photos were taken.
+
+    Args:
+        radio_s, photos_s: times of ranges and photos, in any order.
+        is_one_clock: whether both are by one clock. Otherwise only how long each lasts is compared.
+    """
+    radio_s, photos_s = np.unique(radio_s), np.unique(photos_s)
+    if len(radio_s) < 2 or len(photos_s) < 2:
+        return
+    steps_s, gaps_s = np.diff(photos_s), np.diff(radio_s)
+    is_walk = steps_s <= _PAUSE * np.median(steps_s)
+    is_silent = gaps_s > max(_SILENT_S, _PAUSE * float(np.median(gaps_s)))
+    walked_s = float(steps_s[is_walk].sum())
+    if is_one_clock:
+        middle_s = (photos_s[1:] + photos_s[:-1]) / 2
+        gap = np.searchsorted(radio_s, middle_s) - 1
+        is_outside = (gap < 0) | (gap >= len(gaps_s))
+        silent_s = float(steps_s[is_walk & (is_outside | is_silent[np.clip(gap, 0, len(gaps_s) - 1)])].sum())
+    else:
+        lasts_s = float(radio_s[-1] - radio_s[0])
+        if lasts_s < _MIN_SHARE_OF_TIME * (photos_s[-1] - photos_s[0]):
+            return  # then the times themselves are in doubt
+        silent_s = walked_s - (lasts_s - float(gaps_s[is_silent].sum()))
+    if silent_s > max(_SILENT_S, _MAX_SILENT_SHARE * walked_s):
+        longest = int(np.argmax(gaps_s))
+        where = f" (such as from {radio_s[longest]:.1f} to {radio_s[longest + 1]:.1f} s of the log)"
+        yield (
+            f"for {silent_s:.0f} of the {walked_s:.0f} s of the photos there are no ranges"
+            f"{where if is_silent.any() else ''}: there the map rests on the photos alone"
         )
 
 
@@ -223,27 +292,59 @@ class _Triangles:
         return bad
 
 
+@dataclass(frozen=True)
+class Contradictions:
+    """Distances between anchors that contradict the ranges.
+
+    Attributes:
+        num_pairs, num_bad: pairs of anchors that are compared, and that are contradicted.
+        causes: single mistakes that would explain all.
+        named: the first of the pairs, for the user.
+    """
+
+    num_pairs: int
+    num_bad: int
+    causes: tuple[str, ...]
+    named: str
+
+    @property
+    def found(self) -> str:
+        """What was found, for the user."""
+        num = f"{self.num_bad} of {self.num_pairs} pairs of anchors"
+        return f"in {num}, their coordinates and the ranges contradict each other"
+
+    @property
+    def are_of_unit(self) -> bool:
+        """True if most pairs are contradicted and nothing but another unit explains them."""
+        in_units = all(cause.endswith(tuple(_UNITS.values())) for cause in self.causes)
+        return bool(self.causes) and in_units and 2 * self.num_bad > self.num_pairs
+
+
 def notes_on_distances(log: RangeLog, anchors: Sequence[Anchor]) -> Iterator[str]:
-    """Return a note if distances between anchors contradict the ranges: the likeliest reason and what to do.
+    """Return a note if distances between anchors contradict the ranges: the likeliest reason and what to do."""
+    if (found := find_contradictions(log, anchors)) is not None:
+        likeliest = f"probably {' or '.join(found.causes)}" if found.causes else f"look at {found.named} first"
+        yield f"{found.found}: {likeliest}; check labels, coordinates and units, or the map will be wrong too"
+
+
+def find_contradictions(log: RangeLog, anchors: Sequence[Anchor]) -> Contradictions | None:
+    """Return the distances between anchors that contradict the ranges; None if none does.
 
     Two simultaneous ranges of one tag and the distance between their anchors form a triangle: the distance is at most
     the sum of the ranges, and at least their difference. Ranges between two anchors measure the distance directly.
     """
     surveyed = [anchor for anchor in anchors if anchor.position_m is not None and anchor.anchor_id in log.anchor_ids]
     if len(surveyed) < 2:
-        return
+        return None
     ids = [anchor.anchor_id for anchor in surveyed]
     positions_m = np.array([anchor.position_m for anchor in surveyed])
     triangles = _triangles(log, ids)
     bad = triangles.bad_pairs(positions_m)
     if not bad.any():
-        return
-    num = len(ids) * (len(ids) - 1) // 2
-    found = f"in {bad.sum()} of {num} pairs of anchors, their coordinates and the ranges contradict each other"
-    causes = list(_causes(triangles, ids, positions_m, bad))
+        return None
     named = " and ".join(f"{ids[i]} and {ids[k]}" for i, k in np.argwhere(bad)[:_MAX_NUM_NAMED].tolist())
-    likeliest = f"probably {' or '.join(causes)}" if causes else f"look at {named} first"
-    yield f"{found}: {likeliest}; check labels, coordinates and units, or the map will be wrong too"
+    causes = tuple(_causes(triangles, ids, positions_m, bad))
+    return Contradictions(len(ids) * (len(ids) - 1) // 2, int(bad.sum()), causes, named)
 
 
 def _causes(triangles: _Triangles, ids: Sequence[str], positions_m: Array, bad: Mask) -> Iterator[str]:

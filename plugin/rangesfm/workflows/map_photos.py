@@ -13,7 +13,14 @@ import pycolmap
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.diagnostics.preflight import notes_before_work, notes_on_gaps, notes_on_model, notes_on_times
+from rangesfm.diagnostics.preflight import (
+    check_units,
+    notes_before_work,
+    notes_on_gaps,
+    notes_on_model,
+    notes_on_silence,
+    notes_on_times,
+)
 from rangesfm.distances.locate_lengths import check_ends
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
@@ -45,6 +52,7 @@ def begin_run(survey: Survey, journal: Journal) -> SurveyRun:
         apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
     refuse_to_overwrite(survey)
     inputs = read_ranging_inputs(survey)
+    check_units(survey, inputs)
     journal.note(*inputs.assumed)
     journal.warn(*inputs.notes, *notes_before_work(survey, inputs))
     return SurveyRun(survey, inputs, journal)
@@ -78,7 +86,9 @@ def tell_of_times(run: SurveyRun, times: ImageTimes | None) -> None:
     if times is None or radio_s is None:
         return
     run.journal.warn(*notes_on_gaps(times.timestamps_s, options.max_interpolation_gap_s))
-    if options.time_offset_s is None:
+    at_s, is_given = radio_s + (options.time_offset_s or 0.0), options.time_offset_s is not None
+    run.journal.warn(*notes_on_silence(at_s, times.timestamps_s, is_one_clock=is_given))
+    if not is_given:
         run.journal.warn(*notes_on_times(radio_s, times.timestamps_s))
 
 

@@ -129,3 +129,12 @@ def test_no_anchors_have_no_coordinate_system_and_the_file_is_named() -> None:
     assert (anchors, site.georeference) == ((), None)
     with pytest.raises(InputError, match=r"^anchors\.csv: .*EPSG:2056"):
         site_of(np.zeros((1, 3)), "EPSG:2056", Path("anchors.csv"))
+
+
+def test_degrees_of_no_known_system_are_refused_and_small_things_in_metres_are_not() -> None:
+    at = np.array([[8.541694, 47.376887, 408.0], [8.541831, 47.376954, 409.5], [8.541755, 47.376801, 407.0]])
+    with pytest.raises(InputError, match=r"points\.csv: coordinates look like degrees \(x from 8\.541694 to 8\.541831"):
+        site_of(at, None, Path("points.csv"))
+    on_a_table = np.array([[0.0121234, 0.0331234, 0.1], [0.0221234, 0.0111234, 0.2], [0.0321234, 0.0251234, 0.3]])
+    for metres in (on_a_table, np.round(on_a_table + np.array([8.5, 47.3, 0.0]), 4), 1e3 * at):
+        site_of(metres, None)

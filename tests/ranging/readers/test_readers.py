@@ -241,7 +241,7 @@ def test_uwb_init_log_is_recognised(tmp_path: Path) -> None:
         ({"columns": MAPPING, "timestamp_unit": "hours"}, "timestamp_unit is 'hours'"),
         ({"columns": MAPPING, "range_unit": "feet"}, "range_unit is 'feet'"),
         ({"columns": MAPPING, "separator": "ab"}, "separator is 'ab'"),
-        ({"format": "canonical", "range_unit": "mm"}, "fixed columns"),
+        ({"format": "canonical", "timestamp_unit": "ms"}, "fixed columns"),
     ],
 )
 def test_wrong_options_are_refused(tmp_path: Path, options: dict[str, object], said: str) -> None:

@@ -14,6 +14,10 @@ from rangesfm.ranging.anchors.anchor import Anchor
 
 # The fifth decimal of a degree is about a metre.
 _DECIMALS_OF_DEGREES = 5
+# Degrees of a survey differ by less than this, their size is at least so many times as much, and to be of use they are
+# written with more digits than metres, to less than this.
+_WIDEST_DEG, _MIN_SHARE_OF_SIZE, _FINEST_M = 0.05, 1000.0, 1e-4
+_LARGEST_DEG = np.array([180.0, 90.0])
 
 
 def coordinates_text(coordinates_m: Array) -> str:
@@ -109,7 +113,7 @@ def site_of(coordinates: Array, crs: str | None, path: Path | None = None) -> tu
     """Return a local frame for coordinates (n, 3) of a site, and the coordinates in it; NaN rows stay NaN.
 
     Raises:
-        InputError: the coordinate system is not valid at these points.
+        InputError: the coordinate system is not valid at these points, or they are degrees of no known system.
     """
     if crs is not None:
         try:
@@ -118,12 +122,34 @@ def site_of(coordinates: Array, crs: str | None, path: Path | None = None) -> tu
             raise InputError(str(error), path) from None
         return Site(georeference=georeference), local
     known = coordinates[np.isfinite(coordinates).all(axis=1)]
+    if _are_degrees(known):
+        (x, y), (to_x, to_y) = known[:, :2].min(axis=0), known[:, :2].max(axis=0)
+        raise InputError(
+            f"coordinates look like degrees (x from {x:.7g} to {to_x:.7g}, y from {y:.7g} to {to_y:.7g}), expected "
+            "metres, or their system, such as EPSG:4979 for longitude, latitude and height (--anchor_crs, --point_crs, "
+            "--position_crs)",
+            path,
+        )
     middle = np.median(known, axis=0)  # of most of them, even if one lacks its decimal point
     # Far from the origin, measured in the size of the site, least squares lose digits: a turn of the map about the
     # origin is then nearly a shift. The offset is in whole metres, so that adding it again restores every digit.
     is_far = np.linalg.norm(middle) > np.linalg.norm(np.ptp(known, axis=0))
     offset = np.round(middle) if is_far else np.zeros(3)
     return Site(offset), coordinates - offset
+
+
+def _are_degrees(known: Array) -> bool:
+    """Return whether the first two of coordinates (n, 3) are degrees and not metres."""
+    places = known[:, :2]
+    spread, size = np.ptp(places, axis=0), np.abs(places).max(axis=0)
+    tenths_of_mm = places / _FINEST_M
+    is_finer = np.abs(tenths_of_mm - np.round(tenths_of_mm)) > 1e-3
+    return bool(
+        np.all(size <= _LARGEST_DEG)
+        and np.all((spread > 0) & (spread < _WIDEST_DEG))
+        and size.max() > _MIN_SHARE_OF_SIZE * spread.max()
+        and is_finer.mean() > 1 / 2
+    )
 
 
 def _at(anchors: tuple[Anchor, ...], positions: Array) -> tuple[Anchor, ...]:

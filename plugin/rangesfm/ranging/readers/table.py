@@ -221,11 +221,11 @@ def _recognizes_canonical(head: str) -> bool:
 
 
 def _read_canonical(path: Path, options: ReadOptions) -> RangeLog:
-    if options.columns or options.timestamp_unit not in (None, "s") or options.range_unit not in (None, "m"):
-        raise InputError("the canonical CSV has fixed columns in seconds and metres; use format 'mapped'", path)
+    if options.columns or options.timestamp_unit not in (None, "s"):
+        raise InputError("the canonical CSV has fixed columns, with times in seconds; use format 'mapped'", path)
     names = header_names(read_head(path), options.separator)
     columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
-    return read_columns(path, columns, options.changed(timestamp_unit=None, range_unit=None), CANONICAL.name)
+    return read_columns(path, columns, options.changed(timestamp_unit=None), CANONICAL.name)
 
 
 CANONICAL = Reader("canonical", _recognizes_canonical, _read_canonical)
