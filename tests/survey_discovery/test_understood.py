@@ -119,3 +119,33 @@ def test_the_demos_own_files_are_understood(tmp_path: Path) -> None:
     survey = understand([made.folder], {}).survey()
     for table, key in (("images", "path"), ("ranges", "path"), ("anchors", "path"), ("report", "reference")):
         assert getattr(getattr(survey, table), key) == getattr(getattr(told, table), key)
+
+
+def test_points_whose_columns_have_unknown_names_stop_with_a_whole_command_where_anchors_are_wanted(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "releve.csv").write_text("Foo;Bar;Baz;Qux\nA1;1.5;2.5;0.5\nA2;8.5;2.25;1.5\nA3;8.25;9.5;2.5\n")
+    write_photos(tmp_path / "images", 3)
+    assert understand([tmp_path], {}).values == {"images.path": tmp_path / "images"}  # nobody asks for anchors
+    write_log(tmp_path / "uwb.csv", 0.0)
+    with pytest.raises(InputError, match=r"releve\.csv: a table of anchors whose columns are not known") as caught:
+        understand([tmp_path], {})
+    assert any("--anchor_columns anchor_id=Foo,x=Bar,y=Baz,z=Qux" in line for line in caught.value.advice)
+    write_anchors(tmp_path / "anchors.csv")
+    assert understand([tmp_path], {}).values["anchors.path"] == tmp_path / "anchors.csv"
+
+
+@pytest.mark.parametrize("name", ["anchors.xlsx", "my_anchors.txt", "Ancres.dxf"])
+def test_a_file_about_anchors_by_its_name_that_is_not_understood_stops(tmp_path: Path, name: str) -> None:
+    write_photos(tmp_path / "images", 3)
+    write_log(tmp_path / "uwb.csv", 0.0)
+    (tmp_path / name).write_text("They stand in the corners.\n")
+    (tmp_path / "anchors.png").touch()  # a sketch is no list
+    with pytest.raises(InputError, match="is about anchors by its name and is not understood") as caught:
+        understand([tmp_path], {})
+    assert caught.value.path == tmp_path / name
+    write_anchors(tmp_path / "corners.csv")
+    understand([tmp_path], {})
+    (tmp_path / "corners.csv").unlink()
+    (tmp_path / name).unlink()
+    understand([tmp_path], {})

@@ -9,7 +9,7 @@ import os
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -27,7 +27,7 @@ from rangesfm.ranging.readers import find_log_reader, read_ranges
 from rangesfm.ranging.readers.layout import Layout, find_layout
 from rangesfm.ranging.readers.lists import UnclearListError
 from rangesfm.ranging.readers.table import TABLE
-from rangesfm.ranging.readers.vocabulary import words_of
+from rangesfm.ranging.readers.vocabulary import ABOUT_ANCHORS, words_of
 from rangesfm.sources.bag import has_images
 from rangesfm.sources.source import is_video
 from rangesfm.survey_discovery.calibration_files import CameraCalibration, read_calibrations
@@ -83,6 +83,7 @@ class Found:
         models: folders of COLMAP models.
         unclear: lists that are not understood for sure, by dotted key of a survey file.
         notes: lines about what is there and cannot be used; each such file is listed with the reason.
+        like_anchors: files that are about the log's anchors by their names, where none is understood, with the reason.
     """
 
     paths: dict[str, list[Path]]
@@ -90,6 +91,7 @@ class Found:
     models: tuple[Path, ...]
     unclear: dict[str, list[UnclearListError]]
     notes: tuple[str, ...]
+    like_anchors: dict[Path, str] = field(default_factory=dict)
 
 
 def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
@@ -135,13 +137,19 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
                 unsure[path] = error
             else:
                 notes.append(str(error))
+    like_anchors = {}
+    if LOG in paths and ANCHORS not in {*paths, *unclear}:
+        tables = [path for path in (*unsure, *unused[_UNKNOWN]) if path.suffix.lower() in _TABLE_EXTENSIONS]
+        if those := [asked for path in tables if (asked := anchor_file.like_anchors(path)) is not None]:
+            unclear[ANCHORS] = those
+        like_anchors = {path: why for why, those in unused.items() for path in those if _is_about_anchors(path)}
     if LOG not in paths:
         for path in [*unsure][:_MAX_NUM_UNSURE]:
             notes.append(f"{unsure.pop(path)}; if it is the radio's log, rangesfm ranges {path} says what is missing")
     unused["a table whose columns are not known for sure"] += unsure
     notes += [f"not used: {_listed(those, folders)} ({reason})" for reason, those in unused.items() if those]
     found = {key: those for key, those in paths.items() if those}
-    return Found(found, calibrations, tuple(models), unclear, tuple(notes))
+    return Found(found, calibrations, tuple(models), unclear, tuple(notes), like_anchors)
 
 
 def short_path(path: Path, folders: Sequence[Path]) -> str:
@@ -156,6 +164,12 @@ def _listed(paths: Sequence[Path], folders: Sequence[Path]) -> str:
         return ", ".join(names)
     endings = ", ".join(sorted({path.suffix.lower() or path.name for path in paths[_MAX_NUM_NAMED:]}))
     return f"{', '.join(names[:_MAX_NUM_NAMED])} and {len(names) - _MAX_NUM_NAMED} more ({endings})"
+
+
+def _is_about_anchors(path: Path) -> bool:
+    """Return whether a table or drawing is about anchors by its name."""
+    is_list = path.suffix.lower() in (*_TABLE_EXTENSIONS, *_NOT_READ)
+    return is_list and not ABOUT_ANCHORS.isdisjoint(words_of(path.stem))
 
 
 def _reason_by_name(path: Path) -> str | None:

@@ -19,7 +19,17 @@ from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, METRIC_KEYS, Survey
 from rangesfm.survey.survey_reader import survey_from_tables
-from rangesfm.survey_discovery.found_files import LOG, MODEL, PHOTOS, POINTS, POSITIONS, Found, look_into, short_path
+from rangesfm.survey_discovery.found_files import (
+    ANCHORS,
+    LOG,
+    MODEL,
+    PHOTOS,
+    POINTS,
+    POSITIONS,
+    Found,
+    look_into,
+    short_path,
+)
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.photo_files import gps_data, usable_photos
 
@@ -102,6 +112,13 @@ def understand(
         several = "more than one survey could be meant"
         first = next((those[0] for those in unclear.values()), None)
         raise first.asking(questions) if first else InputError(several, folders[0], advice=questions)
+    if ANCHORS not in values:
+        for path, why in found.like_anchors.items():
+            raise InputError(
+                f"is about anchors by its name and is not understood ({why}): move it out of the folder, or name the "
+                "file of anchors by --anchors PATH",
+                path,
+            )
     notes += [
         f"not used: {short_path(error.path or Path(), folders)} ({error.message})"
         for key, those in found.unclear.items()

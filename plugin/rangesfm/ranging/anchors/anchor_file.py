@@ -93,6 +93,8 @@ def read_anchor_list(path: AnyPath, *, columns: Mapping[str, str] | None = None,
         raise InputError(f"no table, {_EXPECTED}", path)
     taken = _columns_by_user(columns, layout, path) if columns else find_anchor_columns(path, layout)
     if taken is None:
+        if (unclear := like_anchors(path)) is not None:
+            raise unclear
         found = printable(", ".join(layout.units))
         raise InputError(f"no columns of anchors; found {found}; {_EXPECTED}", path)
     units, told = _units(layout, taken, unit)
@@ -160,6 +162,24 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     unknown = {quantity: "NAME" for quantity in ("anchor_id", *_AXES) if quantity not in columns | degrees}
     choices = choices or [_choice("with the names of the columns", columns | degrees | unknown)]
     raise UnclearListError(WHAT, path, layout, doubts, choices)
+
+
+def like_anchors(path: Path) -> UnclearListError | None:
+    """Return the question for a short table that is like a list of points, but whose names are not known; else None."""
+    layout = find_layout(path)
+    if layout is None or not layout.has_names or len(layout.columns[0].cells) > MAX_NUM_IDS:
+        return None
+    first, *others = layout.columns
+    numbers = [column.name for column in others if column.kind == "numbers"]
+    is_other = any(column.names_photos or is_range(column) or is_named_time(column) for column in layout.columns)
+    if is_other or first.num_distinct < len(first.cells) or not _may_be_id(first) or len(numbers) < len(_AXES):
+        return None
+    ways = [dict(zip(_AXES, numbers[k : k + 3])) for k in range(len(numbers) - 2)]
+    choices = [
+        _choice(f"if {', '.join(way.values())} are x, y, z of {first.name}", {"anchor_id": first.name, **way})
+        for way in ways
+    ]
+    return UnclearListError(WHAT, path, layout, ["the names of the columns are not known"], choices)
 
 
 def _choice(when: str, columns: Mapping[str, str], *flags: str) -> Choice:
