@@ -187,6 +187,7 @@ TRAJECTORIES = {
         "pose.orientation.z,pose.orientation.w,twist.linear.x,twist.linear.y,twist.linear.z",
         "{s},{x},{y},{z},0,0,0,1,0.1,0.2,0.3",
     ),
+    "TUM with commas": ("", "{s},{x},{y},{z},0.0,0.6,0.0,0.8"),
     "plain": ("", "{s} {x} {y} {z}"),
     "transform": ("timestamp;tx;ty;tz", "{s};{x};{y};{z}"),
 }
@@ -253,6 +254,11 @@ def test_columns_by_number_do_not_drop_the_coordinate_system_of_the_first_line(t
 def test_local_metres_under_a_heading_for_both_are_no_degrees(tmp_path: Path) -> None:
     found = read(tmp_path, "#Label,X/Longitude,Y/Latitude,Z/Altitude\na,1.5,2.5,0.5\nb,8.5,12.5,0.5\n")
     assert found.crs is None
+
+
+def test_ranges_without_names_are_not_taken_for_positions(tmp_path: Path) -> None:
+    with pytest.raises(UnclearListError, match="a table of positions whose columns are not known for sure"):
+        read(tmp_path, "".join(f"{0.5 * k} 2 {5 + k % 3} {4.25 + 0.1 * k}\n" for k in range(20)))
 
 
 def test_photos_with_large_coordinates_are_asked_about_with_whole_commands(tmp_path: Path) -> None:

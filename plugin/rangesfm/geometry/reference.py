@@ -18,6 +18,7 @@ from rangesfm.files.contents import AnyPath
 from rangesfm.files.photo_names import rows_of_photos
 from rangesfm.files.text_tables import (
     TextTable,
+    guess_separator,
     has_columns,
     header_names,
     read_head,
@@ -200,8 +201,10 @@ def tum_table(path: Path) -> TextTable:
         InputError: a line does not have eight cells, or there is none.
     """
     columns = ("timestamp_s", *POSITION_COLUMNS, *QUATERNION_COLUMNS)
-    rows = [(line, text.split()) for line, text in enumerate(read_text(path).split("\n"), start=1)]
-    rows = [(line, cells) for line, cells in rows if cells and not cells[0].startswith("#")]
+    numbered = enumerate(read_text(path).split("\n"), start=1)
+    texts = [(line, text) for line, text in numbered if text.strip() and not text.lstrip().startswith("#")]
+    separator = guess_separator(texts[0][1]) if texts else " "
+    rows = [(line, text.split(None if separator == " " else separator)) for line, text in texts]
     if not rows:
         raise InputError("no pose in the file, expected lines of timestamp tx ty tz qx qy qz qw", path)
     for line, cells in rows:

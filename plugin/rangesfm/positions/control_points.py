@@ -25,7 +25,7 @@ from rangesfm.files.text_tables import (
 )
 from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
 from rangesfm.positions.position_log import crs_of_line
-from rangesfm.ranging.anchors.anchor_file import find_anchor_columns
+from rangesfm.ranging.anchors.anchor_file import find_anchor_columns, like_anchors
 from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
 from rangesfm.ranging.readers.lists import UnclearListError, check_columns, read_list
 from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
@@ -159,6 +159,8 @@ def _found_columns(path: Path, layout: Layout, head: str) -> dict[str, str]:
         return {quantity: name for quantity, name in _CANONICAL.items() if name in layout.units}
     try:
         found = find_anchor_columns(path, layout)
+        if found is None and (unclear := like_anchors(path)) is not None:
+            raise unclear
     except UnclearListError as error:
         raise error.about_other("points", {"anchor_id": "marker"}, {"--anchor_": "--point_"}) from None
     if found is None:

@@ -126,7 +126,8 @@ def _axes_by_values(free: Sequence[ColumnSample], found: _Found) -> None:
     numbers = [column for column in free if column.kind == "numbers"]
     before = [k for k in range(3, len(numbers) - 3) if _are_quaternions(numbers[k : k + 4])]
     places = numbers[before[0] - 3 : before[0]] if before else numbers
-    if len(places) != len(AXES):
+    may_be_ids = not before and any(all(map(str.isdigit, column.cells)) for column in places[:2])
+    if len(places) != len(AXES) or may_be_ids:
         found.doubts.append("a table without names, of which any three numbers may be x, y, z")
         return
     names = [column.name for column in places]

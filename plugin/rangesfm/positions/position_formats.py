@@ -24,7 +24,7 @@ from rangesfm.files.text_tables import (
     read_table,
     read_text,
 )
-from rangesfm.geometry.reference import is_tum_row, tum_table
+from rangesfm.geometry.reference import is_reference_file, is_tum_row, tum_table
 from rangesfm.option_model import Bounds
 from rangesfm.options import COORDINATE_M, STDDEV_M, TIME_S, PositionOptions
 from rangesfm.positions.pose_priors import is_database, read_pose_priors
@@ -237,7 +237,7 @@ def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> 
 
 
 def _is_tum(head: str) -> bool:
-    return is_tum_row(header_names(head))
+    return is_tum_row(header_names(head)) and is_reference_file(head)  # with a quaternion of unit length
 
 
 def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
