@@ -23,7 +23,7 @@ from rangesfm.vision import snapshots
 
 module, name, num_calls, *argv = sys.argv[1:]
 module, left = importlib.import_module(module), int(num_calls)
-snapshots._MIN_INTERVAL_S = 0.0  # the mapping takes a second
+snapshots._MIN_INTERVAL_S = snapshots._INTERVAL_OVER_DURATION = 0.0  # the mapping takes a second
 function = getattr(module, name)
 
 def function_or_death(*arguments, **options):
