@@ -13,7 +13,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
-from rangesfm.geometry.similarity import Similarity, align_points, similarity_motions
+from rangesfm.geometry.similarity import Similarity, align_points, rounding_of, similarity_motions
 from rangesfm.ranging.clock.fit import OffsetFit, Timing, refine_offset
 from rangesfm.ranging.clock.search import Cells, OffsetCurve, PathSamples, Scanned, centred_columns, scan_parts
 from rangesfm.ranging.clock.squares import residual_stddev
@@ -128,7 +128,7 @@ def scan_positions(positions: TimedPositions, path: PathSamples, weights: Array 
 def _weights_by_place(position_m: Array) -> Array:
     """Return (n,) weights that keep positions far away from most others from deciding."""
     far_m = np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1)
-    return CAUCHY.weights(far_m / max(float(np.median(far_m)), 1e-300))
+    return CAUCHY.weights(far_m / max(float(np.median(far_m)), rounding_of(position_m)))
 
 
 def _scan(positions: TimedPositions, weights: Array, path: PathSamples) -> Scanned:

@@ -13,8 +13,9 @@ import pycolmap
 
 from rangesfm.distances.locate_lengths import locatable
 from rangesfm.distances.tape import Tape
-from rangesfm.errors import InputError
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.atomic import sole_writer
+from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress, SilentProgress
 from rangesfm.result.metric_result import MetricResult
@@ -157,7 +158,7 @@ def map_in_metres(
         images = run.survey.images
         baselines = read_rigs(images.rig_config).baselines(path.sfm, images.baseline_stddev_m)
         tape = (run.inputs.tape or Tape()).with_more(baselines)
-        positions = run.inputs.positions.on_path(path.trajectory)
+        positions = _positions_on_path(run, path)
         run.journal.warn(*positions.notes_on(path.sfm))
         tape_in_map = locatable(tape, path.sfm) if tape.distances else None
         run = replace(run, inputs=replace(run.inputs, tape=tape_in_map, positions=positions))
@@ -166,6 +167,22 @@ def map_in_metres(
     if run.survey.scale.adopt:
         run, made = with_likeliest_cause(run, path, made)
     return run, made.in_site(run.inputs.site)
+
+
+def _positions_on_path(run: SurveyRun, path: PathOfModel) -> SurveyedPositions:
+    """Return the known positions with the time offset of the antenna's, which are left out if nothing tells it.
+
+    Raises:
+        InputError: the photos have no times. GeometryError: nothing tells the offset, and nothing else is measured.
+    """
+    positions = run.inputs.positions
+    try:
+        return positions.on_path(path.trajectory)
+    except GeometryError as error:
+        if not len(run.inputs.log) and positions.points is None:
+            raise
+        run.journal.warn(f"the positions of the antenna are not used: {error}")
+        return replace(positions, antenna=None)
 
 
 def with_results(run: SurveyRun, made: MetricResult) -> RunResult:
