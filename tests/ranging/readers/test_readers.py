@@ -72,9 +72,14 @@ def test_range_of_zero_is_counted_as_no_measurement_and_left_out(tmp_path: Path)
     np.testing.assert_array_equal(log.line, [3])
 
 
-@pytest.mark.parametrize("cell", ["nan", "inf", "-inf", "x", ""])
-def test_range_that_cannot_be_is_refused_with_its_line(tmp_path: Path, cell: str) -> None:
-    error = refusal(write(tmp_path, f"timestamp_s,anchor_id,range_m\n0,a,1\n# pause\n1,a,{cell}\n"))
+@pytest.mark.parametrize("cell", ["nan", "NaN", "inf", "-inf", "", "None"])
+def test_a_word_for_no_number_is_counted_as_no_measurement(tmp_path: Path, cell: str) -> None:
+    log = read_ranges(write(tmp_path, f"timestamp_s,anchor_id,range_m\n0,a,1\n1,a,{cell}\n2,a,2\n"))
+    assert (log.range_m.tolist(), log.num_no_measurement) == ([1.0, 2.0], 1)
+
+
+def test_range_that_cannot_be_is_refused_with_its_line(tmp_path: Path) -> None:
+    error = refusal(write(tmp_path, "timestamp_s,anchor_id,range_m\n0,a,1\n# pause\n1,a,x\n"))
     assert error.line == 4
     assert "expected a positive number of metres; 0 means no measurement" in str(error)
 

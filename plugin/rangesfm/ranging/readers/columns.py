@@ -59,8 +59,7 @@ class RangeColumns:
         wide: by name, the columns of ranges that each belong to one anchor and one tag, with the ids of these.
         anchor_id: anchor of all ranges, if neither a column nor ``wide`` gives it.
         layout: layout of the file; None: its first row is its header.
-        is_strict: whether every cell of ranges must be a number, and ids are taken literally. Otherwise a cell may also
-            be empty (no measurement), and 1.000 is the id 1.
+        is_strict: whether ids are taken literally. Otherwise 1.000 is the id 1.
         notes: lines for the user about how the columns were found.
     """
 
@@ -207,9 +206,8 @@ def _ranges(table: TextTable, name: Mapping[str, str], columns: RangeColumns, op
     if "range" not in name and not columns.wide:
         return _ranges_by_stamps(table, name, StampOptions.of(options))
     unit = " of metres" if options.range_unit in (None, "m") else f" of {options.range_unit}"
-    empty, expected = None if columns.is_strict else 0.0, f"a positive number{unit}; 0 means no measurement"
-    names = columns.wide or [name["range"]]
-    return np.column_stack([table.numbers(k, empty=empty, missing=MISSING, expected=expected) for k in names]).ravel()
+    expected, names = f"a positive number{unit}; 0 means no measurement", columns.wide or [name["range"]]
+    return np.column_stack([table.numbers(k, empty=0.0, missing=MISSING, expected=expected) for k in names]).ravel()
 
 
 def _ranges_by_stamps(table: TextTable, name: Mapping[str, str], options: StampOptions) -> Array:
