@@ -176,6 +176,7 @@ def test_a_public_room_becomes_what_its_survey_file_names(tmp_path: Path) -> Non
     (anchor,) = read_anchors(room / "anchors_antennas.csv")
     assert anchor.anchor_id == "7"
     # The body is turned by a right angle about x: its z, along which the antenna is 0.25 m away, is the site's -y.
+    assert anchor.position_m is not None
     np.testing.assert_allclose(anchor.position_m, [1.25, -2.75, 0.5], atol=1e-8)
     assert rows_of(room / "images.csv") == [["a00.png", "0.25"]]
     assert (room / "images" / "a00.png").read_text() == (
