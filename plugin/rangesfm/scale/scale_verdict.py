@@ -144,7 +144,8 @@ def refuse_unknown(half_width: float, reasons: Sequence[str], advice: Sequence[s
 def _verdict(doubts: list[_Doubt], remarks: list[_Doubt], half_width: float, options: ScaleOptions) -> Verdict:
     why, advised = [doubt.reason for doubt in doubts], [doubt.advice for doubt in doubts if doubt.advice]
     refuse_unknown(half_width, why, advised, options)
-    summary = f"the scale is known to {100 * half_width:.1f} % (95 % interval)"
+    percent = f"{100 * half_width:.1f}" if half_width >= 1e-3 else f"{100 * half_width:.1g}"
+    summary = f"the scale is known to {percent} % (95 % interval)"
     if half_width > DOUBTFUL_ABOVE:
         doubts.insert(0, _Doubt(f"{summary}, worse than {100 * DOUBTFUL_ABOVE:g} %"))
     said = [*doubts, *remarks]
