@@ -58,6 +58,12 @@ def test_outliers_that_a_radio_can_measure_are_kept(tmp_path: Path) -> None:
     assert (len(log), log.num_no_measurement) == (400, 0)
 
 
+def test_an_anchor_that_is_far_away_is_measured(tmp_path: Path) -> None:
+    rows = [f"{0.1 * k:.1f},A{k % 2},{(0.3, 5.1)[k % 2] + 0.1 * (k // 2 % 3 == 0):.1f}" for k in range(200)]
+    (tmp_path / "uwb.csv").write_text("\n".join(["time_s,anchor_id,range_m", *rows]) + "\n")
+    assert len(read_ranges(tmp_path / "uwb.csv")) == 200
+
+
 @pytest.mark.parametrize("name", ["time_s", "timestamp_s"])
 def test_a_column_beyond_all_reach_has_another_unit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str

@@ -110,20 +110,20 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
     num_ends = max(1, len(columns.wide))
     row = np.repeat(np.arange(len(table)), num_ends)
     ranges = _ranges(table, name, columns, options)
-    measured, of_codes = which_are_measured(ranges, path)
+    link = anchor.index * len(tag.names) + tag.index
+    measured, of_codes = which_are_measured(ranges, link, path)
     notes += of_codes
-    unit = "m"
+    unit, others = "m", list[str]()
     if "range" in name or columns.wide:
-        pair = (anchor.index * len(tag.names) + tag.index)[measured]
         column = name.get("range") or next(iter(columns.wide))
         column = f"{column} {units.get(column, '')}".strip()
         ask = partial(options.which_unit, path, "range")
         times = None if timestamps is None else timestamps[row[measured]]
-        unit = options.range_unit or range_unit(column, ranges[measured], times, pair, notes, ask)
+        unit = options.range_unit or range_unit(column, ranges[measured], times, link[measured], notes, ask)
+        mapped = options if options.columns or not columns.is_strict else options.changed(columns=name)
+        others = [mapped.command(path, range_unit=other) for other in units_within_reach(ranges[measured], unit)]
     per_metre = UNITS_PER_METRE[unit]
     ranges_m = ranges / per_metre
-    mapped = options if options.columns or not columns.is_strict else options.changed(columns=name)
-    others = [mapped.command(path, range_unit=other) for other in units_within_reach(ranges_m[measured], unit)]
     measured[measured], of_far = which_are_within_reach(ranges_m[measured], path, others)
     notes += of_far
     row, anchor, tag = row[measured], anchor.subset(measured), tag.subset(measured)

@@ -20,7 +20,7 @@ from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.counters import continued
 from rangesfm.ranging.readers.layout import ColumnSample, Layout
 from rangesfm.ranging.readers.reader import EndpointRoles
-from rangesfm.ranging.readers.times import unit_by_digits
+from rangesfm.ranging.readers.times import SECONDS_PER_UNIT, unit_by_digits
 
 MAX_NUM_IDS = 64
 """Largest number of tags and anchors of a survey, where a table does not say what it holds."""
@@ -125,9 +125,9 @@ def _time_rank(column: ColumnSample) -> tuple[float, int] | None:
 
 
 def _is_since_1970(column: ColumnSample) -> bool:
-    """Return whether a column holds times since 1970 by their size."""
+    """Return whether a column holds present times since 1970, in any unit, by their size."""
     middle = float(np.median(column.numbers)) if column.kind == "numbers" and len(column.numbers) else 0.0
-    return unit_by_digits(middle) is not None or are_seconds_since_1970(middle)
+    return are_seconds_since_1970(middle * SECONDS_PER_UNIT[unit_by_digits(middle) or "s"])
 
 
 def _find_pairs(free: list[ColumnSample], guess: Guess) -> list[ColumnSample]:

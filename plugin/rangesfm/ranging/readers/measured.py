@@ -16,7 +16,8 @@ REACH_M = 2000.0
 
 # A number is far from the others if it exceeds the next smaller one by the factor _FAR, and at least _MIN_NUM numbers
 # are smaller. A far number means no measurement if it occurs _MIN_NUM_OF_CODE times. A radio has few such codes.
-_FAR, _MIN_NUM, _MIN_NUM_OF_CODE, _MOST_CODES = 4.0, 20, 3, 4
+# Several of them come between measurements, unlike the ranges of an anchor that is far away.
+_FAR, _MIN_NUM, _MIN_NUM_OF_CODE, _MOST_CODES, _MOST_SHARE_OF_CODES = 4.0, 20, 3, 4, 0.7
 _NOTHING = 1e-12  # a smaller number counts as 0, in any unit
 # Numbers of bits with which radios count, and how far below the largest number, as a share of it, small negative
 # numbers come to lie that are written as if they had no sign.
@@ -24,17 +25,20 @@ _BITS, _WRAPPED_SHARE = (15, 16, 24, 31, 32), 0.01
 _SHOWN = 3  # number of codes that a note names
 
 
-def which_are_measured(ranges: Array, path: Path) -> tuple[Mask, tuple[str, ...]]:
+def which_are_measured(ranges: Array, link: Indices, path: Path) -> tuple[Mask, tuple[str, ...]]:
     """Return which ranges in a file (n,), in any unit, are measurements, and notes about the others.
 
     A number that is not positive is no measurement. Neither are failure codes such as 65535, of which there may be
     several: numbers far above all others that occur often, or have all bits set.
 
+    Args:
+        link: (n,) number of each range's pair of nodes.
+
     Raises:
         InputError: there is no measurement.
     """
     measured: Mask = (ranges > _NOTHING) & (ranges <= MAX_NUMBER)
-    codes, counts = _failure_codes(ranges[measured])
+    codes, counts = _failure_codes(ranges[measured], link[measured])
     measured &= ~np.isin(ranges, codes)
     if not measured.any():
         said = f"all {len(ranges)} records say that there was no measurement" if len(ranges) else "no records"
@@ -50,16 +54,21 @@ def which_are_measured(ranges: Array, path: Path) -> tuple[Mask, tuple[str, ...]
     return measured, (note,)
 
 
-def _failure_codes(positive: Array) -> tuple[Array, Indices]:
+def _failure_codes(positive: Array, link: Indices) -> tuple[Array, Indices]:
     """Return the numbers that mean no measurement, and how often each occurs."""
-    values, counts = np.unique(positive, return_counts=True)
+    values, index, counts = np.unique(positive, return_inverse=True, return_counts=True)
     are_codes = np.zeros(len(values), bool)
     num_up_to, num_above = np.cumsum(counts), np.arange(len(values))[::-1]
     is_body = (num_up_to >= _MIN_NUM) & ((num_up_to >= len(positive) / 2) | (num_above <= _MOST_CODES))
     gaps = np.flatnonzero(is_body[:-1] & (values[1:] > _FAR * values[:-1]))
     if len(gaps):
         is_far = values > values[gaps[0]]
-        are_codes = is_far & ((counts >= _MIN_NUM_OF_CODE) | _have_all_bits(values, _WRAPPED_SHARE))
+        often = is_far & (counts >= _MIN_NUM_OF_CODE)
+        if np.count_nonzero(is_far) > 1:
+            share_far = np.bincount(link, is_far[index]) / np.maximum(np.bincount(link), 1)
+            between = np.bincount(index, share_far[link] < _MOST_SHARE_OF_CODES, len(values)) > 0
+            often &= between & (np.count_nonzero(often & between) <= _MOST_CODES)
+        are_codes = often | (is_far & _have_all_bits(values, _WRAPPED_SHARE))
     often_full = (counts >= _MIN_NUM_OF_CODE) & _have_all_bits(values, 0.0)
     for k in range(len(values) - 1, _MIN_NUM - 1, -1):  # the largest numbers need no gap if all their bits are set
         if not (often_full[k] or are_codes[k]):

@@ -13,6 +13,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
+from rangesfm.files.text_tables import Categories
 from rangesfm.options import TIME_S
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
@@ -51,7 +52,8 @@ def log_of_readings(
         InputError: there is no measurement, or the unit of the times is ambiguous.
     """
     ranges = np.array([reading.range_m for reading in found], np.float64)
-    measured, of_codes = which_are_measured(ranges, path)
+    link = Categories.of([f"{reading.tag_id} {reading.anchor_id}" for reading in found]).index
+    measured, of_codes = which_are_measured(ranges, link, path)
     measured[measured], of_far = which_are_within_reach(ranges[measured], path)
     times, anchor_ids, ranges_m, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
     times_s, of_times = _times(np.array(times, np.float64), path, options)

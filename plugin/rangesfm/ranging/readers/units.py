@@ -117,9 +117,9 @@ def range_unit(name: str, ranges: Array, times: Array | None, pair: Indices, not
     return can_be[0]
 
 
-def units_within_reach(ranges_m: Array, unit: str) -> list[str]:
-    """Return the units in which most of some ranges (n,), so far read in ``unit``, are within the reach of a radio."""
-    middle = float(np.median(ranges_m)) * UNITS_PER_METRE[unit]
+def units_within_reach(ranges: Array, unit: str) -> list[str]:
+    """Return the units other than ``unit`` in which most of some ranges (n,) are within the reach of a radio."""
+    middle = float(np.median(ranges))
     return [other for other in ("cm", "mm", "ft") if other != unit and middle / UNITS_PER_METRE[other] <= REACH_M]
 
 
