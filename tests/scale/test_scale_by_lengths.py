@@ -351,6 +351,15 @@ def test_beside_ranges_one_length_stands_for_all_between_points() -> None:
     assert lengths.scaled_by(4.0).value == pytest.approx(0.125)
 
 
+def test_the_quantile_of_equal_variances_is_found_however_their_probabilities_are_rounded() -> None:
+    """Lengths of the same two points, taped twice, do not differ by a bending of the map."""
+    for seed in range(50):
+        probabilities = np.random.default_rng(seed).random(21)
+        probabilities /= probabilities.sum()
+        found = _quantile(np.full(21, 0.0004), probabilities, 0.004)
+        assert found == pytest.approx(-0.02 * special.ndtri(0.002), rel=1e-6)
+
+
 def test_the_quantile_of_normal_numbers_is_between_those_of_their_variances() -> None:
     half = np.array([0.5, 0.5])
     for risk in (0.02, 0.3):

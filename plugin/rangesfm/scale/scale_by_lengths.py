@@ -301,7 +301,8 @@ class _Lengths:
 def _quantile(variances: Array, probabilities: Array, risk: float) -> float:
     """Return the size that a normal number with one of these variances (t,) exceeds, on either side, with this risk."""
     stddevs = np.sqrt(np.maximum(variances, 0.0)) + 1e-300
-    widest = -special.ndtri(risk / 2) * float(stddevs.max())
+    # A little beyond the quantile of the largest variance, which it is but for rounding if all variances are equal.
+    widest = -special.ndtri(risk / 2) * float(stddevs.max()) * (1 + 1e-6)
 
     def excess_risk(size: float) -> float:
         return float(2 * probabilities @ special.ndtr(-size / stddevs)) - risk
