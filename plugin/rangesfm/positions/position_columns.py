@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.ranging.anchors.anchor_file import LOCAL_M
+from rangesfm.ranging.anchors.site import WIDEST_DEG
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.guess import Guess, find_time, is_rising, named_photos
 from rangesfm.ranging.readers.layout import ColumnSample, Layout
@@ -132,7 +133,7 @@ def _axes_by_values(free: Sequence[ColumnSample], found: _Found) -> None:
         return
     names = [column.name for column in places]
     east_first, north_first = (dict(zip(order, names)) for order in (AXES, ("y", "x", "z")))
-    largest = max(float(np.abs(column.numbers).max()) for column in places)
+    largest = max(float(np.abs(column.numbers).max(initial=0.0)) for column in places)
     if before or not (largest > LOCAL_M or _may_be_degrees(places)):
         found.columns |= east_first
         found.notes.append(f"the table has no names: columns {', '.join(names)} are taken as x, y, z")
@@ -152,9 +153,9 @@ def _are_quaternions(columns: Sequence[ColumnSample]) -> bool:
 
 
 def _may_be_degrees(places: Sequence[ColumnSample]) -> bool:
-    """Return whether the first two of three numbers may be degrees: nobody walks a path of a few millimetres."""
-    spread = [float(np.ptp(column.numbers)) for column in places[:2]]
-    return max(spread) < 0.05 and all(column.num_distinct > 1 for column in places[:2])
+    """Return whether the first two of three numbers may be degrees: nobody walks less than half a metre."""
+    spread = [float(np.ptp(column.numbers)) if len(column.numbers) else 0.0 for column in places[:2]]
+    return max(spread) < WIDEST_DEG and all(column.num_distinct > 1 for column in places[:2])
 
 
 def _add_errors(free: Sequence[ColumnSample], columns: dict[str, str]) -> None:

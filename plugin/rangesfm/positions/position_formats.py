@@ -37,6 +37,7 @@ from rangesfm.positions.position_columns import (
     is_degrees,
 )
 from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line
+from rangesfm.ranging.anchors.site import WIDEST_DEG
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.columns import read_timestamps
 from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
@@ -52,7 +53,6 @@ _CANONICAL = {
 }
 POSITION_COLUMNS = tuple(_CANONICAL[axis] for axis in AXES)
 _EXPECTED = f"expected a table with timestamp_s or image_name, and {','.join(POSITION_COLUMNS)}"
-_WIDEST_DEG = 0.5
 DEGREES = Bounds(-360, 360, "degrees")
 _SLOWEST_S = 120.0
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
@@ -182,14 +182,14 @@ def _log_of_table(
 def _are_degrees(names: Mapping[str, str], columns: Sequence[Array]) -> bool:
     """Return whether x and y are longitude and latitude: by their names, or where these leave it open by their spread.
 
-    The spread is of degrees if it is less than half of one: a survey of metres is wider, one of degrees never.
+    They are degrees if they spread over less than a survey of metres does.
     """
     if not all(is_degrees(names[axis], axis) for axis in ("x", "y")):
         return False
     if not any(axis in terms.words_of(names[axis]) for axis in ("x", "y")):
         return True
     known = [values[np.isfinite(values)] for values in columns[:2]]
-    return all(len(values) > 0 and float(np.ptp(values)) < _WIDEST_DEG for values in known)
+    return all(len(values) > 0 and float(np.ptp(values)) < WIDEST_DEG for values in known)
 
 
 def _of_one_tag(table: TextTable, names: Mapping[str, str], tag_id: str | None, path: Path) -> Mask:

@@ -14,9 +14,10 @@ from rangesfm.ranging.anchors.anchor import Anchor
 
 # The fifth decimal of a degree is about a metre.
 _DECIMALS_OF_DEGREES = 5
-# Degrees of a survey differ by less than this, their size is at least so many times as much, and to be of use they are
-# written with more digits than metres, to less than this.
-_WIDEST_DEG, _MIN_SHARE_OF_SIZE, _FINEST_M = 0.05, 1000.0, 1e-4
+WIDEST_DEG = 0.5
+"""Degrees of longitude or latitude that a survey spans at most; one in metres spans more."""
+# The size of degrees is at least so many times their spread, and they are written to less than this.
+_MIN_SHARE_OF_SIZE, _FINEST_M = 1000.0, 1e-4
 _LARGEST_DEG = np.array([180.0, 90.0])
 
 
@@ -146,7 +147,7 @@ def _are_degrees(known: Array) -> bool:
     is_finer = np.abs(tenths_of_mm - np.round(tenths_of_mm)) > 1e-3
     return bool(
         np.all(size <= _LARGEST_DEG)
-        and np.all((spread > 0) & (spread < _WIDEST_DEG))
+        and np.all((spread > 0) & (spread < WIDEST_DEG))
         and size.max() > _MIN_SHARE_OF_SIZE * spread.max()
         and is_finer.mean() > 1 / 2
     )
