@@ -100,7 +100,7 @@ def test_most_ranges_without_line_of_sight_are_a_finding() -> None:
     given = surveyed(DRONE, SEED)
     rng = np.random.default_rng(0)
     given.range_m = given.range_m + (rng.random(len(given.range_m)) < 0.7) * rng.exponential(1.0, len(given.range_m))
-    assert "radios in the open reach" in diagnosis(given).reasons[0]
+    assert "radios with a clear line of sight stay below" in diagnosis(given).reasons[0]
 
 
 def test_an_anchor_that_is_mostly_blocked_is_named_before_what_that_looks_like() -> None:
@@ -116,7 +116,7 @@ def test_ranges_to_another_anchor_under_a_label_are_named() -> None:
     given = surveyed(HALL, SEED)
     (mistake,) = [each for each in kinds(given.ids) if each.name == "a third of A1 is of A2"]
     mistake.make(given, 1.0, np.random.default_rng(SEED))
-    assert "as long as those to A2" in diagnosis(given).reasons[0]
+    assert "fit anchor A2 instead" in diagnosis(given).reasons[0]
 
 
 def test_a_step_of_all_ranges_is_found_at_its_own_time() -> None:
