@@ -1,10 +1,13 @@
 """Draw whole small surveys at random over everything that a user may have, and run a command on each.
 
-    python -m tests.studies.random_surveys [--num 100] [--first_seed 0] [--seed N] [--workers 1] [--out FILE]
+    python -m tests.studies.random_surveys [--num 100] [--first_seed 0] [--seed N] [--workers 1] [--pairs] [--out FILE]
 
 ``tests.studies.drawn_surveys`` says what is drawn. ``--seed N`` repeats one survey, prints what its command prints, and
 with ``--keep FOLDER`` leaves its files there. With ``--out`` each outcome is a line of a file, and seeds that are there
 already are not run again.
+
+With ``--pairs`` each honest survey that gives a scale is run again without one kind of measurement, or with its anchors
+unknown. What is added should not widen the interval by more than a tenth, unless the verdict says why.
 
 Each command must end with an exit status of the contract, without an internal error or a word of a library, and must
 write finite numbers. An honest survey must not be refused as bad input. Of the honest ones, the true scale must be in
@@ -28,6 +31,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -45,12 +50,20 @@ from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]
 
+# Flags of each kind of measurement.
+FLAGS = {
+    "anchors": ("--anchors", "--anchor_frame"),
+    "positions": ("--positions", "--antenna_in_cam"),
+    "points": ("--points",),
+    "distances": ("--distances",),
+}
+WIDENED = 1.1
 LEAST_COVERED, MOST_GOOD_AND_OUTSIDE = 0.93, 0.02
 # Of the largest of three coordinates in stddevs, with 95 % probability.
 THREE_95 = 2.388
 
 
-def told(seed: int, keep: Path | None = None, *, echo: bool = False) -> Line:
+def told(seed: int, keep: Path | None = None, *, echo: bool = False, pairs: bool = False) -> Line:
     """Draw a survey, run its command, and return how that ended."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "survey"
@@ -63,12 +76,30 @@ def told(seed: int, keep: Path | None = None, *, echo: bool = False) -> Line:
             line = {"seed": seed, "words": ", ".join(survey.words), "mistake": survey.mistake, "status": status}
             line |= {"seconds": seconds, "said": errors.strip().splitlines()[-1:] if status else []}
             line |= judged(survey, status, errors)
+            if pairs and survey.is_honest and "off" in line:
+                line["without"] = dict(halves_without(survey))
         finally:
             if keep is not None:
                 shutil.copytree(folder, keep, dirs_exist_ok=True)
     if echo:
         print(line["words"], " ".join(["rangesfm", *survey.command]), output, errors, sep="\n")
     return line
+
+
+def halves_without(survey: DrawnSurvey) -> Iterator[tuple[str, float]]:
+    """Run the survey again without each kind of measurement; yield it with half the width of the interval then."""
+    command = survey.command
+    given = {kind: flags for kind, flags in FLAGS.items() if flags[0] in command}
+    for kind, flags in given.items():
+        kept = [k for k in range(len(command)) if not command[k].startswith(flags) and command[k - 1] not in flags]
+        less = [command[k] for k in kept]
+        if not {"--points", "--distances"} & {*less} and "--markers" in less:
+            at = less.index("--markers")
+            less = less[:at] + less[at + 2 :]
+        less += ["--anchor_frame", "unknown"] if kind == "anchors" else []
+        found = judged(survey, *run(replace(survey, command=less))[::2])
+        if "half" in found:
+            yield kind, found["half"]
 
 
 def run(survey: DrawnSurvey) -> tuple[int, str, str]:
@@ -150,6 +181,16 @@ def final_map(folder: Path) -> pycolmap.Reconstruction:
     return pycolmap.Reconstruction(refined if refined.exists() else folder / "sparse_scaled" / "0")
 
 
+def widened(line: Line) -> list[str]:
+    """Return the kinds of measurement that widen the interval without a word about it."""
+    is_said = any("less certain" in reason for reason in line.get("reasons", ()))
+    return [
+        kind
+        for kind, half in line.get("without", {}).items()
+        if line["half"] > WIDENED * half and not (is_said and kind == "anchors")
+    ]
+
+
 def failures(line: Line) -> list[str]:
     """Return the kinds of failure of a survey."""
     found = [*line["wrong"]]
@@ -160,7 +201,7 @@ def failures(line: Line) -> list[str]:
     for what, covered, good in (("scale", "covered", "good"), ("place", "placed", "place_good")):
         if not line.get(covered, True):
             found.append(f"{what} outside, {'good' if line[good] else 'doubtful'}")
-    return found
+    return [*found, *(f"wider with {kind}" for kind in widened(line))]
 
 
 def share(lines: Sequence[Line], key: str) -> float:
@@ -204,13 +245,13 @@ def report(lines: Sequence[Line]) -> tuple[list[str], bool]:
     return texts, is_well
 
 
-def outcomes(seeds: Sequence[int], num_workers: int) -> Iterator[Line]:
+def outcomes(seeds: Sequence[int], num_workers: int, *, pairs: bool) -> Iterator[Line]:
     """Yield the outcomes of surveys as they come."""
     if num_workers == 1:
-        yield from map(told, seeds)
+        yield from map(partial(told, pairs=pairs), seeds)
         return
     with ProcessPoolExecutor(num_workers, get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(told, seed) for seed in seeds]):
+        for future in as_completed([pool.submit(told, seed, pairs=pairs) for seed in seeds]):
             yield future.result()
 
 
@@ -222,16 +263,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, help="of one survey, which alone is run")
     parser.add_argument("--keep", type=Path, help="folder for the files of the survey of --seed")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--pairs", action="store_true", help="run each also without one kind of measurement")
     parser.add_argument("--out", type=Path, help="lines of surveys, which are not run again")
     asked = parser.parse_args(arguments)
     if asked.seed is not None:
-        line = told(asked.seed, asked.keep, echo=True)
+        line = told(asked.seed, asked.keep, echo=True, pairs=asked.pairs)
         print(json.dumps(line), *failures(line), sep="\n")
         return int(bool(failures(line)))
     before = asked.out.read_text(encoding="utf-8").splitlines() if asked.out is not None and asked.out.exists() else []
     done = {line["seed"]: line for line in map(json.loads, before)}
     seeds = [seed for seed in range(asked.first_seed, asked.first_seed + asked.num) if seed not in done]
-    for line in outcomes(seeds, asked.workers):
+    for line in outcomes(seeds, asked.workers, pairs=asked.pairs):
         done[line["seed"]] = line
         if found := failures(line):
             print(f"{line['seed']}: {'; '.join(found)}: {line['words']}", flush=True)
