@@ -22,7 +22,7 @@ import pytest
 from tests.conftest import ANCHORS_M, SITE_M, TAG_IN_CAM_M, Command, WalkedSurvey
 
 from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.vision.image_times import read_image_times_csv
 
 Array = npt.NDArray[np.float64]
@@ -45,6 +45,7 @@ class Case(NamedTuple):
     change: Callable[[Log], None]
     verdict: str = "good"
     reason: str = "the scale is known to"
+    has_ranges: bool = True
 
 
 def erring(log: Log) -> None:
@@ -85,6 +86,8 @@ def by_photo(log: Log) -> None:
 
 
 SITE, UNKNOWN = ("--anchors", "anchors.csv"), ("--anchor_frame", "unknown")
+POINTS = ("--points", "points.csv", "--markers", "markers.csv")
+POSITIONS = ("--positions", "positions.csv", "--antenna_in_cam", "0.1,-0.3,0.05")
 IN_CAMERA = ("--anchors", "anchors_first_camera.csv", "--anchor_frame", "first_camera")
 CASES = {
     "surveyed, obstructed": Case("refine", SITE, obstructed),
@@ -117,6 +120,20 @@ CASES = {
     "a slipped clock": Case("scale", SITE, slipping, "doubtful", "probably the clocks' offset jumped "),
     "an anchor typed wrong": Case(
         "refine", ("--anchors", "typed.csv"), erring, "doubtful", "probably anchor A3's y is given as 5008.600"
+    ),
+    "control points": Case("refine", POINTS, erring, has_ranges=False),
+    "positions": Case("refine", POSITIONS, erring, has_ranges=False),
+    "a tape alone": Case(
+        "refine",
+        ("--distances", "between_marks.csv", "--markers", "markers.csv"),
+        erring,
+        "doubtful",
+        "the scale depends on one length that nothing checks",
+        has_ranges=False,
+    ),
+    "everything": Case("refine", (*SITE, *POINTS, *POSITIONS, "--distances", "taped.csv"), erring),
+    "two anchors and gravity": Case(
+        "scale", ("--anchors", "anchors.csv", "--use_anchors", "A1,A2", "--up_in_first_camera", "{up}"), erring
     ),
     "two candidates": Case(
         "scale", (*IN_CAMERA, "--scale_method", "two-candidate"), erring, "doubtful", "two-candidate, as asked for"
@@ -155,14 +172,55 @@ def survey(own_survey: WalkedSurvey) -> WalkedSurvey:
     write_anchors(folder / "typed.csv", A3=(x, y + 0.6, z))
     write_anchors(folder / "flat.csv", **{name: (x, y, SITE_M[2] + 0.5) for name, (x, y, _) in ANCHORS_M.items()})
     (folder / "taped.csv").write_text("from,to,distance_m,stddev_m\nA1,A2,12.17,0.02\n")
+    write_marks(own_survey)
+    write_positions(own_survey)
     return own_survey
+
+
+def write_marks(survey: WalkedSurvey) -> None:
+    """Write marks of points of the map in their photos, their surveyed coordinates, and a length between two."""
+    model, rng = pycolmap.Reconstruction(survey.folder / "sparse" / "0"), np.random.default_rng(7)
+    seen = [i for i in sorted(model.point3D_ids()) if model.point3D(i).track.length() >= 6][::40][:6]
+    marks, points, places = "marker,image_name,x_px,y_px\n", "marker,x_m,y_m,z_m,stddev_m\n", {}
+    for number, point_id in enumerate(seen):
+        place = survey.site_from_sfm.apply(model.point3D(point_id).xyz[None])[0]
+        places[f"M{number}"] = place
+        x, y, z = (place + 0.01 * rng.standard_normal(3)).tolist()
+        points += f"M{number},{x:.4f},{y:.4f},{z:.4f},0.01\n"
+        for element in model.point3D(point_id).track.elements:
+            image = model.image(element.image_id)
+            x_px, y_px = np.ravel(image.points2D[element.point2D_idx].xy).tolist()
+            marks += f"M{number},{image.name},{x_px:.2f},{y_px:.2f}\n"
+    length_m = float(np.linalg.norm(places["M0"] - places["M1"]))
+    (survey.folder / "markers.csv").write_text(marks)
+    (survey.folder / "points.csv").write_text(points)
+    lengths = f"from,to,distance_m,stddev_m\nM0,M1,{length_m + 0.004:.4f},0.005\n"
+    (survey.folder / "between_marks.csv").write_text(lengths)
+
+
+def site_path(survey: WalkedSurvey) -> Trajectory:
+    """Return the path of the camera in the site."""
+    times = read_image_times_csv(survey.folder / "images.csv").by_name()
+    path = trajectory_from_reconstruction(pycolmap.Reconstruction(survey.folder / "sparse" / "0"), times)
+    placed = survey.site_from_sfm
+    return path.transformed(placed.scale, placed.rotation, placed.translation)
+
+
+def write_positions(survey: WalkedSurvey) -> None:
+    """Write noisy positions of an antenna at the moments of the photos, by another clock."""
+    path, rng = site_path(survey), np.random.default_rng(8)
+    antennas = path.centers + path.world_from_cam @ [0.1, -0.3, 0.05] + 0.03 * rng.standard_normal((len(path), 3))
+    assert path.timestamps_s is not None
+    write_reference(Reference(antennas, timestamps_s=path.timestamps_s + 12.25), survey.folder / "positions.csv")
 
 
 def found_by(case: Case, survey: WalkedSurvey, command: Command) -> Numbers:
     log = read_log(survey.folder / "uwb.csv")
     case.change(log)
     write_log(survey.folder / "uwb.csv", log)
-    flags = [*survey.flags, *case.flags, "--no_report", "--quiet", "--output_path", "out"]
+    given = survey.flags if case.has_ranges else ("--input_path", "sparse/0", "--images", "images.csv")
+    up = ",".join(map(str, site_path(survey).world_from_cam[0, 2].tolist()))
+    flags = [*given, *(flag.format(up=up) for flag in case.flags), "--no_report", "--quiet", "--output_path", "out"]
     command(case.command, *flags, cwd=survey.folder)
     result = json.loads((survey.folder / "out" / "result.json").read_text())
     assert result["scale"]["verdict"] == case.verdict
@@ -218,10 +276,7 @@ def test_a_survey_gives_what_it_gave(name: str, survey: WalkedSurvey, rangesfm_c
 
 def write_known(survey: WalkedSurvey) -> tuple[str, ...]:
     """Write the true path of the camera, and return the flags that use it."""
-    times = read_image_times_csv(survey.folder / "images.csv").by_name()
-    placed = survey.site_from_sfm
-    path = trajectory_from_reconstruction(pycolmap.Reconstruction(survey.folder / "sparse" / "0"), times)
-    path = path.transformed(placed.scale, placed.rotation, placed.translation)
+    path = site_path(survey)
     known = Reference(path.centers, timestamps_s=path.timestamps_s, world_from_cam=path.world_from_cam)
     write_reference(known, survey.folder / "known.csv")
     tag = ",".join(map(str, TAG_IN_CAM_M))
