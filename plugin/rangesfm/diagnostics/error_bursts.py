@@ -16,10 +16,8 @@ from rangesfm.arrays import Indices
 from rangesfm.diagnostics.hypothesis import longest_m
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.ranging.errors.components import LASTING_S
+from rangesfm.ranging.errors.components import BURSTS, LASTING_S
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE
-
-_NAME = "bursts"
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ def without(problem: Linearized, burst: Burst) -> Linearized:
     """Return the problem with the ranges of a burst left out: they may err by as much as a range can."""
     known, num = problem.expected.known, len(problem.bins)
     variances_m2 = np.bincount(burst.bins, np.full(len(burst.bins), longest_m(problem) ** 2), num)
-    known = {**known, _NAME: known.get(_NAME, np.zeros((num, num))) + np.diag(variances_m2)}
+    known = {**known, BURSTS: known.get(BURSTS, np.zeros((num, num))) + np.diag(variances_m2)}
     return replace(problem, expected=replace(problem.expected, known=known))
 
 

@@ -11,7 +11,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
-from rangesfm.ranging.errors.components import DRIFT_S, PLACES
+from rangesfm.ranging.errors.components import DRIFT_S, PLACES, WANDERING, OtherError
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
 from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
@@ -205,7 +205,8 @@ def at_other_map(problem: Linearized, on_map: RangesOnMap) -> Linearized:
 def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -> Linearized:
     towards = RangeGradient.of(on_map.from_anchor_m).by_tag
     placing_m = on_map.posed.placing_stddev_m(on_map.state.metric_from_model.scale)
-    others_m2 = _wandering(bins) | {PLACES: bins.shared_by_places(towards, placing_m, on_map.on_path.before)}
+    by_places_m2 = bins.shared_by_places(towards, placing_m, on_map.on_path.before)
+    others_m2: dict[OtherError, Array] = {WANDERING: _wandering_m2(bins), PLACES: by_places_m2}
     expected = ExpectedErrors.of(
         bins, on_map.posed.curve_stddev_m, ruled_out(on_map.problem), others_m2, _bending(on_map, bins)
     )
@@ -292,10 +293,10 @@ def slopes_by_poses(on_map: RangesOnMap) -> csr_array:
     return by_poses(gradient, placed, on_map.model_from_cam, on_map.problem.tag_from_center, on_map.on_path)
 
 
-def _wandering(bins_of_ranges: RangeBins) -> dict[str, Array]:
+def _wandering_m2(bins_of_ranges: RangeBins) -> Array:
     index, time_s = bins_of_ranges.anchor_index, bins_of_ranges.time_s
     together = np.exp(-np.abs(time_s[:, None] - time_s) / DRIFT_S)
-    return {"wandering": _WANDERING_M**2 * (1.0 + (index[:, None] == index)) * together}
+    return np.asarray(_WANDERING_M**2 * (1.0 + (index[:, None] == index)) * together)
 
 
 def _bins(on_map: RangesOnMap) -> tuple[RangeBins, float]:

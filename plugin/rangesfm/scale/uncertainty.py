@@ -9,7 +9,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
-from rangesfm.ranging.errors.components import BENDS, CLOCKS, GIVEN, PLACES, REWEIGHTING
+from rangesfm.ranging.errors.components import BENDS, CLOCKS, GIVEN, PLACES, REWEIGHTING, OtherError
 from rangesfm.ranging.errors.learned import ErrorParts, ExpectedErrors, LearnedErrors, learn_errors
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, noisiness, range_bins
 from rangesfm.scale.linear_map import LinearMap, Solved
@@ -101,7 +101,7 @@ def errors_to_expect(
     return ExpectedErrors.of(of_ranges, posed.curve_stddev_m, ruled_out(solution.problem), placed_m2).usual(stddevs)
 
 
-def _by_places(posed: ScaleProblem, solution: Solution, of_ranges: RangeBins) -> dict[str, Array]:
+def _by_places(posed: ScaleProblem, solution: Solution, of_ranges: RangeBins) -> dict[OtherError, Array]:
     """Return the bins' covariance due to uncertain antenna places, by name; empty where places are certain."""
     placing_m = posed.placing_stddev_m(solution.fit.state.metric_from_model.scale)
     if not np.any(placing_m > 0):

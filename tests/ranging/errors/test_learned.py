@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from rangesfm.ranging.errors.bending import BendingOfBins, ErrorPart
-from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.ranging.errors.components import COMPONENTS, OtherError
 from rangesfm.ranging.errors.learned import (
     ComponentLikelihood,
     ErrorParts,
@@ -333,7 +333,7 @@ def test_errors_to_expect_are_all_components_that_are_not_ruled_out() -> None:
 def test_bending_of_the_map_and_further_errors_are_expected_too() -> None:
     alike = np.diag([1.0, 0.0, 0.0, 1.0])
     bending = BendingOfBins((ErrorPart("bending", alike, 0.02, 1.0),), np.zeros((4, 4)), np.array([0.1, 0.2, 0.3, 0.4]))
-    others = {"given": 0.25 * np.eye(4), "clocks": np.diag([1.0, 4.0, 9.0, 2.0])}
+    others: dict[OtherError, Array] = {"given": 0.25 * np.eye(4), "clocks": np.diag([1.0, 4.0, 9.0, 2.0])}
     expected = ExpectedErrors.of(few_bins(), None, (), others, bending)
     assert expected.components[-1].name == "bending"
     np.testing.assert_array_equal(expected.of_components[-1], alike)

@@ -10,6 +10,7 @@ import functools
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -213,23 +214,39 @@ BENDS = {
 }
 """Components that are errors of the map, not of the ranges, with descriptions; their effect depends on the map."""
 
-LEARNT_CURVE = "learnt_curve"
+OtherError = Literal["learnt_curve", "given", "reweighting", "clocks", "places", "wandering", "bursts"]
+"""Names of errors that are no components to be learnt; the checker of types finds one without a description."""
+
+_OTHERS: Mapping[OtherError, str] = {
+    "learnt_curve": "what the calibration of the radio leaves open",
+    "given": "given values: anchors' positions, lengths and others",
+    "reweighting": "choice of the ranges' weights",
+    "clocks": "time offset between the clocks",
+    "places": "positions of the camera at and between the photos",
+    "wandering": "slow wandering of the ranges, as hands and bodies move",
+    "bursts": "seconds in which an anchor's ranges err, and are left out",
+}
+
+LEARNT_CURVE: Final = "learnt_curve"
 """Remaining error of an error curve that was subtracted, as learnt with the curve."""
 
-GIVEN = "given"
+GIVEN: Final = "given"
 """Uncertainty of what was given on map and anchors; not a component of the ranges' errors."""
 
-
-REWEIGHTING = "reweighting"
+REWEIGHTING: Final = "reweighting"
 """Change of the scale by the best weights for these errors; not a component of the ranges' errors."""
 
-
-CLOCKS = "clocks"
+CLOCKS: Final = "clocks"
 """Uncertainty of the camera-radio time offset; not a component of the ranges' errors."""
 
-
-PLACES = "places"
+PLACES: Final = "places"
 """Uncertainty of the camera's positions at and between keyframes; not a component of the ranges' errors."""
+
+WANDERING: Final = "wandering"
+"""Slow wandering of the ranges that tests assume in addition to what is learnt."""
+
+BURSTS: Final = "bursts"
+"""Error of ranges that tests leave out, as they err for seconds and are right again."""
 
 
 FRAME = "frame"
@@ -238,13 +255,8 @@ FRAME = "frame"
 
 def component_words(names: Iterable[str]) -> dict[str, str]:
     """Return descriptions of components for people, by name."""
-    words = {component.name: component.words for component in COMPONENTS} | BENDS
+    words = {component.name: component.words for component in COMPONENTS} | BENDS | {**_OTHERS}
     words |= {
-        LEARNT_CURVE: "what the calibration of the radio leaves open",
-        GIVEN: "given values: anchors' positions, lengths and others",
-        REWEIGHTING: "choice of the ranges' weights",
-        CLOCKS: "time offset between the clocks",
-        PLACES: "positions of the camera at and between the photos",
         "points": "coordinates of the control points",
         "positions": "noise of the known positions",
         "positions_warp": "errors of the positions that belong to a place",

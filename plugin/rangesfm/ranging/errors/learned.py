@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.numerics import ROUNDING, UNDETERMINED
 from rangesfm.ranging.errors.bending import BendingOfBins
-from rangesfm.ranging.errors.components import BENDS, COMPONENTS, LEARNT_CURVE, Component
+from rangesfm.ranging.errors.components import BENDS, COMPONENTS, LEARNT_CURVE, Component, OtherError
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.range_bins import RangeBins
 
@@ -105,7 +105,7 @@ def learn_errors(
     noise_m: float,
     curve_stddev_m: Array | None = None,
     ruled_out: Collection[str] = (),
-    others_m2: Mapping[str, Array] | None = None,
+    others_m2: Mapping[OtherError, Array] | None = None,
     bending: BendingOfBins | None = None,
 ) -> LearnedErrors:
     """Estimate the components by restricted maximum likelihood with lognormal priors on the standard deviations.
@@ -149,7 +149,7 @@ class ExpectedErrors:
     bins: RangeBins
     components: tuple[Component, ...]
     of_components: Array
-    known: Mapping[str, Array]
+    known: Mapping[OtherError, Array]
     shift_m: Array
     is_calibrated: bool
 
@@ -159,7 +159,7 @@ class ExpectedErrors:
         bins: RangeBins,
         curve_stddev_m: Array | None = None,
         ruled_out: Collection[str] = (),
-        others_m2: Mapping[str, Array] | None = None,
+        others_m2: Mapping[OtherError, Array] | None = None,
         bending: BendingOfBins | None = None,
     ) -> ExpectedErrors:
         """Set up the expected errors; arguments as for ``learn_errors``."""
@@ -209,7 +209,8 @@ class ExpectedErrors:
             np.array([component.spread for component in self.components]),
             np.sum([*self.known.values(), np.zeros((len(self.bins), len(self.bins)))], axis=0),
             off_m - self.shift_m,
-            *independent_unknowns(design, prior_design),
+            design,
+            prior_design,
         )
         above = np.array([np.inf if c.name in BENDS else most_unusual for c in self.components])
         start = np.log([(near or {}).get(name, median) for name, median in medians.items()])
@@ -248,7 +249,8 @@ class ComponentLikelihood:
         log_medians, spreads: (k,) lognormal priors.
         known: (c, c) covariance that is not learnt.
         off_m: (c,) measured minus predicted.
-        design, prior_design: (c, p), (r, p) derivatives of observations and priors by the unknowns.
+        design, prior_design: (c, p), (r, p) derivatives of observations and priors by the unknowns. Several may have
+            the same effect.
     """
 
     of_components: Array
@@ -307,10 +309,18 @@ class ComponentLikelihood:
         covariance[half.places] = np.exp(2 * logs) @ half.components + half.known
         return _determinant_and_inverse(covariance.reshape(num, num))
 
+    @cached_property
+    def _independent(self) -> tuple[Array, Array]:
+        return independent_unknowns(self.design, self.prior_design)
+
     def _unknowns(self, inverse: Array) -> tuple[Array, Array, float]:
-        """Return the (c, p) whitened design, the (p, p) covariance, and the log-determinant of the latter's inverse."""
-        whitened = inverse @ self.design
-        information: Array = self.design.T @ whitened + self.prior_design.T @ self.prior_design
+        """Return whitened design, covariance and log-determinant of the information, of p independent unknowns.
+
+        They are (c, p), (p, p) and a number.
+        """
+        design, prior_design = self._independent
+        whitened = inverse @ design
+        information: Array = design.T @ whitened + prior_design.T @ prior_design
         determinant, covariance = _determinant_and_inverse(information)
         return whitened, covariance, determinant
 
