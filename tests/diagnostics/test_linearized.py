@@ -252,9 +252,27 @@ class TestNeighbours:
         longer_m[61] = off_m
         found = linearized(with_longer(on_map, longer_m))
         expected = np.ones(len(longer_m))
-        expected[61] = 1.0 if counts else 1e-8
+        expected[61] = counts
         np.testing.assert_allclose(found.bins.robust_weight, expected, rtol=1e-9)
         assert found.scatter_m == pytest.approx(1e-9)
+
+
+class TestGarbage:
+    """Garbage that happens to agree with its neighbours takes no part either."""
+
+    def test_ranges_of_a_bin_that_agree_on_what_no_anchor_of_this_path_can_have(self, on_map: RangesOnMap) -> None:
+        garbage = np.flatnonzero(on_map.problem.anchor_index == 1)[8:16]
+        longer_m = np.zeros(len(on_map.time_s))
+        longer_m[garbage] = 65535.0
+        found = linearized(with_longer(on_map, longer_m)).bins.robust_weight
+        np.testing.assert_array_equal(np.flatnonzero(found == 0), garbage)
+
+    def test_a_few_ranges_most_of_which_are_garbage(self, on_map: RangesOnMap) -> None:
+        garbage = np.flatnonzero(on_map.problem.anchor_index == 1)[8:14]
+        longer_m = np.zeros(len(on_map.time_s))
+        longer_m[garbage] = [3.0, 9.0, 14.0, 2.0, 5.0, 7.0]
+        found = linearized(with_longer(on_map, longer_m)).bins.robust_weight
+        assert (found[garbage] == 0).all()
 
 
 class TestErrors:

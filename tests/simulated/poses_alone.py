@@ -18,7 +18,7 @@ Garble = Callable[[Array, np.random.Generator], Array]
 
 METRES_PER_UNIT = 0.42
 ANCHORS_M = {"N": (4.6, 3.7, 0.4), "E": (-4.9, 4.1, 2.5), "S": (-4.4, -3.8, 0.5), "W": (5.1, -4.2, 2.3)}
-RANGES = ("--ranges", "uwb.csv", "--anchors", "anchors.csv", "--ranges_time_offset", "0")
+RANGES = ("--ranges", "uwb.csv", "--ranges_time_offset", "0")
 POSITIONS = ("--positions", "positions.csv")
 
 

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from tests.conftest import Command
-from tests.simulated.poses_alone import POSITIONS, RANGES, PosesAlone, write_poses_alone
+from tests.simulated.poses_alone import POSITIONS, RANGES, Garble, PosesAlone, write_poses_alone
+
+Array = npt.NDArray[np.float64]
+
+KNOWN, UNKNOWN = ("--anchors", "anchors.csv"), ("--anchor_frame", "unknown")
 
 
 def scaled(survey: PosesAlone, run: Command, *flags: str) -> dict[str, Any]:
@@ -20,6 +26,10 @@ def scaled(survey: PosesAlone, run: Command, *flags: str) -> dict[str, Any]:
     return found
 
 
+def relative_width(interval: list[float]) -> float:
+    return interval[1] / interval[0] - 1
+
+
 def holds(interval: list[float], value: float) -> bool:
     return interval[0] < value < interval[1]
 
@@ -28,7 +38,7 @@ def test_a_path_that_drifts_by_more_than_its_ranges_scatter_has_a_page(
     tmp_path: Path, rangesfm_command: Command
 ) -> None:
     survey = write_poses_alone(tmp_path, drift_m=0.2, seed=1)
-    scale = scaled(survey, rangesfm_command, *RANGES)["scale"]
+    scale = scaled(survey, rangesfm_command, *RANGES, *KNOWN)["scale"]
     assert holds(scale["interval_95"], survey.scale)
     assert any(reason.startswith("the path drifts by") for reason in scale["reasons"])
     assert "slow wandering of the ranges" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -47,3 +57,26 @@ def test_an_exactly_level_path_has_its_scale_from_positions(
     scale = scaled(survey, rangesfm_command, *POSITIONS, "--no_report")["scale"]
     assert scale["verdict"] == "good"
     assert holds(scale["interval_95"], survey.scale)
+
+
+def far_off(range_m: Array, rng: np.random.Generator) -> Array:
+    return np.where(rng.random(len(range_m)) < 0.2, rng.uniform(900.0, 1900.0, len(range_m)), range_m)
+
+
+def anything(range_m: Array, rng: np.random.Generator) -> Array:
+    return np.where(rng.random(len(range_m)) < 0.2, rng.uniform(0.0, 1000.0, len(range_m)), range_m)
+
+
+@pytest.mark.parametrize(
+    ("garble", "drift_m", "anchors"),
+    [(far_off, 0.0, KNOWN), (far_off, 0.2, UNKNOWN), (anything, 0.2, KNOWN), (anything, 0.0, UNKNOWN)],
+)
+def test_a_fifth_of_garbage_leaves_scale_and_place_as_they_are_without(
+    tmp_path: Path, rangesfm_command: Command, garble: Garble, drift_m: float, anchors: Sequence[str]
+) -> None:
+    survey = write_poses_alone(tmp_path, drift_m=drift_m, garble=garble, seed=3)
+    found = scaled(survey, rangesfm_command, *RANGES, *anchors, "--no_report")
+    assert found["scale"]["verdict"] == "good"
+    assert holds(found["scale"]["interval_95"], survey.scale)
+    assert relative_width(found["scale"]["interval_95"]) < 0.04
+    assert anchors == UNKNOWN or found["place"]["worst_keyframe_stddev_m"] < 0.3

@@ -180,12 +180,13 @@ def is_given(problem: Linearized, anchor: int) -> bool:
 
 
 def longest_m(problem: Linearized, anchor: int | None = None) -> float:
-    """Return the longest range to one anchor, or to any.
+    """Return the longest range to one anchor, or to any, of those that take part.
 
     It bounds the errors of ranges and positions: no range is too long by more than itself.
     """
     given = problem.on_map.problem
-    is_of = slice(None) if anchor is None else given.anchor_index == anchor
+    takes_part = problem.bins.robust_weight > 0
+    is_of = takes_part if anchor is None else takes_part & (given.anchor_index == anchor)
     return float(np.max(given.range_m[is_of]))
 
 

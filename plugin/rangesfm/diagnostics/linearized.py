@@ -34,11 +34,14 @@ from rangesfm.scale.uncertainty import ruled_out
 
 # Fewer bins than for an interval, because the tests learn the errors many times.
 _MAX_NUM_BINS = 160
-# Number of consecutive ranges of an anchor whose median they are compared with.
-_NUM_NEIGHBOURS = 8
+# Number of consecutive ranges of an anchor whose median they are compared with, and how many of them agree with it.
+_NUM_NEIGHBOURS, _NUM_AGREEING = 8, 3
 # Least noise that counts where a range is compared with the median of its neighbours, to see whether it is an outlier
 # among them: a radio may repeat itself to a centimetre and still err by ten from one place to the next.
 _LEAST_SCATTER_M = 0.08
+# Largest difference of two errors of an anchor's ranges, as a share of the path's extent and distance: more than where
+# the ranges are in feet, of both ways, or of an anchor that was moved across the site.
+_MOST_MISREAD = 4.0
 # Standard deviation of a slow wandering of the ranges, metres, for each anchor and for all, as hands and bodies move.
 # It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where steps may explain
 # it. It is too slow to be confused with a step. Without it, a mistake that nobody made is named in 7 of 72 real logs,
@@ -303,24 +306,58 @@ def _bins(on_map: RangesOnMap) -> tuple[RangeBins, float]:
     index = on_map.problem.anchor_index
     order = np.lexsort((on_map.time_s, on_map.tag_index, index))
     off_m, scatter_m = _off_neighbours(on_map.residual_m[order], index[order])
-    is_near = np.empty(len(order), dtype=bool)
-    is_near[order] = np.abs(off_m) <= near_m(scatter_m)
+    agrees = np.empty(len(order), dtype=bool)
+    agrees[order] = _agree(np.abs(off_m) <= near_m(scatter_m), index[order])
     of_ranges = range_bins(
         index,
         on_map.tag_index,
         on_map.time_s,
         on_map.from_anchor_m,
         np.swapaxes(on_map.world_from_cam, 1, 2),
-        is_near.astype(np.float64),
+        (agrees & _can_be(on_map)).astype(np.float64),
         noisiness(index[order], off_m, on_map.problem.num_anchors),
         _MAX_NUM_BINS,
     )
     return of_ranges, scatter_m
 
 
+def _can_be(on_map: RangesOnMap) -> Mask:
+    """Return (n,) whether a range can be one of its anchor, by the extent of the path.
+
+    By the triangle inequality, the distances to an anchor from two places differ by no more than these are apart,
+    wherever the anchor stands. Garbage that repeats itself agrees with its neighbours, and is farther off.
+    """
+    index, from_anchor_m, residual_m = on_map.problem.anchor_index, on_map.from_anchor_m, on_map.residual_m
+    can_be = np.ones(len(index), dtype=bool)
+    for anchor in np.unique(index):
+        is_of = index == anchor
+        distance_m = np.linalg.norm(from_anchor_m[is_of], axis=1)
+        apart_m = np.linalg.norm(np.ptp(from_anchor_m[is_of], axis=0))
+        off_m = np.abs(residual_m[is_of] - np.median(residual_m[is_of]))
+        can_be[is_of] = off_m <= _MOST_MISREAD * (apart_m + np.median(distance_m))
+    return can_be
+
+
 def near_m(scatter_m: float) -> float:
     """Return how far from its neighbours a range with this scatter may be, in metres."""
     return SIGNIFICANT_STDDEVS * max(scatter_m, _LEAST_SCATTER_M)
+
+
+def _agree(are_near: Mask, anchor_index: Indices) -> Mask:
+    """Return (n,) which values are near the median of a few consecutive ones, unless too few of these are.
+
+    Where most of them are garbage, so is their median, but hardly another one agrees with it.
+    """
+    labels = _neighbours(anchor_index)
+    enough = np.minimum((np.bincount(labels) + 1) // 2, _NUM_AGREEING)
+    return np.asarray(are_near & (np.bincount(labels, are_near) >= enough)[labels])
+
+
+def _neighbours(anchor_index: Indices) -> Indices:
+    """Return (n,) labels of a few consecutive values of one anchor, given equal indices together."""
+    rows, begins = np.arange(len(anchor_index)), np.diff(anchor_index, prepend=-1) != 0
+    since = rows - np.maximum.accumulate(np.where(begins, rows, 0))
+    return np.asarray(np.cumsum(begins | (since % _NUM_NEIGHBOURS == 0)) - 1)
 
 
 def _off_neighbours(values: Array, anchor_index: Indices) -> tuple[Array, float]:
@@ -329,11 +366,9 @@ def _off_neighbours(values: Array, anchor_index: Indices) -> tuple[Array, float]
     Args:
         values: in order of time within each anchor. anchor_index: (n,), equal values together.
     """
-    begins: Mask = np.diff(anchor_index, prepend=-1) != 0
-    since = np.arange(len(values)) - np.maximum.accumulate(np.where(begins, np.arange(len(values)), 0))
-    labels = np.cumsum(begins | (since % _NUM_NEIGHBOURS == 0)) - 1
+    labels = _neighbours(anchor_index)
     counts = np.bincount(labels)
     by_value = np.lexsort((values, labels))
     middles = values[by_value][np.cumsum(counts) - counts + (counts - 1) // 2]
-    steps = np.diff(values)[~begins[1:]]
+    steps = np.diff(values)[np.diff(anchor_index) == 0]
     return values - middles[labels], max(robust_stddev(steps) / np.sqrt(2), MIN_STDDEV_M)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
 from rangesfm.ranging.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
@@ -39,6 +40,8 @@ from rangesfm.scale.starts import (
 
 # Number of fits, each with the errors that the one before shows.
 _NUM_ROUNDS = 2
+# Noise that falls to less than this share of what a fit assumed: another fit is made.
+_FALLS = 0.5
 # Number of different maps that are compared. Two maps are the same if the logarithms of their scales, their rotations
 # (degrees) and the places of the path's middle (extents of the path) are no further apart than this.
 _NUM_ALTERNATIVES = 4
@@ -217,9 +220,15 @@ def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
         return solve(weighted(given, errors).by_some(rows), state, loss=errors.loss)
 
     rough, _, used = fit_with_own_errors(fit, shown, seen(posed.errors, start), max_num_rounds=_NUM_ROUNDS)
-    problem = weighted(given, used)
-    fitted = solve(problem, rough.state, loss=used.loss)
-    last = shown(used, fitted)
+    state = rough.state
+    for _ in range(MAX_NUM_ROUNDS):
+        problem = weighted(given, used)
+        fitted = solve(problem, state, loss=used.loss)
+        last = shown(used, fitted)
+        # The first rounds may have taken garbage for noise, which the last fit does not any more.
+        if last.noise_m > _FALLS * used.noise_m:
+            break
+        used, state = last, fitted.state
     return Solution(problem, fitted, replace(used, inflation=last.inflation), last.noise_m)
 
 

@@ -96,11 +96,26 @@ def test_a_bin_is_the_average_of_its_ranges_by_their_robust_weights() -> None:
     np.testing.assert_allclose(found.total(np.array([1.0, 10.0, 100.0])), [10.0, 101.0])
 
 
-def test_ranges_without_any_weight_count_a_little_and_a_tag_at_an_anchor_is_in_no_direction() -> None:
-    found = bins_of([0, 0], [0.0, 0.0], np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), [0.0, 1.0])
-    np.testing.assert_allclose(found.robust_weight, [1e-8, 1.0])
-    np.testing.assert_allclose(found.worth, [1.0 + 1e-8])
+def test_ranges_without_any_weight_take_no_part_and_a_tag_at_an_anchor_is_in_no_direction() -> None:
+    found = bins_of([0, 0], [0.0, 0.0], np.zeros((2, 3)), [0.0, 1.0])
+    np.testing.assert_allclose(found.robust_weight, [0.0, 1.0])
+    np.testing.assert_allclose(found.worth, [1.0])
     np.testing.assert_array_equal(found.from_anchor, [[0.0, 0.0, 0.0]])
+
+
+def test_there_is_no_bin_of_ranges_without_weight_alone() -> None:
+    """An outlier between ranges of another anchor, and one of its own anchor's between good ones."""
+    from_m = np.array([[4.0, 0.0, 0.0], [0.0, 3e5, 0.0], [0.0, 2.0, 0.0], [5.0, 0.0, 0.0], [9e4, 0.0, 0.0]])
+    found = bins_of([0, 1, 1, 0, 0], [0.0, 1.0, 2.0, 3.0, 3.1], from_m, [1.0, 1e-30, 0.5, 1.0, 1e-20])
+    np.testing.assert_array_equal(found.anchor_index, [0, 0, 1])
+    np.testing.assert_allclose(found.worth, [1.0, 1.0, 0.5])
+    np.testing.assert_allclose(found.distance_m, [4.0, 5.0, 2.0])
+    np.testing.assert_allclose(found.mean(np.array([1.0, 1e9, 2.0, 3.0, 1e9])), [1.0, 3.0, 2.0])
+
+
+def test_where_no_range_has_any_weight_all_count_alike() -> None:
+    found = bins_of([0, 1], [0.0, 0.0], np.eye(2, 3), [0.0, 1e-30])
+    assert found.worth[0] == found.worth[1] > 0
 
 
 def test_a_bin_is_half_a_second_of_one_anchor_and_tag() -> None:

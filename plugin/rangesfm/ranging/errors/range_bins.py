@@ -16,6 +16,9 @@ MAX_NUM_BINS = 450
 _SHORTEST_S = 0.5
 _LONGER = 1.25
 _MIN_NOISINESS, _MAX_NOISINESS = 0.5, 3.0
+# Robust weight below which a range takes no part. A bin of such ranges alone would have a variance so large that
+# rounding hides the variances of all others.
+_NO_WEIGHT = 1e-8
 
 
 @dataclass(frozen=True)
@@ -23,8 +26,8 @@ class RangeBins:
     """c averages of n ranges.
 
     Attributes:
-        of_range: (n,) bin of each range.
-        robust_weight: (n,) robust weights, by which ranges are averaged.
+        of_range: (n,) bin of each range; any one for a range with weight 0.
+        robust_weight: (n,) robust weights, by which ranges are averaged; 0 for a range that takes no part.
         worth: (c,) sum of the robust weights in each bin, an equivalent number of ranges.
         anchor_index, tag_index: (c,).
         time_s: (c,) mean time since the first range; without times, photos since the first.
@@ -98,9 +101,13 @@ def range_bins(
     distance = np.linalg.norm(from_anchor_m, axis=1)
     towards = from_anchor_m / np.maximum(distance, 1e-9)[:, None]
     of_range = _labels(anchor_index, tag_index, since, max_num)
-    first = np.unique(of_range, return_index=True)[1]
-    # A range of an anchor that stands kilometres away is off by many stddevs still, and is no noise of the others.
-    robust_weight = np.maximum(robust_weight, 1e-8)
+    takes_part = robust_weight >= _NO_WEIGHT
+    if not takes_part.any():
+        robust_weight, takes_part = np.full_like(robust_weight, _NO_WEIGHT), ~takes_part
+    robust_weight = np.where(takes_part, robust_weight, 0.0)
+    kept, first_of_kept = np.unique(of_range[takes_part], return_index=True)
+    first = np.flatnonzero(takes_part)[first_of_kept]
+    of_range = np.where(np.isin(of_range, kept), np.searchsorted(kept, of_range), 0)
     begun = RangeBins(
         of_range=of_range,
         robust_weight=robust_weight,
