@@ -135,9 +135,6 @@ CASES = {
     "two anchors and gravity": Case(
         "scale", ("--anchors", "anchors.csv", "--use_anchors", "A1,A2", "--up_in_first_camera", "{up}"), erring
     ),
-    "two candidates": Case(
-        "scale", (*IN_CAMERA, "--scale_method", "two-candidate"), erring, "doubtful", "two-candidate, as asked for"
-    ),
 }
 
 

@@ -407,8 +407,12 @@ class TagOptions(Options, table="tag"):
 class ScaleOptions(Options, table="scale"):
     """The estimate of the scale, and distances taped on the site."""
 
-    method: Annotated[Literal["robust", "two-candidate"], KeyMeta(flag="scale_method")] = "robust"
-    """Method of the scale estimate. robust: a robust fit of all ranges; two-candidate: that of the 2018 paper."""
+    method: Annotated[Literal["robust", "two-candidate", "two-candidate-unchecked"], KeyMeta(flag="scale_method")] = (
+        "robust"
+    )
+    """Method of the scale estimate. robust: a robust fit of all ranges; two-candidate: that of the 2018 paper, for
+    comparison: it has no interval, and is refused where the robust estimate excludes it; two-candidate-unchecked: not
+    even then."""
     max_relative_stddev: Annotated[float, Field(ge=1e-9, le=1e3)] = 0.1
     """Largest accepted relative standard deviation of the scale; a scale that is less certain is refused."""
     up_in_first_camera: Annotated[

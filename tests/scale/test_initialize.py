@@ -114,6 +114,18 @@ class TestWithoutNoise:
         assert estimate.value == estimate.two_candidate.scale
         assert survey.relative_error(estimate) == pytest.approx(0.0, abs=1e-6)
 
+    def test_the_papers_scale_says_nothing_of_its_error(self, make_survey: MakeSurvey) -> None:
+        survey = make_survey(centers_m=on_a_sphere(), anchors_m={"A": (12.0, 1.0, 2.0)}, radio=NOISE)
+        robust = survey.scale("first_camera", "A")
+        table = known(robust.two_candidate)
+        assert not robust.interval_95[0] < table.scale < robust.interval_95[1]
+        with pytest.raises(GeometryError, match=f"two-candidate gives {table.scale:.4g} m per unit, outside the 95 %"):
+            survey.scale("first_camera", "A", options=ScaleOptions(method="two-candidate"))
+        paper = survey.scale("first_camera", "A", options=ScaleOptions(method="two-candidate-unchecked"))
+        assert (paper.method, paper.value, paper.verdict) == ("two-candidate", table.scale, "doubtful")
+        assert paper.stddev_empirical == paper.stddev_formal == np.inf
+        assert (paper.placement, paper.per_anchor, paper.by_kind) == (None, {}, {})
+
 
 class TestWithOutliers:
     @pytest.mark.parametrize(

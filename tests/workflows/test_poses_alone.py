@@ -80,3 +80,18 @@ def test_a_fifth_of_garbage_leaves_scale_and_place_as_they_are_without(
     assert holds(found["scale"]["interval_95"], survey.scale)
     assert relative_width(found["scale"]["interval_95"]) < 0.04
     assert anchors == UNKNOWN or found["place"]["worst_keyframe_stddev_m"] < 0.3
+
+
+def test_the_papers_estimate_is_refused_where_the_ranges_exclude_it_and_has_no_interval(
+    tmp_path: Path, rangesfm_command: Command
+) -> None:
+    survey = write_poses_alone(tmp_path)
+    flags = (*RANGES, *KNOWN, "--scale_method")
+    refused = rangesfm_command("scale", *survey.flags, *flags, "two-candidate", cwd=tmp_path, status=3)
+    assert "outside the 95 % interval of the robust estimate" in refused.stderr
+    found = scaled(survey, rangesfm_command, *flags, "two-candidate-unchecked")
+    assert not 0.5 < found["scale"]["value"] / survey.scale < 2.0
+    no_words = {name: found["scale"][name] for name in ("interval_95", "stddev_formal", "stddev_empirical")}
+    assert not any([*no_words.values(), found["place"], found["reliability"], found["tests"]])
+    assert found["scale"]["reasons"] == ["two-candidate, for comparison: nothing is known of its error"]
+    assert "how long 10 m in this map are is open" in (tmp_path / "out" / "report.html").read_text("utf-8").lower()

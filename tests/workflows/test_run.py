@@ -399,7 +399,8 @@ def test_how_columns_were_read_is_a_note_and_no_warning(survey: Survey, tmp_path
 
 def test_doubts_are_warnings_in_the_result_and_for_the_user(survey: Survey) -> None:
     listener = Listener()
-    result = scale_model(survey.changed({"scale.method": "two-candidate"}), progress=listener).summary
+    paper = survey.changed({"scale.method": "two-candidate-unchecked"})
+    result = scale_model(paper, progress=listener).summary
     assert result.scale.method == "two-candidate"
     assert result.scale.verdict == "doubtful"
     assert list(result.warnings) == listener.messages != []

@@ -26,7 +26,7 @@ def errors_of_scene(
 
     It is the same as in MapErrors, with as many modes as the shifts of these points need, and no more.
     """
-    if errors is None or not len(path):
+    if errors is None or not len(path) or summary.scale.interval_95 is None:
         return None
     try:
         modes, rests, by_scale = _of_points(errors, path, anchor_ids)
@@ -35,7 +35,7 @@ def errors_of_scene(
     left, sizes, _ = np.linalg.svd(modes.reshape(3 * len(modes), -1), full_matrices=False)
     shifts = left * sizes
     steps = np.maximum(np.abs(shifts).max(axis=0), 1e-12) / _NUM_STEPS
-    scale, up = summary.scale.relative_stddev, up_in_map(summary)
+    scale, up = summary.scale.relative_stddev.uncertainty, up_in_map(summary)
     return {
         "num_modes": len(steps),
         "modes": pack(np.round(shifts / steps), "int16"),

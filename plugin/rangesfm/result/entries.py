@@ -76,6 +76,17 @@ class TwoCandidateEntry(Record):
     num_without_root: Count
 
 
+class RelativeStddevEntry(Record):
+    """Relative standard deviations of the scale; see ScaleUncertainty. ``formal`` is null where nothing is known."""
+
+    formal: NumberOrNull
+    components: dict[Text, Number]
+
+    @property
+    def uncertainty(self) -> ScaleUncertainty:
+        return ScaleUncertainty(math.inf if self.formal is None else self.formal, self.components)
+
+
 class ScaleByKindEntry(Record):
     """The scale by one kind of measurement alone, such as "ranges", in metres per unit of the unscaled model.
 
@@ -94,7 +105,7 @@ class ScaleEntry(Record):
     stddev_formal: NumberOrNull
     stddev_empirical: NumberOrNull
     interval_95: IntervalOrNull
-    relative_stddev: ScaleUncertainty = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
+    relative_stddev: RelativeStddevEntry = Field(validation_alias=AliasChoices("relative_stddev", "uncertainty"))
     error_stddevs: dict[Text, Number] = Field(
         default_factory=dict,
         validation_alias=AliasChoices("error_stddevs", AliasPath("errors", "learned", "stddev_of_component")),

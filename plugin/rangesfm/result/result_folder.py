@@ -13,6 +13,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
+from rangesfm.diagnostics.hypothesis_tests import finite
 from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, OFFSET_NAME, MetricMap, export_map, write_model
 from rangesfm.files.atomic import path_of, scratch_folder, sole_writer
@@ -148,7 +149,7 @@ def write_models_and_tables(
         timestamps_s=None if times is None else times.by_name,
         anchors_m={a.anchor_id: a.position_m for a in found.anchors if np.isfinite(a.position_m).all()},
         metric_from_sfm=found.estimate.metric_from_sfm,
-        relative_scale_stddev=found.estimate.uncertainty.empirical,
+        relative_scale_stddev=finite(found.estimate.uncertainty.empirical),
         images_path=images_path,
         database_path=database_path,
         is_site=found.estimate.frame == "site",

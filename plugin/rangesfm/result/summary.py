@@ -125,11 +125,11 @@ class ResultSummary(Record):
             table: of the comparison with a reference, as text; None without one.
         """
         scale, ranges, offset = self.scale, self.ranges, self.time_offset
-        interval = "unknown"
+        interval = "no interval"
         if scale.interval_95 is not None:
-            interval = " to ".join(number_text(end, ".6g") for end in scale.interval_95)
             yield f"accuracy: {scale.in_words} (95 % interval)"
-        yield f"scale: {scale.value:.6g} m per SfM unit, 95 % interval {interval}"
+            interval = "95 % interval " + " to ".join(number_text(end, ".6g") for end in scale.interval_95)
+        yield f"scale: {scale.value:.6g} m per SfM unit, {interval}"
         yield f"verdict: {scale.verdict}: {'; '.join(scale.reasons)}"
         if self.place is not None:
             # Reasons that hold for both verdicts were given with that on the scale.

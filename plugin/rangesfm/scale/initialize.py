@@ -11,7 +11,7 @@ from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.numerics import ROUNDING
-from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions
@@ -26,7 +26,7 @@ from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
 from rangesfm.scale.range_equation import RangeProblem, solve
 from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind, scale_by_lengths
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
-from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
+from rangesfm.scale.scale_estimate import NOT_KNOWN, ScaleEstimate, ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from, scale_problem
 from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, levelled_places
 from rangesfm.scale.sensitivity import scale_sensitivity
@@ -188,25 +188,20 @@ class _Given:
         found = anchor_estimates(moved, observations.log.anchor_ids, known.covariance)
         unplaced = self._with_unknown_anchors(posed, solution)
         judged = judge(problem, solution, uncertainty, per_anchor, found, options, unplaced)
-        verdict, remarks = judged.verdict, (*open_place, *self.remarks)
+        remarks = (*open_place, *self.remarks)
         if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
             remarks = (*remarks, *levelled_places(gravity, self.anchors, found))
-        reasons = (*judged.reasons, *remarks)
-        if options.method == "two-candidate":
-            robust = solution.fit.state.metric_from_model.scale
-            verdict = "doubtful"
-            reasons = (f"two-candidate, as asked for; the stddevs are of the robust scale, {robust:.6g}", *reasons)
         errors = replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log))
         status = observations.status.copy()
         status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
         status[problem.rows] = status_by_weight(solution.fit.weights)
-        return ScaleEstimate(
-            metric_from_sfm=_by_method(options.method, moved, table) @ problem.first_camera_from_sfm,
+        robust = ScaleEstimate(
+            metric_from_sfm=moved.fit.state.metric_from_model @ problem.first_camera_from_sfm,
             frame=problem.frame,
-            method=options.method,
+            method="robust",
             uncertainty=uncertainty,
-            verdict=verdict,
-            reasons=reasons,
+            verdict=judged.verdict,
+            reasons=(*judged.reasons, *remarks),
             advice=judged.advice,
             sensitivity=scale_sensitivity(moved, problem, known, learned.bins),
             per_anchor=per_anchor,
@@ -226,6 +221,7 @@ class _Given:
             if by_kind and errors.learned
             else np.zeros((len(observations.log), 0)),
         )
+        return robust if options.method == "robust" else _by_paper(robust, is_checked=options.method == "two-candidate")
 
     def _with_unknown_anchors(self, posed: ScaleProblem, solution: Solution) -> ScaleUncertainty | None:
         """Return the uncertainty if no place of an anchor were known; None where none is."""
@@ -300,11 +296,33 @@ def _paper_table(solution: Solution) -> TwoCandidate | None:
     return two_candidate(problem.centers, problem.tag_from_center, anchors[problem.anchor_index], problem.range_m)
 
 
-def _by_method(method: str, solution: Solution, table: TwoCandidate | None) -> Similarity:
-    """Return metric_from_first_camera with the scale of the chosen method."""
-    robust = solution.fit.state.metric_from_model
-    if method == "robust":
-        return robust
+def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:
+    """Return the estimate with the paper's scale, of whose error nothing is known.
+
+    Raises:
+        GeometryError: the scale is not positive, or, if it is checked, outside the interval of the robust estimate.
+    """
+    table, (low, high) = robust.two_candidate, robust.interval_95
     if table is None or not table.scale > 0:
         raise GeometryError("two-candidate found no positive scale: use the robust method")
-    return replace(robust, scale=table.scale)
+    if is_checked and not low <= table.scale <= high:
+        raise GeometryError(
+            f"two-candidate gives {table.scale:.4g} m per unit, outside the 95 % interval of the robust estimate, "
+            f"{low:.4g} to {high:.4g}: use the robust method, or ask for it all the same (--scale_method "
+            "two-candidate-unchecked)"
+        )
+    return replace(
+        robust,
+        metric_from_sfm=replace(robust.metric_from_sfm, scale=table.scale),
+        method="two-candidate",
+        uncertainty=ScaleUncertainty(np.inf, {}),
+        verdict="doubtful",
+        reasons=("two-candidate, for comparison: nothing is known of its error", *robust.remarks),
+        advice=("use the robust method",),
+        sensitivity=NOT_KNOWN,
+        per_anchor={},
+        by_kind={},
+        problem=None,
+        solution=None,
+        placement=None,
+    )

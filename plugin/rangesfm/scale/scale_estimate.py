@@ -81,6 +81,9 @@ class ScaleSensitivity:
     lever_arm_per_cm: tuple[float, float, float]
 
 
+NOT_KNOWN = ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0))
+
+
 @dataclass(frozen=True)
 class ScaleEstimate:
     """The scale, its frame and its uncertainty.
@@ -89,7 +92,7 @@ class ScaleEstimate:
         metric_from_sfm: similarity from the world of the unscaled model to the metric world.
         frame: the metric world: "site" or "first_camera".
         method: "robust", "two-candidate", "lengths" or "positions".
-        uncertainty: relative standard deviations of the scale.
+        uncertainty: relative standard deviations of the scale; infinite with two-candidate, which does not tell.
         verdict: "good" or "doubtful" (a refused scale is a GeometryError).
         reasons: why, in words.
         advice: what to do about it, in words; for a finished survey also what would improve the next one most.
@@ -100,7 +103,8 @@ class ScaleEstimate:
         observations: all ranges, with their status by final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal standard deviation.
         noise_stddev_m: standard deviation of an ordinary range.
-        problem, solution: what the estimate was computed from, by the robust weights; None where there were no ranges.
+        problem, solution: what the estimate was computed from, by the robust weights; None where there were no ranges,
+            and with two-candidate.
         placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
             first camera, from all error components; None in the first camera's frame.
         lengths: what the measured lengths alone say; None without lengths between points of the map.
@@ -121,7 +125,7 @@ class ScaleEstimate:
     advice: tuple[str, ...]
     observations: RangeObservations
     errors: RangeErrors
-    sensitivity: ScaleSensitivity = ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0))
+    sensitivity: ScaleSensitivity = NOT_KNOWN
     per_anchor: Mapping[str, float] = field(default_factory=dict)
     two_candidate: TwoCandidate | None = None
     anchors: tuple[AnchorEstimate, ...] = ()

@@ -580,7 +580,8 @@ def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, Rang
             metric = replace(metric, refined=metric.refined and rescale(metric.refined, known.site_from_model))
             estimate = estimate_by_positions_at(known, metric.refined_scale, start, survey.scale)
         else:
-            refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)
+            if start.method != "two-candidate":  # which has no interval
+                refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)
             estimate = replace(start, refined_value=None if metric.kept_refinement is None else metric.refined_scale)
     except GeometryError as error:
         raise _with_cause(error, survey, on_map) from None

@@ -82,10 +82,13 @@ def measure(
         InputError: the folder is not a result with a metric model, a file cannot be read, or an end is not in the map.
     """
     result = read_result_folder(Path(result_folder))
+    if result.summary.scale.interval_95 is None:
+        said = f"the scale has no interval ({result.summary.scale.method})"
+        raise InputError(f"{said}, so that no length in the map has one", result.path)
     map_ = MeasuredMap(
         _points_of(result, None if markers is None else Path(markers)),
         result.read_map_errors(),
-        result.summary.scale.relative_stddev,
+        result.summary.scale.relative_stddev.uncertainty,
         up_in_map(result.summary),
     )
     return Measurements(map_.measure(pairs), tuple(_notes(result, map_)))

@@ -76,6 +76,8 @@ def with_advice(metric: MetricResult, tag_in_cam_m: Array, georeference: Georefe
         georeference: of the site; None without one.
     """
     doubtful = metric.estimate.verdict == "doubtful", metric.place is not None and metric.place.verdict == "doubtful"
+    if metric.estimate.method == "two-candidate":  # another survey would not make its scale more certain
+        return metric
     observations = metric.observations
     used = observations.has_place & (observations.status < RangeStatus.OUTLIER)
     if not any(doubtful) or not used.any() or not is_one_after_the_other(metric.trajectory):
