@@ -10,7 +10,7 @@ means:
 
     refine          rangesfm refine
     scale           rangesfm scale: only a similarity
-    two-candidate   rangesfm scale --scale_method two-candidate, the paper's estimate
+    two-candidate   rangesfm scale --scale_method two-candidate-unchecked, the paper's estimate
     alignment       positions of the tag by trilateration, at each photo from the ranges within 0.25 s, and COLMAP's
                     similarity to them, that of its model_aligner (pycolmap.align_reconstruction_to_locations)
     pose priors     the same positions as priors in COLMAP's bundle adjustment (create_pose_prior_bundle_adjuster)
@@ -289,7 +289,7 @@ def _gtsam_camera(gtsam: Any, camera: pycolmap.Camera) -> Any:
 METHODS: dict[str, Callable[[Given], Found]] = {
     "refine": lambda given: by_command(given, "refine"),
     "scale": lambda given: by_command(given, "scale"),
-    "two-candidate": lambda given: by_command(given, "scale", "--scale_method", "two-candidate"),
+    "two-candidate": lambda given: by_command(given, "scale", "--scale_method", "two-candidate-unchecked"),
     "alignment": by_alignment,
     "pose priors": by_pose_priors,
     "least squares": by_least_squares,

@@ -137,7 +137,7 @@ def test_lines_for_people_tell_what_is_known() -> None:
     document = result_document(scale=sensitive, refine=REFINE, ranges={"num": 9, "num_used": 7, "rms_m": 0.0512})
     lines = list(ResultSummary.model_validate(document).lines(Path("out"), "a  b\nc  d"))
     assert lines == [
-        "scale: 1.5 m per SfM unit, 95 % interval unknown",
+        "scale: 1.5 m per SfM unit, no interval",
         "verdict: good: the scale is known to 2 % (95 % interval)",
         "the scale depends strongly on single errors: it changes by -0.60 % per cm of error in the short ranges",
         "refined in 23 iterations; it changed the shape of the camera's path by 0.01 m (rms)",

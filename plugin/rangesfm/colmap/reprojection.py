@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pycolmap
@@ -14,6 +16,8 @@ from rangesfm.colmap.point_observations import seen_in
 _MAX_ERROR_PX = 4.0
 # The same limit for large photos, as a fraction of the longer side, because features of large photos are less precise.
 _MAX_ERROR_SHARE = 0.005
+# Photos on which other axes are tried.
+_NUM_PHOTOS = 30
 MISMATCHED = "check that model, photos and the camera's parameters belong together"
 
 
@@ -67,6 +71,72 @@ def point_errors(model: pycolmap.Reconstruction) -> PointErrors:
     )
 
 
+def wrong_axes(model: pycolmap.Reconstruction) -> str | None:
+    """Return in words which axes of a model are not as COLMAP has them; None if none are found.
+
+    Programs with left-handed axes write models that are mirrored, and others have cameras that look along -z. Each
+    choice of signs, or exchange of two axes, is tried on points that do not fit their photos as they are.
+    """
+    errors = point_errors(model)
+    if errors.fit:
+        return None
+    sample = list(_observations(model))
+    for cameras, points in sorted(product(_OF_CAMERAS, _OF_POINTS), key=lambda both: sum(map(len, both))):
+        if _median_px(model, sample, _OF_CAMERAS[cameras], _OF_POINTS[points]) <= errors.max_median_px:
+            is_mirrored = min(np.linalg.det(_OF_CAMERAS[cameras]), np.linalg.det(_OF_POINTS[points])) < 0
+            kind = "is mirrored, as left-handed programs write it" if is_mirrored else "has other axes than COLMAP"
+            changed = " and ".join(filter(None, (points, cameras)))
+            return (
+                f"the model {kind}: its points are where its photos show them only with {changed}, expected "
+                "right-handed coordinates and cameras with x right, y down, z forward: export it so"
+            )
+    return None
+
+
+def _signs(letters: str) -> Array:
+    return np.diag([-1.0 if letter in letters else 1.0 for letter in "xyz"])
+
+
+_SIGNS = ("x", "y", "z", "xy", "xz", "yz", "xyz")
+# What is changed, in words, with the matrix that changes it: axes of the cameras, and coordinates of the points.
+_OF_CAMERAS = {"": np.eye(3)} | {f"the cameras' {' and '.join(s)} in the other direction": _signs(s) for s in _SIGNS}
+_OF_POINTS = (
+    {"": np.eye(3)}
+    | {f"the other sign of the points' {' and '.join(s)}": _signs(s) for s in _SIGNS}
+    | {
+        f"the points' {words} exchanged": np.eye(3)[order]
+        for words, order in {"x and y": [1, 0, 2], "x and z": [2, 1, 0], "y and z": [0, 2, 1]}.items()
+    }
+)
+
+
+def _observations(model: pycolmap.Reconstruction) -> Iterator[tuple[pycolmap.Image, Array, Array]]:
+    """Yield some photos with the points (n, 3) that they see, and where they see them (n, 2), in pixels."""
+    ids = sorted(model.reg_image_ids())
+    for image_id in ids[:: -(-len(ids) // _NUM_PHOTOS)]:
+        image = model.image(image_id)
+        seen, xy = seen_in(image)
+        if len(seen):
+            yield image, np.array([model.point3D(point_id).xyz for point_id in seen.tolist()]), xy
+
+
+def _median_px(
+    model: pycolmap.Reconstruction, sample: list[tuple[pycolmap.Image, Array, Array]], cameras: Array, points: Array
+) -> float:
+    """Return the median reprojection error in pixels after a change of axes; infinite where most are behind."""
+    return float(
+        np.median(np.concatenate([_off_px(model, image, xyz @ points.T, xy, cameras) for image, xyz, xy in sample]))
+    )
+
+
+def _off_px(model: pycolmap.Reconstruction, image: pycolmap.Image, xyz: Array, xy: Array, cameras: Array) -> Array:
+    """Return how far (n,) points are from where a photo sees them, in pixels; infinite for those behind it."""
+    in_cam = (image.cam_from_world() * xyz) @ cameras.T
+    pixels = np.asarray(model.camera(image.camera_id).img_from_cam(in_cam), dtype=np.float64)
+    off_px = np.linalg.norm(pixels - xy, axis=1)
+    return np.where((in_cam[:, 2] > 0) & np.isfinite(off_px), off_px, np.inf)
+
+
 def photo_errors_px(model: pycolmap.Reconstruction) -> dict[str, float]:
     """Return the median reprojection error in pixels of each registered photo that sees points, by name.
 
@@ -79,8 +149,6 @@ def photo_errors_px(model: pycolmap.Reconstruction) -> dict[str, float]:
         ids, xy = seen_in(image)
         if not len(ids):
             continue
-        in_cam = image.cam_from_world() * np.array([xyz[point_id] for point_id in ids.tolist()])
-        pixels = np.asarray(model.camera(image.camera_id).img_from_cam(in_cam), dtype=np.float64)
-        off_px = np.linalg.norm(pixels - xy, axis=1)
-        medians[image.name] = float(np.median(np.where((in_cam[:, 2] > 0) & np.isfinite(off_px), off_px, np.inf)))
+        points = np.array([xyz[point_id] for point_id in ids.tolist()])
+        medians[image.name] = float(np.median(_off_px(model, image, points, xy, np.eye(3))))
     return medians

@@ -13,6 +13,7 @@ import pycolmap
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.passthrough import apply_options
+from rangesfm.colmap.reprojection import wrong_axes
 from rangesfm.diagnostics.preflight import (
     check_units,
     notes_before_work,
@@ -96,11 +97,13 @@ def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
     """Read a given COLMAP model and warn of what is wrong with it.
 
     Raises:
-        InputError: it cannot be read, or has no registered images.
+        InputError: it cannot be read, has no registered images, or its axes are not as in COLMAP.
     """
     model = read_model(path)
     if not model.num_reg_images():
         raise InputError("the model has no registered images", path)
+    if (said := wrong_axes(model)) is not None:
+        raise InputError(said, path)
     journal.warn(*notes_on_model(model))
     return model
 
