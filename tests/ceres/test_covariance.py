@@ -374,6 +374,13 @@ def test_a_turn_about_a_straight_path_leaves_the_variances_of_places_right() -> 
     assert np.all(turns[1] < 0.1)
 
 
+def test_a_map_whose_variances_are_rounding_has_no_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A solver that throws points and photos far apart leaves such a map."""
+    monkeypatch.setattr(covariance._Spread, "times", lambda spread, right: -right)
+    with pytest.raises(GeometryError, match="rounding leaves nothing"):
+        joint(model()).covariance()
+
+
 def photos_alone(*, hold_first: bool = False) -> tuple[pycolmap.Reconstruction, pycolmap.CeresBundleAdjuster]:
     """Return the model adjusted to its photos alone, without ranges, and its adjuster."""
     reconstruction = model()

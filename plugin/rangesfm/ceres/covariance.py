@@ -101,7 +101,7 @@ def joint_covariance(
         firm_frame_ids: of the frames that are the map as a whole; None: all.
 
     Raises:
-        GeometryError: a block is not determined by the residuals.
+        GeometryError: a block is not determined by the residuals, or next to rounding the map as a whole is not.
     """
     columns, variance = equations.columns, residual_stddev**2
     equations, inverse, spread, blocks = _solved(equations, errors)
@@ -121,6 +121,10 @@ def joint_covariance(
     if np.count_nonzero(is_firm) > 1:
         solution = inverse.solve(by_similarity)
         similarity = variance * solution.T @ spread.times(solution)
+        if np.any(np.diag(similarity) < 0):  # as where a solver has thrown points and photos far apart
+            raise GeometryError(
+                "rounding leaves nothing of how well the map's scale and place are known: no covariance"
+            )
     return JointCovariance(
         frame_ids=frames,
         rig_from_world=turn @ poses @ turn,
