@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
 
 FEATURES = {"sift": {"first_octave": 0, "max_num_features": 250}}  # enough for these photos, and quick
-MAPPER = MapperOptions(features=FEATURES)
+MAPPER = MapperOptions(features=FEATURES, reproducible=True)
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +202,7 @@ def test_two_rooms_give_two_models_the_larger_first(
 
 class TestEarlierRun:
     def test_is_taken_over_whatever_the_number_of_threads(self, room: Room, output: Path, listener: Listener) -> None:
-        mapper = MapperOptions(features=FEATURES, num_threads=1)
+        mapper = MapperOptions(features=FEATURES, num_threads=1, reproducible=True)
         summary = reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper, progress=listener)
         assert (summary.num_registered, summary.seconds, listener.stages) == (6, {}, [])
         assert listener.messages == [

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from tests.known import known
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.geometry.similarity import Similarity
@@ -77,8 +78,8 @@ def stereo_survey(folder: Path, *, baseline_error: float = 0.0, seed: int = 0) -
     (pose,) = rig.non_ref_sensors.values()
     assert pose is not None
     x, y, z, w = pose.rotation.quat.tolist()
-    known = {"cam_from_rig_rotation": [w, x, y, z], "cam_from_rig_translation": pose.translation.tolist()}
-    cameras = [{"image_prefix": LEFT, "ref_sensor": True}, {"image_prefix": RIGHT, **known}]
+    relative = {"cam_from_rig_rotation": [w, x, y, z], "cam_from_rig_translation": pose.translation.tolist()}
+    cameras = [{"image_prefix": LEFT, "ref_sensor": True}, {"image_prefix": RIGHT, **relative}]
     (folder / "rig_config.json").write_text(json.dumps([{"cameras": cameras}]))
     return StereoSurvey(folder, 1 / (1 + baseline_error))
 
@@ -101,7 +102,7 @@ def test_scales_by_ranges_and_by_baseline_agree_and_together_are_surer(tmp_path:
     survey = stereo_survey(tmp_path)
     found = survey.refined()
     assert found.scale.verdict == "good"
-    assert abs(np.log(found.scale.value / survey.true_scale)) < 3 * found.scale.relative_stddev.formal
+    assert abs(np.log(found.scale.value / survey.true_scale)) < 3 * known(found.scale.relative_stddev.formal)
     (length,) = found.distances
     assert (length.from_, length.to) == (f"{LEFT}frame000000.png", f"{RIGHT}frame000000.png")
     by_kind = found.scale.by_kind

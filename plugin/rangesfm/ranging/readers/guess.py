@@ -418,7 +418,8 @@ def _is_positive(column: ColumnSample) -> bool:
     """Return whether the numbers of a column are positive; a few other ones, or one such as -1, are no measurements."""
     negative = column.numbers[column.numbers < 0]
     is_code = len(np.unique(negative)) < 2
-    return bool(np.mean(column.numbers > 0) > 0.5 and (is_code or len(negative) < 0.05 * len(column.numbers)))
+    num_positive, num = np.count_nonzero(column.numbers > 0), len(column.numbers)
+    return bool(2 * num_positive > num and (is_code or len(negative) < 0.05 * num))
 
 
 def _is_id(column: ColumnSample) -> bool:
