@@ -260,7 +260,10 @@ def triangulate_marker(
             raise wrong("is behind this photo's camera by the other photos: is it the same point?", k)
         off_px = float(np.linalg.norm(seen_at - marker.pixels[k]))
         if off_px > _MAX_REPROJECTION * max(camera.width, camera.height):
-            raise wrong(f"is {off_px:.0f} px from its position by the other photos: is it the same point?", k)
+            raise wrong(
+                f"is {off_px:.0f} px from where the other photos put it: is it the same point, or does the path drift?",
+                k,
+            )
     return point
 
 

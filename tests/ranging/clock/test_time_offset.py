@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +13,6 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.options import AssociationOptions
-from rangesfm.progress import SilentProgress
-from rangesfm.ranging.clock import time_offset
-from rangesfm.ranging.clock.bursts import BurstPairing, Bursts
-from rangesfm.ranging.clock.fit import Timing
-from rangesfm.ranging.clock.search import CostCurve, TimedRanges, moving_path
 from rangesfm.ranging.clock.time_offset import TimeOffset, estimate_time_offset
 from rangesfm.ranging.range_log import RangeLog
 
@@ -388,6 +380,23 @@ def test_motion_that_does_not_determine_the_offset_is_refused(
         estimate(log, walk.photos(photo_times(70), center_stddev_m=center_stddev_m))
 
 
+def test_one_offset_of_two_laps_is_far_likelier_if_log_and_photos_were_begun_and_ended_together() -> None:
+    """A lap off, half of the ranges are beside the path; with a shorter log, that may be so, and is not ruled out."""
+
+    def center(times: Array) -> Array:
+        turn = 2 * np.pi * times / 35
+        x, y = 2 * np.cos(turn) + 0.7 * np.cos(2 * turn), 1.5 * np.sin(turn) + 0.4 * np.cos(3 * turn)
+        return np.stack([x, y, 1.5 + 0.5 * np.sin(turn + 1)], axis=1)
+
+    walk = Walk(center, no_turn)
+    photos = walk.photos(photo_times(70))
+    found = estimate(walk.log(range_times(-1, 71), 3.0), photos)
+    assert found.value_s == pytest.approx(3.0, abs=0.1)
+    assert found.probability > 0.95
+    half = estimate(walk.log(range_times(20, 66), 3.0), photos)
+    assert any(abs(offset_s - 3.0) < 0.1 for offset_s in (half.value_s, *(rival.value_s for rival in half.rivals)))
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_an_offset_that_the_motion_tells_but_loosely_is_given_with_its_stddev(seed: int) -> None:
     """A later time looks nearly the same as a place further round, on a third of an even walk around an ellipse."""
@@ -478,278 +487,3 @@ def test_progress_is_told_to_the_end() -> None:
     done, total = counter.updates[-1]
     assert done == total
     assert [number for number, _ in counter.updates] == sorted(number for number, _ in counter.updates)
-
-
-HUNDRED = TimedRanges(
-    np.arange(100, dtype=np.float64), np.ones(100), np.zeros(100, dtype=np.int64), np.zeros(100, dtype=np.int64)
-)
-# A path that is known from 0 to 100 s.
-KNOWN: Any = SimpleNamespace(knows=lambda times: (times >= 0) & (times < 100), is_known=np.ones(100, dtype=bool))
-
-
-def a_fit(offset_s: float, score: float = 1.0, *, stddev_s: float = 0.01, drift: float = 0.0, **changed: Any) -> Any:
-    """Return what stands for a fit of the hundred ranges at an offset."""
-    told: dict[str, Any] = {
-        "offset_s": offset_s,
-        "score": score,
-        "is_testable": True,
-        "num_independent": 10.0,
-        "observed": HUNDRED,
-        "times_s": HUNDRED.times_s,
-        "weights": np.ones(100),
-        "losses": lambda *_: np.full(100, -score),
-        "residual_stddev_m": 1.0,
-        "timing": lambda: Timing(stddev_s, drift, 1e-5),
-        "explains": lambda: True,
-    }
-    return SimpleNamespace(**{**told, **changed})
-
-
-@pytest.mark.parametrize(
-    ("stddev_s", "kept"),
-    [
-        (0.01, [0.0, 0.6, 4.9]),  # the same within half a second
-        (0.19, [0.0, 0.6, 4.9]),
-        (0.21, [0.0, 4.9]),  # or within three standard deviations
-        (np.inf, [0.0, 4.9]),  # of which none is larger than a second
-    ],
-)
-def test_fits_that_end_at_the_same_offset_count_once(
-    stddev_s: float, kept: list[float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(time_offset, "_log_odds", lambda *_: 0.0)
-    monkeypatch.setattr(time_offset, "_MAX_NUM_LIKELY", 9)
-    fits = [a_fit(offset_s, 9 - offset_s, stddev_s=stddev_s) for offset_s in (5.1, 0.26, 0.0, 0.24, 4.9, 0.6)]
-    found = time_offset._likely_fits(fits, HUNDRED.times_s, KNOWN, "give it")
-    assert [fit.offset_s for fit, _ in found] == kept
-
-
-def test_an_offset_that_puts_fewer_ranges_on_the_path_is_less_likely_from_the_start(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Seven tenths of the ranges of the best offset are enough; with fewer, its prior is a twentieth."""
-    monkeypatch.setattr(time_offset, "_log_odds", lambda best, fit, path: 1.0 if fit.offset_s > 0 else 0.0)
-    fits = [a_fit(31.0, 2.7), a_fit(0.0, 2.0), a_fit(30.0, 2.8), a_fit(-20.0, 9.0, is_testable=False)]
-    found = time_offset._likely_fits(fits, HUNDRED.times_s, KNOWN, "give it")
-    weights = np.array([1.0, np.exp(-1), 0.05 * np.exp(-1)])
-    assert [fit.offset_s for fit, _ in found] == [0.0, 30.0, 31.0]
-    assert [probability for _, probability in found] == pytest.approx((weights / weights.sum()).tolist())
-
-
-def test_two_offsets_are_compared_by_the_ranges_they_share_or_else_by_their_scores() -> None:
-    def of(values: Array) -> Any:
-        return lambda *_: values
-
-    losses = of(np.where(np.arange(100) < 40, 5.0, -1.0))
-    best = a_fit(0.0, 3.0, losses=losses, num_independent=30.0)
-    # At 40 s, the ranges from 0 to 60 s are on the path; of those that were there, all are at 0 s.
-    rival = a_fit(40.0, 2.5, losses=of(np.full(100, 7.0)), num_independent=20.0)
-    own = (40 * 5.0 - 20 * 1.0) / 60
-    assert time_offset._log_odds(best, rival, KNOWN) == pytest.approx(20 * 0.6 * (7.0 - own))
-    quarter = a_fit(75.0, 2.5, losses=of(np.full(100, 7.0)))
-    assert time_offset._log_odds(best, quarter, KNOWN) == pytest.approx(10 * 0.25 * (7.0 - 5.0))
-    far = a_fit(76.0, 2.5, losses=of(np.full(100, 7.0)), num_independent=50.0)
-    assert time_offset._log_odds(best, far, KNOWN) == pytest.approx(30 * 0.5)
-    # Ranges of the rival that are off the path at the best offset do not count.
-    early = a_fit(0.0, times_s=HUNDRED.times_s - 30, losses=of(np.where(np.arange(100) < 30, 9, 2)))
-    assert time_offset._log_odds(a_fit(0.0, 1.0), early, KNOWN) == pytest.approx(10 * 0.7 * (2 + 1))
-
-
-def test_ranges_stay_at_a_photo_if_they_are_near_the_same_one_at_all_offsets() -> None:
-    photos = Walk(lambda times: np.outer(times, [1.0, 0, 0]), no_turn).photos(np.array([0.0, 4.0, 8.0, 12.0]))
-    times = np.array([-1.2, 0.0, 0.4, 0.6, 3.4, 3.6, 5.4, 6.1, 12.0])
-    log = RangeLog.from_arrays(["A"] * len(times), np.ones(len(times)), timestamp_s=times)
-    options = AssociationOptions(max_interpolation_gap_s=0.5, max_time_difference_s=1.0)
-    assert time_offset._num_at_same_photo(log, photos, options, 0.0) == 6
-    assert time_offset._num_at_same_photo(log, photos, options, 0.0, 0.5) == 5
-    assert time_offset._num_at_same_photo(log, photos, options, 0.0, 0.5, -0.5) == 4
-    assert time_offset._num_at_same_photo(log, photos, options, 0.0, 4.0) == 0  # the next photo is another one
-
-
-PAIRING = BurstPairing(7.0, np.array([0, 2]), np.array([0, 1]), variance=1e-3, num_spare=8.0, chance=1e-9)
-BURSTS = Bursts(
-    np.array([0.0, 4.0, 8.0]),
-    np.array([1.0, 5.0, 12.0]),
-    np.array([60, 7, 40]),
-    np.ones((3, 1)),
-    np.zeros(1, dtype=np.int64),
-    np.zeros(1, dtype=np.int64),
-)
-
-
-def offset_of_bursts(
-    monkeypatch: pytest.MonkeyPatch, pairings: list[BurstPairing], kept_s: tuple[float, float], num_staying: int
-) -> TimeOffset | None:
-    """Run the estimate from bursts with the results of its parts given."""
-    curve = CostCurve(np.zeros(1), np.zeros(1))
-    asked: list[tuple[float, ...]] = []
-
-    def num_at_same_photo(_log: Any, _path: Any, _options: Any, *offsets_s: float) -> int:
-        asked.append(offsets_s)
-        return num_staying
-
-    monkeypatch.setattr(time_offset, "pair_bursts", lambda *_: pairings)
-    monkeypatch.setattr(time_offset, "offsets_that_keep", lambda *_: kept_s)
-    monkeypatch.setattr(time_offset, "_num_at_same_photo", num_at_same_photo)
-    monkeypatch.setattr(time_offset, "curve_of", lambda *_: curve)
-    photos: Any = [None] * 5
-    log: Any = None
-    found = time_offset._offset_of_bursts(BURSTS, log, photos, np.zeros((1, 3)), AssociationOptions())
-    assert all(set(kept_s) <= set(offsets_s) for offsets_s in asked)
-    return found
-
-
-@pytest.mark.parametrize(("kept_s", "value_s"), [((6.0, 9.0), 7.0), ((7.5, 9.0), 7.5), ((3.0, 6.5), 6.5)])
-def test_bursts_give_the_offset_nearest_to_their_middles_at_which_they_stay(
-    kept_s: tuple[float, float], value_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rival = replace(PAIRING, offset_s=-9.0, variance=PAIRING.variance * np.sqrt(2))  # of odds 2^2
-    found = offset_of_bursts(monkeypatch, [PAIRING, rival], kept_s, 95)
-    assert found is not None
-    assert found.value_s == value_s
-    assert found.stddev_s == pytest.approx((kept_s[1] - kept_s[0]) / np.sqrt(12))
-    assert not found.offset_matters
-    assert found.reference_s == pytest.approx((0.5 + 4.5 + 10) / 3)
-    assert found.probability == pytest.approx(0.8)
-    (other,) = found.rivals
-    assert other.value_s == -9.0
-    assert other.probability == pytest.approx(0.2)
-    assert found.note == (
-        f"the camera stands still at every photo: any time offset from {kept_s[0]:+.2f} s to {kept_s[1]:+.2f} s "
-        f"gives the same result; {value_s:+.2f} s centres the ranges on the photos"
-    )
-
-
-@pytest.mark.parametrize(
-    ("kept_s", "num_staying", "is_found"),
-    [((6.0, 9.0), 95, True), ((6.0, 9.0), 94, False), ((7.0, 7.0), 100, False), ((7.0, 6.9), 100, False)],
-)
-def test_bursts_give_no_offset_if_a_twentieth_of_their_ranges_leaves_its_photo(
-    kept_s: tuple[float, float], num_staying: int, is_found: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The paired bursts have 100 ranges."""
-    assert (offset_of_bursts(monkeypatch, [PAIRING], kept_s, num_staying) is not None) == is_found
-
-
-def test_bursts_that_fit_no_better_than_by_chance_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(GeometryError, match="do the 3 bursts of ranges fit the 5 photos better than by chance: give"):
-        offset_of_bursts(monkeypatch, [replace(PAIRING, chance=0.5)], (6.0, 9.0), 100)
-
-
-def offset_of_motion(
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    fits: list[Any],
-    final_stddev_s: float = 0.01,
-    drift: float = 0.0,
-    followed: float = 0.0,
-    num_known: int = 100,
-    num_near: int = 100,
-) -> TimeOffset:
-    """Run the estimate from motion with the results of its parts given: one fit for each candidate."""
-    curve = SimpleNamespace(
-        peaks=lambda *_: [fit.offset_s for fit in fits],
-        around=lambda best_s: CostCurve(np.array([best_s]), np.ones(1)),
-    )
-    left = iter(fits)
-    path: Any = SimpleNamespace(knows=KNOWN.knows, is_known=np.arange(100) < num_known, step_s=0.5)
-    final = a_fit(
-        2.0,
-        rates=np.tile([3.0, -4.0], 50),  # of root mean square sqrt(12.5)
-        residual_stddev_m=0.1 * np.sqrt(12.5),
-    )
-    timing = Timing(final_stddev_s, drift, 2e-5)
-    monkeypatch.setattr(time_offset, "on_path", lambda *_: HUNDRED.take(np.arange(num_near)))
-    monkeypatch.setattr(time_offset, "refine_offset", lambda *_: next(left))
-    scan: Any = lambda *_: curve  # noqa: E731
-    ranges = time_offset._RANGES._replace(scan=scan, fit_clocks=lambda *_: (final, timing, followed, 50.0))
-    return time_offset.offset_of_motion(HUNDRED, path, ranges, seed=0, progress=SilentProgress())
-
-
-def test_an_offset_from_motion_is_told_with_its_rivals_and_the_curve_about_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    fits = [a_fit(-9.0, 1.0 - np.log(4) / 10), a_fit(2.1, 1.0)]
-    found = offset_of_motion(monkeypatch, fits=fits, drift=1e-5)
-    assert (found.value_s, found.stddev_s, found.reference_s) == (2.0, 0.01, 50.0)
-    # The scores differ by log 4 over ten independent ranges, of which 91 % are at both offsets.
-    assert found.probability == pytest.approx(1 / (1 + 4**-0.91), rel=1e-3)
-    assert [rival.value_s for rival in found.rivals] == [-9.0]
-    assert (found.drift, found.drift_stddev, found.drift_is_followed) == (1e-5, 2e-5, False)
-    assert (found.offset_matters, found.is_certain, found.note) == (True, True, None)
-    assert found.curve.offsets_s[0] == 2.0
-    followed = offset_of_motion(monkeypatch, fits=[a_fit(2.1)], drift=1e-6, followed=1e-4, final_stddev_s=0.09)
-    assert (followed.drift, followed.drift_is_followed) == (1e-4, True)
-    assert (followed.note or "").startswith("the clocks drift: the camera's gains +100 ppm on the radio's (within 39")
-
-
-@pytest.mark.parametrize(("stddev_s", "is_certain"), [(0.099, True), (0.101, False), (0.49, False)])
-def test_an_offset_is_certain_if_it_moves_the_ranges_less_than_their_noise(
-    stddev_s: float, is_certain: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A tenth of a second moves them by as much."""
-    found = offset_of_motion(monkeypatch, fits=[a_fit(2.0)], final_stddev_s=stddev_s)
-    assert found.is_certain == is_certain
-    within = f"{1.96 * stddev_s:.2g}"
-    assert found.note == (
-        None
-        if is_certain
-        else f"the motion is too even to tell the time offset well (about +2.00 s, within {within} s, 95 %): "
-        "give the time offset (--ranges_time_offset) if you know it better"
-    )
-
-
-def test_motion_that_tells_no_offset_is_refused_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    even = r"the motion is too even to tell the time offset \(about \+2.00 s, within 1 s, 95 %\): give"
-    with pytest.raises(GeometryError, match=even):
-        offset_of_motion(monkeypatch, fits=[a_fit(2.0)], final_stddev_s=0.51)
-    with pytest.raises(GeometryError, match="no part of the path can be compared with the log"):
-        offset_of_motion(monkeypatch, fits=[a_fit(2.0)], num_known=1)
-    assert offset_of_motion(monkeypatch, fits=[a_fit(2.0)], num_known=2).value_s == 2.0
-    for fits, num_near in (([a_fit(2.0, is_testable=False)], 100), ([a_fit(2.0)], 0)):
-        lasting = rf"\(the log lasts {np.ptp(HUNDRED.times_s):.4g} s, the photos 49.5 s\)"
-        few = f"too few ranges along the camera's path to find the time offset {lasting}: give"
-        with pytest.raises(GeometryError, match=few):
-            offset_of_motion(monkeypatch, fits=fits, num_near=num_near)
-    with pytest.raises(GeometryError, match="at no time offset do the ranges follow the camera's path"):
-        offset_of_motion(monkeypatch, fits=[a_fit(2.0, explains=lambda: False)])
-
-
-@pytest.mark.parametrize(
-    ("gap_s", "bursts", "found", "max_gap_s"),
-    [
-        (1.0, "bursts", "found", 2.0),  # photos so close together need no bursts
-        (1.6, None, None, 2.4),
-        (3.0, None, "found", 4.5),
-        (3.0, "bursts", None, 4.5),
-        (3.0, "bursts", "found", None),
-    ],
-)
-def test_bursts_are_looked_for_where_photos_are_far_apart_and_then_motion(
-    gap_s: float, bursts: str | None, found: str | None, max_gap_s: float | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The motion is interpolated across one and a half times the usual gap."""
-    given: list[Any] = []
-
-    def path_to_search(*arguments: Any) -> Any:
-        given.extend(arguments)
-        return moving_path(*arguments)
-
-    def offset_of_motion(ranges: TimedRanges, *_: Any, seed: int, progress: Any) -> str:
-        given.extend([ranges, seed])
-        return "motion"
-
-    monkeypatch.setattr(time_offset, "find_bursts", lambda *_: bursts)
-    monkeypatch.setattr(time_offset, "_offset_of_bursts", lambda *_: found)
-    monkeypatch.setattr(time_offset, "moving_path", path_to_search)
-    monkeypatch.setattr(time_offset, "offset_of_motion", offset_of_motion)
-    walk = Walk(still, no_turn)
-    log = walk.log(range_times(0, 9), 0.0)
-    answer: Any = estimate(log, walk.photos(gap_s * np.arange(4, dtype=np.float64)))
-    if max_gap_s is None:
-        assert (answer, given) == ("found", [])
-        return
-    assert answer == "motion"
-    _, arms_m, association, ranges, seed = given
-    assert association.max_interpolation_gap_s == pytest.approx(max_gap_s)
-    assert seed == 0
-    np.testing.assert_array_equal(arms_m, [TAG_IN_CAM_M])
-    np.testing.assert_array_equal(np.sort(ranges.range_m), np.sort(log.range_m))

@@ -47,9 +47,11 @@ REMEDY = "give the time offset (--ranges_time_offset)"
 # With more likely offsets than this the estimate fails.
 _MAX_NUM_LIKELY = 3
 # Log and photos usually cover the same time. An offset that puts fewer observations on the path than this fraction of
-# the best offset's number gets this prior probability, relative to the others.
+# the best offset's number gets this prior probability, relative to the others; less where both last equally long, which
+# they do by chance only if they were not begun and ended together.
 _COVERING_SHARE = 0.7
 _PRIOR_OF_THE_OTHERS = 0.05
+_LEAST_DIFFERENCE = 0.02  # of the durations, as a share, below which it says no more
 # Two offsets with a smaller fraction of observations in common are compared by all that each puts on the path.
 _MIN_SHARED = 0.25
 # Largest number of candidates from the scan.
@@ -340,13 +342,17 @@ def _likely_fits(
     order = [k for k in np.argsort([-fit.score for fit in fits] * num_on_path) if fits[k].is_testable]
     best, most = fits[order[0]], num_on_path[order[0]]
     same_s = max(SEPARATION_S, SIGNIFICANT_STDDEVS * min(best.timing().stddev_s, 1.0))
+    log_s, path_s = float(np.ptp(times_s)), path.step_s * (len(path) - 1)
+    difference = max(1.0 - min(log_s, path_s) / max(log_s, path_s), _LEAST_DIFFERENCE)
+    # Two durations of which nothing is known differ by less than a small share with twice that probability.
+    prior_of_the_others = _PRIOR_OF_THE_OTHERS * min(2.0 * difference, 1.0)
     distinct: list[OffsetFit] = []
     log_likelihoods: list[float] = []
     for number in order:
         fit, covers = fits[number], num_on_path[number] >= _COVERING_SHARE * most
         if all(abs(fit.offset_s - other.offset_s) > same_s for other in distinct):
             distinct.append(fit)
-            log_likelihoods.append(-_log_odds(best, fit, path) + np.log(1.0 if covers else _PRIOR_OF_THE_OTHERS))
+            log_likelihoods.append(-_log_odds(best, fit, path) + np.log(1.0 if covers else prior_of_the_others))
     likely = likely_offsets([fit.offset_s for fit in distinct], log_likelihoods, remedy)
     return [(distinct[number], probability) for number, probability in likely]
 

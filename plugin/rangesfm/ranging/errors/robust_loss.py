@@ -42,9 +42,11 @@ class RobustLoss:
     def rho(self, squared: Array) -> Array:
         """Return (3, n) the loss and its first two derivatives by the squared residual, as scipy needs them."""
         ratio = 1 + squared / self.width**2
-        if self.is_bounded:
-            return np.stack([squared / ratio, 1 / ratio**2, -2 / (self.width**2 * ratio**3)])
-        return np.stack([self.width**2 * np.log1p(squared / self.width**2), 1 / ratio, -1 / (self.width * ratio) ** 2])
+        with np.errstate(over="ignore"):  # a step that goes astray may end anywhere; what overflows there is 0 then
+            if self.is_bounded:
+                return np.stack([squared / ratio, 1 / ratio**2, -2 / (self.width**2 * ratio**3)])
+            logarithm = np.log1p(squared / self.width**2)
+            return np.stack([self.width**2 * logarithm, 1 / ratio, -1 / (self.width * ratio) ** 2])
 
     def weights(self, scaled_residuals: Array) -> Array:
         """Return (n,) weights in (0, 1] of the weighted least squares with the same gradient."""
