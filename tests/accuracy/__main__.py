@@ -94,6 +94,16 @@ def rows(found: dict[str, Cases]) -> Iterator[str]:
             yield f"| {group.words} (`{group.name}`) | {len(cases)} | {figures} |"
 
 
+def case_rows(group: Group, cases: Cases) -> Iterator[str]:
+    """Yield a table with the values of each case of a group."""
+    figures = [figure for figure in group.figures if figure.key not in ("covered", "in_stddevs", "named", "refused")]
+    yield f"\n## {group.title}\n"
+    yield f"| | {' | '.join(figure.words for figure in figures)} |"
+    yield "|---" * (len(figures) + 1) + "|"
+    for case, values in cases.items():
+        yield f"| {case} | {' | '.join(figure.text({case: values}) for figure in figures)} |"
+
+
 def store(found: dict[str, Cases]) -> None:
     """Store the cases, and write the table into the page of what is measured."""
     state = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True)
@@ -101,7 +111,8 @@ def store(found: dict[str, Cases]) -> None:
     STORED.write_text(json.dumps(content, indent=0, sort_keys=True) + "\n", encoding="utf-8")
     page = PAGE.read_text(encoding="utf-8")
     before, rest = page.split(BEGIN)
-    table = "\n".join([f"\nMeasured on `{state.stdout.strip()}`:\n", *rows(found), "\n"])
+    of_cases = [row for group in GROUPS if group.title for row in case_rows(group, found.get(group.name, {}))]
+    table = "\n".join([f"\nMeasured on `{state.stdout.strip()}`:\n", *rows(found), *of_cases, "\n"])
     PAGE.write_text(before + BEGIN + table + END + rest.split(END, 1)[1], encoding="utf-8")
 
 

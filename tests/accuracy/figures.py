@@ -51,7 +51,7 @@ class Figure:
         if not len(values):
             return float("nan")
         if self.over == "rms":
-            return float(np.sqrt(np.mean(values**2)))
+            return float(np.sqrt(np.mean(values**2)) if len(values) > 1 else values[0])
         return float(np.median(values) if self.over == "median" else np.mean(values))
 
     def text(self, cases: Cases) -> str:

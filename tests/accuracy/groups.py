@@ -64,12 +64,14 @@ class Group:
     Attributes:
         words: description for people.
         tasks: lists what is to be run, given the folder of data, if any, and whether a part is enough.
+        title: of a table with the values of each case; None: there is none.
     """
 
     name: str
     words: str
     figures: tuple[Figure, ...]
     tasks: Callable[[Path | None, bool], list[Task]]
+    title: str | None = None
 
 
 def scale_figures(*, named: str = "mistake named") -> tuple[Figure, ...]:
@@ -382,6 +384,7 @@ GROUPS: Sequence[Group] = (
             Figure("time after the mapping, of that up to it", "after_mapping", "median", "%", None),
         ),
         room_tasks,
+        "The hand-held room",
     ),
     Group(
         "camera and tags",
@@ -408,6 +411,7 @@ GROUPS: Sequence[Group] = (
         "500 and 2000 keyframes with loops, refined",
         (*scale_figures(), RMSE, Figure("time for a keyframe", "seconds_each", "mean", "s", None)),
         growth_tasks,
+        "Growth",
     ),
     Group(
         "speed",
