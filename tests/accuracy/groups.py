@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from tests.accuracy.figures import Figure, Values
 from tests.benchmarks import reconstruction
-from tests.studies import drifting_maps, growth, known_positions, mistakes, real_logs
+from tests.studies import drifting_maps, growth, known_positions, mistakes, random_surveys, real_logs
 from tests.studies.erring_surveys import SITES, surveyed
 from tests.studies.measured_distances import KINDS, simulated
 
@@ -28,9 +28,7 @@ from rangesfm.options import CameraOptions
 from rangesfm.vision.image_times import list_images
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-# Metres per unit of the models in DIR/starloc_tags and of those that the study of real logs makes.
-STARLOC_SCALE = 1.48788
-STARLOC_ANCHORS = ("unknown", "site")
+FIRST_RANDOM = 30000
 
 Cases = dict[str, Values]
 
@@ -344,6 +342,32 @@ def growth_tasks(_: Path | None, quick: bool) -> list[Task]:
     ]
 
 
+def random_surveys_from(first: int, num: int) -> Cases:
+    """Run honest random surveys; what is drawn with a mistake is left out."""
+    found: Cases = {}
+    for seed in range(first, first + num):
+        line = random_surveys.told(seed)
+        if line["mistake"] == "none":
+            found[str(seed)] = {"refused": 1.0} if "half" not in line else of_random(line)
+    return found
+
+
+def of_random(line: dict[str, Any]) -> Values:
+    return {
+        "covered": float(line["covered"]),
+        "error": line["off"],
+        "in_stddevs": 1.96 * line["off"] / line["half"],
+        "half_width": line["half"],
+        "good_and_wrong": float(line["good"] and not line["covered"]),
+        "refused": 0.0,
+    }
+
+
+def random_tasks(_: Path | None, quick: bool) -> list[Task]:
+    starts = range(FIRST_RANDOM, FIRST_RANDOM + (20 if quick else 80), 10)
+    return [Task("random surveys", f"from {first}", partial(random_surveys_from, first, 10), 15.0) for first in starts]
+
+
 def beside_pycolmap() -> Cases:
     """Take the demo's photos to a model by pycolmap's calls and by rangesfm in turn; the first round warms up."""
     names, camera = list_images(PHOTOS), CameraOptions()
@@ -363,6 +387,7 @@ def speed_tasks(_: Path | None, quick: bool) -> list[Task]:
     return [] if quick else [Task("speed", "demo", beside_pycolmap, 90.0)]
 
 
+REFUSED_SHARE = Figure("refused", "refused", "mean", "%", "higher")
 RMSE = Figure("RMSE", "rmse", "median", "m", "higher")
 PLACES = Figure("place covered", "places", "mean", "%", "lower")
 
@@ -404,6 +429,16 @@ GROUPS: Sequence[Group] = (
         "Control points, positions, and positions with ranges",
         (*scale_figures(), RMSE, PLACES),
         known_tasks,
+    ),
+    Group(
+        "random surveys",
+        "Whole honest surveys drawn at random over all that users have, by commands",
+        (
+            *scale_figures()[:4],
+            Figure("good with a wrong scale", "good_and_wrong", "mean", "%", "higher"),
+            REFUSED_SHARE,
+        ),
+        random_tasks,
     ),
     Group("mistakes", "Surveys with a mistake, and clean ones", MISTAKE_FIGURES, mistake_tasks),
     Group(
