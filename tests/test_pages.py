@@ -238,23 +238,7 @@ OF_OTHER_PROGRAMS = {
     "--ref_images_path",
     "--transform_path",
 }
-OF_STUDIES = {
-    "--kinds",
-    "--num_clean",
-    "--num_keyframes",
-    "--num_ranges_each",
-    "--num_seeds",
-    "--pixel_stddev",
-    "--size_m",
-    "--by_photo",
-    "--calibrated",
-    "--data",
-    "--leave_radio_out",
-    "--model",
-    "--only",
-    "--photos",
-    "--with",
-}
+OF_STUDIES = {"--data", "--leave_radio_out", "--model", "--photos", "--quick", "--room", "--store"}
 
 
 def test_the_survey_file_on_its_page_is_one(tmp_path: Path) -> None:
