@@ -45,7 +45,7 @@ _MOST_MISREAD = 4.0
 # Standard deviation of a slow wandering of the ranges, metres, for each anchor and for all, as hands and bodies move.
 # It is always assumed, in addition to the learnt drift of the radio, which is learnt as nothing where steps may explain
 # it. It is too slow to be confused with a step. Without it, a mistake that nobody made is named in 7 of 72 real logs,
-# with it in 3 (``examples/measured.md``).
+# with it in 4 (``tests.studies.real_logs``).
 _WANDERING_M = 0.025
 
 
