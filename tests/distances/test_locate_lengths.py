@@ -74,7 +74,10 @@ def test_ends_that_are_nowhere_are_refused(made: SyntheticModel) -> None:
         "d.csv:2: an end is 'nobody', expected a photo": (tape(taped(name, "nobody")), []),
         "d.csv:2: from .* expected two anchors": (tape(taped(name, "A")), ["A"]),
         "m.csv:5: marker 'door' is marked in 1 photos": (tape(taped(name, "door"), door=lonely), []),
-        r"m.csv:\d+: marker 'door' is \d+ px from where the other photos put it": (tape(taped(name, "door"), door=astray), []),
+        r"m.csv:\d+: marker 'door' is \d+ px from where the other photos put it": (
+            tape(taped(name, "door"), door=astray),
+            [],
+        ),
         "m.csv:2: marker 'door' is seen from one direction": (tape(taped(name, "door"), door=still), []),
     }
     for said, (given, anchor_ids) in cases.items():
