@@ -13,7 +13,7 @@ from tests.result_document import REFINE, anchor_entry, result_document
 
 from rangesfm.comparison.with_reference import format_table
 from rangesfm.errors import InputError, number_text
-from rangesfm.result.entries import ComparisonRow
+from rangesfm.result.entries import AnchorEntry, ComparisonRow
 from rangesfm.result.summary import ResultSummary, schema
 
 if TYPE_CHECKING:
@@ -176,3 +176,11 @@ def test_loops_and_unnoticed_mistakes_are_told_in_sentences() -> None:
         "reliability: if one mistake was made and not noticed, the scale is off by 7.7 % at most (risk of more: "
         "0.0001); worst case: lever arm"
     ) in lines
+
+
+@pytest.mark.parametrize("position_m", [(6e95, 5e95, 7e95), (1.0, -2e9, 3.0), (np.nan, 0.0, 0.0)])
+def test_an_anchor_that_no_range_holds_has_no_place(position_m: tuple[float, float, float]) -> None:
+    values: dict[str, Any] = {"stddev_m": 0.5, "range_bias_m": 0.0, "surveyed_position_m": None}
+    entry = AnchorEntry(position_m=position_m, mirror_position_m=(1.0, 2.0, 3.0), **values)
+    assert (entry.position_m, entry.mirror_position_m) == (None, (1.0, 2.0, 3.0))
+    assert AnchorEntry(position_m=(5e6, 2e6, 400.0), mirror_position_m=None, **values).position_m == (5e6, 2e6, 400.0)

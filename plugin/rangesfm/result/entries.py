@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, AliasChoices, AliasPath, ConfigDict, Field
+from pydantic import AfterValidator, AliasChoices, AliasPath, BeforeValidator, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Mask
@@ -19,7 +19,7 @@ from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOr
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.join.join_models import ModelVerdict
-from rangesfm.options import AssociationOptions
+from rangesfm.options import COORDINATE_M, AssociationOptions
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.result.metric_result import USED, MetricResult
@@ -188,13 +188,22 @@ class MapEntry(Record):
     num_points3D: Count  # noqa: N815 (as COLMAP has it)
 
 
+def _place(position_m: Any) -> Any:
+    """Return the position of an anchor; None beyond all coordinates: an anchor that no range holds has no place."""
+    is_place = position_m is not None and np.all([COORDINATE_M.hold(float(number)) for number in position_m])
+    return position_m if is_place else None
+
+
+_PlaceOrNull = Annotated[VectorOrNull, BeforeValidator(_place)]
+
+
 class AnchorEntry(Record):
     """An anchor in the world of the metric models; see AnchorEstimate. What is unknown or does not exist is null."""
 
-    position_m: VectorOrNull
+    position_m: _PlaceOrNull
     stddev_m: NumberOrNull = Field(validation_alias=AliasChoices("stddev_m", "position_stddev_m"))
     range_bias_m: NumberOrNull
-    mirror_position_m: VectorOrNull
+    mirror_position_m: _PlaceOrNull
     surveyed_position_m: VectorOrNull = Field(validation_alias=AliasChoices("surveyed_position_m", "prior_position_m"))
 
 
