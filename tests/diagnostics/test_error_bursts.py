@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 from tests.diagnostics.test_linearized import small_map
 from tests.known import known
 from tests.studies.erring_surveys import SITES, Given, run, surveyed
 
-from rangesfm.diagnostics.error_bursts import Burst, _windows, likeliest_burst, without
+from rangesfm.diagnostics.error_bursts import Burst, likeliest_burst, without
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized, linearized
 
@@ -70,30 +67,6 @@ def test_what_is_left_out_says_nothing(problem: Linearized) -> None:
     np.testing.assert_allclose(Factorization(moved).step, Factorization(left_out).step, atol=2e-3)
 
 
-class TestWindows:
-    """A burst is of consecutive bins of one anchor and one tag that are over within three seconds."""
-
-    @staticmethod
-    def windows(anchors: list[int], tags: list[int], time_s: list[float]) -> list[tuple[int, ...]]:
-        bins = SimpleNamespace(anchor_index=np.array(anchors), tag_index=np.array(tags), time_s=np.array(time_s))
-        problem: Any = SimpleNamespace(bins=bins)
-        return sorted(tuple(window.tolist()) for window in _windows(problem))
-
-    def test_it_lasts_for_three_seconds_at_most(self) -> None:
-        assert self.windows([0] * 4, [0] * 4, [0.0, 1.0, 2.9, 3.1]) == [
-            *((0,), (0, 1), (0, 1, 2)),
-            *((1,), (1, 2), (1, 2, 3)),
-            *((2,), (2, 3)),
-            (3,),
-        ]
-
-    def test_it_is_of_one_anchor_and_one_tag(self) -> None:
-        assert self.windows([0, 1, 0, 0], [0, 0, 0, 1], [0.0, 0.5, 1.0, 1.5]) == [(0,), (0, 2), (1,), (2,), (3,)]
-
-    def test_it_is_in_the_order_of_time(self) -> None:
-        assert self.windows([0, 0, 0], [0, 0, 0], [4.0, 0.0, 2.0]) == [(0,), (1,), (1, 2), (2,), (2, 0)]
-
-
 @pytest.fixture(scope="module")
 def of_small() -> Linearized:
     """Two ranges of each of three anchors are a bin, each half a second."""
@@ -104,30 +77,6 @@ def longer(problem: Linearized, bins: list[int], by_m: float) -> Linearized:
     residual_m = problem.residual_m.copy()
     residual_m[bins] -= by_m
     return replace(problem, residual_m=residual_m)
-
-
-def test_the_bins_that_err_alike_are_the_likeliest_burst(of_small: Linearized) -> None:
-    bins = of_small.bins
-    in_burst = np.flatnonzero((bins.anchor_index == 1) & (bins.time_s > 4.0) & (bins.time_s < 6.0))
-    solved = Factorization(longer(of_small, in_burst.tolist(), 0.6))
-    burst = likeliest_burst(solved)
-    np.testing.assert_array_equal(np.sort(burst.bins), in_burst)
-    # It is the statistic of a constant error of those bins.
-    column = np.isin(np.arange(len(bins)), in_burst)[:, None].astype(np.float64)
-    assert burst.statistic == pytest.approx(solved.mistake(column).statistic)
-    assert burst.statistic > burst.threshold
-    # Twenty bins of each anchor, each half a second after the other: up to seven begin at each, but for the last ones.
-    num = 3 * (14 * 7 + 6 + 5 + 4 + 3 + 2 + 1)
-    assert burst.threshold == pytest.approx(stats.chi2.isf(0.02 / num, 1))
-
-
-def test_a_burst_of_ranges_with_large_errors_has_the_statistic_of_its_error(of_small: Linearized) -> None:
-    # Errors of tens of metres, so that one metre is less than a standard deviation.
-    errors = replace(of_small.errors, covariances_m2=1e6 * of_small.errors.covariances_m2)
-    solved = Factorization(longer(replace(of_small, errors=errors), [3, 4], 500.0))
-    burst = likeliest_burst(solved)
-    column = np.isin(np.arange(60), burst.bins)[:, None].astype(np.float64)
-    assert burst.statistic == pytest.approx(solved.mistake(column).statistic)
 
 
 def test_bins_of_a_burst_that_is_left_out_are_off_by_as_much_as_a_range_can(of_small: Linearized) -> None:

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 import pytest
-from scipy import stats
-from scipy.spatial.transform import Rotation
 from tests.conftest import SITE_M, WalkedSurvey
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest
-from rangesfm.diagnostics.point_tests import Placed, _tested, diagnose_points
+from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.distances.map_points import MapPoint
 from rangesfm.distances.tape import CLICKED_STDDEV_PX, Marker
 from rangesfm.geometry.map_errors import MapPointErrors
@@ -104,108 +102,5 @@ def test_a_single_point_is_tested_and_no_point_is_none(marked: Marked) -> None:
     assert diagnose_points(unseen, marked.model, None, 0.0, placed).tests == ()
 
 
-def points_at(*places_m: Sequence[float], own_stddev_m: float = 0.0) -> list[MapPoint]:
-    own_m2 = own_stddev_m**2 * np.eye(3)
-    return [MapPoint(f"P{k}", np.array(at_m), MapPointErrors({}, own_m2)) for k, at_m in enumerate(places_m)]
-
-
-def test_points_of_a_map_that_is_right_but_for_its_place_err_together() -> None:
-    """The map may be scaled and turned about the first camera, and shifted: its points move as these say."""
-    first_m, places_m = np.array([1.0, -2.0, 3.0]), np.array([[4.0, 0, 3], [0, 5, -1]])
-    root = 1e-5 * np.random.default_rng(0).standard_normal((7, 7))
-    found = Placed(root @ root.T, first_m, 0.0).of_place(points_at(*places_m))
-    moves = []
-    for step in root.T:
-        turn = Rotation.from_rotvec(step[1:4]).as_matrix()
-        moved_m = first_m + np.exp(step[0]) * (places_m - first_m) @ turn.T + step[4:]
-        moves.append((moved_m - places_m).ravel())
-    np.testing.assert_allclose(found, np.array(moves).T @ np.array(moves), rtol=1e-3, atol=1e-13)
-
-
-def test_own_errors_and_the_bending_of_points_are_independent() -> None:
-    shift = np.diag([0, 0, 0, 0, 0.2, 0, 0]) ** 2
-    found = Placed(shift, np.zeros(3), 0.3).of(points_at([1, 0, 0], [0, 2, 0], own_stddev_m=0.1))
-    shared = np.zeros((6, 6))
-    shared[np.ix_([0, 3], [0, 3])] = 0.04
-    np.testing.assert_allclose(found, shared + (0.01 + 0.03) * np.eye(6))
-
-
-def rows_of(off_m: Sequence[Sequence[float]], kind: str = "check") -> list[MistakeTest]:
-    """Test points P0, P1, ... that the map has so far from their coordinates; each errs by 0.1 m."""
-    points = [ControlPoint(f"P{k}", np.zeros(3), 0.01, kind, k) for k in range(len(off_m))]
-    return _tested(np.ravel(off_m), 0.1**2 * np.eye(3 * len(off_m)), points)
-
-
 def rejected(rows: Sequence[MistakeTest]) -> list[str]:
     return [row.subject or row.name for row in rows if row.rejected]
-
-
-NONE_M = [0.0, 0.0, 0.0]
-
-
-def test_one_point_alone_is_tested_without_its_frame() -> None:
-    (row,) = rows_of([[0.3, 0.0, -0.4]])
-    assert row.statistic == pytest.approx(25.0)
-    assert row.threshold == pytest.approx(stats.chi2.isf(0.02, 3))
-    assert row.words == "the map has the check point P0 0.50 m from its coordinates (+0.30, +0.00, -0.40 m)"
-    assert (row.name, row.subject, row.unit) == ("check point in the map", "P0", "m")
-    assert row.rejected
-
-
-def test_points_and_their_frame_share_the_rate_of_false_alarms() -> None:
-    rows = rows_of([NONE_M] * 4)
-    assert len(rows) == 5
-    assert all(row.threshold == pytest.approx(stats.chi2.isf(0.02 / 5, 3)) for row in rows)
-    assert sorted(row.subject for row in rows) == ["", "P0", "P1", "P2", "P3"]
-
-
-def test_a_point_is_named_from_the_threshold_on() -> None:
-    """Its statistic is its squared error in stddevs, as points and map err independently."""
-    threshold = float(stats.chi2.isf(0.02 / 4, 3))
-    for factor, names in ((0.99, []), (1.01, ["P1"])):
-        off_m = 0.1 * np.sqrt(factor * threshold)
-        rows = rows_of([NONE_M, [0.0, off_m, 0.0], NONE_M])
-        assert rejected(rows) == names
-        assert rows[0].subject == "P1"  # the likeliest comes first in either case
-
-
-def test_points_that_are_off_are_named_one_after_the_other_the_worst_first() -> None:
-    off_m = [NONE_M, [0, 0, 2.0], NONE_M, [0, 3.0, 0], NONE_M, NONE_M]
-    rows = rows_of(off_m)
-    assert rejected(rows) == ["P3", "P1"]
-    assert [row.size for row in rows[:2]] == [pytest.approx(3.0), pytest.approx(2.0)]
-    # Those that were not found are tested beside those that were, and follow by their statistics.
-    assert [row.statistic for row in rows[2:]] == sorted((row.statistic for row in rows[2:]), reverse=True)
-    assert max(row.statistic for row in rows[2:]) < 1e-9
-
-
-def test_a_shift_of_all_points_is_named_as_such_and_a_wrong_point_beside_it() -> None:
-    shifted_m = np.tile([0.5, -0.25, 1.0], (6, 1))
-    rows = rows_of(shifted_m.tolist())
-    assert rejected(rows) == ["frame of the points"]
-    assert rows[0].words == (
-        "the map has all known points 1.15 m from their coordinates (+0.50, -0.25, +1.00 m), alike"
-    )
-    assert rows[0].effect_on_scale == 0.0
-    assert "in one frame" in rows[0].remedy
-    shifted_m[2] += [0.0, 0.8, 0.0]
-    rows = rows_of(shifted_m.tolist())
-    assert rejected(rows) == ["frame of the points", "P2"]
-    assert rows[1].size == pytest.approx(0.8)
-
-
-@pytest.mark.parametrize("off_m", [[[0, 0, 9.0], [5.0, 0, 0]], [[0, 0, 9.0], [0, -7.0, 0], [5.0, 0, 0]]])
-def test_the_last_point_and_the_frame_explain_the_same_if_all_others_are_wrong(off_m: list[list[float]]) -> None:
-    """So neither of them is taken off before the other is tested."""
-    rows = rows_of(off_m)
-    assert rejected(rows[: len(off_m) - 1]) == [f"P{k}" for k in range(len(off_m) - 1)]
-    last = rows[len(off_m) - 1 :]
-    assert {row.subject for row in last} == {"", f"P{len(off_m) - 1}"}
-    assert [row.statistic for row in last] == [pytest.approx(50.0**2)] * 2
-
-
-def test_a_check_point_moves_no_scale_and_of_a_control_point_it_is_not_known() -> None:
-    assert {row.effect_on_scale for row in rows_of([NONE_M] * 3, kind="check")} == {0.0}
-    of_control = rows_of([NONE_M] * 3, kind="control")
-    assert {row.effect_on_scale for row in of_control if row.subject} == {None}
-    assert {row.name for row in of_control} == {"control point in the map", "frame of the points"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,19 +10,15 @@ import pytest
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 from tests.refine.conftest import bent, poses_and_rays
-from tests.refine.test_vision_information import Scene
 from tests.simulated.model import SyntheticModel
 
-from rangesfm.ceres.nested_dissection import SingularError
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.similarity import align_points, rmse
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.bending import without_similarity
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.refine import keyframe_graph
-from rangesfm.refine.keyframe_graph import GraphBending, KeyframeGraph, local_scales, solve_graph, with_gradient
+from rangesfm.refine.keyframe_graph import KeyframeGraph, local_scales, solve_graph, with_gradient
 from rangesfm.refine.radio import Antennas
 from rangesfm.refine.vision_information import Poses, VisionInformation, photo_gradient, vision_information
 
@@ -216,86 +211,3 @@ def test_neighbours_of_one_place_have_no_scale_of_their_own(chain: SyntheticMode
     before, now = (Poses(still.world_from_rig, still.centers + 1e-14 * rng.normal(size=(60, 3))) for _ in range(2))
     scales = local_scales(replace(vision_information(rays, truth), origin=before), now)
     np.testing.assert_allclose(scales, 1.0, atol=1e-9)
-
-
-ONE_BLOCK = (np.array([0, 2]), np.array([False]))
-
-
-def test_a_hessian_that_rounding_made_indefinite_is_damped_until_it_is_not() -> None:
-    hessian, gradient = np.array([[1.0, 3.0], [3.0, 1.0]]), np.array([[5.0], [-2.0]])
-    # With eigenvalues of 4 and -2, a damping of 1 does not suffice and one of 10 does.
-    damped = hessian + 10.0 * np.eye(2)
-    for damping in (0.0, 1e-8, 0.1, 1.0):
-        found = keyframe_graph._factor(hessian, damping, ONE_BLOCK).solve(gradient)
-        np.testing.assert_allclose(found, np.linalg.solve(damped, gradient), rtol=1e-6)
-    definite = np.diag([2.0, 4.0])
-    found = keyframe_graph._factor(definite, 0.5, ONE_BLOCK).solve(gradient)
-    np.testing.assert_allclose(found, gradient / [[3.0], [6.0]])
-
-
-def test_unknowns_that_nothing_determines_stay_in_place() -> None:
-    found = keyframe_graph._factor(np.diag([4.0, 0.0]), 0.0, ONE_BLOCK).solve(np.array([[1.0], [0.0]]))
-    np.testing.assert_allclose(found, [[0.25], [0.0]], atol=1e-12)
-
-
-@pytest.mark.parametrize(("first", "num_tried"), [(2e-8, 15), (2e4, 3), (2e5, 2), (2e6, 1)])
-def test_a_hessian_without_finite_entries_is_given_up(
-    first: float, num_tried: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The damping grows tenfold until it exceeds a million."""
-    tried = dampings_tried(first, monkeypatch)
-    assert tried == pytest.approx(first * 10.0 ** np.arange(num_tried), rel=1e-2)
-
-
-@pytest.mark.parametrize("first", [0.0, 1e-12, 0.9e-9])
-def test_what_little_damping_does_not_make_definite_gets_the_usual_one_at_first(
-    first: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tried = dampings_tried(first, monkeypatch)
-    assert tried[:4] == pytest.approx([first, 1e-8, 1e-7, 1e-6], rel=1e-2, abs=2e-12)
-
-
-def dampings_tried(first: float, monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Return the dampings of a Hessian that no damping makes definite, until it is given up."""
-    tried: list[float] = []
-
-    def fail(damped: Any, *_: Any) -> None:
-        tried.append(float(damped.diagonal()[0]) - 1.0)
-        raise SingularError(0)
-
-    monkeypatch.setattr(keyframe_graph, "factor", fail)
-    with pytest.raises(SingularError):
-        keyframe_graph._factor(np.eye(2), first, ONE_BLOCK)
-    return tried
-
-
-def in_world_of_first_camera(poses: Poses) -> Trajectory:
-    path = Trajectory(np.arange(4), ("a", "b", "c", "d"), None, poses.centers, poses.world_from_rig)
-    return in_first_camera(path)
-
-
-@pytest.mark.parametrize("frame_is_free", [True, False])
-def test_the_photos_of_a_graph_bend_it_by_the_inverse_of_their_information(frame_is_free: bool) -> None:
-    scene = Scene(stddev=0.0)
-    vision = vision_information(scene.observations, scene.poses)
-    path = in_world_of_first_camera(scene.poses)
-    by_pose = np.random.default_rng(2).normal(size=(3, 24))
-    found = GraphBending(vision, path).of_functions(by_pose, frame_is_free=frame_is_free)
-    # Moves of the poses in the axes of the first camera, which are turned into the world of the information.
-    in_world = np.kron(np.eye(4), np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), path_turn(scene)]]))
-    _, jacobian = keyframe_graph._relative_poses(vision, scene.poses)
-    by_move = jacobian.toarray() @ in_world
-    information = by_move.T @ vision.matrix.toarray() @ by_move
-    functions = without_similarity(by_pose, path, frame_is_free=frame_is_free)
-    expected = functions @ np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ functions.T
-    np.testing.assert_allclose(found.formal_m2, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
-    np.testing.assert_array_equal(found.shift_m, np.zeros(3))
-    (part,) = found.parts
-    assert (part.name, part.spread) == ("bending", 0.0)
-    np.testing.assert_allclose(part.median_m**2 * part.alike, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
-    assert GraphBending(vision, path).of_functions(np.zeros((2, 24)), frame_is_free=frame_is_free).parts == ()
-
-
-def path_turn(scene: Scene) -> Array:
-    """Return the rotation from the first camera's frame to the scene's world."""
-    return np.asarray(scene.poses.world_from_rig[0])

@@ -17,7 +17,6 @@ from rangesfm.refine.vision_information import (
     Observations,
     Poses,
     _pieces,
-    _thinned,
     misplaced_points,
     model_observations,
     model_poses,
@@ -74,30 +73,6 @@ def test_a_track_is_one_piece_a_long_one_overlapping_pieces_of_eight() -> None:
     assert of_track[9] == [list(range(8)), list(range(1, 9))]
     assert of_track[16] == [list(range(start, start + 8)) for start in (0, 4, 8)]
     assert of_track[18] == [list(range(start, start + 8)) for start in (0, 4, 8, 10)]
-
-
-def test_tracks_of_points_that_are_no_longer_seen_are_missing() -> None:
-    pieces = _pieces(np.array([1, 1, 3, 3, 3]))
-    assert pieces[2].tolist() == [[0, 1]]
-    assert pieces[3].tolist() == [[2, 3, 4]]
-
-
-@pytest.mark.parametrize(
-    ("num", "num_keyframes", "step"),
-    [
-        (0, 10, 1), (8000, 10, 1), (8001, 10, 2), (16000, 10, 2), (16001, 10, 3),  # up to 8000 are always kept
-        (12000, 300, 1), (12001, 300, 2),  # 40 for each keyframe
-        (20000, 1000, 1), (20001, 1000, 2), (40001, 1000, 3),  # never more than 20 000
-    ],
-)  # fmt: skip
-def test_very_many_pieces_are_thinned_evenly(num: int, num_keyframes: int, step: int) -> None:
-    pieces = {2: np.zeros((num // 2, 2), dtype=np.int64), 3: np.zeros((0, 3), dtype=np.int64)}
-    pieces[4] = np.arange(4 * (num - num // 2)).reshape(-1, 4)
-    kept, share = _thinned(pieces, num_keyframes)
-    assert share == pytest.approx(1 / step)
-    expected = [pieces[2][::step], pieces[4][::step]] if num else []
-    for found, rows in zip(list(kept), expected, strict=True):
-        np.testing.assert_array_equal(found, rows)
 
 
 class Scene:

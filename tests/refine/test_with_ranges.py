@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from tests.few_links import leave_few_links
 from tests.known import known
 from tests.known_errors import known_errors
-from tests.refine.test_keyframe_graph import errors_of
 from tests.scale.robust_scale import metric_from_sfm_by_robust_weights
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import lap_path, loop_path, sequence_path
@@ -39,13 +37,10 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.errors.range_bins import range_bins
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 from rangesfm.refine import with_ranges
-from rangesfm.refine.distances import MeasuredDistances
 from rangesfm.refine.graph_presolve import Presolved, presolve_again
-from rangesfm.refine.positions import HeldPositions
 from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.refinement_problem import RefinementProblem
 from rangesfm.refine.vision_information import Observations
@@ -1002,112 +997,3 @@ class TestProblem:
         assert not summary.converged
         assert ", not converged," in repr(summary)
         assert summary.message
-
-
-def summary_of(**given: Any) -> RefineSummary:
-    """Return a summary of which only some attributes are known."""
-    return RefineSummary(**{field.name: given.get(field.name) for field in fields(RefineSummary)})  # type: ignore[arg-type]
-
-
-class TestSmallParts:
-    def test_a_summary_says_what_was_done_on_one_line(self) -> None:
-        given = summary_of(converged=True, num_iterations=12, reprojection_rms_px=0.4567)
-        assert repr(given) == "<refinement of 12 iterations, converged, 0.46 px>"
-        stopped = replace(given, converged=False)
-        assert repr(stopped) == "<refinement of 12 iterations, not converged, 0.46 px>"
-
-    def test_a_summary_of_a_map_that_is_moved_has_other_ranges_and_weights(self) -> None:
-        """The third range took no part; the first one fits after the move, and the second does not."""
-        log = RangeLog.from_arrays(["A", "A", "B"], [3.0, 4.0, 5.0], timestamp_s=[0.0, 1.0, 2.0])
-        nowhere, nothing, ones = np.zeros(3, dtype=np.int64), np.zeros((3, 3)), np.ones(3)
-        status = np.full(3, RangeStatus.CHECK, dtype=np.int8)
-        observed = RangeObservations(log, status, nowhere, nowhere, ones, nothing, nothing, nothing, ones, ones)
-        errors = replace(errors_of(np.array([0, 0, 1]), 0.1), loss=GEMAN_MCCLURE)
-        measured_m = observed.log.range_m
-        mirrored = replace(an_anchor("A"), mirror_position_m=np.array([1.0, 2.0, 3.0]))
-        given = summary_of(
-            predicted_m=measured_m + np.array([0.5, 0.0, 7.0]), weights=np.array([0.1, 1.0, np.nan]), errors=errors,
-            observations=observed, anchors=(mirrored, an_anchor("B")),
-        )  # fmt: skip
-        change = Similarity(2.0, np.eye(3), np.array([10.0, 0.0, 0.0]))
-        anchors_m = np.array([[4.0, 5.0, 6.0], [7.0, 8.0, 9.0]])
-        moved = given.moved(change, anchors_m, np.array([0, 1]), np.array([-0.5, 9.0]))
-        np.testing.assert_allclose(moved.predicted_m - measured_m, [0.0, 9.0, 7.0])
-        np.testing.assert_array_equal([each.position_m for each in moved.anchors], anchors_m)
-        np.testing.assert_allclose(known(moved.anchors[0].mirror_position_m), [12.0, 4.0, 6.0])
-        assert moved.anchors[1].mirror_position_m is None
-        assert moved.weights[0] == pytest.approx(1.0)
-        assert moved.weights[1] < 0.01
-        assert np.isnan(moved.weights[2])
-        assert moved.observations.status.tolist() == [RangeStatus.USED, RangeStatus.OUTLIER, RangeStatus.CHECK]
-        np.testing.assert_allclose(given.predicted_m - measured_m, [0.5, 0.0, 7.0])
-        assert given.weights[1] == 1.0
-        assert given.observations.status.tolist() == [RangeStatus.CHECK] * 3
-
-    def test_keyframes_may_move_by_a_hundredth_of_the_smallest_error(self) -> None:
-        def tolerance_m(ranges_m: list[float], tapes_m: list[float], positions_m: list[float]) -> float:
-            problem: Any = SimpleNamespace(
-                distances=SimpleNamespace(
-                    tape=Tape(tuple(TapedDistance(("a", "b"), 1.0, each, "control", 0) for each in tapes_m))
-                ),
-                positions=SimpleNamespace(stddevs_m=positions_m),
-            )
-            errors: Any = SimpleNamespace(stddev_m=np.array(ranges_m))
-            return with_ranges._tolerance_m(problem, errors)
-
-        assert tolerance_m([0.3, 0.2], [0.01], [0.05]) == pytest.approx(0.002)
-        # Without ranges, what else was measured counts.
-        assert tolerance_m([], [0.03, 0.01], [0.05]) == pytest.approx(1e-4)
-        assert tolerance_m([], [0.03], [0.05, 0.02]) == pytest.approx(2e-4)
-
-    def test_anchors_get_the_mean_variance_of_their_coordinates(self) -> None:
-        variances = [np.diag([0.01, 0.04, 0.07]), np.diag([-0.3, 0.1, 0.1]), np.eye(3), np.zeros((3, 3))]
-        covariance: Any = SimpleNamespace(anchors=np.array(variances))
-        lost = replace(an_anchor("C"), position_m=np.array([0.0, np.nan, 0.0]), position_stddev_m=np.inf)
-        anchors = (an_anchor("A"), an_anchor("B"), lost, an_anchor("D"))
-        found = with_ranges._with_stddevs(anchors, covariance)
-        stddevs = [each.position_stddev_m for each in found]
-        assert stddevs == pytest.approx([0.2, np.nan, np.inf, 0.0], nan_ok=True)
-        assert with_ranges._with_stddevs(anchors, None) is anchors
-
-    def test_markers_are_in_the_map_only_as_long_as_they_are_needed(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        calls: list[Any] = []
-
-        def add(*given: Any) -> dict[str, int]:
-            calls.append(given)
-            return {"P": 7}
-
-        monkeypatch.setattr(with_ranges, "add_marker_points", add)
-        monkeypatch.setattr(with_ranges, "remove_marker_points", lambda *given: calls.append(given))
-        none: Any = None
-        metric: Any = object()
-        distances = MeasuredDistances(none, none, {})
-        problem = RefinementProblem(
-            metric, none, none, distances, HeldPositions(), none, none, False, None, 1, False
-        )  # fmt: skip
-        with with_ranges._markers_in_map(problem) as with_markers:
-            assert with_markers.distances.marker_ids == {"P": 7}
-            assert calls == [(metric, None, {})]
-        assert calls[1:] == [(metric, {"P": 7})]
-
-    @pytest.mark.parametrize(("stddev_m", "expected_m"), [([0.3, 0.9, 0.5], 0.5), ([], 0.0)])
-    def test_ranges_between_anchors_have_the_usual_noise_of_ranges(
-        self, stddev_m: list[float], expected_m: float, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        asked: list[Any] = []
-        monkeypatch.setattr(with_ranges, "distances_by_radio", lambda *given, **named: asked.append((given, named)))
-        # The last of the ranges has no place.
-        has_place = np.array([True] * len(stddev_m) + [False])
-        observations: Any = SimpleNamespace(log="log", has_place=has_place)
-        errors: Any = SimpleNamespace(stddev_m=np.array([*stddev_m, np.nan]))
-        biased = replace(an_anchor("A"), prior_bias_m=0.25, prior_bias_stddev_m=0.5)
-        with_ranges._between_anchors(observations, [biased, an_anchor("B")], errors)
-        (((log, noise_m, bias_m, bias_stddev_m), named),) = asked
-        assert (log, noise_m) == ("log", expected_m)
-        np.testing.assert_array_equal(bias_m, [0.25, 0.0])
-        np.testing.assert_array_equal(bias_stddev_m, [0.5, 0.1])
-        assert named == {"common_bias_stddev_m": 0.0}
-
-
-def an_anchor(name: str) -> AnchorEstimate:
-    return AnchorEstimate(name, np.zeros(3), 0.1, None, np.inf, 0.0, 0.0, 0.1)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,8 +27,6 @@ from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.scale import initialize
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_by_lengths import ScaleByKind
-from rangesfm.scale.scale_estimate import ScaleUncertainty
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -510,30 +507,6 @@ def of_no_ranges(**given: Any) -> ScaleEstimate:
     return initialize_scale(no_ranges(), turned_path(), [], anchor_frame="unknown", **given)
 
 
-def test_without_ranges_lengths_scale_the_map_in_its_first_camera() -> None:
-    found, path = of_no_ranges(distances=taped(0.5)), turned_path()
-    lengths = known(found.lengths)
-    assert (found.method, found.frame, found.verdict) == ("lengths", "first_camera", "good")
-    assert found.value == pytest.approx(0.5)
-    into_camera = (path.centers - path.centers[0]) @ path.world_from_cam[0]
-    np.testing.assert_allclose(found.metric_from_sfm.apply(path.centers), 0.5 * into_camera, atol=1e-9)
-    assert found.uncertainty == ScaleUncertainty(lengths.relative_stddev, lengths.components)
-    assert found.by_kind == {"lengths": lengths.alone}
-    assert found.positions is None
-    assert found.placement is None
-
-
-def test_without_ranges_known_positions_put_the_map_in_the_site() -> None:
-    found, positions = of_no_ranges(positions=points_in_site(6, 0.5)), points_in_site(6, 0.5)
-    by_positions = known(found.positions)
-    assert (found.method, found.frame, found.verdict) == ("positions", "site", "good")
-    np.testing.assert_allclose(found.metric_from_sfm.apply(positions.places), positions.position_m, atol=1e-6)
-    assert found.uncertainty is by_positions.uncertainty
-    assert found.placement is by_positions.covariance
-    assert found.by_kind == {}
-    assert found.lengths is None
-
-
 def test_lengths_that_agree_with_known_positions_make_the_scale_more_certain_and_others_have_no_say() -> None:
     positions = points_in_site(3, 0.5)
     positions = replace(positions, covariance_m2=100 * positions.covariance_m2)
@@ -557,51 +530,3 @@ def test_lengths_that_agree_with_known_positions_make_the_scale_more_certain_and
     assert without.by_kind == {}
     assert without.lengths is left_out
     assert without.reasons[-1] == "a remark"
-
-
-def test_without_anything_the_scale_is_open_and_the_reason_is_said() -> None:
-    with pytest.raises(GeometryError, match=r"^the scale is not determined: no known position is used$"):
-        of_no_ranges()
-    between_anchors_only = replace(taped(0.5), anchor_pair=np.tile([0, 1], (3, 1)))
-    nowhere = r"^the scale is not determined: no measured length has both its ends in the map$"
-    with pytest.raises(GeometryError, match=nowhere):
-        of_no_ranges(distances=between_anchors_only)
-    few = r"^the scale is not determined: 2 known positions are in the map"
-    with pytest.raises(GeometryError, match=few):
-        of_no_ranges(positions=points_in_site(2, 0.5), distances=between_anchors_only)
-    # With lengths, positions that determine nothing are only remarked upon.
-    found = of_no_ranges(positions=points_in_site(2, 0.5), distances=taped(0.5))
-    [remark] = found.remarks
-    assert remark.startswith("the known positions are not used: 2 known positions are in the map")
-    assert found.reasons[-1] == remark
-    assert found.frame == "first_camera"
-
-
-def test_only_the_uncertainty_of_lengths_has_the_maps_bending() -> None:
-    lengths = known(of_no_ranges(distances=taped(0.5)).lengths)
-    ranges: Any = SimpleNamespace(distances=None)
-    without: Any = SimpleNamespace(ranges=ranges)
-    assert initialize._bent(without, lengths) is without
-
-    @dataclass(frozen=True)
-    class Posed:
-        ranges: Any
-
-    @dataclass(frozen=True)
-    class Ranges:
-        distances: LocatedDistances
-
-    posed: Any = Posed(Ranges(lengths.beside_ranges(taped(0.5))))
-    bent = initialize._bent(posed, lengths).ranges.distances
-    assert bent is not None
-    np.testing.assert_allclose(bent.stddev_m, [0.5 * lengths.relative_stddev])
-    np.testing.assert_allclose(bent.distance_m, [0.5])
-    measured = np.hypot(lengths.components["tape"], lengths.components["marks"])
-    np.testing.assert_allclose(posed.ranges.distances.stddev_m, [0.5 * measured])
-
-
-@pytest.mark.parametrize(("learnt", "share"), [(0.2, 0.0225), (0.02, 1.0), (np.inf, 1e-12)])
-def test_ranges_are_weighed_by_their_formal_over_their_learnt_variance(learnt: float, share: float) -> None:
-    """The formal standard deviation of 0.01 is inflated three times; the learnt one is of a scale of 2, or unknown."""
-    alone: Any = SimpleNamespace(fit=SimpleNamespace(log_scale_stddev=0.01), errors=SimpleNamespace(inflation=3.0))
-    assert initialize._range_share(alone, ScaleByKind(2.0, 2.0 * learnt)) == pytest.approx(share)

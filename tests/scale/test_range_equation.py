@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.known import known
 
 from rangesfm.distances.locate_lengths import LocatedDistances
-from rangesfm.geometry.gravity import Gravity, gravity_of
+from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
 from rangesfm.scale import range_equation
@@ -197,39 +196,10 @@ def test_some_ranges_stand_for_those_of_their_anchor_that_are_left_out(rng: np.r
     np.testing.assert_allclose(by_some.information, by_all.information, rtol=1e-6, atol=1e-6)
 
 
-def test_unknowns_are_counted_model_by_model_then_anchors_then_biases(rng: np.random.Generator) -> None:
-    free = replace(
-        random_problem(rng, random_state(rng)),
-        anchor_stddev_m=np.array([0.0, 0.4, np.inf]),
-        bias_stddev_m=np.array([0.02, 0.0, 0.3]),
-    )
-    first, second, third = range_equation.columns_of([free, replace(free, frame_is_free=False), free])
-    assert [(each.scale, each.frame) for each in (first, second, third)] == [(0, 1), (7, -1), (8, 9)]
-    assert first.anchor.tolist() == [-1, 15, 18]
-    assert first.bias.tolist() == [21, -1, 22]
-    assert first.num == 23
-    assert first.of_map == [0, 1, 2, 3, 4, 5, 6]
-    assert second.of_map == [7]
-    assert third.of_map == list(range(8, 15))
-    covariance = np.arange(23.0 * 23).reshape(23, 23)
-    np.testing.assert_array_equal(range_equation.Columns.placement(first, covariance), covariance[:7, :7])
-    np.testing.assert_array_equal(range_equation.Columns.placement(third, covariance), covariance[8:15, 8:15])
-    assert second.placement(covariance) is None
-
-
 def fit_with(information: Array, problem: RangeProblem, state: RangeState) -> RangeFit:
     num = len(problem.range_m)
     columns = range_equation.columns_of([problem])
     return RangeFit(state, np.zeros(num), np.ones(num), 0.0, information, np.zeros((num, len(information))), columns)
-
-
-def test_parts_of_anchors_in_a_covariance_are_zero_for_those_that_are_held(rng: np.random.Generator) -> None:
-    state = random_state(rng)
-    problem = replace(random_problem(rng, state), anchor_stddev_m=np.array([0.3, 0.0, np.inf]))
-    fit = fit_with(np.eye(16), problem, state)
-    covariance = np.arange(256.0).reshape(16, 16)
-    parts = fit.of_anchors(covariance)
-    np.testing.assert_array_equal(parts, [covariance[7:10, 7:10], np.zeros((3, 3)), covariance[10:13, 10:13]])
 
 
 def test_the_covariance_is_the_inverse_of_the_information_in_any_units(rng: np.random.Generator) -> None:
@@ -244,77 +214,6 @@ def test_the_covariance_is_the_inverse_of_the_information_in_any_units(rng: np.r
     units = np.array([1e-6, 1.0, 1e5, 1e2])
     in_units = fit_with(information * np.outer(units, units), problem, state)
     np.testing.assert_allclose(in_units.covariance * np.outer(units, units), expected, rtol=1e-9, atol=1e-12)
-
-
-def test_a_direction_without_information_has_a_huge_variance_and_leaves_the_others_alone(
-    rng: np.random.Generator,
-) -> None:
-    state = random_state(rng)
-    problem = random_problem(rng, state)
-    covariance = fit_with(np.diag([4.0, 0.0, 25.0]), problem, state).covariance
-    np.testing.assert_allclose(np.diag(covariance)[[0, 2]], [0.25, 0.04])
-    assert 1e13 < covariance[1, 1] < np.inf
-    # The sum of two unknowns is determined, and their difference is not.
-    covariance = fit_with(np.ones((2, 2)), problem, state).covariance
-    assert np.ones(2) @ covariance @ np.ones(2) == pytest.approx(1.0, abs=0.1)
-    assert covariance[0, 0] > 1e13
-
-
-def test_the_problem_of_one_anchor_has_its_ranges_and_priors_and_a_fixed_frame(rng: np.random.Generator) -> None:
-    taped = LocatedDistances.of(np.array([3.0]), np.array([0.1]), model_length=np.array([2.0]))
-    problem = replace(random_problem(rng, random_state(rng)), distances=taped, share=np.linspace(0.1, 1.0, NUM_RANGES))
-    part = problem.of_anchor(1)
-    rows = problem.anchor_index == 1
-    for name in ("centers", "tag_from_center", "range_m", "stddev_m", "share"):
-        np.testing.assert_array_equal(getattr(part, name), getattr(problem, name)[rows])
-    assert part.anchor_index.tolist() == [0] * int(rows.sum())
-    for name in ("anchor_mean_m", "anchor_stddev_m", "bias_mean_m", "bias_stddev_m"):
-        np.testing.assert_array_equal(getattr(part, name), getattr(problem, name)[1:2])
-    assert (part.num_anchors, part.frame_is_free, part.distances) == (1, False, None)
-    assert part.common_bias_stddev_m == problem.common_bias_stddev_m
-
-
-def test_shares_of_some_ranges_are_those_they_had_times_the_ranges_they_stand_for(rng: np.random.Generator) -> None:
-    problem = replace(random_problem(rng, random_state(rng)), anchor_index=np.repeat([0, 1, 2], [24, 12, 4]))
-    rows = np.array([0, 1, 2, 3, 24, 36, 37])
-    assert problem.subset(rows).share is None
-    np.testing.assert_allclose(known(problem.by_some(rows).share), [6, 6, 6, 6, 12, 2, 2])
-    shared = replace(problem, share=np.linspace(0.1, 1.0, NUM_RANGES))
-    expected = np.linspace(0.1, 1.0, NUM_RANGES)[rows] * [6, 6, 6, 6, 12, 2, 2]
-    np.testing.assert_allclose(known(shared.by_some(rows).share), expected)
-
-
-@pytest.mark.parametrize(("step", "log_scale"), [(19.0, 19.0), (25.0, 20.0), (-19.0, -19.0), (-25.0, -20.0)])
-def test_a_step_of_the_scale_is_never_so_long_that_it_overflows(
-    rng: np.random.Generator, step: float, log_scale: float
-) -> None:
-    state = random_state(rng)
-    problem = replace(random_problem(rng, state), frame_is_free=False)
-    columns = range_equation.columns_of([problem])
-    x = np.zeros(columns[0].num)
-    x[0] = step
-    moved = range_equation.state_after(columns, state, x).metric_from_model
-    assert np.log(moved.scale / state.metric_from_model.scale) == pytest.approx(log_scale)
-    np.testing.assert_array_equal(moved.rotation, state.metric_from_model.rotation)
-    np.testing.assert_array_equal(moved.translation, state.metric_from_model.translation)
-
-
-def test_priors_cost_half_of_their_squares_and_gravity_only_where_the_frame_is_free(rng: np.random.Generator) -> None:
-    state = random_state(rng)
-    up = state.metric_from_model.rotation.T @ [0.0, 0.6, 0.8]
-    problem = replace(
-        random_problem(rng, state),
-        anchor_mean_m=state.anchors_m + np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]]),
-        bias_mean_m=state.bias_m,
-        gravity=Gravity(up, 0.5),
-    )
-    # An anchor is off by 2 standard deviations, and up by (0, 0.6, -0.2) over 0.5.
-    assert range_equation.prior_cost(problem, state) == pytest.approx(0.5 * (4.0 + 4 * 0.4))
-    assert range_equation.prior_cost(replace(problem, frame_is_free=False), state) == pytest.approx(2.0)
-    off = replace(problem, gravity=None, bias_mean_m=state.bias_m + np.array([0.1, -0.2, 0.3]))
-    covariance = np.diag(problem.bias_stddev_m**2) + problem.common_bias_stddev_m**2
-    by_bias = np.array([0.1, -0.2, 0.3]) @ np.linalg.solve(covariance, [0.1, -0.2, 0.3])
-    assert range_equation.prior_cost(off, state) == pytest.approx(0.5 * (4.0 + by_bias))
 
 
 @pytest.mark.parametrize("loss", [CAUCHY, GEMAN_MCCLURE])
@@ -343,48 +242,3 @@ def test_the_slope_of_the_cost_is_its_finite_difference_and_far_ranges_add_no_cu
     of_priors = range_equation.prior_jacobian(problem, columns[0], start, start)
     np.testing.assert_allclose(of_far, of_priors.T @ of_priors, atol=1e-9)
     assert np.linalg.eigvalsh(curvature).min() > -1e-9
-
-
-def test_at_an_exact_fit_the_curvature_and_the_information_are_those_of_least_squares(rng: np.random.Generator) -> None:
-    state = random_state(rng)
-    share = rng.uniform(0.3, 1.0, NUM_RANGES)
-    problem = replace(random_problem(rng, state), share=share)
-    columns = range_equation.columns_of([problem])
-    ranges = range_equation.range_jacobian(problem, columns[0], state, state)
-    priors = range_equation.prior_jacobian(problem, columns[0], state, state)
-    expected = ranges.T @ (share[:, None] * ranges) + priors.T @ priors
-    _, curvature = range_equation._System((problem,), columns, state, CAUCHY).slope(state)
-    np.testing.assert_allclose(curvature, expected, rtol=1e-9, atol=1e-9)
-    weights = np.linspace(0.2, 2.0, NUM_RANGES)
-    fit = range_equation.fit_at(replace(problem, range_m=problem.range_m + 0.25), state, weights)
-    np.testing.assert_allclose(fit.residuals_m, -0.25)
-    np.testing.assert_array_equal(fit.weights, weights)
-    np.testing.assert_allclose(fit.gradients, (share * weights)[:, None] * ranges)
-    weighted = ranges.T @ ((share * weights)[:, None] * ranges) + priors.T @ priors
-    np.testing.assert_allclose(fit.information, weighted, rtol=1e-9, atol=1e-9)
-    assert fit.cost == 0.0
-
-
-def test_a_tight_solution_is_at_the_minimum_itself(rng: np.random.Generator) -> None:
-    """A Newton step would gain far less than what hides in the rounding of the cost."""
-    truth = random_state(rng)
-    problem = replace(random_problem(rng, truth), anchor_mean_m=truth.anchors_m, anchor_stddev_m=np.zeros(NUM_ANCHORS))
-    problem = replace(problem, range_m=problem.range_m + problem.stddev_m * rng.standard_normal(NUM_RANGES))
-    columns = range_equation.columns_of([problem])
-    fit = solve(problem, truth)
-    gradient, curvature = range_equation._System((problem,), columns, fit.state, CAUCHY).slope(fit.state)
-    assert gradient @ np.linalg.solve(curvature, gradient) < 1e-22
-
-
-def test_settling_steps_only_where_the_minimum_is_near(rng: np.random.Generator) -> None:
-    truth = random_state(rng)
-    problem = replace(random_problem(rng, truth), anchor_mean_m=truth.anchors_m, anchor_stddev_m=np.zeros(NUM_ANCHORS))
-    problem = replace(problem, bias_mean_m=truth.bias_m)
-    columns = range_equation.columns_of([problem])
-    system = range_equation._System((problem,), columns, truth, CAUCHY)
-    direction = rng.normal(size=columns[0].num)
-    _, curvature = system.slope(truth)
-    unit = direction / np.sqrt(direction @ curvature @ direction)
-    near, far = 0.9e-3 * unit, 1.1e-3 * unit
-    assert np.abs(range_equation._settled(system, near) / np.abs(near).max()).max() < 1e-6
-    np.testing.assert_array_equal(range_equation._settled(system, far), far)

@@ -12,16 +12,13 @@ from tests.known import known
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.gravity import gravity_of
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale import scale_verdict
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_estimate import ScaleUncertainty
-from rangesfm.scale.scale_verdict import judge_lengths, judge_positions, levelled_places, refuse_unknown
-from rangesfm.scale.solution import WHY_SCALE_IS_OPEN
+from rangesfm.scale.scale_verdict import judge_lengths, judge_positions, refuse_unknown
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey
@@ -186,15 +183,7 @@ def test_short_lengths_are_said_to_be_short() -> None:
     assert doubted.advice == ("measure more and longer lengths",)
 
 
-CIRCLE = np.stack([np.cos(np.linspace(0, 6.2, 60)), np.sin(np.linspace(0, 6.2, 60)), np.zeros(60)], axis=1)
 ROOM = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3)) * [4.0, 3.0, 2.0]
-
-
-def strip(width: float) -> np.ndarray:
-    """Places along a straight way of a standard deviation of 1, with one of ``width`` across it."""
-    along = np.linspace(-np.sqrt(3), np.sqrt(3), 60)
-    across = np.tile([1.0, -1.0, -1.0, 1.0], 15)  # as often ahead on either side
-    return np.stack([along / along.std(), width * across, np.zeros(60)], axis=1)
 
 
 def survey_reasons(
@@ -226,28 +215,6 @@ def survey_reasons(
     return [doubt.reason for doubt in scale_verdict._doubts_of_survey(posed, solution, uncertainty)]
 
 
-def test_a_round_path_among_unknown_anchors_is_why_a_wide_scale_is_open() -> None:
-    circle = "the path is a flat circle, and its radius and the anchors' heights can make up for each other"
-    sphere = np.random.default_rng(1).standard_normal((60, 3))
-    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    assert survey_reasons(CIRCLE, 0.041) == [circle]
-    assert survey_reasons(CIRCLE, 0.039) == []
-    assert survey_reasons(sphere, 0.041) == [WHY_SCALE_IS_OPEN["spherical"][0]]
-    # An anchor with a place is enough, but only if it is heard.
-    assert survey_reasons(CIRCLE, 0.041, (0.1, np.inf)) == []
-    assert survey_reasons(CIRCLE, 0.041, (np.inf, np.inf, 0.1)) == [circle]
-    assert survey_reasons(ROOM, 0.041) == []
-    # The shape is the reason even where nothing is known of the scale.
-    assert survey_reasons(CIRCLE, 2.5) == [circle]
-
-
-def test_ranges_that_tell_nothing_of_the_scale_do_not_show_a_motion() -> None:
-    moved = "the ranges do not show that the camera moved"
-    assert survey_reasons(ROOM, 1.97) == [moved]
-    assert survey_reasons(ROOM, 1.95) == []
-    assert survey_reasons(CIRCLE, 1.97, (0.1, 0.1)) == [moved]
-
-
 def test_a_map_whose_shape_its_photos_leave_open_is_said_to_be_one() -> None:
     shape = "ranges and photos leave the shape of the map open"
     assert survey_reasons(ROOM, 2.5, by_map=1.01) == [shape]
@@ -268,92 +235,6 @@ def test_a_scale_of_which_nothing_is_known_is_not_given_a_size() -> None:
     )
 
 
-def test_anchors_that_are_left_out_are_counted_and_named() -> None:
-    few = "too few ranges on the path to be placed: left out"
-    assert survey_reasons(ROOM, 0.01, left_out=("C",)) == [f"anchor C has {few}"]
-    assert survey_reasons(ROOM, 0.01, left_out=("C", "F"), notes=("so",)) == ["so", f"anchors C, F have {few}"]
-
-
-def test_a_path_is_nearly_straight_below_three_percent_across_it() -> None:
-    circle, roll = "an unknown anchor may stand anywhere on a circle", "the map's roll about it is uncertain"
-    straight, bent = strip(0.0295), strip(0.0305)
-    assert [circle in reason for reason in survey_reasons(straight, 0.01, (0.1, np.inf))] == [True]
-    assert [circle in reason for reason in survey_reasons(straight, 0.01, (np.inf, np.inf), frame_is_free=True)] == [
-        True
-    ]
-    assert [roll in reason for reason in survey_reasons(straight, 0.01, (0.1, 0.1), frame_is_free=True)] == [True]
-    assert survey_reasons(straight, 0.01, (0.1, 0.1)) == []
-    assert survey_reasons(bent, 0.01, (0.1, np.inf), frame_is_free=True) == []
-
-
-def range_reasons(weights: np.ndarray, per_anchor: dict[str, float] | None = None) -> list[str]:
-    fit: Any = SimpleNamespace(weights=weights)
-    return [doubt.reason for doubt in scale_verdict._doubts_of_ranges(fit, per_anchor or {})]
-
-
-def test_fewer_than_fifty_ranges_are_few() -> None:
-    assert range_reasons(np.ones(49)) == ["only 49 ranges lie on the path"]
-    assert range_reasons(np.ones(50)) == []
-
-
-def test_more_than_thirty_percent_of_outliers_are_many() -> None:
-    weights = np.where(np.arange(100) < 31, 0.099, 0.1)
-    assert range_reasons(weights) == ["31 % of the ranges do not fit the map: blocked, reflected, or of another anchor"]
-    assert range_reasons(np.where(np.arange(100) < 30, 0.099, 0.1)) == []
-
-
-def test_anchors_disagree_if_their_scales_scatter_by_five_percent() -> None:
-    """Two logarithms that are d apart have a standard deviation of d over the root of two."""
-    weights = np.ones(60)
-    apart = {"A": 2.0, "B": 2.0 * np.exp(0.052 * np.sqrt(2))}
-    assert range_reasons(weights, apart) == [
-        "the anchors disagree: the scales found with each of them alone scatter by 5.2 %"
-    ]
-    assert range_reasons(weights, {"A": 2.0, "B": 2.0 * np.exp(0.049 * np.sqrt(2))}) == []
-    assert range_reasons(weights, {"A": 2.0}) == []
-
-
-def estimated(anchor_id: str, position_m: object, mirror_m: object = None) -> AnchorEstimate:
-    mirror = None if mirror_m is None else np.array(mirror_m)
-    return AnchorEstimate(anchor_id, np.array(position_m), 0.1, None, np.inf, 0.0, 0.0, 0.1, mirror)
-
-
-def test_the_side_of_unknown_anchors_is_open_on_a_path_below_five_percent_in_height() -> None:
-    flat, high = (CIRCLE + np.tile([[0, 0, 1.0], [0, 0, -1.0]], (30, 1)) * 0.7071 * h for h in (0.049, 0.051))
-    mirrored, alone = estimated("A", [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]), estimated("B", [1.0, 0.0, 0.0])
-    for centers, anchors, is_open in (
-        (flat, [alone, mirrored], True),
-        (high, [alone, mirrored], False),
-        (flat, [alone], False),
-    ):
-        solution: Any = SimpleNamespace(problem=SimpleNamespace(centers=centers))
-        remarks = scale_verdict._remarks(solution, anchors)
-        assert [each.reason.startswith("the path is nearly flat: nothing tells on which") for each in remarks] == [
-            True
-        ] * is_open
-
-
-def test_gravity_puts_the_first_camera_at_a_height_and_a_distance_from_each_surveyed_anchor() -> None:
-    """An anchor at (3, -2, 4) is 2 m above the camera and 5 m away if up is along its -y."""
-    gravity = known(gravity_of((0.0, -1.0, 0.0)))
-    surveyed = [Anchor("A", np.array([50.0, 60.0, 7.0])), Anchor("B", np.array([0.0, 0.0, 1.0])), Anchor("C")]
-    found = [
-        estimated("C", [1.0, 1.0, 1.0]),
-        estimated("A", [3.0, -2.0, 4.0], [3.0, 2.5, 4.0]),
-        estimated("B", [0.0, 0.25, 2.0], [0.0, 0.25, -2.0]),
-        estimated("D", [1.0, 1.0, 1.0]),
-    ]
-    away = "in which direction is not determined"
-    assert levelled_places(gravity, surveyed, found) == (
-        "the first camera was at site height 5.00 m, 5.00 m horizontally or at site height 9.50 m, 5.00 m horizontally "
-        f"from anchor A; {away}",
-        f"the first camera was at site height 1.25 m, 2.00 m horizontally from anchor B; {away}",
-    )
-    assert levelled_places(gravity, surveyed, [estimated("A", [np.nan, 0.0, 0.0])]) == ()
-    [one] = levelled_places(gravity, surveyed, [estimated("A", [3.0, -2.0, 4.0])])
-    assert one == f"the first camera was at site height 5.00 m, 5.00 m horizontally from anchor A; {away}"
-
-
 def test_a_refusal_gives_one_reason_and_one_piece_of_advice_and_else_the_plan() -> None:
     options = ScaleOptions(max_relative_stddev=0.1)
     refuse_unknown(0.1959, ["a"], [], options)
@@ -365,17 +246,3 @@ def test_a_refusal_gives_one_reason_and_one_piece_of_advice_and_else_the_plan() 
     )
     with pytest.raises(GeometryError, match=r"times max_relative_stddev\); next time: plan the survey first"):
         refuse_unknown(0.5, [], [], options)
-
-
-def test_only_doubts_make_a_scale_doubtful_and_remarks_come_last() -> None:
-    doubt, remark = scale_verdict._Doubt("doubt", "walk"), scale_verdict._Doubt("remark", "raise")
-    options = ScaleOptions()
-    good = scale_verdict._verdict([], [remark], 0.0399, options)
-    assert (good.verdict, good.advice) == ("good", ("raise",))
-    assert good.reasons == ("the scale is known to 4.0 % (95 % interval)", "remark")
-    doubted = scale_verdict._verdict([doubt, scale_verdict._Doubt("bare"), doubt], [remark], 0.02, options)
-    assert (doubted.verdict, doubted.advice) == ("doubtful", ("walk", "raise"))
-    assert doubted.reasons == ("doubt", "bare", "doubt", "remark")
-    wide = scale_verdict._verdict([], [], 0.0401, options)
-    assert (wide.verdict, wide.advice) == ("doubtful", ())
-    assert wide.reasons == ("the scale is known to 4.0 % (95 % interval), worse than 4 %",)

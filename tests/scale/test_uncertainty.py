@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,13 +15,9 @@ from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.bending import BendingOfBins
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.ranging.errors.learned import ErrorParts, LearnedErrors
-from rangesfm.ranging.errors.range_bins import range_bins
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.linear_map import LinearMap
-from rangesfm.scale.range_equation import Columns
 from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
-from rangesfm.scale.uncertainty import KnownMap, bias_covariance, known_map, linear_map, shared_errors_m
+from rangesfm.scale.uncertainty import bias_covariance, known_map, linear_map
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -185,59 +180,3 @@ def test_what_the_clocks_leave_open_is_part_of_scale_and_place(make_survey: Make
 def heading_stddev_rad(estimate: ScaleEstimate) -> float:
     assert estimate.placement is not None
     return float(np.sqrt(estimate.placement[3, 3]))
-
-
-def test_ranges_share_the_errors_that_are_larger_than_what_their_bins_scatter() -> None:
-    """Four ranges in three bins, and one without a bin; the map's own errors and the noise are not shared."""
-    bins = range_bins(
-        np.array([0, 1, 2, 2]),
-        np.zeros(4, dtype=np.int64),
-        np.zeros(4),
-        np.eye(3)[[0, 1, 2, 2]],
-        np.tile(np.eye(3), (4, 1, 1)),
-        np.ones(4),
-        np.ones(3),
-    )
-    np.testing.assert_array_equal(bins.of_range, [0, 1, 2, 2])
-    stddev_m, weights, worth = np.array([0.1, 0.2, 0.3, 0.3]), np.array([1.0, 0.5, 1.0, 1.0]), np.full(4, 0.5)
-    scatter_m2 = np.array([0.01 / 0.5, 0.04 / 0.25, 0.09 / 1.0])
-    first, second = np.array([0.3, 0.4, 0.0]), np.array([0.0, 0.0, 1.01 * np.sqrt(scatter_m2[2])])
-    covariances = np.array([np.outer(first, first), np.outer(second, second), 9.0 * np.eye(3), 8.0 * np.eye(3)])
-    learned = LearnedErrors(("time", "bias", "white", "bending"), np.ones(4), covariances, bins, bins.of_range)
-    errors = SimpleNamespace(worth=worth, stddev_m=stddev_m)
-    solution: Any = SimpleNamespace(errors=errors, fit=SimpleNamespace(weights=weights))
-    of_range = np.array([0, 2, -1, 1, 2])
-    found = shared_errors_m(solution, learned, of_range)
-    assert found.shape == (5, 2)
-    expected = (covariances[0] + covariances[1])[np.ix_(of_range, of_range)]
-    expected[2], expected[:, 2] = 0.0, 0.0
-    np.testing.assert_allclose(found @ found.T, expected, atol=1e-12)
-    # An error that is a little smaller than the scatter is noise to the bin.
-    smaller = replace(learned, covariances_m2=covariances * np.array([1.0, 0.97, 1.0, 1.0])[:, None, None])
-    assert shared_errors_m(solution, smaller, of_range).shape == (5, 1)
-    none: Any = SimpleNamespace(errors=errors, fit=SimpleNamespace(weights=0 * weights))
-    assert shared_errors_m(none, learned, of_range).shape == (5, 0)
-
-
-def test_the_best_weights_are_followed_half_way_but_not_farther_than_chance() -> None:
-    """One number, measured twice: the other weights have half of each, the best ones of 1 and 4 parts."""
-    errors = ErrorParts(("time", "bias"), np.ones(2), np.array([np.diag([3.0, 0.0]), np.diag([1.0, 1.0])]))
-    nothing = np.zeros(0, dtype=np.int64)
-    columns = Columns(0, -1, nothing, nothing, 1)
-    by_others = np.array([[1.25]])  # of the mean of the two
-    chance = np.sqrt(1.25 - 0.8)
-    for residual_m, step in (([-1.0, -0.5], 0.6), ([-9.0, 1.0], 1.0)):
-        linear = LinearMap(np.array(residual_m), np.ones((2, 1)), np.zeros(0), np.zeros((0, 1)), columns)
-        found = KnownMap.between(linear, errors, 0.7, by_others)
-        np.testing.assert_allclose(found.half_way, [0.5 * np.sign(step) * min(step, chance)])
-        assert found.uncertainty.formal == 0.7
-        assert found.uncertainty.components == pytest.approx(
-            {"time": np.sqrt(0.04 * 3), "bias": np.sqrt(0.04 + 0.64), "reweighting": abs(found.half_way[0])}
-        )
-        np.testing.assert_allclose(found.covariance, [[0.8 + found.half_way[0] ** 2]])
-        np.testing.assert_allclose(found.best_by_bins, [0.2, 0.8])
-    back = KnownMap.between(linear, errors, 0.7, by_others, np.array([-0.2]))
-    np.testing.assert_allclose(back.half_way, [-0.1])
-    with_prior = LinearMap(np.zeros(2), np.ones((2, 1)), np.zeros(1), np.array([[1.0]]), columns)
-    given = KnownMap.between(with_prior, errors, 0.7, by_others).uncertainty.components
-    assert given["given"] == pytest.approx(1 / 2.25)

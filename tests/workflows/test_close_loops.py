@@ -184,8 +184,8 @@ def test_where_no_loops_are_found_the_map_is_refined_once(laps: Laps, tmp_path: 
 
 def test_loops_stay_open_where_that_is_asked_for(laps: Laps) -> None:
     survey = laps.survey.changed({"mapper.close_loops": False})
-    run = SurveyRun(survey, cast(RangingInputs, None), Journal(SilentProgress()))
-    metric = cast(MetricResult, None)
+    run = SurveyRun(survey, cast("RangingInputs", None), Journal(SilentProgress()))
+    metric = cast("MetricResult", None)
     assert close_loops(run, metric, lambda *_: pytest.fail("it is refined again")) is metric
 
 

@@ -7,17 +7,14 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.bending import (
-    ErrorPart,
     WalkBending,
     averaged,
     bending_in_bins,
-    bending_part,
     bent_path,
     by_poses,
     without_similarity,
@@ -171,108 +168,3 @@ def test_a_path_that_stands_still_is_not_bent(path: Trajectory) -> None:
     found = bending_in_bins(WalkBending(still), of_ranges, by_range, frame_is_free=False)
     assert {component.name for component in found.components} <= {"heading_drift"}
     assert not found.shift_m.any()
-
-
-def test_a_part_of_the_bending_has_its_median_in_metres() -> None:
-    covariance = np.array([[0.01, 0.02], [0.02, 0.07]])
-    part = bending_part("bending", covariance, 3.0, 0.7)
-    assert part is not None
-    np.testing.assert_allclose(part.median_m**2 * part.alike, 9.0 * covariance)
-    assert np.trace(part.alike) == pytest.approx(2.0)
-    assert (part.name, part.spread) == ("bending", 0.7)
-    assert bending_part("bending", np.zeros((2, 2)), 3.0, 0.7) is None
-    assert bending_part("bending", np.zeros((0, 0)), 3.0, 0.7) is None
-
-
-def test_a_part_is_a_component_that_does_not_depend_on_the_anchor(path: Trajectory) -> None:
-    component = ErrorPart("scale_drift", np.eye(2), 0.3, 0.7).component
-    assert (component.name, component.median, component.spread) == ("scale_drift", 0.3, 0.7)
-    assert (component.is_of_anchor, component.calibrated_median) == (False, None)
-    assert component.words == "drift of the map's scale along the path"
-    np.testing.assert_array_equal(component.correlation(in_bins(path)), np.eye(2))
-
-
-def test_poses_after_the_last_range_have_no_effect_on_a_bin(path: Trajectory) -> None:
-    bins = in_bins(path)
-    by_range = csr_array(np.random.default_rng(0).standard_normal((NUM_RANGES, 12)))
-    found = averaged(bins, by_range, 4)
-    assert found.shape == (len(bins), 24)
-    np.testing.assert_allclose(found[:, :12], bins.mean(by_range.toarray()))
-    assert not found[:, 12:].any()
-
-
-def test_steps_of_a_long_path_are_a_hundred_and_their_variance_is_by_their_length(path: Trajectory) -> None:
-    starts, unit = WalkBending(path)._steps_of_path
-    np.testing.assert_array_equal(starts, np.arange(NUM_POSES - 1))
-    lengths = np.linalg.norm(np.diff(path.centers, axis=0), axis=1)
-    np.testing.assert_allclose(unit[:, :4] ** 2, np.tile(lengths[:, None] / lengths.sum(), 4))
-    np.testing.assert_allclose(unit[:, 4:], np.tile(unit[:, :1], 3) * lengths.sum())
-    num = 251
-    along = np.arange(float(num))
-    long = Trajectory(
-        np.arange(num),
-        tuple(f"{k}.jpg" for k in range(num)),
-        None,
-        np.column_stack([along, 0 * along, 0 * along]),
-        np.tile(np.eye(3), (num, 1, 1)),
-    )
-    starts, unit = WalkBending(long)._steps_of_path
-    assert len(starts) == 100
-    assert (starts[0], starts[1], starts[-1]) == (0, 2, 247)
-    np.testing.assert_allclose(np.sum(unit**2, axis=0), [1.0] * 4 + [250.0**2] * 3)
-
-
-@pytest.mark.parametrize("frame_is_free", [True, False])
-def test_a_walk_is_bent_back_to_the_most_likely_steps(path: Trajectory, frame_is_free: bool) -> None:
-    """The mean of steps given residuals has them and their prior in balance."""
-    walk = WalkBending(path)
-    by_pose = np.random.default_rng(2).standard_normal((5, 6 * NUM_POSES))
-    factors = walk.factors(by_pose, frame_is_free=frame_is_free)
-    sizes = {"scale_drift": 2.0, "heading_drift": 3.0, "bending": 0.5}
-    stddevs = np.array([2.0 * 0.004, *[3.0 * 0.002] * 3, *[0.5 * 0.0005] * 3])
-    of_steps = (factors * stddevs).reshape(5, -1)
-    covariance = of_steps @ of_steps.T + 0.1 * np.eye(5)
-    residuals = np.array([0.3, -0.1, 0.2, 0.5, -0.4])
-    weighed = np.linalg.solve(covariance, residuals)
-    found = walk.bent_back(weighed @ by_pose, sizes, frame_is_free=frame_is_free)
-    assert found.steps is not None
-    assert found.frame_is_free == frame_is_free
-    # Steps whiten to w with the least |w|^2 + |residuals + F w|^2 / 0.1.
-    expected = -np.linalg.solve(of_steps.T @ of_steps / 0.1 + np.eye(of_steps.shape[1]), of_steps.T @ residuals / 0.1)
-    np.testing.assert_allclose(found.steps / stddevs, expected.reshape(found.steps.shape), atol=1e-9)
-    only = walk.bent_back(weighed @ by_pose, {"scale_drift": 2.0}, frame_is_free=frame_is_free).steps
-    assert only is not None
-    np.testing.assert_allclose(only[:, 0], found.steps[:, 0])
-    assert not only[:, 1:].any()
-
-
-def test_of_a_path_bent_back_the_ranges_would_shift_to_where_it_came_from(path: Trajectory) -> None:
-    by_pose = np.random.default_rng(2).standard_normal((5, 6 * NUM_POSES))
-    assert not WalkBending(path).of_functions(by_pose, frame_is_free=True).shift_m.any()
-    steps = 1e-3 * np.random.default_rng(5).standard_normal((NUM_POSES - 1, 7))
-    walk = WalkBending(path, steps)
-    found = walk.of_functions(by_pose, frame_is_free=True)
-    factors = walk.factors(by_pose, frame_is_free=True).reshape(5, -1)
-    np.testing.assert_allclose(found.shift_m, -(factors @ steps.ravel()))
-    assert [part.name for part in found.parts] == ["scale_drift", "heading_drift", "bending"]
-    covariances = [part.median_m**2 * part.alike for part in found.parts]
-    each = walk.factors(by_pose, frame_is_free=True)
-    for which, factor, covariance in zip(
-        (slice(0, 1), slice(1, 4), slice(4, 7)), (0.004, 0.002, 0.0005), covariances, strict=True
-    ):
-        expected = factor**2 * np.einsum("csi,dsi->cd", each[:, :, which], each[:, :, which])
-        np.testing.assert_allclose(covariance, expected, rtol=1e-9)
-    assert [part.spread for part in found.parts] == [1.0] * 3
-    np.testing.assert_array_equal(found.formal_m2, np.zeros((5, 5)))
-
-
-def test_the_change_at_a_step_is_of_all_later_poses_about_it(path: Trajectory) -> None:
-    steps = np.array([[0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5, 1.0, 2.0, 3.0]])
-    bent = bent_path(path, np.array([3, 8]), steps)
-    np.testing.assert_allclose(bent.centers[:4], path.centers[:4])
-    grown = path.centers[3] + np.exp(0.2) * (path.centers - path.centers[3])
-    np.testing.assert_allclose(bent.centers[4:9], grown[4:9])
-    turn = Rotation.from_rotvec([0.0, 0.0, 0.5]).as_matrix()
-    np.testing.assert_allclose(bent.centers[9:], grown[8] + (grown[9:] - grown[8]) @ turn.T + [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(bent.world_from_cam[:9], path.world_from_cam[:9])
-    np.testing.assert_allclose(bent.world_from_cam[9:], turn @ path.world_from_cam[9:])

@@ -11,7 +11,6 @@ from rangesfm.errors import InputError
 from rangesfm.ranging.errors.error_curve import (
     ErrorCurve,
     correct_ranges,
-    is_error_curve_file,
     read_error_curve,
     write_error_curve,
 )
@@ -72,44 +71,6 @@ def test_a_curve_that_is_none_is_refused_with_its_line(tmp_path: Path, rows: str
     with pytest.raises(InputError) as error:
         read_error_curve(path)
     assert str(error.value).endswith(message)
-
-
-def test_the_stddev_grows_by_a_decimetre_for_each_factor_e_beyond_the_ends() -> None:
-    distance, stddev = CURVE.true_distance(np.array([4.0 * np.e + 0.1, np.exp(-2.0) - 0.1, 2.0, 3.05]))
-    np.testing.assert_allclose(distance[:3], [4.0 * np.e, np.exp(-2.0), 2.0])
-    np.testing.assert_allclose(stddev, [np.hypot(0.02, 0.1), np.hypot(0.03, 0.2), 0.02, 0.02])
-
-
-def test_a_distance_is_at_least_a_tenth_of_the_range() -> None:
-    long = ErrorCurve(np.array([1.0, 2.0]), np.array([0.5, 0.5]), np.full(2, 0.1), np.full(2, 0.1))
-    np.testing.assert_allclose(long.true_distance(np.array([0.52, 0.6, 1.5]))[0], [0.052, 0.1, 1.0])
-
-
-def test_ranges_outside_are_those_beyond_the_ranges_at_its_ends() -> None:
-    assert CURVE.share_outside(np.array([0.89, 0.91, 4.09, 4.11])) == 0.5
-    ends = np.array([1.0, 4.0]) + CURVE.error_m[[0, -1]]
-    assert CURVE.share_outside(ends) == CURVE.share_outside(np.zeros(0)) == 0.0
-
-
-@pytest.mark.parametrize(("num", "notes"), [(50, 0), (49, 1)])
-def test_more_than_two_ranges_of_a_hundred_outside_are_told(num: int, notes: int) -> None:
-    log = RangeLog.from_arrays(["a"] * num, [9.0] + [3.0] * (num - 1), timestamp_s=np.arange(float(num)))
-    corrected, told = correct_ranges(log, CURVE)
-    assert [note[:19] for note in told] == ["2 % of the ranges a"] * notes
-    np.testing.assert_allclose(corrected.range_m, CURVE.true_distance(log.range_m)[0])
-
-
-def test_a_file_is_a_curve_by_its_columns_and_its_noise_may_be_left_out(tmp_path: Path) -> None:
-    path = tmp_path / "curve.csv"
-    write_error_curve(CURVE, path)
-    lines = path.read_text().splitlines()
-    assert lines[:2] == ["distance_m,error_m,stddev_m,noise_stddev_m", "1.00000,-0.10000,0.03000,0.10000"]
-    assert is_error_curve_file(path.read_text())
-    assert not is_error_curve_file("distance_m,error_m\n1,0\n")
-    path.write_text("distance_m,error_m,stddev_m\n1,0.5,0\n2,-0.4,0.1\n")
-    read = read_error_curve(path)
-    np.testing.assert_array_equal(read.noise_stddev_m, [0.0, 0.0])
-    np.testing.assert_array_equal(read.stddev_m, [0.0, 0.1])
 
 
 @pytest.mark.parametrize("rows", ["1,-1,0.1\n2,0,0.1\n", "1,0.5,0.1\n2,-0.5,0.1\n"])

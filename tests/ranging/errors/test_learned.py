@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.stats import multivariate_normal, norm
 
-from rangesfm.ranging.errors.bending import BendingOfBins, ErrorPart
-from rangesfm.ranging.errors.components import COMPONENTS, OtherError
+from rangesfm.ranging.errors.components import COMPONENTS
 from rangesfm.ranging.errors.learned import (
     ComponentLikelihood,
-    ErrorParts,
     ExpectedErrors,
     LearnedErrors,
-    _determinant_and_inverse,
-    independent_unknowns,
     learn_errors,
     usual_stddevs,
 )
@@ -232,175 +227,3 @@ def test_the_most_likely_sizes_are_where_the_gradient_vanishes_from_any_start() 
     found = likelihood.most_likely()
     np.testing.assert_allclose(likelihood._negative_with_gradient(found)[1], 0.0, atol=1e-3)
     np.testing.assert_allclose(likelihood.most_likely(start=np.log([0.02, 0.4])), found, atol=1e-3)
-
-
-@pytest.mark.parametrize(("size", "spread", "bound"), [(0.0, 5.0, -5.0), (1e6, 2.5, 8.0)])
-def test_sizes_are_sought_within_five_below_and_eight_above_the_median(
-    size: float, spread: float, bound: float
-) -> None:
-    off_m = size * np.random.default_rng(0).standard_normal(30)
-    one_cause = ComponentLikelihood(
-        np.eye(30)[None], np.log([0.01]), np.array([spread]), 0 * np.eye(30), off_m, np.ones((30, 1)), np.zeros((0, 1))
-    )
-    assert one_cause.most_likely()[0] == pytest.approx(np.log(0.01) + bound)
-
-
-def test_a_size_that_is_uncertain_counts_with_the_root_of_its_mean_variance() -> None:
-    """The information of restricted likelihood on a variance is half the trace of a squared product."""
-    likelihood, logs = two_causes(), np.log([0.07, 0.05])
-    inverse = np.linalg.inv(covariance_of(likelihood, logs))
-    design = likelihood.design
-    of_unknowns = np.linalg.inv(design.T @ inverse @ design + np.diag([9.0, 0.0]))
-    left = inverse - inverse @ design @ of_unknowns @ design.T @ inverse
-    # The derivative of a variance by the logarithm of its root is twice the variance.
-    slopes = [2 * np.exp(2 * log) * alike for log, alike in zip(logs, likelihood.of_components, strict=True)]
-    information = [[0.5 * np.trace(left @ a @ left @ b) for a in slopes] for b in slopes]
-    variances = np.diag(np.linalg.inv(np.array(information) + np.diag(likelihood.spreads**-2.0)))
-    np.testing.assert_allclose(likelihood.mean_stddevs(logs), np.exp(logs + variances), rtol=1e-8)
-
-
-def test_determinant_and_inverse_are_those_of_numpy_and_need_a_positive_matrix() -> None:
-    root = np.random.default_rng(0).standard_normal((5, 5))
-    matrix = root @ root.T
-    log_determinant, inverse = _determinant_and_inverse(np.triu(matrix))
-    assert log_determinant == pytest.approx(np.linalg.slogdet(matrix)[1])
-    np.testing.assert_allclose(inverse, np.linalg.inv(matrix), rtol=1e-8)
-    with pytest.raises(np.linalg.LinAlgError, match="the matrix is not positive definite"):
-        _determinant_and_inverse(np.diag([1.0, -1.0]))
-
-
-def test_independent_unknowns_span_what_the_unknowns_did() -> None:
-    """The third unknown is the sum of the others, one more has no effect, and one is told by its prior alone."""
-    rng = np.random.default_rng(0)
-    two = rng.standard_normal((6, 2)) * [1e4, 1e-4]
-    design = np.column_stack([two, two.sum(axis=1), np.zeros(6), np.zeros(6)])
-    prior_design = np.array([[0.0, 0.0, 0.0, 0.0, 5.0]])
-    independent, prior = independent_unknowns(design, prior_design)
-    assert (independent.shape, prior.shape) == ((6, 3), (1, 3))
-    stacked, kept = np.vstack([design, prior_design]), np.vstack([independent, prior])
-    np.testing.assert_allclose(kept @ (np.linalg.pinv(kept) @ stacked), stacked, atol=1e-8)
-    assert independent_unknowns(np.zeros((4, 2)), np.zeros((1, 2)))[0].shape == (4, 0)
-
-
-def three_parts() -> ErrorParts:
-    parts = np.stack([np.diag([1.0, 4.0]), np.ones((2, 2)), -0.1 * np.eye(2)])
-    return ErrorParts(("a", "b", "c"), np.array([1.0, 2.0, 3.0]), parts)
-
-
-def test_parts_of_the_errors_are_added_chosen_and_left_out_by_name() -> None:
-    parts = three_parts()
-    np.testing.assert_allclose(parts.covariance_m2, [[1.9, 1.0], [1.0, 4.9]])
-    assert parts.stddev_of_component == {"a": 1.0, "b": 2.0, "c": 3.0}
-    for some in (parts.only("c", "a"), parts.without("b")):
-        assert some.names == ("a", "c")
-        np.testing.assert_array_equal(some.stddevs, [1.0, 3.0])
-        np.testing.assert_array_equal(some.covariances_m2, parts.covariances_m2[[0, 2]])
-
-
-def test_parts_have_an_effect_on_what_depends_on_the_bins() -> None:
-    """The variance of the last is negative by rounding."""
-    of = three_parts().stddev_of_bins(np.array([3.0, 1.0]))
-    assert of == pytest.approx({"a": np.sqrt(9 + 4), "b": 4.0, "c": 0.0})
-
-
-def few_bins(tags: tuple[int, int] = (0, 0)) -> RangeBins:
-    """Four bins of one range each, of two anchors of which the second is twice as noisy."""
-    from_anchor_m = np.array([[2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 4.0], [5.0, 0.0, 0.0]])
-    return range_bins(
-        np.array([0, 1, 0, 1]),
-        np.array([*tags, *tags]),
-        np.array([0.0, 0.0, 9.0, 9.0]),
-        from_anchor_m,
-        np.tile(np.eye(3), (4, 1, 1)),
-        np.ones(4),
-        np.array([1.0, 2.0]),
-    )
-
-
-def test_errors_to_expect_are_all_components_that_are_not_ruled_out() -> None:
-    names = [component.name for component in COMPONENTS]
-    one_tag = ExpectedErrors.of(few_bins())
-    assert [c.name for c in one_tag.components] == [name for name in names if name != "tag_bias"]
-    two_tags = ExpectedErrors.of(few_bins((0, 1)), ruled_out=["slope", "bias"])
-    assert [c.name for c in two_tags.components] == [name for name in names if name not in ("slope", "bias")]
-    of = {c.name: alike for c, alike in zip(one_tag.components, one_tag.of_components, strict=True)}
-    np.testing.assert_allclose(np.diag(of["bias"])[np.argsort(few_bins().anchor_index)], [1.0, 1.0, 4.0, 4.0])
-    np.testing.assert_allclose(of["common_bias"], 1.0)
-    assert (one_tag.known, one_tag.is_calibrated) == ({}, False)
-    np.testing.assert_array_equal(one_tag.shift_m, np.zeros(4))
-
-
-def test_bending_of_the_map_and_further_errors_are_expected_too() -> None:
-    alike = np.diag([1.0, 0.0, 0.0, 1.0])
-    bending = BendingOfBins((ErrorPart("bending", alike, 0.02, 1.0),), np.zeros((4, 4)), np.array([0.1, 0.2, 0.3, 0.4]))
-    others: dict[OtherError, Array] = {"given": 0.25 * np.eye(4), "clocks": np.diag([1.0, 4.0, 9.0, 2.0])}
-    expected = ExpectedErrors.of(few_bins(), None, (), others, bending)
-    assert expected.components[-1].name == "bending"
-    np.testing.assert_array_equal(expected.of_components[-1], alike)
-    np.testing.assert_array_equal(expected.shift_m, bending.shift_m)
-    usual = expected.usual({"bending": 0.5, "white": 0.3})
-    assert usual.names[-3:] == ("bending", "given", "clocks")
-    stddevs_by_name = usual.stddev_of_component
-    assert (stddevs_by_name["bending"], stddevs_by_name["white"]) == (0.5, 0.3)
-    assert stddevs_by_name["given"] == pytest.approx(0.5)
-    assert stddevs_by_name["clocks"] == pytest.approx(2.0)
-    np.testing.assert_allclose(usual.only("bending").covariance_m2, 0.25 * alike)
-    np.testing.assert_array_equal(usual.only("clocks").covariance_m2, others["clocks"])
-    np.testing.assert_array_equal(usual.of_range, few_bins().of_range)
-
-
-def test_a_learnt_curve_errs_alike_at_like_distances_and_leaves_less_to_be_learnt() -> None:
-    bins = few_bins()
-    stddev = np.array([0.1, 0.2, 0.3, 0.4])
-    expected = ExpectedErrors.of(bins, stddev)
-    of_bins = bins.mean(stddev)
-    ratio = np.log(bins.distance_m[:, None] / bins.distance_m)
-    np.testing.assert_allclose(
-        expected.known["learnt_curve"], of_bins[:, None] * of_bins * np.exp(-0.5 * ratio**2), rtol=1e-9
-    )
-    usual, before = (usual_stddevs(is_calibrated=flag) for flag in (True, False))
-    assert {name for name in usual if usual[name] < before[name]} == {"common_bias", "short", "curve", "slope"}
-    assert expected.usual({}).stddev_of_component["slope"] == pytest.approx(usual["slope"])
-
-
-def learnt_with(noise_m: float, off_m: float = 0.0, **others: Any) -> dict[str, float]:
-    """Learn from four bins with a free unknown for each, which show nothing but the priors."""
-    bending = BendingOfBins((ErrorPart("bending", np.eye(4), 0.02, 1.0),), np.zeros((4, 4)), np.zeros(4))
-    expected = ExpectedErrors.of(few_bins(), bending=bending)
-    learned = expected.learnt(np.full(4, off_m), np.eye(4), np.zeros((0, 4)), noise_m, **others)
-    effect = np.sqrt(np.trace(learned.covariances_m2, axis1=1, axis2=2))
-    usual = np.sqrt(np.trace(expected.usual({}).covariances_m2, axis1=1, axis2=2))
-    return dict(zip(learned.names, (effect / usual).tolist(), strict=True))
-
-
-def test_noise_beyond_the_usual_widens_all_but_itself_and_the_map_by_its_power_of_one_and_a_half() -> None:
-    for noise_m, widening in ((0.05, 1.0), (0.1, 1.0), (0.4, 8.0)):
-        for name, ratio in learnt_with(noise_m).items():
-            assert ratio == pytest.approx(1.0 if name in ("white", "bending") else widening, rel=1e-3), name
-
-
-def test_the_unlikeliness_is_the_squared_distance_from_the_medians_in_spreads() -> None:
-    expected = ExpectedErrors.of(few_bins())
-    learned = expected.learnt(np.array([0.5, -0.5, 0.4, 0.1]), np.zeros((4, 1)), NO_MAP, 0.05)
-    off = [
-        (np.log(stddev) - np.log(c.median)) / c.spread
-        for c, stddev in zip(expected.components, learned.stddevs, strict=True)
-    ]
-    assert learned.unlikeliness == pytest.approx(np.sum(np.square(off)))
-    assert learned.unlikeliness > 1.0
-
-
-def test_a_shift_of_the_map_is_no_error_of_the_ranges() -> None:
-    shift_m = np.array([3.0, -2.0, 4.0, 1.0])
-    bending = BendingOfBins((), np.zeros((4, 4)), shift_m)
-    off_m, nothing = np.array([0.05, 0.0, -0.05, 0.02]), np.zeros((4, 1))
-    shifted = ExpectedErrors.of(few_bins(), bending=bending).learnt(off_m + shift_m, nothing, NO_MAP, 0.05)
-    plain = ExpectedErrors.of(few_bins()).learnt(off_m, nothing, NO_MAP, 0.05)
-    np.testing.assert_allclose(shifted.stddevs, plain.stddevs, rtol=1e-9)
-
-
-def test_ranges_of_some_rows_are_those_rows() -> None:
-    usual = ExpectedErrors.of(few_bins()).usual({})
-    np.testing.assert_array_equal(usual.subset(np.array([2, 0])).of_range, few_bins().of_range[[2, 0]])
-    spread = usual.subset(np.array([2, 0])).spread(np.array([1, 3]), 5)
-    np.testing.assert_array_equal(spread.of_range, [-1, few_bins().of_range[2], -1, few_bins().of_range[0], -1])

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from rangesfm.ranging.errors.place import (
     correlation_in_place,
     place_labels,
-    shares_by_residuals,
     shares_of_places,
 )
-from rangesfm.ranging.errors.robust_loss import CAUCHY
 
 
 def test_a_place_is_a_bin_and_an_anchor() -> None:
@@ -85,55 +82,3 @@ def test_rounding_does_not_part_a_place_on_round_coordinates() -> None:
 def test_rounding_has_no_place() -> None:
     labels = np.repeat(np.arange(20), 10)
     assert correlation_in_place(1e-12 * np.repeat(np.random.default_rng(0).normal(size=20), 10), labels) == 0.0
-
-
-def test_a_place_is_two_decimetres_wide() -> None:
-    for edge, is_one in ((0.199, True), (0.201, False)):
-        for axis in np.eye(3):
-            labels = place_labels(np.stack([0.001 * axis, edge * axis]), np.zeros(2, dtype=np.int64))
-            assert (labels[0] == labels[1]) == is_one
-
-
-def pairs(num_places: int, common: float, own: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """Return errors of which two are in each place, and the labels of the places."""
-    errors = common * np.repeat(np.resize([1.0, -1.0], num_places), 2) + own * np.resize([1.0, -1.0], 2 * num_places)
-    return errors, np.repeat(np.arange(num_places), 2)
-
-
-def test_the_correlation_is_that_of_an_analysis_of_variance() -> None:
-    """The mean square within places is 2 * 0.25, and between them 2 * 1; (2 - 0.5) / (2 + 0.5) is common."""
-    assert correlation_in_place(*pairs(30, 1.0, 0.5)) == pytest.approx(0.6)
-    assert correlation_in_place(*pairs(30, 0.1, 1.0)) == 0.0, "less than by chance"
-    # Ten further places of five errors each of half the size: 110 errors in 40 places.
-    errors, labels = pairs(30, 1.0, 0.5)
-    errors, labels = np.append(errors, np.full(50, 0.5)), np.append(labels, np.repeat(np.arange(30, 40), 5))
-    within, between = 60 * 0.25 / 70, (60 * 1.0 + 50 * 0.25) / 40
-    expected = (between - within) / (between + (110 / 40 - 1) * within)
-    assert correlation_in_place(errors, labels) == pytest.approx(expected)
-
-
-def test_twenty_errors_besides_one_of_each_place_are_needed_for_a_correlation() -> None:
-    assert correlation_in_place(*pairs(20, 1.0, 0.5)) == pytest.approx(0.6)
-    assert correlation_in_place(*pairs(19, 1.0, 0.5)) == 0.0
-
-
-def test_errors_of_a_thousandth_of_their_stddev_are_rounding() -> None:
-    """The mean square between places and within them add up to two and a half times the square."""
-    for size, expected in ((0.6e-3, 0.0), (0.7e-3, 0.6)):
-        errors, labels = pairs(30, size, size / 2)
-        assert correlation_in_place(errors, labels) == pytest.approx(expected)
-
-
-def test_outliers_do_not_make_a_place() -> None:
-    """One place has outliers on one side; without the loss it would seem to have an error of its own."""
-    errors, labels = pairs(30, 0.0, 1.0)
-    errors[:2] = 50.0
-    np.testing.assert_allclose(shares_by_residuals(labels, errors, CAUCHY), 1.0)
-    assert correlation_in_place(errors, labels) > 0.5
-
-
-def test_places_of_common_errors_count_by_their_number_of_ranges() -> None:
-    """Errors of half a stddev or less are nearly not reduced; one place has four, which count as one."""
-    labels = np.concatenate([np.repeat(np.arange(20), 2), np.full(4, 20)])
-    shares = shares_by_residuals(labels, 0.01 * np.resize([1.0, 1.0, -1.0, -1.0], 44) * (labels < 20), CAUCHY)
-    assert shares[-1] < 0.6 * shares[0]

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors import radio_calibration
 from rangesfm.ranging.errors.radio_calibration import (
     RadioCalibration,
     _knots,
-    _noise_by_knot,
     calibrate_ranges,
 )
 from rangesfm.ranging.range_log import RangeLog
@@ -129,60 +125,6 @@ def test_knots_are_a_sixth_of_an_e_fold_apart_at_most_from_the_shortest_range_to
     np.testing.assert_allclose(steps, steps[0])
     assert len(knots) == int(np.ceil(6 * np.log(40.0))) + 1
     assert steps[0] < 1 / 6
-
-
-@pytest.mark.parametrize(("e_folds", "is_curve"), [(0.335, True), (0.331, False)])
-def test_a_curve_needs_lengths_that_differ_by_a_third_of_an_e_fold(e_folds: float, is_curve: bool) -> None:
-    distance = np.repeat([2.0, 2.0 * np.exp(e_folds)], 500)
-    if is_curve:
-        assert len(_knots(distance)) == 4
-    else:
-        with pytest.raises(GeometryError, match=r"^the ranges are 2\.00 to 2\.78 m long: a curve needs"):
-            _knots(distance)
-
-
-def test_noise_is_told_for_each_knot_by_twenty_ranges_that_are_nearest() -> None:
-    distance = np.concatenate([np.full(20, 1.4), np.full(19, 2.4), np.full(20, 3.6), np.full(10, 9.0)])
-    residuals = np.resize([1.0, -1.0], 69) * np.repeat([0.1, 0.2, 0.3, 0.3], [20, 19, 20, 10])
-    found = _noise_by_knot(np.array([1.0, 2.0, 3.0, 4.0]), distance, residuals, 0.07)
-    np.testing.assert_allclose(found, [1.4826022 * 0.1, 0.07, 0.07, 1.4826022 * 0.3])
-
-
-def test_the_calibration_tells_what_is_beyond_the_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The curve and the biases are given here; a tenth of the ranges is off by a metre, and one photo is each time."""
-    asked: list[Any] = []
-    biases = np.array([0.1, -0.2, 0.0, 0.05])
-
-    def expected(bins: Any, error_m: Array, knots: Array, noise_m: float, num: int) -> tuple[Array, Array, Array]:
-        asked.append((bins, error_m, noise_m, num))
-        return 0.3 + 0 * knots, 0.01 + 0 * knots, biases
-
-    monkeypatch.setattr(radio_calibration, "_expected_curve", expected)
-    rng = np.random.default_rng(0)
-    tags = np.repeat(rng.uniform([-3, -3, 0], [9, 8, 2], (60, 3)), 4, axis=0)
-    index = np.tile(np.arange(4), 60)
-    distance = np.linalg.norm(tags - np.array([anchor.position_m for anchor in ANCHORS])[index], axis=1)
-    off = 0.05 * rng.standard_normal(240)
-    off[::10] += 1.0
-    log = RangeLog.from_arrays(
-        [ANCHORS[k].anchor_id for k in index],
-        distance + 0.3 + biases[index] + off,
-        image_name=[f"{k // 4:02d}.jpg" for k in range(240)],
-    )
-    found = calibrate_ranges(log, tags, ANCHORS)
-    assert (found.num_ranges, found.outlier_share) == (240, 0.1)
-    assert found.anchor_bias_m == pytest.approx(dict(zip("abcd", biases, strict=True)))
-    assert found.noise_stddev_m == pytest.approx(1.4826022 * np.median(np.abs(off)))
-    np.testing.assert_allclose(found.distance_m, distance)
-    np.testing.assert_allclose(found.error_m, 0.3 + biases[index] + off)
-    np.testing.assert_array_equal(found.curve.stddev_m, 0.01)
-    bins, error_m, noise_m, num = asked[-1]
-    assert (len(asked), num) == (6, 4)
-    assert noise_m == pytest.approx(found.noise_stddev_m)
-    assert len(bins) <= 200
-    np.testing.assert_allclose(error_m, bins.mean(found.error_m))
-    assert bins.time_s.max() == pytest.approx(59, abs=1), "photos since the first"
-    np.testing.assert_allclose(bins.in_cam, bins.from_anchor, atol=1e-12)
 
 
 def test_a_hundred_ranges_are_needed() -> None:

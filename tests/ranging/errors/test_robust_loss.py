@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss, wider
+from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
 
 BOTH = pytest.mark.parametrize("loss", [CAUCHY, GEMAN_MCCLURE], ids=["Cauchy", "Geman-McClure"])
 
@@ -60,16 +60,3 @@ def test_next_to_no_residual_the_loss_is_its_square(loss: RobustLoss) -> None:
     residuals = np.geomspace(1e-12, 1e-5, 60)
     np.testing.assert_allclose(loss.rho(residuals**2)[0], residuals**2, rtol=1e-9)
     np.testing.assert_allclose(loss.slopes(residuals), 1.0, rtol=1e-9)
-
-
-def test_a_wider_loss_is_the_same_in_larger_units() -> None:
-    twice = CAUCHY.scaled(2.0)
-    assert (twice.width, twice.is_bounded) == (2 * CAUCHY.width, False)
-    np.testing.assert_allclose(twice.rho(np.array([36.0]))[0], 4 * CAUCHY.rho(np.array([9.0]))[0])
-    np.testing.assert_allclose(twice.weights(np.array([6.0])), CAUCHY.weights(np.array([3.0])))
-
-
-def test_the_loss_that_keeps_growing_is_as_wide_as_the_bounded_one_that_it_stands_for() -> None:
-    assert wider(GEMAN_MCCLURE) == CAUCHY
-    assert wider(GEMAN_MCCLURE.scaled(3.0)).width == pytest.approx(3 * CAUCHY.width)
-    assert not wider(GEMAN_MCCLURE).is_bounded
