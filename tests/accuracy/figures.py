@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -61,29 +62,50 @@ class Figure:
             return "-"
         return f"{100 * value:.3g} %" if self.unit == "%" else f"{value:.3g} {self.unit}".strip()
 
-    def loss(self, cases: Cases, stored: Cases) -> Loss | None:
-        """Compare the cases that both have; None if nothing is for the worse, or fewer than two cases are in both."""
+    def losses(self, cases: Cases, stored: Cases) -> list[Loss]:
+        """Compare the cases that both have: all of them, and those of each kind of which there are several.
+
+        What makes one kind of case worse hides among the others, which it leaves as they were.
+        """
         now, before = self.values(cases), self.values(stored)
         both = sorted(now.keys() & before.keys())
         if self.worse is None or len(both) < 2:
-            return None
-        old, new = (self._cost(np.array([values[case] for case in both])) for values in (before, now))
+            return []
+        kinds = {kind_of(case): [other for other in both if kind_of(other) == kind_of(case)] for case in both}
+        parts = {"": both} | {kind: part for kind, part in kinds.items() if 1 < len(part) < len(both)}
+        # All comparisons of a figure together are to have this confidence.
+        confidence = 1 - (1 - _CONFIDENCE) / len(parts)
+        return [self._loss(kind, before, now, part, confidence) for kind, part in parts.items()]
+
+    def _loss(
+        self, kind: str, before: dict[str, float], now: dict[str, float], cases: list[str], confidence: float
+    ) -> Loss:
+        old, new = (self._cost(np.array([values[case] for case in cases])) for values in (before, now))
         change = (new - old) * (1 if self.worse == "higher" else -1)
         # With the same cases in both, what they have in common falls out.
-        stderr = float(np.std(change, ddof=1) / np.sqrt(len(both)))
-        allowed = float(student.ppf(_CONFIDENCE, len(both) - 1)) * stderr + _TRIFLE * float(np.mean(np.abs(old)))
-        return Loss(self, float(np.mean(change)), allowed)
+        stderr = float(np.std(change, ddof=1) / np.sqrt(len(cases)))
+        allowed = float(student.ppf(confidence, len(cases) - 1)) * stderr + _TRIFLE * float(np.mean(np.abs(old)))
+        return Loss(f"{self.words}, {kind}" if kind else self.words, float(np.mean(change)), allowed)
 
     def _cost(self, values: Array) -> Array:
         """Return what the figure averages: squares for a root mean square."""
         return values**2 if self.over == "rms" else values
 
 
+def kind_of(case: str) -> str:
+    """Return the name of a case without the number at its end, which is mostly its seed."""
+    return re.sub(r",? ?\d+$", "", case)
+
+
 @dataclass(frozen=True)
 class Loss:
-    """By how much the cases' mean is for the worse, and by how much it may be."""
+    """By how much the mean of cases is for the worse, and by how much it may be.
 
-    figure: Figure
+    Attributes:
+        words: the figure, and the cases if they are not all of their group.
+    """
+
+    words: str
     by: float
     allowed: float
 
