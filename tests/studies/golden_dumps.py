@@ -1,118 +1,384 @@
 """Dump what is computed of ten surveys on one state of the program, and compare the dumps of two states.
 
-    python -m tests.studies.golden_dumps dump FOLDER [--surveys NAME ...]
+    python -m tests.studies.golden_dumps dump FOLDER [--surveys FOLDER] [--only NAME ...]
     python -m tests.studies.golden_dumps compare FOLDER OTHER [--tolerance 1e-6]
 
-For changes that are meant to change no number, such as a move of code. Each survey becomes one file with all numbers
-in full: residuals, weights and noise of the ranges, derivatives by the motions of the map, learnt parts of the errors,
-covariances, the table of tests; and the words of the verdicts. ``numbers_of`` is the only place that knows where the
-program keeps them. The surveys are laps and halls that drift, paths without points, control points, positions alone and
-with ranges, tapes, and one unknown anchor.
+For changes that are meant to change no number, such as a move of code. The surveys are files, as users have them.
+``dump`` makes ten, writes them to ``FOLDER/surveys`` and runs them; with ``--surveys`` it runs those of an earlier
+dump, or any other folders that have a ``survey.toml`` each. So both states run the same files, even if the simulation
+has changed between them. The ten are:
 
-``compare`` prints the largest difference of each array, relative to its largest number, and whether the words are the
-same. Exit status 1 if an array differs by more than the tolerance, or words do.
+- ``hall``: ranges to six surveyed anchors, of which a quarter is obstructed, and a map that drifts;
+- ``room_unknown``: ranges to six unknown anchors;
+- ``yard_loose``: four surveyed anchors, a radio with a clock of its own, and a lever arm that is known to 0.1 m;
+- ``lap``: one anchor in the first camera's frame, and a path that drifts by 5 m, straightened in the keyframe graph;
+- ``poses``: four surveyed anchors, and a drifting path without points, which is scaled only;
+- ``yard_all``: ranges, positions of an antenna, control points and taped lengths together;
+- ``room_positions``, ``yard_points``, ``yard_lengths``: positions, control points and lengths alone;
+- ``loops``: two laps with one anchor, whose loops are closed by the matches of the model's database.
+
+A dump has of each survey ``result.json``, the tables, and the poses and points of the models, all in full precision;
+and what a move of code should not change either: equations, noise and covariances. Only the functions from
+``metric_of`` to ``covariances_of`` know where the program keeps these. After a move, point them at the new places.
+
+``compare`` names each array that differs, with the largest difference relative to its largest number, and all words
+that differ. Exit status 1 if an array differs by more than the tolerance, or words do.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
-from tests.studies import drifting_maps, known_positions
+import pycolmap
+from tests.simulated.looped import two_laps, write_matches
+from tests.studies.drifting_maps import Made, hall, lap_of_drift, of_poses, poses
+from tests.studies.known_positions import POINT_STDDEV_M, RECEIVERS, points_of, track_of
 from tests.studies.measured_distances import KINDS, simulated
+from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
 
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest
+import rangesfm
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
+from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.result.metric_result import MetricResult
+from rangesfm.result.result_tables import RESULT_TABLES
+from rangesfm.workflows.run_results import RunResult, write_results
 
-Numbers = dict[str, npt.NDArray[Any]]
+Values = dict[str, npt.NDArray[Any]]
+Tables = dict[str, dict[str, Any]]
 
-
-def drifting(kind: str, seed: int) -> MetricResult:
-    return drifting_maps.run(drifting_maps.surveys(None)[kind](seed), seed)
-
-
-def known(what: str, kind: str, seed: int) -> MetricResult:
-    truth, survey = simulated(replace(KINDS[kind], frame="site"), seed)
-    of_survey = known_positions.Known.of(what.split("+"), truth, survey, KINDS[kind].path(seed), seed)
-    return of_survey.run(of_survey.surveyed, seed)
+NOT_NUMBERS = ("computed", "inputs", "seconds", "settings", "versions")
+"""Keys of ``result.json`` that tell of the run, not of the map."""
+SEED = 1
+NUM_LENGTHS = 3
 
 
-SURVEYS: dict[str, Callable[[], MetricResult]] = {
-    "lap": lambda: drifting("lap", 1),
-    "lap_unknown": lambda: drifting("lap_unknown", 0),
-    "lap_radio": lambda: drifting("lap_radio", 3),
-    "hall": lambda: drifting("hall", 0),
-    "poses": lambda: drifting("poses", 2),
-    "yard_points": lambda: known("points", "yard", 0),
-    "room_positions": lambda: known("positions", "room", 1),
-    "orbit_exif": lambda: known("exif", "orbit of a drone", 0),
-    "yard_all": lambda: known("points+positions+ranges+anchors", "yard", 1),
-    "room_ranges_unknown": lambda: known("ranges", "room", 0),
+# The surveys, as files.
+
+
+def write_hall(folder: Path) -> Tables:
+    survey, rng = hall(0), np.random.default_rng(1)
+    obstructed_m = (rng.random(len(survey.log)) < 0.25) * rng.exponential(1.0, len(survey.log))
+    return written(replace(survey, log=replace(survey.log, range_m=survey.log.range_m + obstructed_m)), folder)
+
+
+def write_room_unknown(folder: Path) -> Tables:
+    return written(simulated(KINDS["room, six unknown anchors"], 0)[1], folder)
+
+
+def write_yard_loose(folder: Path) -> Tables:
+    survey = simulated(KINDS["yard"], 3)[1]
+    assert survey.log.timestamp_s is not None
+    ahead = replace(survey, log=replace(survey.log, timestamp_s=survey.log.timestamp_s + 7.3))
+    tables = written(replace(ahead, tag_in_cam_m=TAG_IN_CAM_M + np.array([0.06, -0.04, 0.05])), folder)
+    tables["ranges"]["time_offset"] = "auto"
+    tables["refine"]["lever_arm_stddev_m"] = 0.1
+    return tables
+
+
+def write_lap(folder: Path) -> Tables:
+    return written(lap_of_drift(5.0, 4, with_radio=True), folder)
+
+
+def write_poses(folder: Path) -> Tables:
+    return written(poses(2), folder)
+
+
+def write_known(kind: str, names: Sequence[str], folder: Path) -> Tables:
+    """Write a survey with "ranges", "positions", "points" or "lengths", whose errors are the same whatever else is."""
+    truth, survey = simulated(replace(KINDS[kind], frame="site"), SEED)
+    rng = np.random.default_rng([SEED, 41])
+    points, track = points_of(truth, rng), track_of(survey, KINDS[kind].path(SEED), rng)
+    tables = written(survey, folder) if "ranges" in names else with_model(survey, folder)
+    if "positions" in names:
+        assert track.log.timestamp_s is not None
+        rows = np.column_stack([track.log.timestamp_s, track.log.position_m])
+        stated_m = float(np.hypot(RECEIVERS["positions"].noise_m, RECEIVERS["positions"].lasting_m))
+        header = ("timestamp_s", "x_m", "y_m", "z_m", "stddev_m")
+        write_rows(folder / "positions.csv", header, [(*row, stated_m) for row in rows.tolist()])
+        tables["positions"] = {"path": "positions.csv", "antenna_in_cam_m": TAG_IN_CAM_M.tolist()}
+    if "points" in names:
+        given = [(each.name, *each.position_m.tolist(), POINT_STDDEV_M, each.kind) for each in points.points]
+        write_rows(folder / "points.csv", ("marker", "x_m", "y_m", "z_m", "stddev_m", "kind"), given)
+        tables["points"] = {"path": "points.csv"}
+    if "lengths" in names:
+        ends = zip(points.points[:NUM_LENGTHS], reversed(points.points), strict=False)
+        taped = [(a.name, b.name, float(np.linalg.norm(a.position_m - b.position_m))) for a, b in ends]
+        write_rows(folder / "taped.csv", ("from", "to", "distance_m", "stddev_m"), [(*row, 0.015) for row in taped])
+        tables["scale"]["distances"] = "taped.csv"
+    if {"points", "lengths"} & {*names}:
+        seen = [
+            (name, photo, *pixel)
+            for name, marker in points.markers.items()
+            for photo, pixel in zip(marker.image_names, marker.pixels.tolist(), strict=True)
+        ]
+        write_rows(folder / "markers.csv", ("marker", "image_name", "x_px", "y_px"), seen)
+        tables["scale"]["markers"] = "markers.csv"
+    return tables
+
+
+def write_loops(folder: Path) -> Tables:
+    looped = two_laps(80, size_m=(32.0, 20.0), num_observations=100, pixel_stddev=1.0)
+    truth, chain = looped.survey.model, looped.chain()
+    write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
+    log = range_log(looped.survey, 1, num_each=4)
+    path = rangesfm.trajectory_from_reconstruction(chain, truth.timestamps_s)
+    anchors_m = looped.survey.anchors_m
+    survey = Made(chain, path, anchors_m, "first_camera", log, TAG_IN_CAM_M, truth.centers_m, refine=True)
+    tables = written(survey, folder)
+    tables["mapper"]["database_path"] = "database.db"
+    return tables
+
+
+SURVEYS: dict[str, Callable[[Path], Tables]] = {
+    "hall": write_hall,
+    "room_unknown": write_room_unknown,
+    "yard_loose": write_yard_loose,
+    "lap": write_lap,
+    "poses": write_poses,
+    "yard_all": partial(write_known, "yard", ("ranges", "positions", "points", "lengths")),
+    "room_positions": partial(write_known, "room", ("positions",)),
+    "yard_points": partial(write_known, "yard", ("points",)),
+    "yard_lengths": partial(write_known, "yard", ("lengths",)),
+    "loops": write_loops,
 }
 
 
-def numbers_of(metric: MetricResult) -> Numbers:
-    """Return all numbers of a result by name; words are arrays of text."""
-    estimate, place = metric.estimate, metric.place
-    found: Numbers = {
-        "scale": np.array([estimate.value, *estimate.interval_95, estimate.uncertainty.empirical]),
-        "centers_m": metric.trajectory.as_in(metric.final).centers,
-        "residuals_m": metric.residuals_m,
-        "weights": metric.weights,
-        "noise_m": metric.range_stddev_m,
-        "status": metric.observations.status,
-        "words": np.array([estimate.verdict, *estimate.reasons, *(place.reasons if place is not None else ())]),
+def write_survey(name: str, folder: Path) -> None:
+    """Make a survey, and write it into a new folder."""
+    folder.mkdir(parents=True)
+    lines = []
+    for table, values in SURVEYS[name](folder).items():
+        lines += [f"[{table}]", *(f"{key} = {json.dumps(value)}" for key, value in values.items()), ""]
+    (folder / "survey.toml").write_text("\n".join(lines), encoding="utf-8")
+
+
+def written(survey: Made, folder: Path) -> Tables:
+    """Write a survey with ranges, and return the tables of its survey file."""
+    tables = with_model(survey, folder)
+    write_ranges_csv(survey.log, folder / "uwb.csv")
+    tables["ranges"] = {"path": "uwb.csv", "time_offset": 0.0}
+    tables["tag"] = {"tag_in_cam_m": survey.tag_in_cam_m.tolist()}
+    tables["anchors"] = {"frame": survey.frame}
+    if survey.frame != "unknown":
+        rows = [(name, *at.tolist()) for name, at in survey.anchors_m.items()]
+        write_rows(folder / "anchors.csv", ("anchor_id", "x_m", "y_m", "z_m"), rows)
+        tables["anchors"]["path"] = "anchors.csv"
+    return tables
+
+
+def with_model(survey: Made, folder: Path) -> Tables:
+    """Write the model and the times of its photos."""
+    sfm = survey.sfm if survey.sfm.num_reg_images() else of_poses(survey.trajectory)
+    (folder / "sparse").mkdir()
+    sfm.write_binary(folder / "sparse")
+    assert survey.trajectory.timestamps_s is not None
+    times = zip(survey.trajectory.image_names, survey.trajectory.timestamps_s.tolist(), strict=True)
+    write_rows(folder / "images.csv", ("image_name", "timestamp_s"), times)
+    return {
+        "images": {"model": "sparse", "times": "images.csv"},
+        "camera": {"refine_intrinsics": False},
+        "mapper": {"num_threads": 1},
+        "scale": {},
+        "refine": {"enabled": survey.refine},
+        "report": {"enabled": False},
+        "export": {"formats": []},
+        "output": {"seed": 0},
     }
-    if place is not None:
-        found["place_stddev_m"] = np.array(place.stddev_m)
-    components = estimate.uncertainty.components
-    found["components"] = np.array([components[name] for name in sorted(components)])
-    for anchor in metric.anchors:
-        found[f"anchor_{anchor.anchor_id}"] = np.array([*anchor.position_m, *np.ravel(anchor.range_bias_m)])
-    at = metric.refined_with_ranges
-    on_map = metric.on_map if at is None else ranges_on_map(at.posed, at.solution, at.bending)
-    if on_map is not None:
-        problem = linearized(on_map).with_learnt_errors()
-        found |= {
-            "derivatives": problem.design,
-            "bins_residual_m": problem.residual_m,
-            "bins_covariance_m2": problem.errors.covariance_m2,
-            "learnt": problem.errors.stddevs,
-        }
-    if metric.by_positions is not None:
-        found["positions_stddev_m"] = metric.by_positions.stddev_m
-    if metric.center_covariance_m2:
-        found["centers_covariance_m2"] = np.array(list(metric.center_covariance_m2.values()))
-    if metric.kept_refinement is not None and metric.kept_refinement.covariance is not None:
-        found["similarity_covariance"] = metric.kept_refinement.covariance.similarity
-    if metric.diagnosis is not None:
-        tests = metric.diagnosis.tests
-        names = [field.name for field in fields(MistakeTest) if field.type in ("float", "float | None", "bool | None")]
-        rows = [[np.nan if getattr(test, name) is None else getattr(test, name) for name in names] for test in tests]
-        found["tests"] = np.array(rows, dtype=np.float64)
-        found["tests_words"] = np.array([f"{test.name} {test.subject}: {test.words}" for test in tests])
+
+
+def write_rows(path: Path, header: Sequence[str], rows: Any) -> None:
+    cells = [",".join(map(str, row)) for row in rows]
+    path.write_text("\n".join([",".join(header), *cells]) + "\n", encoding="utf-8")
+
+
+# What the program has in memory. Each of these functions knows where it keeps one kind of thing.
+
+
+def metric_of(survey_path: Path, output_path: Path) -> MetricResult:
+    """Run a survey as ``rangesfm`` does, and return what is in memory when the results are written."""
+    kept: list[MetricResult] = []
+
+    def write(run: Any, metric: MetricResult) -> RunResult:
+        kept.append(metric)
+        return write_results(run, metric)
+
+    survey = rangesfm.read_survey(survey_path).changed({"output.path": output_path})
+    with patch("rangesfm.workflows.run.write_results", write):
+        rangesfm.run_survey(survey)
+    return kept[0]
+
+
+def tables_of(metric: MetricResult) -> Values:
+    """Return the columns of the CSV files, which round most of them."""
+    found: Values = {}
+    for kind in RESULT_TABLES:
+        table = kind.of(metric)
+        if table is not None:
+            found |= {f"{kind.NAME} {each.name}": np.array(getattr(table, each.name)) for each in fields(table)}
     return found
 
 
-def dump(folder: Path, names: list[str]) -> None:
+def range_equations_of(metric: MetricResult) -> Values:
+    """Return residuals of ranges, their derivatives by the map as a whole and the anchors, and the same of priors."""
+    at = metric.refined_with_ranges
+    on_map = metric.on_map if at is None else ranges_on_map(at.posed, at.solution, at.bending)
+    if on_map is None:
+        return {}
+    problem = linearized(on_map).with_learnt_errors()
+    return {
+        "ranges residual": problem.residual_m,
+        "ranges derivatives": problem.design,
+        "ranges prior residual": problem.prior_residual,
+        "ranges prior derivatives": problem.prior_design,
+        "ranges covariance": problem.errors.covariance_m2,
+    }
+
+
+def position_equations_of(metric: MetricResult) -> Values:
+    """Return residuals of positions and control points, their derivatives by the map as a whole, and their errors."""
+    found = metric.by_positions
+    if found is None:
+        return {}
+    return {
+        "positions residual": found.equations.linear.residual_m,
+        "positions derivatives": found.equations.linear.design,
+        "positions covariance": found.equations.errors.covariance_m2,
+        "positions weight": found.weights,
+    }
+
+
+def length_equations_of(metric: MetricResult) -> Values:
+    """Return residuals of measured lengths, derivatives of the scale by them, and their errors."""
+    found = metric.estimate.lengths
+    if found is None:
+        return {}
+    return {
+        "lengths residual": found.too_long_m,
+        "lengths derivatives": found.by_metre,
+        "lengths stddev": found.stddev_m,
+        "lengths redundancy": found.redundancy,
+    }
+
+
+def noise_of(metric: MetricResult) -> Values:
+    """Return the standard deviation of each component of the noise, as learnt for the final map."""
+    positions = metric.by_positions
+    learnt = {
+        "ranges": metric.learned_at_refined or metric.estimate.errors.learned,
+        "positions": None if positions is None else positions.equations.errors,
+    }
+    return {
+        f"{kind} noise {name}": np.array(stddev)
+        for kind, errors in learnt.items()
+        if errors is not None
+        for name, stddev in zip(errors.names, errors.stddevs.tolist(), strict=True)
+    }
+
+
+def covariances_of(metric: MetricResult) -> Values:
+    """Return the components of the scale's standard deviation, and the covariances of the final map."""
+    uncertainty = metric.estimate.uncertainty
+    found: Values = {f"scale component {name}": np.array(size) for name, size in uncertainty.components.items()}
+    found["scale half width"] = np.array(uncertainty.half_width_95)
+    if metric.estimate.placement is not None:
+        found["covariance placement"] = metric.estimate.placement
+    if metric.by_positions is not None:
+        found["covariance by positions"] = metric.by_positions.covariance
+    joint = None if metric.kept_refinement is None else metric.kept_refinement.covariance
+    if joint is not None:
+        found |= {
+            "covariance similarity": joint.similarity,
+            "covariance centers": joint.centers,
+            "covariance poses": joint.rig_from_world,
+            "covariance anchors": joint.anchors,
+        }
+        found |= {f"covariance block {k}": block for k, block in enumerate(joint.others)}
+    return found
+
+
+# What every state has: the files of a result.
+
+
+def values_of(survey_path: Path) -> Values:
+    """Run a survey, and return all numbers and words of its result by name; those of a refusal are its error."""
+    with tempfile.TemporaryDirectory() as folder:
+        output_path = Path(folder) / "out"
+        try:
+            metric = metric_of(survey_path, output_path)
+        except rangesfm.RangesfmError as error:
+            return {"refused": np.array(str(error))}
+        found = dict(written_values(output_path))
+    for kept_in_memory in (
+        *(tables_of, range_equations_of, position_equations_of, length_equations_of, noise_of, covariances_of),
+    ):
+        found |= kept_in_memory(metric)
+    return found
+
+
+def written_values(output_path: Path) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """Yield what ``result.json`` and the final model say."""
+    result = json.loads((output_path / "result.json").read_text(encoding="utf-8"))
+    yield from leaves("result", {key: value for key, value in result.items() if key not in NOT_NUMBERS})
+    for stage in ("sparse_scaled", "sparse_metric"):
+        if (path := output_path / stage / "0").is_dir():
+            model = pycolmap.Reconstruction(path)
+            frames = [model.frame(frame_id).rig_from_world for frame_id in sorted(model.reg_frame_ids())]
+            yield f"{stage} rotations", np.array([pose.rotation.matrix() for pose in frames if pose is not None])
+            yield f"{stage} translations", np.array([pose.translation for pose in frames if pose is not None])
+            points = [model.point3D(point_id).xyz for point_id in sorted(model.point3D_ids())]
+            yield f"{stage} points", np.array(points).reshape(-1, 3)
+
+
+def leaves(name: str, value: Any) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """Yield numbers and words with their keys; equal keys of a list of entries are a column."""
+    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+        keys = dict.fromkeys(key for entry in value for key in entry)
+        value = {key: [entry.get(key) for entry in value] for key in keys}
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from leaves(f"{name}.{key}", item)
+    elif any(isinstance(item, (str, list, dict)) for item in (value if isinstance(value, list) else [value])):
+        yield name, numbers_or_words(value)
+    else:
+        yield name, np.array(value, dtype=np.float64)
+
+
+def numbers_or_words(value: Any) -> npt.NDArray[Any]:
+    """Return an array of numbers if there are only such, all equally many, else of words."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.array([item if isinstance(item, str) else json.dumps(item) for item in np.atleast_1d(value).tolist()])
+
+
+def dump(folder: Path, surveys: Path | None, only: Sequence[str]) -> None:
+    """Run surveys and write the values of each."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        np.savez_compressed(folder / f"{name}.npz", **numbers_of(SURVEYS[name]()))  # type: ignore[arg-type]
-        print(name, flush=True)
+    if surveys is None:
+        surveys = folder / "surveys"
+        for name in only or SURVEYS:
+            write_survey(name, surveys / name)
+    for path in sorted(surveys.glob("*/survey.toml")):
+        name = path.parent.name
+        if not only or name in only:
+            np.savez_compressed(folder / f"{name}.npz", **values_of(path))  # type: ignore[arg-type]
+            print(name, flush=True)
 
 
 def difference(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> float:
     """Return the largest difference relative to the largest number; infinite for another shape or other words."""
-    if one.shape != other.shape:
-        return np.inf
-    if one.dtype.kind == "U":
+    if one.shape != other.shape or "U" in (one.dtype.kind, other.dtype.kind):
         return 0.0 if np.array_equal(one, other) else np.inf
     if not np.array_equal(np.isfinite(one), np.isfinite(other)):
         return np.inf
@@ -124,14 +390,36 @@ def difference(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> float:
 def compare(folder: Path, other: Path, tolerance: float) -> bool:
     """Print how two dumps differ, and return whether they are the same."""
     is_same = True
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as one, np.load(other / path.name) as two:
-            apart = {key: difference(one[key], two[key]) if key in two else np.inf for key in one}
-            apart |= {key: np.inf for key in two if key not in one}
-        worst = max(apart.values())
-        is_same &= worst <= tolerance
-        print(f"{path.stem}: {worst:.1e}", *(f"{key} {by:.1e}" for key, by in apart.items() if by > tolerance))
+    for name in sorted({path.stem for place in (folder, other) for path in place.glob("*.npz")}):
+        if lines := [*differences(read(folder / f"{name}.npz"), read(other / f"{name}.npz"), tolerance)]:
+            is_same = False
+        print(f"{name}: {'differs' if lines else 'the same'}", *lines, sep="\n  ", flush=True)
     return is_same
+
+
+def read(path: Path) -> Values:
+    """Read the values of a survey; none if the dump does not have it."""
+    if not path.exists():
+        return {}
+    with np.load(path) as values:
+        return {**values}
+
+
+def differences(before: Values, after: Values, tolerance: float) -> Iterator[str]:
+    """Yield a line for each array that differs by more than the tolerance, or is in one of the dumps alone."""
+    for key in sorted({*before, *after}):
+        if key not in before or key not in after:
+            yield f"{key}: only {'before' if key in before else 'after'}"
+            continue
+        one, other = before[key], after[key]
+        by = difference(one, other)
+        if by <= tolerance:
+            continue
+        if "U" in (one.dtype.kind, other.dtype.kind):
+            old, new = ([*map(str, np.ravel(words))] for words in (one, other))
+            yield f"{key}: {[word for word in old if word not in new]} -> {[word for word in new if word not in old]}"
+        else:
+            yield f"{key}: {by:.1e}" + ("" if one.shape == other.shape else f", shape {one.shape} -> {other.shape}")
 
 
 def main() -> int:
@@ -139,14 +427,15 @@ def main() -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     dumping = commands.add_parser("dump")
     dumping.add_argument("folder", type=Path)
-    dumping.add_argument("--surveys", nargs="+", choices=SURVEYS, default=list(SURVEYS))
+    dumping.add_argument("--surveys", type=Path, help="folders with a survey.toml each; default: the ten, made anew")
+    dumping.add_argument("--only", nargs="+", default=[], metavar="NAME")
     comparing = commands.add_parser("compare")
     comparing.add_argument("folder", type=Path)
     comparing.add_argument("other", type=Path)
     comparing.add_argument("--tolerance", type=float, default=1e-6)
     args = parser.parse_args()
     if args.command == "dump":
-        dump(args.folder, args.surveys)
+        dump(args.folder, args.surveys, args.only)
         return 0
     return int(not compare(args.folder, args.other, args.tolerance))
 
