@@ -57,8 +57,8 @@ from rangesfm.workflows.run_results import RunResult, write_results
 Values = dict[str, npt.NDArray[Any]]
 Tables = dict[str, dict[str, Any]]
 
-NOT_NUMBERS = ("computed", "inputs", "seconds", "settings", "versions")
-"""Keys of ``result.json`` that tell of the run, not of the map."""
+OF_THE_RUN = {"computed", "inputs", "seconds", "settings", "versions"}
+"""Keys in ``result.json`` of what tells of the run, not of the map."""
 SEED = 1
 NUM_LENGTHS = 3
 
@@ -329,7 +329,7 @@ def values_of(survey_path: Path) -> Values:
 def written_values(output_path: Path) -> Iterator[tuple[str, npt.NDArray[Any]]]:
     """Yield what ``result.json`` and the final model say."""
     result = json.loads((output_path / "result.json").read_text(encoding="utf-8"))
-    yield from leaves("result", {key: value for key, value in result.items() if key not in NOT_NUMBERS})
+    yield from leaves("result", result)
     for stage in ("sparse_scaled", "sparse_metric"):
         if (path := output_path / stage / "0").is_dir():
             model = pycolmap.Reconstruction(path)
@@ -346,8 +346,8 @@ def leaves(name: str, value: Any) -> Iterator[tuple[str, npt.NDArray[Any]]]:
         keys = dict.fromkeys(key for entry in value for key in entry)
         value = {key: [entry.get(key) for entry in value] for key in keys}
     if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from leaves(f"{name}.{key}", item)
+        for key in value.keys() - OF_THE_RUN:
+            yield from leaves(f"{name}.{key}", value[key])
     elif any(isinstance(item, (str, list, dict)) for item in (value if isinstance(value, list) else [value])):
         yield name, numbers_or_words(value)
     else:
@@ -376,9 +376,11 @@ def dump(folder: Path, surveys: Path | None, only: Sequence[str]) -> None:
             print(name, flush=True)
 
 
-def difference(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> float:
+def difference(one: npt.NDArray[Any] | None, other: npt.NDArray[Any] | None) -> float:
     """Return the largest difference relative to the largest number; infinite for another shape or other words."""
-    if one.shape != other.shape or "U" in (one.dtype.kind, other.dtype.kind):
+    if one is None or other is None or one.shape != other.shape:
+        return np.inf
+    if "U" in (one.dtype.kind, other.dtype.kind):
         return 0.0 if np.array_equal(one, other) else np.inf
     if not np.array_equal(np.isfinite(one), np.isfinite(other)):
         return np.inf
@@ -406,20 +408,21 @@ def read(path: Path) -> Values:
 
 
 def differences(before: Values, after: Values, tolerance: float) -> Iterator[str]:
-    """Yield a line for each array that differs by more than the tolerance, or is in one of the dumps alone."""
-    for key in sorted({*before, *after}):
-        if key not in before or key not in after:
-            yield f"{key}: only {'before' if key in before else 'after'}"
-            continue
-        one, other = before[key], after[key]
-        by = difference(one, other)
-        if by <= tolerance:
-            continue
-        if "U" in (one.dtype.kind, other.dtype.kind):
-            old, new = ([*map(str, np.ravel(words))] for words in (one, other))
-            yield f"{key}: {[word for word in old if word not in new]} -> {[word for word in new if word not in old]}"
-        else:
-            yield f"{key}: {by:.1e}" + ("" if one.shape == other.shape else f", shape {one.shape} -> {other.shape}")
+    """Yield a line for each array that differs by more than the tolerance, the largest difference first."""
+    apart = {key: difference(before.get(key), after.get(key)) for key in sorted({*before, *after})}
+    for key, by in sorted(apart.items(), key=lambda item: -item[1]):
+        if by > tolerance:
+            one, other = before.get(key), after.get(key)
+            yield f"{key}: {by:.1e}" if np.isfinite(by) else f"{key}: {in_short(one, other)} -> {in_short(other, one)}"
+
+
+def in_short(values: npt.NDArray[Any] | None, others: npt.NDArray[Any] | None) -> str:
+    """Return what to show of an array that cannot be compared: words that the other one lacks, or its shape."""
+    if values is None:
+        return "not there"
+    if values.dtype.kind != "U":
+        return f"{np.isfinite(values).sum()} finite numbers of shape {values.shape}"
+    return str([word for word in np.ravel(values).tolist() if others is None or word not in others])
 
 
 def main() -> int:
