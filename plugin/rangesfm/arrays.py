@@ -22,3 +22,13 @@ def rows_by_key(*keys: Indices) -> list[Indices]:
     order = np.lexsort(keys[::-1])
     starts = np.flatnonzero(np.any(np.diff(np.stack(keys)[:, order]) != 0, axis=0)) + 1
     return np.split(order, starts) if len(order) else []
+
+
+def rms(values: Array) -> float:
+    """Return the root mean square of values, or NaN where there are none."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
+
+
+def median(values: Array) -> float:
+    """Return the median of values, or NaN where there are none."""
+    return float(np.median(values)) if len(values) else np.nan

@@ -14,8 +14,8 @@ from tests.studies.erring_surveys import surveyed as surveyed_by_drone
 
 from rangesfm.diagnostics.anchor_sides import likelier_sides
 from rangesfm.diagnostics.linearized import ranges_on_map
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.workflows import make_metric_map
+from rangesfm.workflows.metric_result import MetricResult
 
 DRIFT_M, NUM_KEYFRAMES = 0.5, 100
 # As one piece, this map fits better with the anchor below the path. The anchor is above it, which is -y here.

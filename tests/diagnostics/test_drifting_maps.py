@@ -9,7 +9,7 @@ from tests.studies.drifting_maps import Made, lap_of_drift, run, without_points
 
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.refine.radio import ranges_predicted_by_model
-from rangesfm.result.metric_result import MetricResult
+from rangesfm.workflows.metric_result import MetricResult
 
 NUM_KEYFRAMES = 100
 

@@ -18,8 +18,9 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.diagnostics.alternatives import alternatives
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis import Hypothesis, mistake_in_words
+from rangesfm.diagnostics.hypothesis import Hypothesis
 from rangesfm.diagnostics.linearized import Linearized, linearized
+from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.diagnostics.mistakes import _settled_test, _varied
 from rangesfm.diagnostics.timed_hypotheses import SCANNING, _changes
 

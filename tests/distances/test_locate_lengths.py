@@ -11,8 +11,10 @@ from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
 from rangesfm.distances.locate_lengths import locate_distances
-from rangesfm.distances.tape import Marker, Tape, TapedDistance, disagreements, distance_rows
+from rangesfm.distances.tape import Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
+from rangesfm.result.entries import DistanceRow
+from rangesfm.workflows.result_records import disagreements
 
 
 @pytest.fixture(scope="module")
@@ -86,10 +88,12 @@ def test_ends_that_are_nowhere_are_refused(made: SyntheticModel) -> None:
 
 
 def test_a_distance_off_by_more_than_tape_and_scale_explain_is_named() -> None:
-    given = tape(taped("a", "b", 10.0), taped("c", "d", 10.0), taped("e", "f", 10.0, kind="control"))
-    rows = distance_rows(given, np.array([10.25, 10.35, 10.04]))
-    assert [row.residual_m for row in rows] == pytest.approx([0.25, 0.35, 0.04])
-    notes = list(disagreements(rows, relative_scale_stddev=0.01))
+    lengths = (("a", "b", "check", 10.25), ("c", "d", "check", 10.35), ("e", "f", "control", 10.04))
+    rows = [
+        DistanceRow(from_=a, to=b, kind=kind, measured_m=10.0, stddev_m=0.01, estimated_m=at, residual_m=at - 10.0)
+        for a, b, kind, at in lengths
+    ]
+    notes = list(disagreements(rows, relative_scale_stddev=0.01, bending=0.0))
     assert len(notes) == 2
     assert notes[0].startswith("check distance from c to d: 10.350 m in the map, 10.000 m by tape (+0.350 m")
     assert notes[1].startswith("control distance from e to f")

@@ -53,10 +53,10 @@ from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.components import population
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.run import map_in_metres
 
 Array = npt.NDArray[np.float64]

@@ -15,10 +15,10 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site as SiteFrame
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.run import map_in_metres
 
 # One photo a second with this many features, each seen in up to eight photos, at these distances: the map of a hall

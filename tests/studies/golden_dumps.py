@@ -50,8 +50,8 @@ from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
 import rangesfm
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
 from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.result_tables import RESULT_TABLES
+from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.run_results import RunResult, write_results
 
 Values = dict[str, npt.NDArray[Any]]

@@ -43,6 +43,7 @@ from rangesfm.ceres.covariance import PhotosAlone
 from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.similarity import align_points, similarity_motions
 from rangesfm.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
 from rangesfm.options import RangesOptions
@@ -50,19 +51,19 @@ from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.positions.position_formats import AUTONOMOUS_STDDEV_M
 from rangesfm.positions.position_log import PositionLog
-from rangesfm.positions.surveyed_positions import PointsEntry, SurveyedPositions
+from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.refine.photo_bending import PhotoBending
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.scale.scale_by_positions import scale_by_positions
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
+from rangesfm.workflows.metric_result import MetricResult
+from rangesfm.workflows.result_records import points_entry
 from rangesfm.workflows.run import map_in_metres
 
 Array = npt.NDArray[np.float64]
@@ -247,7 +248,7 @@ def told(known: Known, mistake: str, pixel_stddev: float, seed: int) -> Line:
     final_m, truth_m = metric.trajectory.as_in(metric.final).centers, known.survey.truth_m
     off = float(np.log(align_points(final_m, truth_m).scale))
     low, high = metric.estimate.uncertainty.interval_95
-    errors = PointsEntry.of(metric.positions, metric.final, metric.trajectory.as_in(metric.final))
+    errors = points_entry(metric)
     assert errors is not None
     shift_m = np.mean(final_m - truth_m, axis=0)
     in_stddevs = shift_m / (metric.place.stddev_m if metric.place is not None else np.nan)

@@ -39,7 +39,7 @@ from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import UP_IN_SITE
 from rangesfm.result.measurements import MeasuredMap, Measurement
-from rangesfm.result.metric_result import MetricResult
+from rangesfm.workflows.metric_result import MetricResult
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]
@@ -153,7 +153,7 @@ def measured_map(metric: MetricResult, markers: dict[str, Marker]) -> MeasuredMa
     anchors_m = {anchor.anchor_id: anchor.position_m for anchor in metric.anchors}
     points = MapPoints(metric.final, anchors_m, markers, summary.pixel_stddev)
     up = (UP_IN_SITE, 0.0) if metric.estimate.frame == "site" else None
-    return MeasuredMap(points, metric.map_errors, metric.estimate.uncertainty, up)
+    return MeasuredMap(points, metric.map_errors, metric.estimate.uncertainty.empirical, up)
 
 
 def told(name: str, seed: int) -> Line:

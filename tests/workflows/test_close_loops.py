@@ -20,7 +20,6 @@ from rangesfm.geometry.similarity import rmse
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.result_tables import LoopPairs
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import RangingInputs
@@ -28,6 +27,7 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.loop_database import LoopDatabase
 from rangesfm.workflows.close_loops import close_loops
+from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.run import refine_model
 from rangesfm.workflows.run_results import RunResult, write_results
 

@@ -9,7 +9,7 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from rangesfm.batch.batch_state import BatchState, Status, SurveyRow
-from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.report import report_page
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain

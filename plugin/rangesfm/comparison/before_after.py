@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, median, rms
 from rangesfm.comparison.many_models import Length, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import format_table, papers_table
 from rangesfm.errors import InputError
@@ -16,7 +16,7 @@ from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.result.entries import ComparisonRow, median, rms
+from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, rms
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.model_ranges import ModelRanges, ranges_of_result
 from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto, text_or_dash
@@ -24,7 +24,6 @@ from rangesfm.geometry.similarity import Similarity, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.positions.true_positions import read_true_positions
 from rangesfm.report.report_tables import ReportTable
-from rangesfm.result.entries import rms
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,10 +12,8 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.result.metric_result import USED, MetricResult
 from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
-from rangesfm.survey.survey_run import SurveyRun
 
 
 @dataclass(frozen=True)
@@ -90,30 +88,4 @@ def ranges_of_result(result: ResultFolder, metric_path: Trajectory) -> ModelRang
         image_times_s=result.timestamps_s,
         metric_path=metric_path,
         association=result.summary.settings.ranges.association,
-    )
-
-
-def ranges_of_map(run: SurveyRun, metric: MetricResult, image_times_s: Mapping[str, float] | None) -> ModelRanges:
-    """Return the ranges that a map in metres uses, and its anchors.
-
-    Args:
-        run: survey of the map.
-        metric: the map, scaled by its ranges.
-        image_times_s: as in ``ModelRanges``.
-    """
-    estimate, log, inputs = metric.estimate, metric.observations.log, run.inputs
-    if log.timestamp_s is not None:
-        offset = metric.time_offset
-        offset_s = (metric.time_offset_s or 0.0) if offset is None else offset.at(log.timestamp_s)
-        log = replace(log, timestamp_s=log.timestamp_s + offset_s)
-    anchors = {anchor.anchor_id: anchor for anchor in metric.anchors if np.isfinite(anchor.position_m).all()}
-    scaled = estimate.metric_from_sfm
-    return ModelRanges(
-        log=log.subset(np.isin(metric.observations.status, USED)),
-        tags_in_cam_m=dict(zip(log.tag_ids, inputs.tag_in_cam_m, strict=True)),
-        anchors_m={id_: anchor.position_m for id_, anchor in anchors.items()},
-        biases_m={id_: anchor.range_bias_m for id_, anchor in anchors.items()},
-        image_times_s=image_times_s,
-        metric_path=metric.trajectory.transformed(scaled.scale, scaled.rotation, scaled.translation),
-        association=run.survey.ranges,
     )

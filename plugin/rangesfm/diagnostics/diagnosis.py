@@ -10,9 +10,9 @@ import numpy as np
 from rangesfm.arrays import Indices
 from rangesfm.diagnostics.alternatives import LEAST_USED
 from rangesfm.diagnostics.bent_path import drifts
-from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, Test, row_of
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
+from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
 from rangesfm.diagnostics.scale_bound import HiddenMistake
 from rangesfm.processes.threads import with_one_blas_thread

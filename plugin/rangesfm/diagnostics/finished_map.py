@@ -15,9 +15,9 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.scale_estimate import ScaleEstimate

@@ -18,23 +18,14 @@ from scipy import special
 from scipy.optimize import brentq
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.diagnostics.hypothesis_tests import Test
+from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE, noncentrality
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_estimate import ScaleUncertainty
 
 RISK = 1e-4
 """Probability with which the scale may be off by more than the bound."""
-CHECKED_KINDS = (
-    "anchor place",
-    "anchor bias",
-    "lever arm",
-    "length",
-    "lengths against ranges",
-    "lengths against positions",
-)
-"""Mistakes in what was given: coordinates and ranges of each anchor, lever arm of each tag, measured lengths."""
 # Number of sizes of a mistake that are tried.
 _NUM_SIZES = 80
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from pydantic import AliasChoices, Field
 
 from rangesfm.arrays import Array
 from rangesfm.distances.measured_lists import LENGTHS, MARKS, MeasuredList
-from rangesfm.errors import InputError, number_text
+from rangesfm.errors import InputError
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.photo_names import photos_meant
-from rangesfm.files.records import Number, NumberOrNull, Record, Text
 from rangesfm.files.text_tables import repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 
@@ -173,51 +170,3 @@ def markers_of_photos(markers: Mapping[str, Marker], photos: Collection[str]) ->
         name: replace(marker, image_names=tuple(meant[photo] for photo in marker.image_names))
         for name, marker in markers.items()
     }
-
-
-class DistanceRow(Record):
-    """One measured length in metres: measured, in the map, and the difference map minus measurement."""
-
-    from_: Text = Field(validation_alias=AliasChoices("from", "from_"), serialization_alias="from")
-    to: Text
-    kind: Text
-    measured_m: Number
-    stddev_m: Number
-    estimated_m: NumberOrNull
-    residual_m: NumberOrNull
-
-
-def distance_rows(tape: Tape, lengths_m: Array) -> list[DistanceRow]:
-    """Return a row for each length of the tape, in its order, given the lengths in the map (k,)."""
-    return [
-        DistanceRow(
-            from_=taped.ends[0],
-            to=taped.ends[1],
-            kind=taped.kind,
-            measured_m=taped.distance_m,
-            stddev_m=taped.stddev_m,
-            estimated_m=length_m,
-            residual_m=length_m - taped.distance_m,
-        )
-        for taped, length_m in zip(tape.distances, lengths_m.tolist(), strict=True)
-    ]
-
-
-def disagreements(rows: Iterable[DistanceRow], relative_scale_stddev: float, bending: float = 0.0) -> Iterator[str]:
-    """Yield a line for each length that differs from the map by more than tape, scale and bending explain.
-
-    For a control length the uncertainty of the scale is not counted, because it has taken part in the scale.
-
-    Args:
-        relative_scale_stddev: relative standard deviation of the scale.
-        bending: relative standard deviation by which the scale varies from place to place.
-    """
-    for row in rows:
-        of_scale = relative_scale_stddev if row.kind == CHECK else 0.0
-        stddev_m = math.hypot(row.stddev_m, of_scale * row.measured_m, bending * row.measured_m)
-        if row.kind != LEFT_OUT and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
-            yield (
-                f"{row.kind} distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
-                f"{row.measured_m:.3f} m by tape ({number_text(row.residual_m, '+.3f')} m, expected within "
-                f"{_DISAGREES * stddev_m:.3f} m)"
-            )

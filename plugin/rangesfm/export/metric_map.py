@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import shutil
 from collections.abc import Iterable, Mapping
@@ -45,7 +46,7 @@ class MetricMap:
         timestamps_s: time of each photo on the camera's clock, by name; None if unknown.
         anchors_m: position (3,) of each anchor by id, in the world of the model; None if unknown.
         metric_from_sfm: similarity from the world of the unscaled model to that of this model; None if unknown.
-        relative_scale_stddev: relative stddev that the scale gives every length in the map; None if unknown.
+        relative_scale_stddev: relative stddev that the scale gives every length in the map; inf if unknown.
         images_path: folder of the photos; None if unknown.
         database_path: COLMAP's database of the photos; None if unknown.
         is_site: whether the world of the model is the site frame of the anchors, where z is up by convention.
@@ -58,7 +59,7 @@ class MetricMap:
     timestamps_s: Mapping[str, float] | None = None
     anchors_m: Mapping[str, Array] | None = None
     metric_from_sfm: Similarity | None = None
-    relative_scale_stddev: float | None = None
+    relative_scale_stddev: float = math.inf
     images_path: Path | None = None
     database_path: Path | None = None
     is_site: bool = False

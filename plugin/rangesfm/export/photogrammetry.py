@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import uuid
 from collections.abc import Mapping
@@ -180,7 +181,7 @@ def write_opf(map_: MetricMap, folder: Path) -> Path:
         InputError: the map has no two points that three photos see, or the stddev of its scale is not known.
     """
     model, stddev = map_.reconstruction, map_.relative_scale_stddev
-    if stddev is None:
+    if not math.isfinite(stddev):
         raise InputError("the format 'opf' needs the stddev of the scale, which is not known for this model")
     names = sorted(image.name for image in model.images.values())
     pairs = _distant_pairs(model)

@@ -19,3 +19,6 @@ NEGLIGIBLE_STDDEVS: Final = 0.05
 
 NUM_REWEIGHTINGS: Final = 6
 """Rounds of a robust fit whose scale is estimated anew in each: after these it changes by less than it is known."""
+
+NORMAL_95: Final = 1.96
+"""Half the width of a 95 % interval, in standard deviations of a normal distribution."""

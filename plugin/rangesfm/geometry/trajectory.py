@@ -51,9 +51,13 @@ class Trajectory:
 
     def as_in(self, model: pycolmap.Reconstruction) -> Trajectory:
         """Return the path of the same keyframes in another model."""
+        return trajectory_from_reconstruction(model, self.times_by_name)
+
+    @property
+    def times_by_name(self) -> dict[str, float] | None:
+        """Times of the keyframes by name of the photo; None if unknown."""
         times = self.timestamps_s
-        by_name = None if times is None else dict(zip(self.image_names, times.tolist(), strict=True))
-        return trajectory_from_reconstruction(model, by_name)
+        return None if times is None else dict(zip(self.image_names, times.tolist(), strict=True))
 
     def timed(self, timestamps_s: Mapping[str, float]) -> Trajectory:
         """Return the keyframes whose photo has a time, in the order of these times, given by the photos' names."""

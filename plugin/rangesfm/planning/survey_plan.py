@@ -11,16 +11,16 @@ import numpy as np
 
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.finished_map import place_in_words
-from rangesfm.diagnostics.hypothesis import mistake_in_words
 from rangesfm.diagnostics.hypothesis_tests import Factorization, MistakeTest, row_of
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
+from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import component_words
-from rangesfm.ranging.errors.noise import NORMAL_95
 
 REFUSED, OPEN_PLACE = "refused", "open"
 """Verdicts of a plan: a run will refuse the scale; it will leave open where the map is."""

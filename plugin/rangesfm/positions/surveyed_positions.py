@@ -6,13 +6,10 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.distances.tape import CHECK, CONTROL, Marker
-from rangesfm.files.records import Number, NumberOrNull, Record, Text, Vector, VectorOrNull
-from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.distances.tape import Marker
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.control_points import ControlPoints, marks_seen
@@ -127,80 +124,3 @@ class SurveyedPositions:
     def markers(self) -> Mapping[str, Marker]:
         """Marks of the points in photos, by name."""
         return {} if self.points is None else self.points.markers
-
-
-class PointRow(Record):
-    """One control or check point, in the frame of the metric models.
-
-    Attributes:
-        kind: "control", "check" or "left out".
-        estimated_m: by the marks in the final map; null where fewer than two of its photos have them.
-        residual_m: in the map minus known. distance_m: its length.
-    """
-
-    marker: Text
-    kind: Text
-    known_m: Vector
-    stddev_m: Number
-    estimated_m: VectorOrNull
-    residual_m: VectorOrNull
-    distance_m: NumberOrNull
-
-
-class PointErrors3d(Record):
-    """Root mean square of the residuals of some points.
-
-    Attributes:
-        num: of points that are in the map. rmse_m: of each coordinate. rmse_3d_m: of the distances.
-    """
-
-    num: int
-    rmse_m: VectorOrNull
-    rmse_3d_m: NumberOrNull
-
-
-class PointsEntry(Record):
-    """Control and check points, compared with the final map."""
-
-    control: PointErrors3d
-    check: PointErrors3d
-    points: tuple[PointRow, ...]
-
-    def lines(self) -> Iterator[str]:
-        """Yield the lines that the user sees at the end of a run."""
-        for kind, errors in (("control", self.control), ("check", self.check)):
-            if errors.rmse_m is not None:
-                axes = ", ".join(f"{value:.3f}" for value in errors.rmse_m)
-                yield f"{kind} points: {errors.num}, RMSE {errors.rmse_3d_m:.3f} m (x, y, z: {axes} m)"
-
-    @classmethod
-    def of(cls, surveyed: SurveyedPositions, model: pycolmap.Reconstruction, path: Trajectory) -> PointsEntry | None:
-        """Compare points with a model in the site's frame; None without any points."""
-        if surveyed.points is None:
-            return None
-        located = locate_points(surveyed.points, model, path)
-        places = dict(zip(located.names, located.predicted_m(IDENTITY), strict=True))
-        rows = []
-        for point in surveyed.points.points:
-            at = places.get(point.name)
-            off = None if at is None else at - point.position_m
-            rows.append(
-                PointRow(
-                    marker=point.name,
-                    kind=point.kind,
-                    known_m=point.position_m.tolist(),
-                    stddev_m=point.stddev_m,
-                    estimated_m=None if at is None else at.tolist(),
-                    residual_m=None if off is None else off.tolist(),
-                    distance_m=None if off is None else float(np.linalg.norm(off)),
-                )
-            )
-        return cls(control=_rmse(rows, CONTROL), check=_rmse(rows, CHECK), points=tuple(rows))
-
-
-def _rmse(rows: Iterable[PointRow], kind: str) -> PointErrors3d:
-    off: Array = np.array([row.residual_m for row in rows if row.kind == kind and row.residual_m is not None])
-    if not len(off):
-        return PointErrors3d(num=0, rmse_m=None, rmse_3d_m=None)
-    squares = np.mean(off**2, axis=0)
-    return PointErrors3d(num=len(off), rmse_m=np.sqrt(squares).tolist(), rmse_3d_m=float(np.sqrt(squares.sum())))

@@ -36,6 +36,10 @@ class RangeStatus(IntEnum):
         return self.name.lower().replace("_", "-")
 
 
+USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
+"""Statuses of ranges that are used in the final model, with full or reduced weight."""
+
+
 @dataclass(frozen=True)
 class OnPath:
     """Positions of n ranges on a path of keyframes: ``(1 - fraction) * before + fraction * after``."""

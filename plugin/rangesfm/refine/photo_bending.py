@@ -13,6 +13,7 @@ from rangesfm.ceres.covariance import PhotosAlone
 from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError, InputError, SolverError
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.bending import (
@@ -22,7 +23,6 @@ from rangesfm.ranging.errors.bending import (
     bending_part,
     without_similarity,
 )
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.refine.bundle_adjustment import bundle_adjustment
 from rangesfm.refine.vision_information import misplaced_points, model_observations, model_poses
 

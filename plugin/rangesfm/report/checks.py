@@ -9,8 +9,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from rangesfm.diagnostics.hypothesis import mistake_in_words
-from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.diagnostics.mistake_words import mistake_in_words
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.report.text import count, decimals_for, fixed, keyed, sentence, signed
 from rangesfm.result.summary import ResultSummary
 from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE

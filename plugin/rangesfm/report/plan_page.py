@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.diagnostics.hypothesis import mistake_in_words
+from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.files.atomic import make_output_folder, write_text
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan, size_in_words
 from rangesfm.ranging.errors.components import component_words
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.report_tables import ReportTable

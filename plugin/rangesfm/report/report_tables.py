@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from rangesfm.diagnostics.hypothesis import mistake_in_words
-from rangesfm.diagnostics.scale_bound import CHECKED_KINDS
+from rangesfm.arrays import median, rms
+from rangesfm.diagnostics.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.files.folders import natural_order
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.ranging.errors.components import component_words
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.report.content import Content, in_natural_order
 from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, sentence, signed
-from rangesfm.result.entries import AnchorEntry, MistakeEntry, median, rms, rmse_heading
+from rangesfm.result.entries import AnchorEntry, MistakeEntry, rmse_heading
 from rangesfm.survey.settings import KEYS
 
 _Columns = Mapping[str, Callable[[Any], str]]

@@ -35,14 +35,14 @@ def errors_of_scene(
     left, sizes, _ = np.linalg.svd(modes.reshape(3 * len(modes), -1), full_matrices=False)
     shifts = left * sizes
     steps = np.maximum(np.abs(shifts).max(axis=0), 1e-12) / _NUM_STEPS
-    scale, up = summary.scale.relative_stddev.uncertainty, up_in_map(summary)
+    up = up_in_map(summary)
     return {
         "num_modes": len(steps),
         "modes": pack(np.round(shifts / steps), "int16"),
         "steps": pack(steps, "float32"),
         "rests": pack(rests, "float32"),
         "by_scale": pack(by_scale, "float32"),
-        "scale_variance_change": scale.empirical**2 - errors.scale_stddev**2,
+        "scale_variance_change": summary.scale.relative_stddev_empirical**2 - errors.scale_stddev**2,
         "up": None if up is None else up[0].tolist(),
         "tilt_stddev": None if up is None else up[1],
     }

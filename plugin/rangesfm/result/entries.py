@@ -1,4 +1,4 @@
-"""Entries of ``result.json``: their keys, and how they are made from what a run found."""
+"""Entries of ``result.json``: plain data, whose fields are its keys."""
 
 from __future__ import annotations
 
@@ -11,20 +11,10 @@ import numpy as np
 from pydantic import AfterValidator, AliasChoices, AliasPath, BeforeValidator, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from rangesfm.arrays import Array, Mask
-from rangesfm.diagnostics.hypothesis import mistake_in_words
-from rangesfm.diagnostics.hypothesis_tests import finite
-from rangesfm.diagnostics.scale_bound import CHECKED_KINDS, RISK, scale_bound
 from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.join.join_models import ModelVerdict
 from rangesfm.options import COORDINATE_M, AssociationOptions
-from rangesfm.ranging.range_log import RangeKind
-from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.result.metric_result import USED, MetricResult
-from rangesfm.scale.scale_estimate import ScaleSensitivity, ScaleUncertainty
-from rangesfm.scale.two_candidate import Branch
 
 
 def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:
@@ -52,19 +42,18 @@ class SimilarityEntry(Record):
     rotation_xyzw: Quaternion
     translation_m: Vector
 
-    @classmethod
-    def of(cls, similarity: Similarity) -> SimilarityEntry:
-        return cls(
-            scale=similarity.scale,
-            rotation_xyzw=Rotation.from_matrix(similarity.rotation).as_quat().tolist(),
-            translation_m=similarity.translation.tolist(),
-        )
-
     @property
     def similarity(self) -> Similarity:
         return Similarity(
             self.scale, Rotation.from_quat(self.rotation_xyzw).as_matrix(), np.array(self.translation_m, np.float64)
         )
+
+
+class Branch(Record):
+    """Mean and standard deviation of one of the two roots over all ranges, metres per SfM unit."""
+
+    mean: float
+    std: float
 
 
 class TwoCandidateEntry(Record):
@@ -82,10 +71,6 @@ class RelativeStddevEntry(Record):
     formal: NumberOrNull
     components: dict[Text, Number]
 
-    @property
-    def uncertainty(self) -> ScaleUncertainty:
-        return ScaleUncertainty(math.inf if self.formal is None else self.formal, self.components)
-
 
 class ScaleByKindEntry(Record):
     """The scale by one kind of measurement alone, such as "ranges", in metres per unit of the unscaled model.
@@ -96,6 +81,24 @@ class ScaleByKindEntry(Record):
 
     value: Number
     stddev: NumberOrNull
+
+
+class ScaleSensitivity(Record):
+    """Change of the scale, in percent, per error of the range model; estimated biases absorb their part of it.
+
+    Attributes:
+        common_bias_per_cm: if all ranges were a centimetre longer.
+        short_range_per_cm: if the shorter half of the ranges were a centimetre longer.
+        anchor_bias_per_cm: by anchor id, if the ranges to that anchor were a centimetre longer.
+        range_slope_per_percent: if all ranges were one percent longer.
+        lever_arm_per_cm: if the tag sat a centimetre further along x, y, z of the camera.
+    """
+
+    common_bias_per_cm: float
+    short_range_per_cm: float
+    anchor_bias_per_cm: dict[str, float]
+    range_slope_per_percent: float
+    lever_arm_per_cm: tuple[float, float, float]
 
 
 class ScaleEntry(Record):
@@ -142,9 +145,9 @@ class ScaleEntry(Record):
         return f"10 m in this map are {low_m:.{decimals}f} to {high_m:.{decimals}f} m"
 
     @property
-    def relative_stddev_empirical(self) -> float | None:
-        """Return the relative stddev that the scale gives every length in the metric models; None if unknown."""
-        return self.stddev_empirical / self.value if self.stddev_empirical is not None and self.value else None
+    def relative_stddev_empirical(self) -> float:
+        """Return the relative stddev that the scale gives every length in the metric models; inf if unknown."""
+        return self.stddev_empirical / self.value if self.stddev_empirical is not None and self.value else math.inf
 
 
 class ModelScaleEntry(Record):
@@ -166,19 +169,6 @@ class ModelEntry(Record):
     reason: Text | None
     scale: ModelScaleEntry
     metric_from_sfm: SimilarityEntry | None
-
-    @classmethod
-    def of(cls, model: ModelVerdict, metric_from_joined: Similarity) -> ModelEntry:
-        refused = {"value": None, "stddev_empirical": None, "interval_95": None, "verdict": "refused"}
-        joined = model.joined_from_sfm
-        return cls(
-            name=model.name,
-            num_images=model.num_images,
-            joined=joined is not None,
-            reason=model.reason or None,
-            scale=ModelScaleEntry.model_validate(model.estimate or {**refused, "reasons": [model.reason]}),
-            metric_from_sfm=None if joined is None else SimilarityEntry.of(metric_from_joined @ joined),
-        )
 
 
 class MapEntry(Record):
@@ -222,14 +212,6 @@ class TimeOffsetEntry(Record):
     drift_is_followed: Flag | None = None
     note: Text | None
 
-    @classmethod
-    def of(cls, found: MetricResult) -> TimeOffsetEntry:
-        offset, given_s = found.time_offset, found.time_offset_s
-        if offset is None:
-            return cls(value_s=given_s, stddev_s=None if given_s is None else 0.0, estimated=False, note=None)
-        in_ppm = {"drift_ppm": 1e6 * offset.drift, "drift_stddev_ppm": 1e6 * offset.drift_stddev}
-        return cls.model_validate({**vars(offset), **in_ppm, "estimated": True})
-
 
 class ResidualEntry(Record):
     """Numbers of ranges between tag and anchor, and residuals in the final model of those that are used."""
@@ -248,24 +230,6 @@ class RangesEntry(ResidualEntry):
     num_tag_tag: Count
     per_anchor: dict[Text, ResidualEntry]
 
-    @classmethod
-    def of(cls, found: MetricResult) -> RangesEntry:
-        kind, used = found.observations.log.kind, np.isin(found.observations.status, USED)
-
-        def residuals(of: Mask) -> dict[str, Any]:
-            chosen = found.residuals_m[used & of]
-            nums = {"num": of.sum(), "num_used": (used & of).sum(), "num_rejected": (~used & of).sum()}
-            return {**nums, "rms_m": rms(chosen), "median_abs_m": median(np.abs(chosen))}
-
-        others = {RangeKind.ANCHOR_ANCHOR: "num_anchor_anchor", RangeKind.TAG_TAG: "num_tag_tag"}
-        return cls.model_validate(
-            {
-                **residuals(kind == RangeKind.TAG_ANCHOR),
-                **{name: np.count_nonzero(kind == other) for other, name in others.items()},
-                "per_anchor": {id_: residuals(of) for id_, of in _by_anchor(found, kind == RangeKind.TAG_ANCHOR)},
-            }
-        )
-
 
 class CheckEntry(Record):
     """Ranges that were held out of all estimates, and their residuals in the final model."""
@@ -279,33 +243,6 @@ class CheckRangesEntry(CheckEntry):
     """All held-out ranges, together and by anchor."""
 
     per_anchor: dict[Text, CheckEntry]
-
-    @classmethod
-    def of(cls, found: MetricResult) -> CheckRangesEntry:
-        held_out = found.observations.status == RangeStatus.CHECK
-
-        def residuals(of: Mask) -> dict[str, Any]:
-            chosen = found.residuals_m[of & np.isfinite(found.residuals_m)]
-            return {"num": len(chosen), "rms_m": rms(chosen), "median_m": median(chosen)}
-
-        per_anchor = {id_: residuals(of) for id_, of in _by_anchor(found, held_out) if of.any()}
-        return cls.model_validate({**residuals(held_out), "per_anchor": per_anchor})
-
-
-def _by_anchor(found: MetricResult, chosen: Mask) -> Iterator[tuple[str, Mask]]:
-    """Yield the id of each anchor and the mask (n,) of the chosen ranges to it."""
-    log = found.observations.log
-    for k, anchor_id in enumerate(log.anchor_ids):
-        yield anchor_id, chosen & (log.anchor_index == k)
-
-
-def rms(values: Array) -> float:
-    """Return the root mean square of values, or NaN where there are none."""
-    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
-
-
-def median(values: Array) -> float:
-    return float(np.median(values)) if len(values) else np.nan
 
 
 class PlaceEntry(Record):
@@ -334,19 +271,6 @@ class LoopsEntry(Record):
     num_closed: Count
     num_contradicted: Count
     moved_m: Number
-
-    @classmethod
-    def of(cls, found: MetricResult) -> LoopsEntry | None:
-        loops = found.loops
-        if loops is None:
-            return None
-        return cls(
-            num_proposed=loops.num_proposed,
-            num_verified=loops.num_verified,
-            num_closed=len(loops.closed),
-            num_contradicted=len(loops.contradicted),
-            moved_m=loops.moved_m(found.trajectory.as_in(found.final)),
-        )
 
 
 class RefineEntry(Record):
@@ -383,26 +307,6 @@ class RefineEntry(Record):
     time_offset_change_s: NumberOrNull
     short_range_error_m: NumberOrNull
 
-    @classmethod
-    def of(cls, found: MetricResult) -> RefineEntry | None:
-        summary = found.refinement
-        if summary is None:
-            return None
-        tag_ids, covariance = found.observations.log.tag_ids, summary.covariance
-        others = {
-            "kept": not found.why_broken,
-            "why_not_kept": found.why_broken,
-            "iterations": summary.num_iterations,
-            "keyframe_graph_steps": summary.num_graph_steps,
-            "correlation_inflation": summary.errors.inflation,
-            "converged": summary.converged,
-            "scale_value": found.refined_scale,
-            "relative_scale_stddev": None if covariance is None else covariance.relative_scale_stddev,
-            "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
-            "time_offset_change_s": summary.time_shift_s,
-        }
-        return cls.model_validate({**vars(summary), **others})
-
 
 class PositionsEntry(Record):
     """Positions of an antenna on the camera, and their residuals in the final map.
@@ -427,28 +331,62 @@ class PositionsEntry(Record):
     time_offset_stddev_s: NumberOrNull
     antenna_in_cam_m: Vector
 
-    @classmethod
-    def of(cls, found: MetricResult) -> PositionsEntry | None:
-        track, scale = found.positions.antenna, found.by_positions
-        if track is None or scale is None:
-            return None
-        mine, used = ~scale.known.is_mark, ~scale.known.is_mark & scale.is_used
-        off_m = scale.known.misclosures_m(scale.site_from_model)[used]
-        summary = found.kept_refinement
-        shift_s = (summary and summary.position_time_shift_s) or 0.0
-        refined_m = None if summary is None else summary.antenna_in_cam_m
-        return cls(
-            num=len(track.log),
-            num_used=int(used.sum()),
-            num_rejected=int((mine & ~used).sum()),
-            rms_m=rms(np.linalg.norm(off_m, axis=1)),
-            rms_by_axis_m=(rms(off_m[:, 0]), rms(off_m[:, 1]), rms(off_m[:, 2])) if len(off_m) else None,
-            stddev_m=median(scale.stddev_m[used]),
-            inflation=scale.inflation,
-            time_offset_s=None if track.log.timestamp_s is None else (track.offset_s or 0.0) + shift_s,
-            time_offset_stddev_s=None if track.log.timestamp_s is None else track.offset_stddev_s,
-            antenna_in_cam_m=(track.antenna_in_cam_m if refined_m is None else refined_m).tolist(),
-        )
+
+class DistanceRow(Record):
+    """One measured length in metres: measured, in the map, and the difference map minus measurement."""
+
+    from_: Text = Field(validation_alias=AliasChoices("from", "from_"), serialization_alias="from")
+    to: Text
+    kind: Text
+    measured_m: Number
+    stddev_m: Number
+    estimated_m: NumberOrNull
+    residual_m: NumberOrNull
+
+
+class PointRow(Record):
+    """One control or check point, in the frame of the metric models.
+
+    Attributes:
+        kind: "control", "check" or "left out".
+        estimated_m: by the marks in the final map; null where fewer than two of its photos have them.
+        residual_m: in the map minus known. distance_m: its length.
+    """
+
+    marker: Text
+    kind: Text
+    known_m: Vector
+    stddev_m: Number
+    estimated_m: VectorOrNull
+    residual_m: VectorOrNull
+    distance_m: NumberOrNull
+
+
+class PointErrors3d(Record):
+    """Root mean square of the residuals of some points.
+
+    Attributes:
+        num: of points that are in the map. rmse_m: of each coordinate. rmse_3d_m: of the distances.
+    """
+
+    num: int
+    rmse_m: VectorOrNull
+    rmse_3d_m: NumberOrNull
+
+
+class PointsEntry(Record):
+    """Control and check points, compared with the final map."""
+
+    control: PointErrors3d
+    check: PointErrors3d
+    points: tuple[PointRow, ...]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines that the user sees at the end of a run."""
+        for kind, errors in (("control", self.control), ("check", self.check)):
+            if errors.rmse_m is not None:
+                axes = ", ".join(f"{value:.3f}" for value in errors.rmse_m)
+                yield f"{kind} points: {errors.num}, RMSE {errors.rmse_3d_m:.3f} m (x, y, z: {axes} m)"
 
 
 class MistakeEntry(Record):
@@ -485,22 +423,6 @@ class ReliabilityEntry(Record):
     risk: Number
     limited_by: Text
     unchecked: tuple[Text, ...]
-
-    @classmethod
-    def of(cls, found: MetricResult) -> ReliabilityEntry | None:
-        """Return the entry; None where no mistakes were tested."""
-        diagnosis = found.diagnosis
-        if diagnosis is None or not diagnosis.hidden:
-            return None
-        bound, limited_by = scale_bound(found.estimate.uncertainty, diagnosis.hidden)
-        is_found = any(test.rejected for test in diagnosis.tests)
-        given = [test for test in diagnosis.tests if test.name in CHECKED_KINDS and test.is_checked is False]
-        return cls(
-            scale_within=None if is_found else finite(float(np.expm1(bound))),
-            risk=RISK,
-            limited_by=limited_by,
-            unchecked=tuple(mistake_in_words(test.name, test.subject) for test in given),
-        )
 
 
 class ComparisonRow(Record):

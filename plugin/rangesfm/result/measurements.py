@@ -12,9 +12,8 @@ from rangesfm.arrays import Array
 from rangesfm.distances.map_points import MapPoint, MapPoints
 from rangesfm.geometry.gravity import UP_IN_SITE, gravity_of
 from rangesfm.geometry.map_errors import MapErrors
-from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.result.summary import ResultSummary
-from rangesfm.scale.scale_estimate import ScaleUncertainty
 
 Interval = tuple[float, float]
 
@@ -53,13 +52,13 @@ class MeasuredMap:
     Attributes:
         points: of the map, by name.
         errors: how its parts err together; None if that is not known. Then intervals come from the scale alone.
-        scale: uncertainty of its scale, as it is stated.
+        relative_scale_stddev: standard deviation of its scale, divided by the scale, as it is stated.
         up: upward unit vector (3,) in the map and the standard deviation of its direction in radians; None if unknown.
     """
 
     points: MapPoints
     errors: MapErrors | None
-    scale: ScaleUncertainty
+    relative_scale_stddev: float
     up: tuple[Array, float] | None
 
     def measure(self, pairs: Iterable[tuple[str, str]]) -> tuple[Measurement, ...]:
@@ -91,8 +90,8 @@ class MeasuredMap:
         """Return the covariance (3, 3) of second minus first."""
         if self.errors is None:
             apart = second.position_m - first.position_m
-            return self.scale.empirical**2 * np.outer(apart, apart)
-        return self.errors.relative(first.errors, second.errors, self.scale.empirical)
+            return self.relative_scale_stddev**2 * np.outer(apart, apart)
+        return self.errors.relative(first.errors, second.errors, self.relative_scale_stddev)
 
     def _interval(self, value: float, along: Array, covariance: Array, more_stddev: float = 0.0) -> Interval:
         half = NORMAL_95 * math.sqrt(max(float(along @ covariance @ along), 0.0) + more_stddev**2)

@@ -13,17 +13,13 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
-from rangesfm.diagnostics.hypothesis_tests import finite
-from rangesfm.errors import BAD_INPUT, InputError
-from rangesfm.export import COVARIANCE_FORMATS, EXPORTED_NAMES, OFFSET_NAME, MetricMap, export_map, write_model
+from rangesfm.errors import InputError
+from rangesfm.export import EXPORTED_NAMES, OFFSET_NAME
 from rangesfm.files.atomic import path_of, scratch_folder, sole_writer
 from rangesfm.files.folders import real_path
-from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.reference import Reference, read_reference
-from rangesfm.options import ExportOptions
-from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME, read_map_errors, write_map_errors
-from rangesfm.result.metric_result import MetricResult
+from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME, read_map_errors
 from rangesfm.result.places import input_beside, path_in
 from rangesfm.result.result_tables import RESULT_TABLES, PhotoTimes, TableFile
 from rangesfm.result.summary import ResultSummary
@@ -105,67 +101,6 @@ def new_result(folder: Path, images_path: Path | None = None) -> Iterator[Path]:
             if images_path is not None and real_path(images_path) in photos:
                 removed += [path for path in photos if path != real_path(images_path) and output.is_own(path)]
             output.publish(new, removed, last=output.path / ResultSummary.NAME)
-
-
-def write_models_and_tables(
-    found: MetricResult,
-    export: ExportOptions,
-    folder: Path,
-    *,
-    database_path: Path,
-    images_path: Path | None = None,
-    georeference: Georeference | None = None,
-) -> InputError | None:
-    """Write the models, the tables and the export formats of a result into a new folder.
-
-    Args:
-        found: the result.
-        export: options that name the formats. Formats that this result cannot have (points or covariances without any)
-            are left out.
-        folder: to write into.
-        database_path: final place of the database with the features of the photos.
-        images_path: folder of the photos; None where it is not known.
-        georeference: of the result's frame; None without one.
-
-    Returns:
-        The error of a format that cannot be written, for a warning; None if all were written. Models and tables are
-        complete in either case.
-
-    Raises:
-        RangesfmError: something else failed, such as a full disk.
-    """
-    write_model(found.scaled, folder / "sparse_scaled" / "0")
-    if found.refined is not None:
-        write_model(found.final, folder / "sparse_metric" / "0")
-    for kind in RESULT_TABLES:
-        table = kind.of(found)
-        if table is not None:
-            table.write(folder)
-    if found.map_errors is not None:
-        write_map_errors(found.map_errors, folder)
-    times = PhotoTimes.of(found)
-    map_ = MetricMap(
-        found.final,
-        timestamps_s=None if times is None else times.by_name,
-        anchors_m={a.anchor_id: a.position_m for a in found.anchors if np.isfinite(a.position_m).all()},
-        metric_from_sfm=found.estimate.metric_from_sfm,
-        relative_scale_stddev=finite(found.estimate.uncertainty.empirical),
-        images_path=images_path,
-        database_path=database_path,
-        is_site=found.estimate.frame == "site",
-        georeference=georeference,
-        center_covariance_m2=found.center_covariance_m2,
-    )
-    impossible = [] if found.final.num_points3D() else ["ply"]
-    impossible += [] if found.center_covariance_m2 else COVARIANCE_FORMATS
-    formats = tuple(name for name in export.formats if name not in impossible)
-    try:
-        export_map(map_, folder, export.changed(formats=formats))
-    except InputError as error:
-        if error.exit_status != BAD_INPUT:  # a full disk, on which the rest of the result cannot be written either
-            raise
-        return error
-    return None
 
 
 @dataclass(frozen=True)

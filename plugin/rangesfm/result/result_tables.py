@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -14,8 +13,7 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.files.text_tables import TextTable, read_table, write_table
-from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.result.metric_result import USED, MetricResult
+from rangesfm.ranging.range_observations import USED
 
 _Kind = TypeVar("_Kind", bound="TableFile")
 _TEXT = "s"
@@ -45,15 +43,10 @@ _Covariance = Annotated[Array, ColumnFormat(".9g")]
 
 
 @dataclass(frozen=True)
-class TableFile(ABC):
+class TableFile:
     """A table with n rows. Each field is a column (``Texts``, ``Numbers``, ...), with its name and in its order."""
 
     NAME: ClassVar[str]
-
-    @classmethod
-    @abstractmethod
-    def of(cls: type[_Kind], found: MetricResult) -> _Kind | None:
-        """Return the table of what a run found; None where the run does not write this file."""
 
     @classmethod
     def columns(cls) -> dict[str, ColumnFormat]:
@@ -132,33 +125,6 @@ class RangesAsUsed(TableFile):
     robust_weight: RoundedOrEmpty
     status: Texts
 
-    @classmethod
-    def of(cls, found: MetricResult) -> RangesAsUsed | None:
-        observations, log = found.observations, found.observations.log
-        if not len(log):
-            return None
-        unknown = np.full(len(log), np.nan)
-        has_say = np.isin(observations.status, (*USED, RangeStatus.OUTLIER))
-        labels = {int(status): status.label for status in RangeStatus}
-        names = (*found.trajectory.image_names, "")
-        tag_ids, anchor_ids = log.end_ids()
-        return cls(
-            timestamp_s=unknown if log.timestamp_s is None else log.timestamp_s,
-            image_name=("",) * len(log) if log.image_name is None else log.image_name,
-            anchor_id=tuple(anchor_ids),
-            tag_id=tuple(tag_ids),
-            range_m=log.range_m,
-            range_stddev_m=found.range_stddev_m,
-            keyframe_before=tuple(names[i] for i in observations.before),
-            keyframe_after=tuple(names[i] for i in observations.after),
-            weight=np.where(observations.before >= 0, observations.fraction, np.nan),
-            predicted_scaled_m=found.predicted_scaled_m,
-            predicted_refined_m=unknown if found.kept_refinement is None else found.kept_refinement.predicted_m,
-            residual_m=found.residuals_m,
-            robust_weight=np.where(has_say, found.weights, np.nan),
-            status=tuple(labels[status] for status in observations.status.tolist()),
-        )
-
     def places_on(self, image_names: Sequence[str]) -> tuple[Indices, Indices, Mask]:
         """Return where each range is on a path.
 
@@ -197,11 +163,6 @@ class PhotoTimes(TableFile):
     image_name: Texts
     timestamp_s: Numbers
 
-    @classmethod
-    def of(cls, found: MetricResult) -> PhotoTimes | None:
-        times = found.trajectory.timestamps_s
-        return None if times is None else cls(found.trajectory.image_names, times)
-
     @cached_property
     def by_name(self) -> dict[str, float]:
         return dict(zip(self.image_name, self.timestamp_s.tolist(), strict=True))
@@ -219,14 +180,6 @@ class CenterCovariances(TableFile):
     cov_yy_m2: _Covariance
     cov_yz_m2: _Covariance
     cov_zz_m2: _Covariance
-
-    @classmethod
-    def of(cls, found: MetricResult) -> CenterCovariances | None:
-        by_photo = found.center_covariance_m2
-        if not by_photo:
-            return None
-        rows, columns = np.triu_indices(3)
-        return cls(tuple(by_photo), *np.array(list(by_photo.values()))[:, rows, columns].T)
 
     @property
     def by_photo_m2(self) -> dict[str, Array]:
@@ -247,16 +200,6 @@ class TagCorners(TableFile):
     x_px: Rounded
     y_px: Rounded
 
-    @classmethod
-    def of(cls, found: MetricResult) -> TagCorners | None:
-        markers = {} if found.tape is None else found.tape.found_markers
-        if not markers:
-            return None
-        names = [name for name, marker in markers.items() for _ in marker.image_names]
-        photos = [name for marker in markers.values() for name in marker.image_names]
-        pixels = np.concatenate([marker.pixels for marker in markers.values()])
-        return cls(tuple(names), tuple(photos), *pixels.T)
-
 
 @dataclass(frozen=True)
 class ScaleCandidates(TableFile):
@@ -268,15 +211,6 @@ class ScaleCandidates(TableFile):
     alpha0: Rounded
     alpha1: Rounded
 
-    @classmethod
-    def of(cls, found: MetricResult) -> ScaleCandidates | None:
-        if not len(found.observations.log):
-            return None
-        rows, log = found.diagnostics.candidate_rows, found.observations.log
-        times = np.full(len(rows), np.nan) if log.timestamp_s is None else log.timestamp_s[rows]
-        ids = tuple(log.anchor_ids[k] for k in log.anchor_index[rows])
-        return cls(times, ids, *found.diagnostics.candidates.T)
-
 
 @dataclass(frozen=True)
 class ScaleConsensus(TableFile):
@@ -286,12 +220,6 @@ class ScaleConsensus(TableFile):
     scale: Rounded
     num_agreeing: Annotated[Array, ColumnFormat(".0f")]
 
-    @classmethod
-    def of(cls, found: MetricResult) -> ScaleConsensus | None:
-        if not len(found.observations.log):
-            return None
-        return cls(found.diagnostics.curve_scales, found.diagnostics.num_agreeing.astype(np.float64))
-
 
 @dataclass(frozen=True)
 class TimeOffsetCurve(TableFile):
@@ -300,11 +228,6 @@ class TimeOffsetCurve(TableFile):
     NAME: ClassVar[str] = "time_offset_curve.csv"
     time_offset_s: Numbers
     cost: RoundedOrEmpty
-
-    @classmethod
-    def of(cls, found: MetricResult) -> TimeOffsetCurve | None:
-        curve = None if found.time_offset is None else found.time_offset.curve
-        return None if curve is None else cls(curve.offsets_s, curve.costs_m)
 
 
 @dataclass(frozen=True)
@@ -321,23 +244,13 @@ class LoopPairs(TableFile):
     other_image_name: Texts
     status: Texts
 
-    @classmethod
-    def of(cls, found: MetricResult) -> LoopPairs | None:
-        if found.loops is None:
-            return None
-        kinds = {"closed": found.loops.closed, "contradicted": found.loops.contradicted}
-        rows = [(*pair, kind) for kind, pairs in kinds.items() for pair in pairs]
-        first, second, status = zip(*rows) if rows else ((), (), ())
-        return cls(first, second, status)
-
     def pairs(self, status: str) -> list[tuple[str, str]]:
         """Return the names of the pairs with this status."""
         rows = zip(self.image_name, self.other_image_name, self.status, strict=True)
         return [(first, second) for first, second, of_pair in rows if of_pair == status]
 
 
-_OF_A_RUN = (
+RESULT_TABLES: tuple[type[TableFile], ...] = (
     *(RangesAsUsed, PhotoTimes, CenterCovariances, LoopPairs),
     *(ScaleCandidates, ScaleConsensus, TimeOffsetCurve, TagCorners),
 )
-RESULT_TABLES: tuple[type[TableFile], ...] = _OF_A_RUN

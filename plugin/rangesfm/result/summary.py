@@ -11,16 +11,12 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from rangesfm.distances.tape import CONTROL, DistanceRow
 from rangesfm.errors import number_text
 from rangesfm.files.records import NumberOrNull, Record, Text
-from rangesfm.positions.surveyed_positions import PointsEntry
-from rangesfm.ranging.errors.noise import NORMAL_95
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.result import entries
-from rangesfm.result.metric_result import MetricResult
-from rangesfm.scale.scale_estimate import ScaleSensitivity
 
 # Change of the scale, in percent per centimetre of an error, above which the summary mentions it.
 _NOTABLE_PERCENT = 0.5
@@ -67,9 +63,9 @@ class ResultSummary(Record):
     models: tuple[entries.ModelEntry, ...]
     tests: tuple[entries.MistakeEntry, ...] = ()
     reliability: entries.ReliabilityEntry | None = None
-    distances: tuple[DistanceRow, ...]
+    distances: tuple[entries.DistanceRow, ...]
     positions: entries.PositionsEntry | None = None
-    points: PointsEntry | None = None
+    points: entries.PointsEntry | None = None
     comparison: tuple[entries.ComparisonRow, ...] = ()
     georeference: entries.GeoreferenceEntry | None
     versions: dict[Text, Text]
@@ -88,34 +84,6 @@ class ResultSummary(Record):
     def has_ranges(self) -> bool:
         """Return whether there are ranges; otherwise the scale comes from measured lengths or known positions alone."""
         return self.ranges.num > 0
-
-    @classmethod
-    def of(cls, found: MetricResult, **others: Any) -> ResultSummary:
-        """Return the summary of a result.
-
-        Args:
-            found: what the stages found.
-            others: entries that do not follow from it, from ``distances`` on.
-        """
-        estimate = found.estimate
-        return cls(
-            scale=entries.ScaleEntry.model_validate(estimate),
-            place=None if found.place is None else entries.PlaceEntry.model_validate(found.place),
-            metric_from_sfm=entries.SimilarityEntry.of(estimate.metric_from_sfm),
-            frame="site" if estimate.frame == "site" else "first_camera",
-            map=entries.MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),
-            anchors={anchor.anchor_id: entries.AnchorEntry.model_validate(anchor) for anchor in found.anchors},
-            time_offset=entries.TimeOffsetEntry.of(found),
-            ranges=entries.RangesEntry.of(found),
-            check_ranges=entries.CheckRangesEntry.of(found),
-            refine=entries.RefineEntry.of(found),
-            loops=entries.LoopsEntry.of(found),
-            positions=entries.PositionsEntry.of(found),
-            tests=tuple(map(entries.MistakeEntry.model_validate, found.diagnosis.tests if found.diagnosis else ())),
-            reliability=entries.ReliabilityEntry.of(found),
-            models=tuple(entries.ModelEntry.of(model, estimate.metric_from_sfm) for model in found.models),
-            **others,
-        )
 
     def lines(self, folder: Path, table: str | None) -> Iterator[str]:
         """Yield the lines that the user sees at the end of a run.
@@ -150,7 +118,8 @@ class ResultSummary(Record):
                 residuals += f", half of them by less than {number_text(ranges.median_abs_m, '.3f')} m"
             yield f"ranges: {ranges.num_used} of {ranges.num} used{residuals}"
         if self.distances:
-            held = [abs(row.residual_m) for row in self.distances if row.kind == CONTROL and row.residual_m is not None]
+            control = [row.residual_m for row in self.distances if row.kind == "control"]
+            held = [abs(residual_m) for residual_m in control if residual_m is not None]
             worst = f"; the map differs from these by {max(held):.3f} m at most" if held else ""
             yield f"measured lengths: {len(held)} of {len(self.distances)} used for the scale{worst}"
         if self.positions is not None:
@@ -197,7 +166,7 @@ def _closed(loops: entries.LoopsEntry) -> str:
     )
 
 
-def _notable(sensitivity: ScaleSensitivity) -> Iterator[str]:
+def _notable(sensitivity: entries.ScaleSensitivity) -> Iterator[str]:
     """Yield a line that names the errors of which one centimetre changes the scale much, if there are any."""
     values = {
         "of error in the short ranges": sensitivity.short_range_per_cm,

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind

@@ -10,11 +10,11 @@ import numpy as np
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
 from rangesfm.ranging.errors.components import BENDS, FRAME
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.scale_by_lengths import LengthScale

@@ -11,10 +11,10 @@ from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import Correction
 from rangesfm.errors import GeometryError, number_text
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.workflows.make_metric_map import metric_map
+from rangesfm.workflows.metric_result import MetricResult
 
 
 def with_likeliest_cause(run: SurveyRun, path: PathOfModel, metric: MetricResult) -> tuple[SurveyRun, MetricResult]:

@@ -18,10 +18,10 @@ from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.resection import Loop
 from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
 from rangesfm.refine.with_ranges import LoopClosing
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.scale.at_map import half_way
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.workflows.loop_matching import LoopMatching
+from rangesfm.workflows.metric_result import MetricResult
 
 Refine = Callable[[MetricResult, LoopClosing], MetricResult]
 """Refines a map with loops that are to be closed."""

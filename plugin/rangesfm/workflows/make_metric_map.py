@@ -33,6 +33,7 @@ from rangesfm.distances.locate_lengths import locate_distances, surveyed_distanc
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import gravity_of
+from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.join.join_models import ModelVerdict, join_models
@@ -41,12 +42,10 @@ from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.ranging.errors.noise import NORMAL_95
 from rangesfm.refine.photo_bending import PhotoBending, bending_of_model, by_photos
 from rangesfm.refine.positions import HeldPositions
 from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, LoopClosing, RefineSummary, refine_with_ranges
-from rangesfm.result.metric_result import MetricResult, Rivals
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.scale.at_map import MapWithRanges, estimate_at, estimate_by_positions_at
 from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
@@ -57,6 +56,7 @@ from rangesfm.scale.scale_verdict import NOTHING_KNOWN, refuse_unknown
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.workflows.close_loops import close_loops
+from rangesfm.workflows.metric_result import MetricResult, Rivals
 
 # Two likely time offsets whose scales differ by more than this fraction leave the scale undetermined, ...
 _MAX_SPREAD = 0.03

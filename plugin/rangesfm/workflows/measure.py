@@ -88,7 +88,7 @@ def measure(
     map_ = MeasuredMap(
         _points_of(result, None if markers is None else Path(markers)),
         result.read_map_errors(),
-        result.summary.scale.relative_stddev.uncertainty,
+        result.summary.scale.relative_stddev_empirical,
         up_in_map(result.summary),
     )
     return Measurements(map_.measure(pairs), tuple(_notes(result, map_)))

@@ -20,11 +20,11 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.scale.scale_verdict import CALIBRATE
+from rangesfm.workflows.metric_result import MetricResult
 
 # Assumed rate of photos without times.
 _PHOTO_RATE_HZ = 2.0

@@ -18,7 +18,6 @@ from rangesfm.files.atomic import sole_writer
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress, SilentProgress
-from rangesfm.result.metric_result import MetricResult
 from rangesfm.result.result_folder import refuse_to_overwrite, result_names
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import times_of_model
@@ -38,6 +37,7 @@ from rangesfm.workflows.map_photos import (
     with_photos_in_folder,
     with_tags,
 )
+from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.place_ranges import place_ranges
 from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.run_results import RunResult, write_results

@@ -10,28 +10,24 @@ import numpy as np
 
 from rangesfm.ceres.installation_checks import recorded_versions
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
-from rangesfm.distances.locate_lengths import locate_distances
-from rangesfm.distances.tape import DistanceRow, disagreements, distance_rows
-from rangesfm.export import COVARIANCE_FORMATS
+from rangesfm.errors import BAD_INPUT, InputError
+from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
+from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import write_reference
-from rangesfm.positions.surveyed_positions import PointsEntry
+from rangesfm.options import ExportOptions
 from rangesfm.report import write_report_of
 from rangesfm.report.content import Content
 from rangesfm.result.entries import ComparisonRow
-from rangesfm.result.metric_result import MetricResult
+from rangesfm.result.joint_covariance import write_map_errors
 from rangesfm.result.places import recorded_inputs, recorded_settings
-from rangesfm.result.result_folder import (
-    REFERENCE_NAME,
-    REPORT_NAME,
-    new_result,
-    read_result_folder,
-    write_models_and_tables,
-)
+from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_result, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.survey.inputs import RangingInputs, input_hashes
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.steps import DATABASE_NAME
+from rangesfm.workflows.metric_result import MetricResult
+from rangesfm.workflows.result_records import disagreements, distance_rows, summary_of, tables_of
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
     survey, inputs, journal = run.survey, run.inputs, run.journal
     if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
         journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
-    distances = _distances(metric)
+    distances = distance_rows(metric)
     disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical, BENDING))
     journal.warn(*disagreeing)
     metric = metric.doubted(disagreeing)
@@ -73,7 +69,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
             comparison = _comparison(inputs, metric, staged)
             # The georeference of the anchors is that of the map, if the map is in their frame.
             georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
-            not_exported = write_models_and_tables(
+            not_exported = _write_models_and_tables(
                 metric,
                 survey.export,
                 staged,
@@ -81,10 +77,9 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
                 images_path=survey.images.path,
                 georeference=georeference,
             )
-        summary = ResultSummary.of(
+        summary = summary_of(
             metric,
             distances=distances,
-            points=_points(metric),
             **({"comparison": comparison} if comparison else {}),
             georeference=georeference,
             versions=recorded_versions(),
@@ -108,21 +103,6 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
     return RunResult(folder, summary, tuple(lines))
 
 
-def _distances(metric: MetricResult) -> list[DistanceRow]:
-    """Return the table of control and check distances in the final map; empty without measured lengths."""
-    if metric.tape is None:
-        return []
-    located = locate_distances(metric.tape, metric.final, [anchor.anchor_id for anchor in metric.anchors])
-    anchors_m = np.array([anchor.position_m for anchor in metric.anchors]).reshape(-1, 3)
-    return distance_rows(metric.tape, located.lengths_m(1.0, anchors_m))
-
-
-def _points(metric: MetricResult) -> PointsEntry | None:
-    if metric.estimate.frame != "site":
-        return None
-    return PointsEntry.of(metric.positions, metric.final, metric.trajectory.as_in(metric.final))
-
-
 def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
     """Return the comparison with the reference, empty without one; write the reference in the frame of the map."""
     if inputs.reference is None:
@@ -136,3 +116,61 @@ def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tu
     if in_frame is not None:
         write_reference(in_frame, folder / REFERENCE_NAME)
     return rows
+
+
+def _write_models_and_tables(
+    found: MetricResult,
+    export: ExportOptions,
+    folder: Path,
+    *,
+    database_path: Path,
+    images_path: Path | None = None,
+    georeference: Georeference | None = None,
+) -> InputError | None:
+    """Write the models, the tables and the export formats of a result into a new folder.
+
+    Args:
+        found: the result.
+        export: options that name the formats. Formats that this result cannot have (points or covariances without any)
+            are left out.
+        folder: to write into.
+        database_path: final place of the database with the features of the photos.
+        images_path: folder of the photos; None where it is not known.
+        georeference: of the result's frame; None without one.
+
+    Returns:
+        The error of a format that cannot be written, for a warning; None if all were written. Models and tables are
+        complete in either case.
+
+    Raises:
+        RangesfmError: something else failed, such as a full disk.
+    """
+    write_model(found.scaled, folder / "sparse_scaled" / "0")
+    if found.refined is not None:
+        write_model(found.final, folder / "sparse_metric" / "0")
+    for table in tables_of(found):
+        table.write(folder)
+    if found.map_errors is not None:
+        write_map_errors(found.map_errors, folder)
+    map_ = MetricMap(
+        found.final,
+        timestamps_s=found.trajectory.times_by_name,
+        anchors_m={a.anchor_id: a.position_m for a in found.anchors if np.isfinite(a.position_m).all()},
+        metric_from_sfm=found.estimate.metric_from_sfm,
+        relative_scale_stddev=found.estimate.uncertainty.empirical,
+        images_path=images_path,
+        database_path=database_path,
+        is_site=found.estimate.frame == "site",
+        georeference=georeference,
+        center_covariance_m2=found.center_covariance_m2,
+    )
+    impossible = [] if found.final.num_points3D() else ["ply"]
+    impossible += [] if found.center_covariance_m2 else COVARIANCE_FORMATS
+    formats = tuple(name for name in export.formats if name not in impossible)
+    try:
+        export_map(map_, folder, export.changed(formats=formats))
+    except InputError as error:
+        if error.exit_status != BAD_INPUT:  # a full disk, on which the rest of the result cannot be written either
+            raise
+        return error
+    return None

@@ -14,10 +14,10 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array, Indices, rows_by_key
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS, UNDETERMINED
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, NORMAL_95, SIGNIFICANT_STDDEVS, UNDETERMINED
 from rangesfm.ranging.clock.search import MIN_COVERAGE, AnyObserved, Observed, PathSamples, TimedRanges
 from rangesfm.ranging.clock.squares import fit_squares, residual_stddev
-from rangesfm.ranging.errors.noise import NORMAL_95, STRETCH_S
+from rangesfm.ranging.errors.noise import STRETCH_S
 
 # Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
 _CELL_S = 1.0

@@ -23,8 +23,6 @@ from rangesfm.ranging.range_log import RangeLog
 # short ranges does not average out, so they are trusted far less than their scatter suggests.
 _SHORT_RANGE_STDDEV_M = 2.0
 SHORT_RANGE_LENGTH_M = 1.0
-NORMAL_95 = 1.96
-"""Half the width of a 95 % interval, in standard deviations of a normal distribution."""
 START_STDDEV_M = 0.1
 """Noise of a usual radio, metres, assumed before an estimate: in ``examples/radios.md`` 0.03 to 0.1, one has more."""
 MIN_NUM_OF_SCATTER = 20

@@ -26,15 +26,12 @@ from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.clock.time_offset import TimeOffset
 from rangesfm.ranging.errors.learned import LearnedErrors
-from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.at_map import MapWithRanges
 from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.scale.scale_diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.scale_estimate import ScaleEstimate
-
-USED = (RangeStatus.USED, RangeStatus.DOWN_WEIGHTED)
-"""Statuses of ranges that are used in the final model, with full or reduced weight."""
 
 
 class Rivals(NamedTuple):
