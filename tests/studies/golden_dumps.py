@@ -50,7 +50,7 @@ from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
 import rangesfm
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
 from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.result.result_tables import RESULT_TABLES
+from rangesfm.workflows import result_records
 from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.run_results import RunResult, write_results
 
@@ -222,10 +222,8 @@ def metric_of(survey_path: Path, output_path: Path) -> MetricResult:
 def tables_of(metric: MetricResult) -> Values:
     """Return the columns of the CSV files, which round most of them."""
     found: Values = {}
-    for kind in RESULT_TABLES:
-        table = kind.of(metric)
-        if table is not None:
-            found |= {f"{kind.NAME} {each.name}": np.array(getattr(table, each.name)) for each in fields(table)}
+    for table in result_records.tables_of(metric):
+        found |= {f"{table.NAME} {each.name}": np.array(getattr(table, each.name)) for each in fields(table)}
     return found
 
 
