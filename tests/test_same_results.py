@@ -20,6 +20,11 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from tests.conftest import ANCHORS_M, SITE_M, TAG_IN_CAM_M, Command, WalkedSurvey
+from tests.join.test_join_models import walk
+from tests.simulated.looped import bent_laps, write_survey
+from tests.studies.simulated_survey import TAG_IN_CAM_M as LAPS_TAG_IN_CAM_M
+from tests.workflows.test_surveys_of_rigs import TAG_IN_CAM_M as RIG_TAG_IN_CAM_M
+from tests.workflows.test_surveys_of_rigs import stereo_survey
 
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
@@ -33,8 +38,8 @@ Numbers = dict[str, Number]
 FILE = Path(__file__).parent / "same_results.json"
 # Of the stddev of a number: a change that no user would notice.
 TOLERANCE = 0.1
-# Of reprojection errors, which have no stddev of their own.
-SHARE_OF_PIXELS = 0.05
+# Of numbers that have no stddev of their own, such as reprojection errors.
+SHARE_OF_OTHERS = 0.05
 
 
 class Case(NamedTuple):
@@ -138,6 +143,22 @@ CASES = {
 }
 
 
+PLAN = """
+[anchors]
+frame = "site"
+position_stddev_m = 0.02
+places = {A1 = [0.0, 0.0, 2.5], A2 = [12.0, 0.0, 0.5], A3 = [12.0, 8.0, 2.5], A4 = [0.0, 8.0, 0.5]}
+[path]
+waypoints = [[2, 2, 1.2], [10, 2, 1.6], [10, 6, 1.2], [2, 6, 1.8], [2, 2, 1.2]]
+speed_m_per_s = 0.5
+photo_rate_hz = 1.0
+[radio]
+rate_hz = 5.0
+[tag]
+tag_in_cam_m = [0.0, -0.1, 0.0]
+"""
+
+
 def read_log(path: Path) -> Log:
     rows = list(csv.DictReader(path.read_text().splitlines()))
     log: Log = {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -217,11 +238,19 @@ def found_by(case: Case, survey: WalkedSurvey, command: Command) -> Numbers:
     write_log(survey.folder / "uwb.csv", log)
     given = survey.flags if case.has_ranges else ("--input_path", "sparse/0", "--images", "images.csv")
     up = ",".join(map(str, site_path(survey).world_from_cam[0, 2].tolist()))
-    flags = [*given, *(flag.format(up=up) for flag in case.flags), "--no_report", "--quiet", "--output_path", "out"]
-    command(case.command, *flags, cwd=survey.folder)
-    result = json.loads((survey.folder / "out" / "result.json").read_text())
-    assert result["scale"]["verdict"] == case.verdict
-    assert case.reason in result["scale"]["reasons"][0]
+    flags = (*given, *(flag.format(up=up) for flag in case.flags))
+    words = {"verdict": case.verdict, "reason": case.reason}
+    return result_of(case.command, *flags, cwd=survey.folder, run=command, **words)
+
+
+def result_of(
+    *arguments: str, cwd: Path, run: Command, verdict: str = "good", reason: str = "the scale is known to"
+) -> Numbers:
+    """Return the numbers of a command's result, after a look at its verdict and its first reason."""
+    run(*arguments, "--no_report", "--quiet", "--output_path", "out", cwd=cwd)
+    result = json.loads((cwd / "out" / "result.json").read_text())
+    assert result["scale"]["verdict"] == verdict
+    assert reason in result["scale"]["reasons"][0]
     return dict(numbers_of(result))
 
 
@@ -242,9 +271,30 @@ def numbers_of(result: dict[str, Any]) -> Iterator[tuple[str, Number]]:
     for name, anchor in list(estimated.items())[:1]:
         for axis, value_m in zip("xyz", anchor["position_m"], strict=True):
             yield f"anchor {name}, {axis}", (value_m, anchor["stddev_m"])
+    for kind, own in scale["by_kind"].items():
+        yield f"scale by {kind}", (own["value"], own["stddev"])
+    for model in result["models"]:
+        placed, stddev = model["metric_from_sfm"], model["scale"]["stddev_empirical"]
+        yield f"{model['name']}, scale", (placed["scale"], stddev * placed["scale"] / model["scale"]["value"])
+        for axis, value_m in zip("xyz", placed["translation_m"], strict=True):
+            yield (
+                f"{model['name']}, {axis}",
+                (value_m, max(stddev * float(np.linalg.norm(placed["translation_m"])), 0.01)),
+            )
     if result["refine"] is not None:
-        pixels = result["refine"]["reprojection_rms_px"]
-        yield "reprojection", (pixels, SHARE_OF_PIXELS * pixels / TOLERANCE)
+        yield "reprojection", without_stddev(result["refine"]["reprojection_rms_px"], least=0.1)
+    if result["loops"] is not None:
+        yield "loops move", without_stddev(result["loops"]["moved_m"])
+        yield "loops closed", without_stddev(result["loops"]["num_closed"])
+
+
+def without_stddev(value: float, least: float = 0.0) -> Number:
+    """Return a number that has no stddev of its own, with one that lets it change by ``SHARE_OF_OTHERS``.
+
+    Args:
+        least: smaller numbers may change as much as this one.
+    """
+    return value, SHARE_OF_OTHERS * max(value, least) / TOLERANCE
 
 
 def compare(name: str, found: Numbers) -> None:
@@ -308,3 +358,55 @@ def test_a_table_says_what_it_said(
             for column, stddev in columns.items()
         },
     )
+
+
+def test_closed_loops_give_what_they_gave(tmp_path: Path, rangesfm_command: Command) -> None:
+    write_survey(bent_laps(), tmp_path)
+    tag = ",".join(map(str, LAPS_TAG_IN_CAM_M))
+    model = ("--input_path", "sparse", "--images", "images.csv", "--database_path", "database.db")
+    radio = ("--ranges", "uwb.csv", "--tag_in_cam", tag, "--ranges_time_offset", "0")
+    anchor = ("--anchors", "anchors.csv", "--anchor_frame", "first_camera")
+    words = {"verdict": "doubtful", "reason": "the photos do not hold the map together: 2 of its 80 photos"}
+    compare("loops", result_of("refine", *model, *radio, *anchor, cwd=tmp_path, run=rangesfm_command, **words))
+
+
+def test_a_rig_and_a_radio_give_what_they_gave(tmp_path: Path, rangesfm_command: Command) -> None:
+    stereo_survey(tmp_path)
+    tag = ",".join(map(str, RIG_TAG_IN_CAM_M))
+    rig = ("--input_path", "sparse", "--rig_config_path", "rig_config.json", "--baseline_stddev_m", "0.003")
+    radio = ("--ranges", "ranges.csv", "--tag_in_cam", tag, *SITE)
+    compare("a rig and a radio", result_of("refine", *rig, *radio, cwd=tmp_path, run=rangesfm_command))
+
+
+def test_joined_models_give_what_they_gave(tmp_path: Path, rangesfm_command: Command) -> None:
+    halves = walk()
+    halves.write(tmp_path)
+    rng, log = np.random.default_rng(9), read_log(tmp_path / "uwb.csv")
+    log["range_m"] += 0.05 * rng.standard_normal(len(log["range_m"]))
+    write_log(tmp_path / "uwb.csv", log)
+    tag = ",".join(map(str, TAG_IN_CAM_M))
+    radio = ("--ranges", "uwb.csv", "--tag_in_cam", tag, "--ranges_time_offset", "0", *UNKNOWN)
+    for part, day in zip(halves.parts, ("monday", "tuesday"), strict=True):
+        (tmp_path / day).mkdir()
+        part.sfm.write(tmp_path / day)
+        flags = ("--input_path", day, "--images", "images.csv", *radio, "--output_path", f"{day}/out", "--no_report")
+        rangesfm_command("scale", *flags, "--quiet", cwd=tmp_path)
+    words = {"verdict": "doubtful", "reason": "the photos do not hold the map together: 14 of its 28 photos"}
+    compare("joined", result_of("join", "monday/out", "tuesday/out", cwd=tmp_path, run=rangesfm_command, **words))
+
+
+def test_a_plan_says_what_it_said(tmp_path: Path, rangesfm_command: Command) -> None:
+    """Numbers of a plan are stddevs: each may change by a tenth of itself."""
+    (tmp_path / "plan.toml").write_text(PLAN)
+    rangesfm_command("plan", "plan.toml", "--output_path", "plan", "--quiet", cwd=tmp_path)
+    plan = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    assert plan["verdict"] == plan["place"]["verdict"] == "good"
+    found = {"scale": plan["scale_stddev"], "scale, formal": plan["scale_stddev_formal"]}
+    found |= {f"scale by {name}": own for name, own in plan["by_kind"].items()}
+    found |= {f"map, {axis}": own for axis, own in zip("xyz", plan["place"]["stddev_m"], strict=True)}
+    found |= {name: plan["place"][f"{name}_stddev_deg"] for name in ("heading", "tilt")}
+    found["worst keyframe"] = max(plan["keyframe_stddevs_m"])
+    largest = max(plan["mistakes"], key=lambda mistake: mistake["effect_on_scale"] or 0.0)
+    found[f"{largest['name']} {largest['subject']}".strip()] = largest["smallest_detectable"]
+    found |= {advice["kind"]: advice["scale_stddev"] for advice in plan["advice_for_scale"][:2]}
+    compare("plan", {name: (value, value) for name, value in found.items()})

@@ -13,10 +13,11 @@ import numpy.typing as npt
 import pycolmap
 from tests.simulated.model import SyntheticModel, _Frames, _reconstruction, synthetic_model
 from tests.simulated.path import lap_path, look_at
-from tests.studies.simulated_survey import RANGE_MODEL, SITE_ANCHORS_M, TAG_IN_CAM_M, Survey
+from tests.studies.simulated_survey import RANGE_MODEL, SITE_ANCHORS_M, TAG_IN_CAM_M, Survey, range_log
 
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.colmap.transform import rescale
+from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.similarity import IDENTITY, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.loops.loop_finder import LoopFinder
@@ -27,6 +28,7 @@ from rangesfm.options import CameraOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.refine.with_ranges import Learnt, LoopClosing, RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate
@@ -146,6 +148,25 @@ def write_matches(
             geometry.inlier_matches = of_pair.astype(np.uint32)
             database.write_matches(*pair, of_pair.astype(np.uint32))
             database.write_two_view_geometry(*pair, geometry)
+
+
+def write_survey(looped: LoopedSurvey, folder: Path) -> None:
+    """Write a survey with one anchor: a model whose loops are open, ranges at its photos, and all else that is known.
+
+    The files are ``sparse``, ``database.db`` with the matches of neighbours in time, ``images.csv``, ``uwb.csv``,
+    ``anchors.csv`` and ``reference.csv``, the truth.
+    """
+    truth = looped.survey.model
+    (folder / "sparse").mkdir()
+    looped.chain().write_binary(folder / "sparse")
+    write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
+    write_ranges_csv(range_log(looped.survey, 1, num_each=4), folder / "uwb.csv")
+    times = "".join(f"{name},{time}\n" for name, time in truth.timestamps_s.items())
+    (folder / "images.csv").write_text(f"image_name,timestamp_s\n{times}")
+    (anchor,) = looped.survey.anchors_m.values()
+    (folder / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\nA1,{},{},{}\n".format(*anchor))
+    reference = Reference(truth.centers_m, image_names=tuple(truth.timestamps_s), world_from_cam=truth.world_from_cam)
+    write_reference(reference, folder / "reference.csv")
 
 
 @dataclass(frozen=True)
@@ -305,6 +326,11 @@ def two_laps(
     )
     anchor = (np.array([0.1 * size_m[0], -0.4 * size_m[1], 4.0]) - centers[0]) @ turns[0]
     return LoopedSurvey(Survey(model, {"A1": anchor}, "first_camera", 0.1), max_track_length)
+
+
+def bent_laps() -> LoopedSurvey:
+    """Return laps that bend by some decimetres, which their ranges hardly see."""
+    return two_laps(80, size_m=(32.0, 20.0), num_observations=100, pixel_stddev=1.0)
 
 
 @dataclass(frozen=True)

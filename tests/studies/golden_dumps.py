@@ -41,11 +41,11 @@ from unittest.mock import patch
 import numpy as np
 import numpy.typing as npt
 import pycolmap
-from tests.simulated.looped import two_laps, write_matches
+from tests.simulated import looped
 from tests.studies.drifting_maps import Made, hall, lap_of_drift, of_poses, poses
 from tests.studies.known_positions import POINT_STDDEV_M, RECEIVERS, points_of, track_of
 from tests.studies.measured_distances import KINDS, simulated
-from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
+from tests.studies.simulated_survey import TAG_IN_CAM_M
 
 import rangesfm
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
@@ -80,7 +80,8 @@ def write_yard_loose(folder: Path) -> Tables:
     survey = simulated(KINDS["yard"], 3)[1]
     assert survey.log.timestamp_s is not None
     ahead = replace(survey, log=replace(survey.log, timestamp_s=survey.log.timestamp_s + 7.3))
-    tables = written(replace(ahead, tag_in_cam_m=TAG_IN_CAM_M + np.array([0.06, -0.04, 0.05])), folder)
+    tables = written(ahead, folder)
+    tables["tag"]["tag_in_cam_m"] = (TAG_IN_CAM_M + np.array([0.06, -0.04, 0.05])).tolist()
     tables["ranges"]["time_offset"] = "auto"
     tables["refine"]["lever_arm_stddev_m"] = 0.1
     return tables
@@ -99,7 +100,9 @@ def write_known(kind: str, names: Sequence[str], folder: Path) -> Tables:
     truth, survey = simulated(replace(KINDS[kind], frame="site"), SEED)
     rng = np.random.default_rng([SEED, 41])
     points, track = points_of(truth, rng), track_of(survey, KINDS[kind].path(SEED), rng)
-    tables = written(survey, folder) if "ranges" in names else with_model(survey, folder)
+    has_ranges = "ranges" in names
+    (written if has_ranges else write_model)(survey, folder)
+    tables = tables_of_files("site" if has_ranges else None)
     if "positions" in names:
         assert track.log.timestamp_s is not None
         rows = np.column_stack([track.log.timestamp_s, track.log.position_m])
@@ -128,14 +131,8 @@ def write_known(kind: str, names: Sequence[str], folder: Path) -> Tables:
 
 
 def write_loops(folder: Path) -> Tables:
-    looped = two_laps(80, size_m=(32.0, 20.0), num_observations=100, pixel_stddev=1.0)
-    truth, chain = looped.survey.model, looped.chain()
-    write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
-    log = range_log(looped.survey, 1, num_each=4)
-    path = rangesfm.trajectory_from_reconstruction(chain, truth.timestamps_s)
-    anchors_m = looped.survey.anchors_m
-    survey = Made(chain, path, anchors_m, "first_camera", log, TAG_IN_CAM_M, truth.centers_m, refine=True)
-    tables = written(survey, folder)
+    looped.write_survey(looped.bent_laps(), folder)
+    tables = tables_of_files("first_camera")
     tables["mapper"]["database_path"] = "database.db"
     return tables
 
@@ -165,19 +162,16 @@ def write_survey(name: str, folder: Path) -> None:
 
 def written(survey: Made, folder: Path) -> Tables:
     """Write a survey with ranges, and return the tables of its survey file."""
-    tables = with_model(survey, folder)
+    write_model(survey, folder)
     write_ranges_csv(survey.log, folder / "uwb.csv")
-    tables["ranges"] = {"path": "uwb.csv", "time_offset": 0.0}
-    tables["tag"] = {"tag_in_cam_m": survey.tag_in_cam_m.tolist()}
-    tables["anchors"] = {"frame": survey.frame}
-    if survey.frame != "unknown":
-        rows = [(name, *at.tolist()) for name, at in survey.anchors_m.items()]
-        write_rows(folder / "anchors.csv", ("anchor_id", "x_m", "y_m", "z_m"), rows)
-        tables["anchors"]["path"] = "anchors.csv"
+    rows = [(name, *at.tolist()) for name, at in survey.anchors_m.items()]
+    write_rows(folder / "anchors.csv", ("anchor_id", "x_m", "y_m", "z_m"), rows)
+    tables = tables_of_files(survey.frame)
+    tables["refine"]["enabled"] = survey.refine
     return tables
 
 
-def with_model(survey: Made, folder: Path) -> Tables:
+def write_model(survey: Made, folder: Path) -> None:
     """Write the model and the times of its photos."""
     sfm = survey.sfm if survey.sfm.num_reg_images() else of_poses(survey.trajectory)
     (folder / "sparse").mkdir()
@@ -185,16 +179,25 @@ def with_model(survey: Made, folder: Path) -> Tables:
     assert survey.trajectory.timestamps_s is not None
     times = zip(survey.trajectory.image_names, survey.trajectory.timestamps_s.tolist(), strict=True)
     write_rows(folder / "images.csv", ("image_name", "timestamp_s"), times)
-    return {
+
+
+def tables_of_files(frame: str | None) -> Tables:
+    """Return the tables of a survey file for ranges with anchors in a frame; None: there are no ranges."""
+    tables: Tables = {
         "images": {"model": "sparse", "times": "images.csv"},
         "camera": {"refine_intrinsics": False},
         "mapper": {"num_threads": 1},
         "scale": {},
-        "refine": {"enabled": survey.refine},
+        "refine": {},
         "report": {"enabled": False},
         "export": {"formats": []},
         "output": {"seed": 0},
     }
+    if frame is not None:
+        tables["ranges"] = {"path": "uwb.csv", "time_offset": 0.0}
+        tables["tag"] = {"tag_in_cam_m": TAG_IN_CAM_M.tolist()}
+        tables["anchors"] = {"frame": frame} | ({} if frame == "unknown" else {"path": "anchors.csv"})
+    return tables
 
 
 def write_rows(path: Path, header: Sequence[str], rows: Any) -> None:

@@ -10,16 +10,14 @@ import pycolmap
 import pytest
 from tests.known import known
 from tests.outputs import names_in
-from tests.simulated.looped import LoopedSurvey, two_laps, write_matches
-from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
+from tests.simulated.looped import bent_laps, two_laps, write_matches, write_survey
+from tests.studies.simulated_survey import TAG_IN_CAM_M
 
 from rangesfm.errors import InputError
 from rangesfm.files.manifest import content_hash
-from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.similarity import rmse
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.progress import Journal, SilentProgress
-from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.result.result_tables import LoopPairs
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import RangingInputs
@@ -58,25 +56,10 @@ class Laps:
     database: Path
 
 
-def bent_laps() -> LoopedSurvey:
-    """Return laps that bend by some decimetres, which their ranges hardly see."""
-    return two_laps(80, size_m=(32.0, 20.0), num_observations=100, pixel_stddev=1.0)
-
-
 @pytest.fixture(scope="module")
 def laps(tmp_path_factory: pytest.TempPathFactory) -> Laps:
-    folder, looped = tmp_path_factory.mktemp("laps"), bent_laps()
-    truth, chain = looped.survey.model, looped.chain()
-    (folder / "sparse").mkdir()
-    chain.write_binary(folder / "sparse")
-    write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
-    write_ranges_csv(range_log(looped.survey, 1, num_each=4), folder / "uwb.csv")
-    times = "".join(f"{name},{time}\n" for name, time in truth.timestamps_s.items())
-    (folder / "images.csv").write_text(f"image_name,timestamp_s\n{times}")
-    (anchor,) = looped.survey.anchors_m.values()
-    (folder / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\nA1,{},{},{}\n".format(*anchor))
-    reference = Reference(truth.centers_m, image_names=tuple(truth.timestamps_s), world_from_cam=truth.world_from_cam)
-    write_reference(reference, folder / "reference.csv")
+    folder = tmp_path_factory.mktemp("laps")
+    write_survey(bent_laps(), folder)
     survey = Survey().changed(
         {
             "images.model": folder / "sparse",
