@@ -25,3 +25,11 @@ def test_a_worse_mean_is_named_and_scatter_is_not() -> None:
 
 def test_a_kind_of_case_that_is_worse_is_named_among_those_that_are_not() -> None:
     assert worse({f"yard {seed}": 0.01 + 0.0005 * seed for seed in range(4)}) == ["RMSE, yard"]
+
+
+def test_cases_of_any_size_that_are_worse_are_named_beside_large_ones_that_are_not() -> None:
+    stored = {"a map that drifts far": {"rmse": 12.0}}
+    stored |= {f"{letter} map": {"rmse": 0.02 * 1.5**k} for k, letter in enumerate("abcdefgh")}
+    now = {case: {"rmse": rmse["rmse"] * (1.3 if rmse["rmse"] < 1 else 1.001)} for case, rmse in stored.items()}
+    assert [loss.words for loss in RMSE.losses(now, stored) if loss.is_real] == ["RMSE"]
+    assert not [loss for loss in RMSE.losses(stored, now) if loss.is_real]

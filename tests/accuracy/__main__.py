@@ -8,8 +8,8 @@ cases of each group. The same cases have the same seeds, so that two runs on one
 times.
 
 Each figure is compared with the stored one over the cases that both have: over all of a group, and over those whose
-names differ only in the number at their end, which mostly is the seed. It is worse if the cases are worse on the
-average by more than the scatter of their changes allows for. Prints the table; exit status 1 if a figure is worse.
+names differ only in the number at their end, which mostly is the seed. It is worse if more cases are worse, and by
+more, than chance makes so. Prints the table; exit status 1 if a figure is worse.
 
 ``--store`` stores the cases, and writes the table into ``examples/measured.md``.
 """
@@ -52,7 +52,7 @@ def main() -> int:
     print("\n".join(rows(found)))
     for name, loss in losses:
         if loss.is_real:
-            print(f"WORSE: {name}, {loss.words}: {loss.by:.3g} on the average, scatter {loss.allowed:.3g}")
+            print(f"WORSE: {name}, {loss.words}: by {loss.by:.3g} on the average")
     if args.store:
         store({**stored, **found})
     return int(any(loss.is_real for _, loss in losses))

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import t as student
+from scipy.stats import wilcoxon
 
 Array = npt.NDArray[np.float64]
 Values = Mapping[str, float | None]
@@ -17,10 +18,11 @@ Values = Mapping[str, float | None]
 Cases = Mapping[str, Values]
 """Values by case."""
 
-# A figure is worse if its cases are, on the average, by more than their scatter allows for with this probability, ...
-_CONFIDENCE = 0.99
-# ... and by more than this share of it, which other processors and versions of libraries may change.
-_TRIFLE = 0.01
+# Probability that a figure is named whose cases became worse or better by chance. A change by a smaller share of a
+# value counts as none, as other processors and versions of libraries may make it.
+_CHANCE, _TRIFLE = 0.01, 0.01
+# Divisor where nothing scatters.
+_SMALLEST = 1e-300
 
 
 @dataclass(frozen=True)
@@ -65,31 +67,42 @@ class Figure:
     def losses(self, cases: Cases, stored: Cases) -> list[Loss]:
         """Compare the cases that both have: all of them, and those of each kind of which there are several.
 
-        What makes one kind of case worse hides among the others, which it leaves as they were.
+        Cases of different kinds differ in size by a factor of a thousand, so that only the ranks of their changes say
+        something of all (Wilcoxon, "Individual comparisons by ranking methods", 1945). Cases of one kind differ in
+        their seed alone, so that their scatter shows what is chance (Student's t); among all cases hides what makes one
+        kind worse.
         """
         now, before = self.values(cases), self.values(stored)
         both = sorted(now.keys() & before.keys())
         if self.worse is None or len(both) < 2:
             return []
-        kinds = {kind_of(case): [other for other in both if kind_of(other) == kind_of(case)] for case in both}
-        parts = {"": both} | {kind: part for kind, part in kinds.items() if 1 < len(part) < len(both)}
-        # All comparisons of a figure together are to have this confidence.
-        confidence = 1 - (1 - _CONFIDENCE) / len(parts)
-        return [self._loss(kind, before, now, part, confidence) for kind, part in parts.items()]
-
-    def _loss(
-        self, kind: str, before: dict[str, float], now: dict[str, float], cases: list[str], confidence: float
-    ) -> Loss:
-        old, new = (self._cost(np.array([values[case] for case in cases])) for values in (before, now))
+        old, new = (self._cost(np.array([values[case] for case in both])) for values in (before, now))
         change = (new - old) * (1 if self.worse == "higher" else -1)
-        # With the same cases in both, what they have in common falls out.
-        stderr = float(np.std(change, ddof=1) / np.sqrt(len(cases)))
-        allowed = float(student.ppf(confidence, len(cases) - 1)) * stderr + _TRIFLE * float(np.mean(np.abs(old)))
-        return Loss(f"{self.words}, {kind}" if kind else self.words, float(np.mean(change)), allowed)
+        change = np.where(np.abs(change) > _TRIFLE * np.abs(old), change, 0.0)
+        kinds = np.array([kind_of(case) for case in both])
+        several = [kind for kind in sorted(set(kinds)) if np.count_nonzero(kinds == kind) > 1]
+        found = [Loss(self.words, float(np.mean(change)), _chance_by_ranks(change) < _CHANCE)]
+        for kind in several:
+            of_kind = change[kinds == kind]
+            # All kinds together are to be named by chance as seldom as the figure itself.
+            is_real = _chance_by_scatter(of_kind) < _CHANCE / len(several)
+            found.append(Loss(f"{self.words}, {kind}", float(np.mean(of_kind)), is_real))
+        return found
 
     def _cost(self, values: Array) -> Array:
-        """Return what the figure averages: squares for a root mean square."""
-        return values**2 if self.over == "rms" else values
+        """Return what the figure averages: sizes for a root mean square."""
+        return np.abs(values) if self.over == "rms" else values
+
+
+def _chance_by_ranks(change: Array) -> float:
+    """Return the probability that changes for the worse are as many and as large by chance."""
+    return float(wilcoxon(change[change != 0], alternative="greater").pvalue) if change.any() else 1.0
+
+
+def _chance_by_scatter(change: Array) -> float:
+    """Return the probability that the mean change is as large by chance, given the scatter of changes."""
+    stderr = np.std(change, ddof=1) / np.sqrt(len(change))
+    return float(student.sf(np.mean(change) / max(float(stderr), _SMALLEST), len(change) - 1))
 
 
 def kind_of(case: str) -> str:
@@ -99,16 +112,13 @@ def kind_of(case: str) -> str:
 
 @dataclass(frozen=True)
 class Loss:
-    """By how much the mean of cases is for the worse, and by how much it may be.
+    """By how much the mean of cases is for the worse.
 
     Attributes:
         words: the figure, and the cases if they are not all of their group.
+        is_real: whether it is hardly chance.
     """
 
     words: str
     by: float
-    allowed: float
-
-    @property
-    def is_real(self) -> bool:
-        return self.by > self.allowed
+    is_real: bool
