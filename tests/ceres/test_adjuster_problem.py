@@ -6,10 +6,8 @@ import itertools
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -20,18 +18,12 @@ import pytest
 from rangesfm.ceres import (
     PlacedRanges,
     RangeBlocks,
-    Step,
     add_normal_prior,
     add_ranges,
     add_residual_block,
-    adjuster_problem,
     distance_cost,
-    interpolated_range_cost,
     keep_from_elimination,
-    num_columns,
     range_cost,
-    shared_blocks,
-    solve_adjuster,
     tangent_jacobian,
 )
 
@@ -320,20 +312,6 @@ def unturned(*translation: float) -> Array:
     return np.array([0.0, 0, 0, 1, *translation])
 
 
-def test_only_a_pose_that_is_new_to_the_problem_is_held_constant() -> None:
-    adjuster, anchor, bias = empty_adjuster(), np.array([4.0, 4, 0]), np.zeros(1)
-    problem, known, new = adjuster.problem, unturned(0, 0, 0), unturned(1, 0, 0)
-    cost = range_cost(range_m=5.0, tag_in_cam_m=[1.0, 0.0, 0.0], stddev_m=0.25)
-    add_residual_block(adjuster, cost, None, [known, anchor, bias])
-    assert [problem.is_parameter_block_constant(block) for block in (known, anchor, bias)] == [True, False, False]
-    problem.set_parameter_block_variable(known)
-    others = interpolated_range_cost(
-        range_m=5.0, tag_in_cam_m=[1.0, 0, 0], stddev_m=0.25, weight=0.5, offset_in_world_m=np.zeros(3)
-    )
-    add_residual_block(adjuster, others, None, [known, new, anchor, bias])
-    assert [problem.is_parameter_block_constant(block) for block in (known, new)] == [False, True]
-
-
 @pytest.mark.parametrize("stddev", [1e-200, 1e200])
 def test_a_prior_whose_variance_no_number_can_hold_is_refused(stddev: float) -> None:
     with (
@@ -341,32 +319,6 @@ def test_a_prior_whose_variance_no_number_can_hold_is_refused(stddev: float) -> 
         pytest.raises(ValueError, match=r"^a prior of mean \[1.0, 2.0\] and stddev 1e.200, expected finite and pos"),
     ):
         add_normal_prior(empty_adjuster(), np.zeros(2), [1.0, 2.0], stddev)
-
-
-def test_shared_numbers_are_copied_into_blocks_of_six() -> None:
-    numbers = np.arange(13.0)
-    blocks = shared_blocks(numbers)
-    assert [block.tolist() for block in blocks] == [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9, 10, 11], [12]]
-    assert not any(np.shares_memory(block, numbers) for block in blocks)
-    assert [len(block) for block in shared_blocks(np.zeros(6))] == [6]
-    assert shared_blocks(np.zeros(0)) == []
-
-
-def test_a_padded_block_has_its_own_numbers_of_columns_only() -> None:
-    """The zero columns of the padding are left out of the Jacobian, also those of a block in the middle."""
-    adjuster, (first, bias, last), point = empty_adjuster(), (np.ones(3), np.ones(1), np.ones(3)), np.ones(3)
-    for block, stddev in ((first, 0.5), (bias, 0.25), (last, 0.1)):
-        add_normal_prior(adjuster, block, np.zeros(len(block)), stddev)
-    for block in (first, bias):
-        keep_from_elimination(adjuster, block, point)
-    problem = adjuster.problem
-    assert [problem.parameter_block_tangent_size(block) for block in (first, bias, last)] == [6, 6, 3]
-    assert [num_columns(problem, block) for block in (first, bias, last)] == [3, 1, 3]
-    jacobian = tangent_jacobian(problem, [first, bias, last])
-    assert jacobian.shape == (problem.num_residuals(), 7)
-    expected = np.diag([2.0, 2.0, 2.0, 4.0, 10.0, 10.0, 10.0])
-    np.testing.assert_allclose(jacobian.toarray()[:7], expected, rtol=1e-12)
-    assert not jacobian.toarray()[7:].any()
 
 
 def placed(before: int, after: int) -> PlacedRanges:
@@ -399,78 +351,6 @@ def blocks_with_all() -> RangeBlocks:
     )
 
 
-MODEL: dict[str, float | bool | None] = {"short_range_length_m": 2.0, "loss_scale": np.inf, "loss_is_bounded": False}
-
-
-def residuals_of(ranges: PlacedRanges, blocks: RangeBlocks, model: dict[str, float | bool | None]) -> Array:
-    cost = adjuster_problem._cost(ranges, np.array([0, 2]), blocks, model)
-    residuals, _ = cost.evaluate(*adjuster_problem._blocks_of_group(ranges, 0, blocks))
-    return np.ravel(residuals)
-
-
-def test_the_cost_of_ranges_at_a_keyframe_is_that_of_their_own_rows() -> None:
-    # The tag is at x = 7, so 3 m from the anchor.
-    expected = 3.0 + 0.3 + 0.6 * np.exp(-3.0 / 2.0) + np.array([0.1, 0.4]) - np.array([3.0, 4.0])
-    found = residuals_of(placed(2, 2), blocks_with_all(), MODEL)
-    np.testing.assert_allclose(found, np.array([4.0, 12.0]) * expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("lever_arms_are_free", [False, True])
-def test_the_cost_of_ranges_between_keyframes_is_that_of_their_own_rows(*, lever_arms_are_free: bool) -> None:
-    # The tag moves from x = 3 to x = 7, of which the time shift makes up a quarter.
-    distance = 10.0 - np.array([3.0 + 0.5 * 4.0, 3.0 + 0.75 * 4.0 - 0.5])
-    expected = distance + 0.3 + 0.6 * np.exp(-distance / 2.0) + np.array([0.1, 0.4]) - np.array([3.0, 4.0])
-    blocks = replace(blocks_with_all(), lever_arms_are_free=lever_arms_are_free)
-    np.testing.assert_allclose(residuals_of(placed(1, 2), blocks, MODEL), np.array([4.0, 12.0]) * expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("is_between", [False, True])
-def test_ranges_with_none_of_the_further_errors_count_once_each(*, is_between: bool) -> None:
-    ranges = replace(placed(1 if is_between else 2, 2), share=None, loadings_m=None, interval_s=None)
-    blocks = replace(blocks_with_all(), time_shift=None, amplitude=None, shared=())
-    distance = 10.0 - (np.array([4.0, 4.5]) if is_between else np.array([7.0, 7.0]))
-    found = residuals_of(ranges, blocks, {**MODEL, "short_range_length_m": None})
-    np.testing.assert_allclose(found, (distance + 0.3 - np.array([3.0, 4.0])) / [0.5, 0.25], rtol=1e-12)
-
-
-def test_the_blocks_of_a_group_are_in_the_order_of_its_cost() -> None:
-    blocks = replace(blocks_with_all(), lever_arms_are_free=True)
-    ends, rest = [blocks.anchors[1], blocks.biases[1]], [blocks.amplitude, *blocks.shared]
-
-    def found(before: int, after: int, row: int, **changed: object) -> list[int]:
-        given = replace(blocks, **changed)  # type: ignore[arg-type]
-        return list(map(id, adjuster_problem._blocks_of_group(placed(before, after), row, given)))
-
-    one, two, tag = blocks.poses[1], blocks.poses[2], blocks.tags_in_cam[1]
-    assert found(1, 2, 0) == list(map(id, [one, two, *ends, tag, blocks.time_shift, *rest]))
-    assert found(2, 1, 2) == list(map(id, [two, one, *ends, tag, blocks.time_shift, *rest]))
-    assert found(1, 2, 0, lever_arms_are_free=False) == list(map(id, [one, two, *ends, blocks.time_shift, *rest]))
-    assert found(1, 2, 0, time_shift=None) == list(map(id, [one, two, *ends, tag, *rest]))
-    assert found(1, 2, 0, amplitude=None, shared=()) == list(map(id, [one, two, *ends, tag, blocks.time_shift]))
-    # A range at a keyframe does not depend on the time shift.
-    assert found(2, 2, 0) == list(map(id, [two, *ends, tag, *rest]))
-    of_row_1 = [blocks.poses[0], blocks.anchors[0], blocks.biases[0], blocks.tags_in_cam[0], *rest]
-    assert found(2, 2, 1) == list(map(id, of_row_1))
-
-
-def test_ranges_of_one_place_anchor_and_tag_are_one_block_after_what_there_is() -> None:
-    adjuster, blocks = empty_adjuster(), replace(blocks_with_all(), time_shift=None, amplitude=None, shared=())
-    add_normal_prior(adjuster, np.zeros(2), [0.0, 0.0], 1.0)
-    # Rows 0 and 3 are at keyframe 1; the others differ from them in the keyframe, the anchor or the tag.
-    num, ones = 6, np.ones(6, dtype=np.int64)
-    before, anchor, tag = ones.copy(), ones.copy(), ones.copy()
-    before[1], anchor[2], tag[4] = 2, 0, 0
-    after = np.array([1, 2, 1, 1, 1, 2])
-    ranges = PlacedRanges(
-        np.full(num, 3.0), np.ones(num), before, after, np.zeros(num), np.zeros((num, 3)), anchor, tag
-    )
-    rows = add_ranges(adjuster, ranges, blocks)
-    assert sorted(rows.tolist()) == list(range(2, 8))
-    assert rows[3] == rows[0] + 1  # the two that share a block
-    assert adjuster.problem.num_residual_blocks() == 1 + 5
-    assert not adjuster.problem.has_parameter_block(blocks.poses[0])
-
-
 def test_ranges_that_lack_a_part_of_their_model_are_refused() -> None:
     ranges, blocks = placed(1, 2), blocks_with_all()
     of_short = "^of short_range_length_m and its amplitude one is given without the other$"
@@ -481,87 +361,3 @@ def test_ranges_that_lack_a_part_of_their_model_are_refused() -> None:
     of_shift = "^a time shift needs interval_s, the time between the keyframes of each range$"
     with pytest.raises(ValueError, match=of_shift):
         add_ranges(empty_adjuster(), replace(ranges, interval_s=None), blocks, short_range_length_m=2.0)
-
-
-def iteration(number: int, **given: float | bool) -> SimpleNamespace:
-    """Return what Ceres says after an iteration."""
-    said: dict[str, Any] = {"step_is_successful": True, "trust_region_radius": 100.0 * 10.0**number, "cost": 5.0}
-    said |= {"cost_change": 3.0, "relative_decrease": 0.75, "iteration": number}
-    return SimpleNamespace(**(said | given))
-
-
-def keeping(steps: list[Step]) -> Callable[[Step], bool]:
-    """Return a function that keeps each step, and to which none is enough."""
-
-    def is_enough(step: Step) -> bool:
-        steps.append(step)
-        return False
-
-    return is_enough
-
-
-def answers_to(
-    monkeypatch: pytest.MonkeyPatch, is_enough: Callable[[Step], bool], *iterations: SimpleNamespace
-) -> list[str]:
-    """Return what the solver is told after each of some iterations."""
-    answers: list[str] = []
-
-    def solve(options: pyceres.SolverOptions, problem: pyceres.Problem, summary: pyceres.SolverSummary) -> None:
-        assert options.update_state_every_iteration
-        (after_step,) = options.callbacks
-        answers.extend(after_step(said).name for said in iterations)
-
-    monkeypatch.setattr(pyceres, "solve", solve)
-    solve_adjuster(empty_adjuster(), is_enough)
-    return answers
-
-
-def test_each_step_has_the_radius_it_was_made_with_and_what_it_was_expected_to_gain(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    steps: list[Step] = []
-    iterations = [
-        iteration(0),
-        iteration(1),
-        iteration(2, step_is_successful=False, cost=7.0, cost_change=-2.0, relative_decrease=-0.5),
-        iteration(3, cost_change=0.0, relative_decrease=0.0),
-    ]
-    answers = answers_to(monkeypatch, keeping(steps), *iterations)
-    assert answers == ["SOLVER_CONTINUE"] * 4
-    assert steps == [
-        Step(is_successful=True, trust_region_radius=1e2, cost=5.0, gain=3.0, expected_gain=4.0),
-        Step(is_successful=False, trust_region_radius=1e3, cost=7.0, gain=-2.0, expected_gain=4.0),
-        Step(is_successful=True, trust_region_radius=1e4, cost=5.0, gain=0.0, expected_gain=0.0),
-    ]
-
-
-def test_the_start_is_no_step_that_could_be_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = answers_to(monkeypatch, lambda _: True, iteration(0), iteration(1))
-    assert answers == ["SOLVER_CONTINUE", "SOLVER_TERMINATE_SUCCESSFULLY"]
-
-
-def test_an_exception_between_steps_aborts_the_solver_and_is_raised_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    answers: list[str] = []
-
-    def is_enough(_: Step) -> bool:
-        raise SystemExit(3)
-
-    def solve(options: pyceres.SolverOptions, *_: object) -> None:
-        answers.append(options.callbacks[0](iteration(1)).name)
-
-    monkeypatch.setattr(pyceres, "solve", solve)
-    with pytest.raises(SystemExit, match="3"):
-        solve_adjuster(empty_adjuster(), is_enough)
-    assert answers == ["SOLVER_ABORT"]
-
-
-def test_a_linear_problem_is_solved_and_gains_what_was_expected() -> None:
-    adjuster, block, steps = empty_adjuster(), np.array([3.0]), list[Step]()
-    add_normal_prior(adjuster, block, [1.0], 0.5)
-    summary = solve_adjuster(adjuster, keeping(steps))
-    assert summary.initial_cost == pytest.approx(8.0)
-    assert block[0] == pytest.approx(1.0, abs=1e-3)
-    assert steps[0].is_successful
-    assert steps[0].gain == pytest.approx(8.0, rel=1e-3)
-    assert steps[0].expected_gain == pytest.approx(steps[0].gain, rel=1e-3)
-    assert steps[0].cost == pytest.approx(8.0 - steps[0].gain, abs=1e-9)

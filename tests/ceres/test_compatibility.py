@@ -5,18 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 
-import numpy as np
-import numpy.typing as npt
 import pyceres
 import pytest
 
 from rangesfm import _cpp
 from rangesfm.ceres import check_compatibility
 from rangesfm.errors import SolverError
-
-Array = npt.NDArray[np.float64]
-
-TAG_IN_CAM_M = np.array([-0.0012, -0.0900, -0.0663])
 
 
 def test_the_gate_opens_for_what_is_installed() -> None:

@@ -22,7 +22,6 @@ from rangesfm.ceres import (
     add_normal_prior,
     add_ranges,
     add_residual_block,
-    covariance,
     distance_cost,
     keep_from_elimination,
     range_cost,
@@ -30,7 +29,6 @@ from rangesfm.ceres import (
 )
 from rangesfm.ceres.covariance import JointCovariance, PhotosAlone, ResidualErrors, joint_covariance
 from rangesfm.ceres.normal_equations import BlockColumns, NormalEquations
-from rangesfm.ceres.part_errors import PartSteps
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import pose_of
@@ -374,13 +372,6 @@ def test_a_turn_about_a_straight_path_leaves_the_variances_of_places_right() -> 
     assert np.all(turns[1] < 0.1)
 
 
-def test_a_map_whose_variances_are_rounding_has_no_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A solver that throws points and photos far apart leaves such a map."""
-    monkeypatch.setattr(covariance._Spread, "times", lambda spread, right: -right)
-    with pytest.raises(GeometryError, match="rounding leaves nothing"):
-        joint(model()).covariance()
-
-
 def photos_alone(*, hold_first: bool = False) -> tuple[pycolmap.Reconstruction, pycolmap.CeresBundleAdjuster]:
     """Return the model adjusted to its photos alone, without ranges, and its adjuster."""
     reconstruction = model()
@@ -503,11 +494,6 @@ def random_pose(seed: int) -> Array:
     return np.concatenate([Rotation.random(rng=seed).as_quat(), np.random.default_rng(seed).normal(size=3)])
 
 
-def pose_with(center: Sequence[float] | Array) -> Array:
-    """Return an unturned pose with a centre."""
-    return np.concatenate([[0.0, 0, 0, 1], -np.asarray(center, dtype=np.float64)])
-
-
 def after_step(pose: Array, step: Array) -> tuple[Rotation, Array]:
     """Return world_from_rig and the centre after a step of Ceres, which turns on the left by twice its step."""
     rotation = Rotation.from_rotvec(2.0 * step[:3]) * Rotation.from_quat(pose[:4])
@@ -624,72 +610,6 @@ def test_each_part_of_the_covariance_is_that_of_the_inverse(residual_stddev: flo
     np.testing.assert_allclose(errors.parts["anchor"].by_scale, by_scale[None], rtol=1e-6, atol=1e-8)
 
 
-def test_residuals_that_err_together_or_not_at_all_have_the_spread_that_they_are_said_to_have() -> None:
-    given = small()
-    others, rows, exact = given.equations.others.toarray(), [1, 4, 5], [0, 7]
-    by_error = np.random.default_rng(2).normal(size=(3, 2))
-    errors = ResidualErrors(np.array(rows) + 20, csr_array(by_error), definite(2), np.array(exact) + 20, 0.25)
-    of_residuals = np.diag([0.0, 0.0, 0.25, 0.25, 0.0, 0.0, 0.25, 0.0, 0.25])
-    of_residuals[np.ix_(rows, rows)] = by_error @ definite(2) @ by_error.T
-    expected = csr_array(given.equations.of_photos).toarray() + others.T @ of_residuals @ others
-    spread = covariance._Spread.of(given.equations, errors)
-    np.testing.assert_allclose(spread.times(np.eye(16)), expected, rtol=1e-9, atol=1e-9)
-    # Unless it is said otherwise, the others err as the photos do.
-    usual = covariance._Spread.of(
-        given.equations, ResidualErrors(errors.rows, errors.by_error, errors.covariance, errors.exact)
-    )
-    of_residuals[[2, 3, 6, 8], [2, 3, 6, 8]] = 1.0
-    of_all = csr_array(given.equations.of_photos).toarray() + others.T @ of_residuals @ others
-    np.testing.assert_allclose(usual.times(np.eye(16)), of_all, rtol=1e-9, atol=1e-9)
-    independent = covariance._Spread.of(given.equations, None)
-    np.testing.assert_allclose(independent.times(np.eye(16)), given.normal, rtol=1e-9, atol=1e-9)
-    gain = np.linalg.inv(given.normal)
-    found = joint_covariance(
-        given.equations, anchors=[given.anchor], others=[given.bias], errors=errors, anchor_ids=["A"]
-    )
-    np.testing.assert_allclose(found.anchors[0], (gain @ expected @ gain)[12:15, 12:15], rtol=1e-8)
-    assert found.errors.parts["anchor"].ids == ("A",)
-    modes, rests = found.errors.parts["anchor"].modes[0], found.errors.parts["anchor"].rests[0]
-    np.testing.assert_allclose(modes @ modes.T, found.anchors[0], rtol=1e-5)
-    assert np.abs(rests).max() < 1e-6 * np.abs(found.anchors).max()
-
-
-@pytest.mark.parametrize("num_frames", [1, 2])
-def test_only_a_map_of_one_frame_has_no_similarity(num_frames: int) -> None:
-    poses, size = [random_pose(k) for k in range(num_frames)], 6 * num_frames
-    equations = replace(
-        small().equations,
-        columns=columns_of([("pose", pose, 6) for pose in poses], poses),
-        of_photos=csr_array(definite(size)),
-        gradient=np.zeros(size),
-        others=csr_array((0, size)),
-        free=np.zeros((size, 0)),
-    )
-    found = joint_covariance(equations)
-    assert found.similarity.shape == (7, 7)
-    assert np.isnan(found.similarity).all() == np.isnan(found.similarity).any() == (num_frames == 1)
-    assert np.isfinite(found.centers).all()
-
-
-def test_a_camera_errs_in_the_parameters_that_are_adjusted() -> None:
-    given, camera = small(), np.array([500.0, 300.0, 32.0, 24.0])
-    blocks = [
-        ("pose", given.poses[0], 6),
-        ("pose", given.poses[2], 6),
-        ("anchor", given.anchor, 3),
-        ("other", camera, 1),
-    ]
-    equations = replace(
-        given.equations, columns=columns_of(blocks, given.poses), reconstruction=model_of({}, {7: (camera, 400.0)})
-    )
-    found = joint_covariance(equations, anchors=[given.anchor], refined_params={7: [2]}).errors.parts["camera"]
-    assert found.ids == (7,)
-    variance = np.linalg.inv(given.normal)[15, 15]
-    np.testing.assert_allclose(found.modes[0] @ found.modes[0].T, np.diag([0, 0, variance, 0]), rtol=1e-6, atol=1e-9)
-    with pytest.raises(ValueError, match="camera 7 is adjusted in part"):
-        joint_covariance(equations, anchors=[given.anchor])
-
-
 def test_functions_of_poses_err_as_the_photos_inverse_says() -> None:
     given, rng = small(), np.random.default_rng(3)
     of_photos = csr_array(given.equations.of_photos).toarray()[:12, :12]
@@ -707,167 +627,3 @@ def test_functions_of_poses_err_as_the_photos_inverse_says() -> None:
     inverse = np.linalg.inv(of_photos)
     np.testing.assert_allclose(found, 0.25 * slopes @ inverse @ slopes.T, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(shift, -slopes @ inverse @ given.equations.gradient[:12], rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("num_free", [0, 2])
-def test_the_inverse_is_the_pseudo_inverse_beside_the_free_motions(num_free: int) -> None:
-    rng = np.random.default_rng(num_free)
-    scale = np.array([1e3, 1, 1, 1, 1, 1, 1e-2, 1, 1])
-    free = rng.normal(size=(9, num_free))
-    jacobian, further = rng.normal(size=(20, 9)) * scale, rng.normal(size=(9, 2)) * scale[:, None]
-    off_free = np.eye(9) - free @ np.linalg.pinv(free) if num_free else np.eye(9)
-    jacobian, further = jacobian @ off_free, off_free @ further
-    normal, expected = jacobian.T @ jacobian, np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13, hermitian=True)
-    columns = columns_of([("pose", random_pose(0), 6), ("anchor", np.zeros(3), 3)], [])
-    inverse = covariance._Inverse(csr_array(normal), free, columns)
-    np.testing.assert_allclose(inverse.free.T @ inverse.free, np.eye(num_free), atol=1e-12)
-    found = inverse.solve(np.eye(9))
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
-    half = jacobian[::2]
-    spread = covariance._Spread(csr_array(half.T @ half), csr_array(further), definite(2))
-    whole = expected @ (half.T @ half + further @ definite(2) @ further.T) @ expected
-    for block, rows in zip(inverse.diagonal_blocks(spread), (slice(6), slice(6, 9)), strict=True):
-        np.testing.assert_allclose(block, whole[rows, rows], rtol=1e-6, atol=1e-7 * np.abs(whole).max())
-
-
-@pytest.mark.parametrize("smallest", [1.5e-13, 0.7e-13, 0.0])
-def test_a_direction_with_a_pivot_of_less_than_a_tenth_of_a_trillionth_is_not_determined(smallest: float) -> None:
-    blocks = [("pose", random_pose(0), 6), ("anchor", np.zeros(3), 3), ("anchor", np.ones(3), 3)]
-    columns, diagonal = columns_of(blocks, []), np.ones(12)
-    diagonal[10] = smallest
-    if smallest > 1e-13:
-        np.testing.assert_allclose(covariance._factored(np.diag(diagonal), columns).pivots, diagonal)
-    else:
-        message = "^the residuals do not determine the problem's anchor number 1: no covariance$"
-        with pytest.raises(GeometryError, match=message):
-            covariance._factored(np.diag(diagonal), columns)
-
-
-def test_what_many_poses_are_tied_to_is_eliminated_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    blocks = [(kind, np.zeros(1), 1) for kind in ("pose", "sensor", "anchor", "other", "point")]
-    given: list[Any] = []
-
-    def factor(normal: Array, starts: Array, is_last: Array) -> SimpleNamespace:
-        given.extend([starts.tolist(), is_last.tolist()])
-        return SimpleNamespace(pivots=np.ones(5))
-
-    monkeypatch.setattr(covariance, "factor", factor)
-    covariance._factored(np.eye(5), columns_of(blocks, []))
-    assert given == [[0, 1, 2, 3, 4, 5], [False, True, True, True, False]]
-
-
-def test_loose_poses_are_held_only_where_a_block_is_not_determined() -> None:
-    given = small().equations
-    asked: list[Array] = []
-    an_inverse: Any = object()
-
-    def fails_at_first(equations: NormalEquations) -> Any:
-        asked.append(csr_array(equations.of_photos).toarray().diagonal())
-        if len(asked) == 1:
-            raise GeometryError("not determined")
-        return an_inverse
-
-    held, inverse = covariance._held_if_loose(given, fails_at_first)
-    assert inverse is an_inverse
-    assert (asked[1] > asked[0])[:12].all()
-    np.testing.assert_array_equal(csr_array(held.of_photos).toarray().diagonal(), asked[1])
-    assert covariance._held_if_loose(given, lambda _: an_inverse)[0] is given
-
-
-def test_the_center_of_a_pose_moves_with_its_step() -> None:
-    pose = random_pose(4)
-    expected = by_steps(lambda step: after_step(pose, step)[1])
-    np.testing.assert_allclose(covariance._center_from_step(pose), expected, atol=1e-8)
-
-
-def similarity_by_steps(centers: Array, is_firm: npt.NDArray[np.bool_] | None = None) -> Array:
-    """Return the gradients of the similarity by steps of unturned poses at some centres."""
-    is_firm = np.ones(len(centers), dtype=bool) if is_firm is None else is_firm
-    poses = [pose_with(center) for center in centers]
-    columns = columns_of([("pose", pose, 6) for pose in poses], poses)
-    gradients = covariance._similarity_gradients(columns, is_firm, 6 * len(poses))
-    by_pose: Array = gradients.reshape(len(poses), 6, 7)
-    return by_pose
-
-
-@pytest.mark.parametrize(("share", "has_turn"), [(0.8e-14, False), (1.25e-14, True)])
-def test_a_path_is_straight_below_a_ten_millionth_of_its_extent(share: float, *, has_turn: bool) -> None:
-    """Then the turn about it is left out, and all other motions are as they were."""
-    aside = np.sqrt(share / 3.0)  # of the squares, the sum is 6 aside**2, of which the length has 2
-    gradients = similarity_by_steps(5.0 + 7.0 * np.array([[-1.0, aside, 0], [0, -2 * aside, 0], [1, aside, 0]]))
-    # An unturned pose's centre moves against its translation.
-    assert (np.abs(gradients[:, 3:, 1]).max() > 1.0) == has_turn
-    np.testing.assert_allclose(gradients[:, 3, 0], np.array([1.0, 0, -1]) / 14.0, atol=1e-9)
-    np.testing.assert_allclose(gradients[:, 4, 3], np.array([1.0, 0, -1]) / 14.0, atol=1e-9)
-    np.testing.assert_allclose(gradients[:, 3, 4], -1.0 / 3.0, atol=1e-9)
-
-
-def test_the_similarity_is_that_of_the_firm_frames() -> None:
-    centers = np.random.default_rng(3).normal(size=(5, 3))
-    is_firm = np.array([True, True, False, True, True])
-    found = similarity_by_steps(centers, is_firm)
-    assert not found[2].any()
-    np.testing.assert_allclose(found[is_firm], similarity_by_steps(centers[is_firm]), atol=1e-12)
-
-
-def test_frames_in_one_place_have_a_shift_only() -> None:
-    gradients = similarity_by_steps(np.zeros((2, 3)))
-    np.testing.assert_allclose(gradients[:, 3:, 4:], -0.5 * np.array([np.eye(3)] * 2), atol=1e-12)
-    assert not gradients[:, :, :4].any()
-
-
-def parts_of(equations: Any, anchors: Mapping[str, Array], refined: Mapping[int, Sequence[int]]) -> list[PartSteps]:
-    return list(covariance._parts(equations, anchors, refined))
-
-
-def test_parts_of_a_map_change_with_their_columns() -> None:
-    poses, anchor, sensor, held = [random_pose(0), random_pose(1)], np.zeros(3), random_pose(2), random_pose(3)
-    pinhole, simple = np.array([500.0, 300.0, 32.0, 24.0]), np.array([400.0, 32.0, 24.0])
-    unseen = np.array([100.0, 5.0, 5.0])
-    blocks = [
-        *(("pose", poses[1], 6), ("sensor", sensor, 6), ("other", pinhole, 2), ("other", simple, 3)),
-        ("anchor", anchor, 3),
-    ]
-    equations = SimpleNamespace(
-        columns=columns_of(blocks, poses),
-        reconstruction=model_of(
-            {5: None, 6: sensor, 7: held}, {1: (pinhole, 400.0), 2: (simple, 200.0), 3: (unseen, 50.0)}
-        ),
-        size_m=20.0,
-    )
-    parts = parts_of(equations, {"A": anchor, "B": np.ones(3)}, {1: [0, 1]})
-    assert [(part.kind, part.id_, part.start) for part in parts] == [
-        *(("frame", 1, None), ("frame", 2, 0), ("sensor", 6, 6), ("sensor", 7, None)),
-        *(("camera", 1, 12), ("camera", 2, 14), ("camera", 3, None), ("anchor", "A", 17), ("anchor", "B", None)),
-    ]
-    before = Rotation.from_quat(poses[1][:4])
-
-    def turn_and_shift(step: Array) -> Array:
-        world_from_rig, center = after_step(poses[1], step)
-        return np.concatenate([(world_from_rig * before).as_rotvec(), center])
-
-    np.testing.assert_allclose(parts[1].by_step, by_steps(turn_and_shift), atol=1e-8)
-    for part in parts[:4]:
-        assert part.unit.tolist() == [20.0, 20.0, 20.0, 1.0, 1.0, 1.0]
-    np.testing.assert_array_equal(parts[2].by_step, np.diag([2.0, 2, 2, 1, 1, 1]))
-    np.testing.assert_array_equal(parts[4].by_step, np.eye(4)[:, :2])
-    np.testing.assert_array_equal(parts[5].by_step, np.eye(4)[:, :3])
-    assert [part.unit.tolist() for part in parts[4:7]] == [[0.05] * 4, [0.1] * 4, [0.4] * 4]
-    for part in parts[7:]:
-        np.testing.assert_array_equal(part.by_step, np.eye(3))
-        assert part.unit.tolist() == [1.0, 1.0, 1.0]
-    (_, _, _, _, of_camera, *_) = parts_of(equations, {}, {1: [3, 0]})
-    np.testing.assert_array_equal(of_camera.by_step, np.eye(4)[:, [3, 0]])
-
-
-@pytest.mark.parametrize("refined", [{}, {1: [0]}, {1: [0, 1, 2]}, {2: [0, 1]}])
-def test_a_camera_that_is_adjusted_in_part_needs_the_numbers_of_these_parameters(refined: dict[int, list[int]]) -> None:
-    camera = np.array([500.0, 300.0, 32.0, 24.0])
-    equations = SimpleNamespace(
-        columns=columns_of([("other", np.zeros(1), 1), ("other", camera, 2)], []),
-        reconstruction=model_of({}, {1: (camera, 400.0)}),
-        size_m=20.0,
-    )
-    message = "^camera 1 is adjusted in part: expected the numbers of these parameters$"
-    with pytest.raises(ValueError, match=message):
-        parts_of(equations, {}, refined)

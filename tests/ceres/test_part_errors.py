@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import tracemalloc
-
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.ceres.test_covariance import Joint, covariance_of_all, joint, model, variable
 
-from rangesfm.ceres import part_errors
 from rangesfm.ceres.covariance import JointCovariance
 from rangesfm.ceres.part_errors import PartSteps, map_errors
 from rangesfm.geometry.map_errors import MapErrors, MapPointErrors
@@ -116,18 +113,6 @@ def test_the_same_problem_has_the_same_modes_each_time() -> None:
         assert np.array_equal(errors.modes, second.parts[kind].modes)
 
 
-def test_the_modes_of_many_keyframes_take_memory_in_proportion_to_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(part_errors, "MAX_NUM_MODES", 20)
-    num = 200
-    parts = [PartSteps("frame", k, 6 * k, np.eye(6), np.ones(6)) for k in range(num)]
-    variances = np.linspace(1.0, 2.0, 6 * num)[:, None]
-    tracemalloc.start()
-    map_errors(parts, 6 * num, lambda right: variances * right, lambda _: np.eye(6), np.zeros(6 * num), 0.0)
-    peak_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak_bytes < 0.5 * 8 * (6 * num) ** 2  # half of a matrix with an entry for each two numbers
-
-
 def covariance_like(size: int, rank: int, seed: int = 0) -> Array:
     """Return a random covariance matrix of a rank."""
     factor = np.random.default_rng(seed).normal(size=(size, rank))
@@ -184,36 +169,6 @@ def test_the_modes_of_few_numbers_have_their_whole_covariance() -> None:
         assert np.abs(of.rests).max() < 1e-8 * expected.max()
 
 
-def test_what_few_modes_leave_of_a_part_is_independent_of_other_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(part_errors, "MAX_NUM_MODES", 4)
-    parts, covariance = some_parts(), covariance_like(11, 11)
-    found = errors_of(parts, covariance).parts
-    steps = of_all_numbers(parts, covariance)
-    whole = steps.T @ covariance @ steps
-    for kind, row, first in (("frame", 0, 0), ("anchor", 0, 4), ("camera", 0, 7), ("frame", 1, 9)):
-        modes, rest = found[kind].modes[row], found[kind].rests[row]  # type: ignore[index]
-        numbers = slice(first, first + len(modes))
-        assert modes.shape[1] == 4
-        np.testing.assert_allclose(modes @ modes.T + rest, whole[numbers, numbers], atol=1e-8 * whole.max())
-        assert np.linalg.eigvalsh(rest).min() > -1e-9 * whole.max()
-        assert (np.trace(rest) > 1e-3) == (kind != "camera")
-
-
-def test_the_largest_modes_are_the_largest_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(part_errors, "MAX_NUM_MODES", 1)
-    parts = [
-        PartSteps("frame", 1, 0, np.eye(2), np.array([1.0, 100.0])),
-        PartSteps("anchor", "A", 2, np.eye(2), np.ones(2)),
-    ]
-    found = errors_of(parts, np.diag([9.0, 1.0, 16.0, 4.0])).parts
-    # The second number has a variance of 1 in its own unit, but 10 000 square metres.
-    (mode,), (others,) = found["frame"].modes[..., 0], found["anchor"].modes[..., 0]
-    assert abs(mode[1]) == pytest.approx(1.0, abs=1e-6)
-    assert abs(mode[0]) < 1e-3
-    assert np.abs(others).max() < 1e-3
-    np.testing.assert_allclose(found["anchor"].rests[0], np.diag([16.0, 4.0]), atol=1e-3)
-
-
 def test_parts_change_with_the_scale_as_their_covariance_with_it_says() -> None:
     parts, covariance = some_parts(), covariance_like(11, 11)
     of_scale = np.random.default_rng(2).normal(size=11)
@@ -225,63 +180,3 @@ def test_parts_change_with_the_scale_as_their_covariance_with_it_says() -> None:
     np.testing.assert_allclose(found["frame"].by_scale, [expected[:4], expected[9:]])
     np.testing.assert_allclose(found["anchor"].by_scale, [expected[4:7]])
     np.testing.assert_array_equal(found["camera"].by_scale, np.zeros((1, 2)))
-
-
-@pytest.mark.parametrize("scale_stddev", [0.0, np.nan])
-def test_nothing_changes_with_a_scale_that_does_not_err(scale_stddev: float) -> None:
-    found = errors_of(some_parts(), covariance_like(11, 11), np.ones(11), scale_stddev).parts
-    assert not any(of.by_scale.any() for of in found.values())
-
-
-def test_no_parts_have_no_errors() -> None:
-    assert errors_of([], covariance_like(3, 3)).parts == {}
-
-
-@pytest.mark.parametrize(("size", "num_modes", "num_products"), [(3, 3, 1), (4, 4, 1), (5, 4, 3)])
-def test_only_of_more_numbers_than_modes_a_subspace_is_looked_for(
-    size: int, num_modes: int, num_products: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A product is a solution of the normal equations for many right sides, so there are only two further ones."""
-    monkeypatch.setattr(part_errors, "MAX_NUM_MODES", 4)
-    covariance, widths = covariance_like(size, 3), []
-
-    def product(right: Array) -> Array:
-        widths.append(right.shape[1])
-        return covariance @ right
-
-    found = part_errors._largest_modes(product, size)
-    assert found.shape == (size, num_modes)
-    assert widths == [num_modes] * num_products
-    np.testing.assert_allclose(found @ found.T, covariance, atol=1e-9)  # 4 modes have all of a covariance of rank 3
-
-
-def test_there_are_at_most_300_modes() -> None:
-    variances = np.ones(301)
-    assert part_errors._largest_modes(lambda right: variances[:, None] * right, 301).shape == (301, 300)
-
-
-def test_modes_that_may_be_rounding_are_made_smaller() -> None:
-    variances = np.array([4.0, 4.4e-12, 3.6e-12, 4e-14, -1e-18, 0.0])
-    found = part_errors._largest_modes(lambda right: variances[:, None] * right, 6)
-    # Below 1e-12 of the largest variance, the mode is the variance over the root of that.
-    expected = [4.0, 4.4e-12, 3.6e-12**2 / 4e-12, 4e-14**2 / 4e-12, 0.0, 0.0]
-    np.testing.assert_allclose(np.diag(found @ found.T), expected, rtol=1e-9, atol=1e-20)
-
-
-def test_a_covariance_of_zero_has_modes_of_zero() -> None:
-    assert not part_errors._largest_modes(np.zeros_like, 3).any()
-    assert part_errors._largest_modes(np.zeros_like, 0).shape == (0, 0)
-
-
-def test_the_rest_of_a_part_has_no_negative_variance() -> None:
-    part = PartSteps("anchor", "A", 5, np.array([[0.0, 1.0], [2.0, 0.0]]), np.ones(2))
-    asked: list[int] = []
-
-    def block(start: int) -> Array:
-        asked.append(start)
-        return np.diag([1.0, 9.0])
-
-    # The two numbers have the variances 9 and 4, of which the modes have 5 and 4.5.
-    found = part_errors._rest(part, block, np.diag(np.sqrt([5.0, 4.5])))
-    np.testing.assert_allclose(found, [[4.0, 0.0], [0.0, 0.0]], atol=1e-12)
-    assert asked == [5]

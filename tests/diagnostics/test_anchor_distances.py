@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from rangesfm.diagnostics.preflight import notes_on_distances
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import RangeLog
 
-Array = npt.NDArray[np.float64]
 SITE_M: dict[str, tuple[float, ...]] = {
     "A": (0.0, 0.0, 0.5),
     "B": (9.0, 1.0, 2.0),

@@ -14,7 +14,6 @@ from tests.studies.erring_surveys import surveyed as surveyed_by_drone
 
 from rangesfm.diagnostics.anchor_sides import likelier_sides
 from rangesfm.diagnostics.linearized import ranges_on_map
-from rangesfm.workflows import make_metric_map
 from rangesfm.workflows.metric_result import MetricResult
 
 DRIFT_M, NUM_KEYFRAMES = 0.5, 100
@@ -39,13 +38,6 @@ def test_an_anchor_that_drift_puts_on_the_wrong_side_is_brought_to_the_right_one
     assert np.linalg.norm(anchor.position_m - truth_m) < 3 * np.sqrt(3) * anchor.position_stddev_m
     assert anchor.mirror_position_m is None
     assert crossed.estimate.verdict == "good", crossed.estimate.reasons
-
-
-def test_without_the_second_look_the_anchor_would_be_on_the_wrong_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The survey above is one whose map of one piece misleads; a mistake was named there that nobody made."""
-    monkeypatch.setattr(make_metric_map, "_with_anchors_on_likelier_sides", lambda run, start, refined: refined)
-    found = run(surveyed(FITS_BELOW), 0)
-    assert found.anchors[0].position_m[1] > 0
 
 
 def test_an_anchor_on_the_right_side_stays_there(crossed: MetricResult) -> None:

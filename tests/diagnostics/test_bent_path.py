@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -57,27 +54,6 @@ def test_an_anchor_whose_height_nothing_determines_stays_near(seed: int) -> None
     assert moved_m < 5.0
     off_m = float(np.sqrt(np.mean(bent.residual_m**2)))
     assert off_m < 1.2 * float(np.sqrt(np.mean(given.residual_m**2)))
-
-
-def on_map(steps: Array | None) -> Any:
-    """Return what ``bends_m`` reads of ranges on a path of six poses, in a model of 2 m per unit."""
-    along = np.arange(6.0)
-    centers = np.column_stack([along, np.sin(along), 0.3 * along**2])
-    names = tuple(f"{k}.jpg" for k in range(6))
-    path = Trajectory(np.arange(6), names, along, centers, np.tile(np.eye(3), (6, 1, 1)))
-    state = SimpleNamespace(metric_from_model=SimpleNamespace(scale=2.0))
-    return SimpleNamespace(bending=WalkBending(path, steps), state=state)
-
-
-def test_bends_are_in_metres_and_of_each_pose() -> None:
-    steps = np.zeros((5, 7))
-    steps[1, 5] = 0.1
-    found = on_map(steps)
-    walk = found.bending
-    expected = 2.0 * np.sqrt(np.sum((walk.path.centers - walk.given.centers) ** 2, axis=1))
-    assert expected.max() > 0
-    assert bends_m(found) == pytest.approx(expected)
-    assert not len(bends_m(on_map(None)))
 
 
 def drifting(share: float, seed: int) -> tuple[ScaleEstimate, RangesOnMap, Array, Array]:

@@ -137,16 +137,6 @@ def test_where_it_breaks_the_scaled_map_is_the_result_and_says_so(survey: Survey
     assert "the refinement broke the map: the result is the scaled map" in done.lines
 
 
-def test_converged_is_what_the_solver_did_even_where_the_map_is_not_kept(
-    survey: Survey, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rangesfm.workflows.make_metric_map.why_broken", lambda *_: ("the map is bent",))
-    refine = known(refined(survey).summary.refine)
-    assert refine.converged
-    assert (refine.kept, refine.why_not_kept) == (False, ("the map is bent",))
-    assert "the map is bent" not in refine.message
-
-
 @pytest.mark.parametrize("spoil", [mix_points, shorten_focal_length])
 def test_where_the_model_was_none_before_nothing_is_left(survey: Survey, spoil: Spoil) -> None:
     with pytest.raises(SolverError, match=r"the refinement broke the map: .*nor do the points of the model") as caught:

@@ -1,4 +1,4 @@
-"""Mistakes that last for the whole survey: what they do to the ranges, when they can be, and what is said of them."""
+"""Clocks that are off are told with the sign of the offset."""
 
 from __future__ import annotations
 

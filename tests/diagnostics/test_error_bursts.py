@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
-from tests.diagnostics.test_linearized import small_map
 from tests.known import known
 from tests.studies.erring_surveys import SITES, Given, run, surveyed
 
-from rangesfm.diagnostics.error_bursts import Burst, likeliest_burst, without
+from rangesfm.diagnostics.error_bursts import likeliest_burst
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized, linearized
 
@@ -56,38 +52,3 @@ def test_ranges_without_a_burst_show_none() -> None:
     clean = linearized(known(run(surveyed(DRONE, SEED), SEED).on_map)).with_learnt_errors()
     burst = likeliest_burst(Factorization(clean))
     assert burst.statistic < burst.threshold
-
-
-def test_what_is_left_out_says_nothing(problem: Linearized) -> None:
-    burst = likeliest_burst(Factorization(problem))
-    left_out = without(problem, burst).with_usual_errors()
-    moved_m = left_out.residual_m.copy()
-    moved_m[burst.bins] += 1.0
-    moved = replace(left_out, residual_m=moved_m)
-    np.testing.assert_allclose(Factorization(moved).step, Factorization(left_out).step, atol=2e-3)
-
-
-@pytest.fixture(scope="module")
-def of_small() -> Linearized:
-    """Two ranges of each of three anchors are a bin, each half a second."""
-    return linearized(small_map())
-
-
-def longer(problem: Linearized, bins: list[int], by_m: float) -> Linearized:
-    residual_m = problem.residual_m.copy()
-    residual_m[bins] -= by_m
-    return replace(problem, residual_m=residual_m)
-
-
-def test_bins_of_a_burst_that_is_left_out_are_off_by_as_much_as_a_range_can(of_small: Linearized) -> None:
-    first = without(of_small, Burst(np.array([3, 4]), 0.0, 0.0))
-    both = without(first, Burst(np.array([4, 7]), 0.0, 0.0))
-    of_one = float(np.max(of_small.on_map.problem.range_m)) ** 2
-    for problem, expected in ((first, {3: of_one, 4: of_one}), (both, {3: of_one, 4: 2 * of_one, 7: of_one})):
-        variances = np.array([expected.get(k, 0.0) for k in range(60)])
-        np.testing.assert_allclose(problem.expected.known["bursts"], np.diag(variances))
-        assert set(problem.expected.known) == {"bursts", *of_small.expected.known}
-    assert "bursts" not in of_small.expected.known
-    # What is left out says nothing of the map.
-    still, moved = (Factorization(longer(first, [3, 4], by_m).with_usual_errors()).step for by_m in (0.0, 1.0))
-    np.testing.assert_allclose(moved, still, atol=2e-3)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from tests.scale.conftest import MakeSurvey, Survey, make_survey
 
 from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.simulated_radio import Radio
-from rangesfm.diagnostics import finished_map
 from rangesfm.diagnostics.finished_map import doubts_of_map, place_of_map
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
@@ -121,23 +119,6 @@ def test_motions_of_a_similarity_are_its_derivatives() -> None:
     np.testing.assert_allclose(motions @ np.eye(7)[5], np.tile(np.eye(3)[1], (5, 1)))
 
 
-@pytest.mark.parametrize(("share", "is_said"), [(0.4, False), (0.6, True)])
-def test_points_thrown_away_are_said_if_they_are_most(share: float, is_said: bool) -> None:
-    """Reprojection errors do not show this: along its ray a point may move far with a small error."""
-    points = np.random.default_rng(0).standard_normal((100, 3))
-    thrown = np.where((np.arange(100) < 100 * share)[:, None], 1e4 * points, points)
-    reasons = list(finished_map._elsewhere(points, thrown))
-    assert [reason.split(":")[0] for reason in reasons] == is_said * ["the points moved away from the path"]
-
-
-def summary_of(**attributes: Any) -> Any:
-    """A refinement that went well, unless it is said."""
-    return SimpleNamespace(
-        **{"converged": True, "message": "", "misfits": (), "pixel_stddev": 0.5, "anchors": (), "covariance": None}
-        | attributes
-    )
-
-
 def moved(centers_m: Array, step: Array) -> Array:
     """Centres after a small scaling and turn about the first one, and a shift."""
     off_m = centers_m - centers_m[0]
@@ -150,30 +131,5 @@ FRAME_IDS = np.array([3, 5, 7])
 PATH = Trajectory(FRAME_IDS[::-1], ("a", "b", "c"), None, CENTERS_M, np.array([np.eye(3)] * 3))
 
 
-def estimate_of(
-    shift_m: float, heading: float = 0.0, *, has_positions: bool = False, anchors: Sequence[Any] = ()
-) -> Any:
-    """An estimate whose map may be shifted along y and turned about z, about its first camera."""
-    placement = np.diag([0.0, 0, 0, heading**2, 0, shift_m**2, 0])
-    return SimpleNamespace(placement=placement, positions=object() if has_positions else None, anchors=anchors)
-
-
 def place(estimate: Any, summary: Any = None, doubts: Sequence[str] = (), bent_by_m: Array = NOT_BENT) -> Any:
     return known(place_of_map(estimate, summary, PATH, doubts, bent_by_m))
-
-
-def test_keyframes_that_hang_loose_are_named_beside_how_well_the_others_are_known() -> None:
-    def reasons_of(*stddevs_m: float, doubts: Sequence[str] = ()) -> Any:
-        centers = np.square(stddevs_m)[:, None, None] * np.eye(3) / 3
-        covariance = SimpleNamespace(frame_ids=FRAME_IDS, similarity=np.zeros((7, 7)), centers=centers)
-        return place(estimate_of(0.0), summary_of(covariance=covariance), doubts=doubts).reasons
-
-    one = "the photos hardly tie keyframe a to the map; each other keyframe is known to 0.2 m or better (95 %)"
-    assert reasons_of(0.1, 0.05, 600.0, doubts=["it is broken"])[1:] == (one, "it is broken")
-    # None is far less certain than most, and one that is known well enough is no matter.
-    assert len(reasons_of(300.0, 150.0, 600.0)) == len(reasons_of(0.001, 0.001, 0.1)) == 1
-    several = Trajectory(np.arange(5), tuple("abcde"), None, np.zeros((5, 3)), np.array([np.eye(3)] * 5))
-    (said,) = finished_map._loose_ones(several, np.array([0.1, 5.0, 0.2, 7.0, 0.1]))
-    assert said.startswith(
-        "the photos hardly tie keyframe d (and 1 more) to the map; each other keyframe is known to 0.39"
-    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -123,50 +122,6 @@ def test_all_together_alarm_for_nothing_as_seldom_as_they_say(
         tests = Factorization(drawn).test(tried, 0)
         alarms += any(test.statistic > most for test, most in zip(tests, thresholds, strict=True))
     assert stats.binom.sf(alarms - 1, num, FALSE_ALARM_RATE) > 0.001
-
-
-def of_columns(columns: Array, *, num_priors: int = 0, **attributes: Any) -> Hypothesis:
-    """A mistake that changes the residuals by these (c, k) columns."""
-    told = {
-        "name": "bias",
-        "words": lambda size: f"it is {size[0]:+.2f} m",
-        "remedy": "measure",
-        "correction": lambda _: Correction(),
-        "most": np.inf,
-        "effect": Effect(columns, np.zeros((num_priors, columns.shape[1]))),
-    }
-    return Hypothesis(**{**told, **attributes})
-
-
-def made_test(
-    *,
-    sizes: Sequence[float] = (1.0,),
-    stddevs: Sequence[float] = (0.25,),
-    statistic: float = 16.0,
-    threshold: float = 10.0,
-    by_unknowns: Array | None = None,
-    basis: Array | None = None,
-    smallest_detectable: float = 0.8,
-    effect_on_log_scale: float = 0.02,
-    effect_on_place_m: float = 0.3,
-    redundancy: float = 0.7,
-    **of_hypothesis: Any,
-) -> hypothesis_tests.Test:
-    """A result of a test as no problem gave it; its hypothesis has no effect on anything."""
-    num = len(stddevs)
-    return hypothesis_tests.Test(
-        sizes=np.array(sizes),
-        root=np.diag(stddevs) if num else np.zeros((len(sizes), 0)),
-        statistic=statistic,
-        by_unknowns=np.zeros((7, len(sizes))) if by_unknowns is None else by_unknowns,
-        basis=np.eye(9, num) if basis is None else basis,
-        smallest_detectable=smallest_detectable,
-        effect_on_log_scale=effect_on_log_scale,
-        hypothesis=of_columns(np.zeros((9, len(sizes))), **of_hypothesis),
-        threshold=threshold,
-        redundancy=redundancy,
-        effect_on_place_m=effect_on_place_m,
-    )
 
 
 def bases_of(nums: Sequence[int], together: int = 0) -> list[Array]:

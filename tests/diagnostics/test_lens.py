@@ -13,7 +13,7 @@ import pytest
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
-from rangesfm.diagnostics.lens import _RICHER, _enrich, doubt_of_lens, fit_lens
+from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
@@ -44,17 +44,6 @@ def photograph_with_low_pixels(model: pycolmap.Reconstruction, camera_model: str
         for point in image.points2D:
             point.xy = np.array([point.xy[0], center_px + (point.xy[1] - center_px) / height])
     pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions(print_summary=False))
-
-
-@pytest.mark.parametrize(("name", "richer"), _RICHER.items())
-def test_a_richer_camera_shows_points_where_its_origin_does(name: str, richer: str) -> None:
-    camera = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
-    camera.params = [param + 0.01 * number for number, param in enumerate(camera.params, 1)]
-    points = np.random.default_rng(0).uniform([-0.4, -0.3, 1], [0.4, 0.3, 2], (20, 3))
-    before = np.asarray(camera.img_from_cam(points), dtype=np.float64)
-    _enrich(camera)
-    assert camera.model_name == richer
-    np.testing.assert_allclose(np.asarray(camera.img_from_cam(points), dtype=np.float64), before, atol=1e-9)
 
 
 def test_pixels_that_are_no_squares_are_named_with_a_camera_model_that_has_them(

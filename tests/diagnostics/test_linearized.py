@@ -1,4 +1,4 @@
-"""Ranges on a map as a linear problem: its derivatives, its bins, its errors and its steps."""
+"""Ranges on a map as a linear problem: its derivatives."""
 
 from __future__ import annotations
 
@@ -89,11 +89,6 @@ def small_map(
     )
 
 
-def with_longer(on_map: RangesOnMap, longer_m: Array) -> RangesOnMap:
-    """Return the map with ranges that read longer by (n,) metres."""
-    return replace(on_map, problem=replace(on_map.problem, range_m=on_map.problem.range_m + longer_m))
-
-
 def slopes(function: Callable[[Array], Array], num: int, step: float = 1e-6) -> Array:
     """Return the derivatives at zero of a function of ``num`` numbers, which are the last axis."""
     steps = step * np.eye(num)
@@ -132,21 +127,3 @@ class TestDerivatives:
             return problem.bins.mean(state.metric_from_model.apply(on_map.problem.centers))
 
         np.testing.assert_allclose(problem.place, slopes(places_m, problem.columns.num), atol=1e-7)
-
-
-class TestGarbage:
-    """Garbage that happens to agree with its neighbours takes no part either."""
-
-    def test_ranges_of_a_bin_that_agree_on_what_no_anchor_of_this_path_can_have(self, on_map: RangesOnMap) -> None:
-        garbage = np.flatnonzero(on_map.problem.anchor_index == 1)[8:16]
-        longer_m = np.zeros(len(on_map.time_s))
-        longer_m[garbage] = 65535.0
-        found = linearized(with_longer(on_map, longer_m)).bins.robust_weight
-        np.testing.assert_array_equal(np.flatnonzero(found == 0), garbage)
-
-    def test_a_few_ranges_most_of_which_are_garbage(self, on_map: RangesOnMap) -> None:
-        garbage = np.flatnonzero(on_map.problem.anchor_index == 1)[8:14]
-        longer_m = np.zeros(len(on_map.time_s))
-        longer_m[garbage] = [3.0, 9.0, 14.0, 2.0, 5.0, 7.0]
-        found = linearized(with_longer(on_map, longer_m)).bins.robust_weight
-        assert (found[garbage] == 0).all()

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,15 +11,10 @@ from tests.known import known
 from tests.studies.erring_surveys import SITES, Given, run, surveyed
 from tests.studies.mistakes import kinds
 
-from rangesfm.arrays import Array, Mask
 from rangesfm.diagnostics.alternatives import alternatives
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis import Hypothesis
 from rangesfm.diagnostics.linearized import Linearized, linearized
-from rangesfm.diagnostics.mistake_words import mistake_in_words
-from rangesfm.diagnostics.mistakes import _settled_test, _varied
-from rangesfm.diagnostics.timed_hypotheses import SCANNING, _changes
 
 HALL, YARD, DRONE = SITES
 SEED = 3
@@ -45,21 +37,6 @@ def test_a_clean_survey_is_not_doubted() -> None:
     assert found.reasons == ()
     assert not any(test.rejected for test in found.tests)
     assert len({(test.name, test.subject) for test in found.tests}) == len(found.tests)
-
-
-def test_the_worst_that_could_hide_is_named_where_it_does_more_than_a_good_scale_may_be_off_by(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("rangesfm.diagnostics.diagnosis.DOUBTFUL_ABOVE", 0.0)
-    found = diagnosis(surveyed(DRONE, SEED))
-    (reason,) = found.reasons
-    assert reason.startswith("the ranges cannot show every mistake that matters")
-    hidden = [test for test in found.tests if f"({mistake_in_words(test.name, test.subject)})" in reason]
-    assert "scale error of all ranges" not in reason  # it changes the scale most, but the scale's interval includes it
-    said = re.search(r"change the scale by ([0-9.]+) %", reason)
-    assert hidden
-    assert said is not None
-    assert 0 < float(said[1]) <= 100 * max(test.effect_on_scale or 0.0 for test in hidden) + 0.05
 
 
 def test_a_clock_that_is_off_is_named_with_its_size() -> None:
@@ -252,65 +229,10 @@ def test_a_tag_that_is_found_farther_than_its_camera_is_large_did_not_slip() -> 
     assert all(test.size is None or test.size < 0.75 for test in found.tests if test.name == "tag slipped")
 
 
-def test_every_hypothesis_has_a_largest_size_that_can_happen(of_yard: Linearized) -> None:
-    hypotheses = [h for of_kind in (*STANDING, *SCANNING) for h in of_kind(of_yard)]
-    assert {h.name for h in hypotheses} >= {"anchor moved", "map break", "clock jump", "common bias", "lever arm"}
-    # The scale's interval includes what radios have in small: constant errors and those that grow with the distance.
-    in_interval = {h.name for h in hypotheses if h.is_in_interval}
-    assert in_interval == {"anchor bias", "common bias", "range scale", "anchor range scale", "anchors' scale"}
-    for each in hypotheses:
-        assert 0 < each.most < 200
-        assert each.can_be(np.zeros(each.num))
-        assert not each.can_be(np.full(each.num, 1.01 * each.most))
-
-
-def test_one_step_finds_the_size_of_those_that_change_the_ranges_in_proportion(of_yard: Linearized) -> None:
-    for each in (h for of_kind in (*STANDING, *SCANNING) for h in of_kind(of_yard)):
-        once_m, thrice_m = (each.correction(np.full(each.num, size)).longer_m for size in (0.01, 0.03))
-        # Ranges that are too long by a share are divided by it, so that their correction is no share of theirs.
-        if once_m is not None and thrice_m is not None and each.name != "range scale":
-            assert each.is_linear == np.allclose(thrice_m, 3 * once_m, atol=1e-12), each.key
-
-
 @pytest.mark.parametrize(("size", "said"), [(0.03, "3.0 % too long"), (-0.03, "3.0 % too short")])
 def test_ranges_that_grow_too_much_are_said_to_be_too_long(size: float, said: str, of_yard: Linearized) -> None:
     (of_all,) = [h for of_kind in STANDING for h in of_kind(of_yard) if h.name == "range scale"]
     assert of_all.words(np.array([size])) == f"all ranges read about {said}"
-
-
-def test_of_each_kind_of_mistake_only_the_first_few_are_tried() -> None:
-    tests: list[Any] = [SimpleNamespace(hypothesis=SimpleNamespace(name=name)) for name in "aaaaabab"]
-    assert _varied(tests) == [tests[0], tests[1], tests[5], tests[7]]
-
-
-def test_a_change_leaves_enough_bins_before_and_after_it(of_yard: Linearized) -> None:
-    (any_of_all, *_) = [h for of_kind in STANDING for h in of_kind(of_yard)]
-    num, later = len(of_yard.bins), list[float]()
-
-    def change(_: str, __: Callable[[], Mask], after: Array) -> Hypothesis:
-        later.append(float(after.sum()))
-        return any_of_all
-
-    least = num // 3
-    list(_changes(of_yard, None, least, change))
-    assert later
-    assert least <= min(later) <= max(later) <= num - least
-
-
-def test_a_mistake_whose_steps_grow_explains_nothing() -> None:
-    """The correction has the wrong sign: each step leaves twice what it was to remove."""
-    given = surveyed(HALL, SEED)
-    given.range_m = given.range_m + 0.3 * given.is_of("A1")
-    problem = linearized(known(run(given, SEED).on_map))
-    linear = next(h for of_kind in STANDING for h in of_kind(problem) if h.key == ("anchor bias", "A1"))
-    in_steps = replace(linear, is_linear=False)
-    opposite = replace(in_steps, correction=lambda size: linear.correction(-size))
-    assert np.isfinite(_settled_test(problem, linear)[1])
-    assert np.isfinite(_settled_test(problem, in_steps)[1])
-    assert _settled_test(problem, opposite)[1] == np.inf
-    # Neither does a correction that leads beyond what can happen.
-    assert _settled_test(problem, replace(linear, most=0.1))[1] == np.inf
-    assert _settled_test(problem, replace(in_steps, most=0.1))[1] == np.inf
 
 
 def test_a_lever_arm_in_other_axes_is_as_long_as_it_was_given() -> None:

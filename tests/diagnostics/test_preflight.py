@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 import pytest
 from tests.known import known
@@ -28,9 +26,6 @@ from rangesfm.diagnostics.preflight import (
 )
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.errors import InputError
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.range_log import RangeLog
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 
@@ -232,31 +227,6 @@ def test_a_photo_whose_pose_is_wrong_is_named(model: pycolmap.Reconstruction) ->
     assert note.startswith(f"photo {model.image(7).name}: most of its points lie more than 4.8 px")
 
 
-def log_of(anchors: Sequence[str], ranges_m: npt.ArrayLike, **columns: Any) -> RangeLog:
-    """Ranges to these anchors, a second apart unless their times or photos are given."""
-    if not columns.keys() & {"timestamp_s", "image_name"}:
-        columns["timestamp_s"] = np.arange(len(anchors), dtype=np.float64)
-    return RangeLog.from_arrays(anchors, ranges_m, **columns)
-
-
-def inputs_of(log: RangeLog, arms_m: npt.ArrayLike | None = None, **attributes: Any) -> Any:
-    arms = np.zeros((len(log.tag_ids), 3)) if arms_m is None else np.array(arms_m)
-    usual = {"log": log, "tag_in_cam_m": arms, "anchors": (), "anchor_frame": "unknown", "site": AS_GIVEN, "tape": None}
-    return SimpleNamespace(**(usual | attributes))
-
-
-AS_GIVEN = Site()
-PLACED = Survey().changed({"tag.tag_in_cam_m": (0.0, 0.0, 0.0)})
-
-
-@pytest.mark.parametrize(("longest_m", "told"), [(2.95, ()), (3.05, ("t9 is 3.05 m long",))])
-def test_a_lever_arm_longer_than_any_rig_is_told_with_its_tag(longest_m: float, told: tuple[str, ...]) -> None:
-    log = log_of(["A", "B"], [1.0, 2.0], tag_id=["t1", "t9"])
-    notes = list(notes_before_work(PLACED, inputs_of(log, [[0, 0, 2.0], [0, longest_m, 0]])))
-    assert len(notes) == len(told)
-    assert all(f"the lever arm of {words}, more" in note for note, words in zip(notes, told, strict=True))
-
-
 def triangles(of_pairs: Mapping[tuple[int, int], Sequence[tuple[float, float]]]) -> preflight._Triangles:
     """Bounds, shortest and longest, on the distances of pairs of anchors."""
     rows = [(pair, *bounds) for pair, of_pair in of_pairs.items() for bounds in of_pair]
@@ -274,37 +244,3 @@ def apart(positions_m: Array) -> dict[tuple[int, int], float]:
     """True distances of all pairs."""
     of_pairs = combinations(range(len(positions_m)), 2)
     return {(i, k): float(np.linalg.norm(positions_m[i] - positions_m[k])) for i, k in of_pairs}
-
-
-ODD_SITE_M = np.array([[0.0, 0, 0], [10.0, 0, 0], [3.0, 25.0, 0], [40.0, 9.0, 5.0]])
-
-
-def test_two_labels_that_are_swapped_explain_all_contradictions() -> None:
-    assert causes(apart(ODD_SITE_M), ODD_SITE_M[[0, 3, 2, 1]]) == ["the labels B and D are swapped"]
-    assert causes(apart(ODD_SITE_M), ODD_SITE_M[[3, 1, 2, 0]]) == ["the labels A and D are swapped"]
-
-
-def between_anchors(positions_m: Mapping[str, Array]) -> RangeLog:
-    """One range between each two anchors, as they stand."""
-    pairs = list(combinations(positions_m, 2))
-    lengths_m = [float(np.linalg.norm(positions_m[one] - positions_m[other])) for one, other in pairs]
-    return log_of([b for _, b in pairs], lengths_m, tag_id=[a for a, _ in pairs]).with_anchors(positions_m)
-
-
-@pytest.mark.parametrize(
-    ("of_anchors", "of_ranges", "said"),
-    [(1 / 0.3048, 1.0, "anchors are in feet"), (1.0, 1 / 0.3048, "ranges are in feet"), (1.0, 1.0, "")],
-)
-def test_a_unit_that_most_distances_between_anchors_show_ends_the_run(
-    of_anchors: float, of_ranges: float, said: str
-) -> None:
-    log = between_anchors(dict(zip("ABCD", ODD_SITE_M, strict=True)))
-    anchors = tuple(Anchor(name, of_anchors * at) for name, at in zip("ABCD", ODD_SITE_M, strict=True))
-    log = replace(log, range_m=of_ranges * log.range_m, format="table")
-    inputs = inputs_of(log, anchors=anchors, anchor_frame="site")
-    if not said:
-        check_units(Survey(), inputs)
-        return
-    with pytest.raises(InputError, match=f"6 of 6 pairs .* contradict each other; they would not if {said}: give"):
-        check_units(Survey(), inputs)
-    check_units(Survey().changed({"ranges.range_unit": "m", "anchors.unit": "m"}), inputs)

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 import pytest
 from PIL import Image
@@ -27,8 +26,6 @@ from rangesfm.export import (
 )
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.workflows.export_result import export_result
-
-Array = npt.NDArray[np.float64]
 
 FAR_AWAY = np.array([2_600_000.0, 1_200_000.0, 400.0])
 METRIC_FROM_SFM = Similarity(0.37, Rotation.from_rotvec([0.1, -0.7, 2.5]).as_matrix(), np.array([1 / 3, -2e5, 1e-7]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -20,8 +19,6 @@ from rangesfm.geometry.similarity import (
     similarity_between,
 )
 from rangesfm.geometry.trajectory import Trajectory
-
-Array = npt.NDArray[np.float64]
 
 
 @pytest.fixture

@@ -365,6 +365,13 @@ class TestLogsThatNamePhotos:
         assert found.before.tolist() == found.after.tolist() == [2, 0, 2]
         np.testing.assert_array_equal(found.centers, path.centers[[2, 0, 2]])
 
+    @pytest.mark.parametrize("times", [None, np.arange(4.0)], ids=["without times", "with times"])
+    def test_the_tag_sits_at_its_lever_arm_in_the_axes_of_that_photo(self, times: Array | None) -> None:
+        turned = Rotation.from_rotvec(np.outer(np.arange(4.0), [0.1, 0.0, 0.3]))
+        path = trajectory_of(times, straight(np.arange(4.0)), turned.as_matrix())
+        found = associate(self.log(["002.jpg", "000.jpg"]), path, TAG_IN_CAM_M)
+        np.testing.assert_allclose(found.tag_from_center, turned[[2, 0]].apply(TAG_IN_CAM_M), atol=1e-12)
+
     def test_a_photo_that_is_not_in_the_model_is_told(self) -> None:
         path = trajectory_of(None, straight(np.arange(4.0)))
         found = associate(self.log(["001.jpg", "else.jpg"]), path, TAG_IN_CAM_M)

@@ -12,8 +12,6 @@ from rangesfm.geometry.reference import Reference
 from rangesfm.ranging.association import tag_positions
 from rangesfm.ranging.range_log import RangeLog
 
-Array = npt.NDArray[np.float64]
-
 TIMES_S = np.array([0.0, 0.4, 0.8, 2.0, 2.4])
 PATH_M = np.outer(TIMES_S, [1.0, 0.0, -0.5])
 

@@ -1,4 +1,4 @@
-"""The bundle adjustment of photos that the ranges are added to."""
+"""Points of the photos that take no part in the bundle adjustment."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.refine.bundle_adjustment import (
     BundleAdjustment,
     bundle_adjustment,
-    solve_bundle_adjustment,
-    solve_until_still,
 )
 
 
@@ -30,19 +28,6 @@ def _orbit() -> pycolmap.Reconstruction:
     times, path = np.arange(6.0), orbit_path(8.0)
     poses = (times, path.centers(times), path.world_from_cam(times))
     return synthetic_model(*poses, num_observations=20, pixel_stddev=1.0).reconstruction
-
-
-@pytest.mark.parametrize(("num_left", "expected"), [(1, False), (20, True)])
-def test_a_map_is_at_rest_only_after_the_iterations_that_it_needs(num_left: int, expected: bool) -> None:
-    model = orbit()
-    rng = np.random.default_rng(0)
-    for point in model.points3D.values():
-        point.xyz += 0.3 * rng.standard_normal(3)
-    one_step = RefineOptions(max_num_iterations=1)
-    bundle = bundle_adjustment(model, CameraOptions(), one_step, fixed_frame_id=None, num_threads=1)
-    run = solve_bundle_adjustment(bundle, tolerance_m=1e-4)
-    assert not run.is_still
-    assert solve_until_still(bundle, run, tolerance_m=1e-4, num_left=num_left)[1] == expected
 
 
 def test_points_that_are_left_out_take_no_part_and_stay_in_the_model() -> None:

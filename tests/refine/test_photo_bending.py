@@ -9,7 +9,6 @@ import pycolmap
 import pytest
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
-from tests.simulated.pieces import leave_across
 
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RefineOptions
@@ -69,14 +68,3 @@ def test_a_path_without_points_walks() -> None:
     for point_id in list(model.points3D):
         model.delete_point3D(point_id)
     assert isinstance(bending_of(model), WalkBending)
-
-
-@pytest.mark.parametrize(("num_across", "are_held"), [(3, False), (30, True)])
-def test_parts_that_share_few_points_are_not_held_together(num_across: int, are_held: bool) -> None:
-    model = simulated(pixel_stddev=0.5).reconstruction
-    names = sorted(image.name for image in model.images.values())
-    second = set(names[NUM // 2 :])
-    leave_across(model, second, num_across)
-    bending = bending_of(model)
-    assert isinstance(bending, PhotoBending)
-    assert bending.hold_together(second) == are_held

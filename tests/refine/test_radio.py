@@ -1,4 +1,4 @@
-"""Ranges in the refinement: the places of their antennas, what they should be, and their residuals and priors."""
+"""Ranges that the refinement predicts."""
 
 from __future__ import annotations
 
@@ -10,12 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 from tests.refine.test_bundle_adjustment import orbit
-from tests.refine.test_keyframe_graph import errors_of
 
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.errors.robust_loss import RobustLoss
 from rangesfm.refine.radio import (
     Antennas,
     RadioEstimate,
@@ -24,7 +21,6 @@ from rangesfm.refine.radio import (
 
 Array = npt.NDArray[np.float64]
 TAGS_M = np.array([[0.1, -0.2, 0.3], [-0.3, 0.1, 0.05]])
-LOSS = RobustLoss(3.0, is_bounded=True)
 
 
 def anchor(name: str, place: list[float], **given: Any) -> AnchorEstimate:
@@ -62,15 +58,6 @@ def four_ranges(model: pycolmap.Reconstruction) -> RadioRanges:
 
 def estimate(**given: Any) -> RadioEstimate:
     return replace(RadioEstimate(ANCHORS, TAGS_M, 0.0, 0.0, np.array([0.5, -1.0])), **given)
-
-
-def errors(common_bias_stddev_m: float = 0.1) -> RangeErrors:
-    """Return the errors of the three ranges with a place."""
-    found = errors_of(np.array([0, 0, 1]), 0.3)
-    return replace(
-        found, stddev_m=np.array([0.2, 0.3, 0.4]), share=np.array([1.0, 0.5, 0.25]), inflation=1.5, loss=LOSS,
-        common_bias_stddev_m=common_bias_stddev_m,
-    )  # fmt: skip
 
 
 def places_by_hand(path: Trajectory, ranges: RadioRanges, tags_m: Array, shift_s: float = 0.0) -> tuple[Array, Array]:

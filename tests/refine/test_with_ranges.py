@@ -12,12 +12,11 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.few_links import leave_few_links
 from tests.known import known
 from tests.known_errors import known_errors
 from tests.scale.robust_scale import metric_from_sfm_by_robust_weights
 from tests.simulated.model import synthetic_model
-from tests.simulated.path import lap_path, loop_path, sequence_path
+from tests.simulated.path import loop_path, sequence_path
 from tests.simulated.ranges import simulate_ranges_at
 from tests.studies.scale_breakdown import spoilt
 
@@ -39,11 +38,7 @@ from rangesfm.ranging.errors.range_bins import range_bins
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
-from rangesfm.refine import with_ranges
-from rangesfm.refine.graph_presolve import Presolved, presolve_again
 from rangesfm.refine.radio import ranges_predicted_by_model
-from rangesfm.refine.refinement_problem import RefinementProblem
-from rangesfm.refine.vision_information import Observations
 from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 
@@ -164,10 +159,6 @@ def make_survey(
     )
 
 
-def presolve_with_known_errors(problem: RefinementProblem, rays: Observations, errors: RangeErrors) -> Presolved:
-    return presolve_again(problem, rays, errors, problem.radio.anchors)
-
-
 def adjust_by_colmap(sfm: pycolmap.Reconstruction) -> None:
     """Adjust a noisy model as a mapper would."""
     config = pycolmap.BundleAdjustmentConfig()
@@ -194,19 +185,6 @@ def adjusters(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[pycolmap.CeresBu
     monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", make_and_keep)
     yield made
     made.clear()
-
-
-def add_point_in_camera(model: pycolmap.Reconstruction, depth: float) -> int:
-    """Add a point right in front of one photo's camera, which the photo behind also sees; return its id."""
-    behind, image = sorted(model.images.values(), key=lambda image: image.name)[10:12]
-    xyz = image.cam_from_world().inverse() * np.array([0.1 * depth, -0.05 * depth, depth])
-    track = pycolmap.Track()
-    for seeing in (behind, image):
-        pixel = model.camera(seeing.camera_id).img_from_cam(seeing.cam_from_world() * xyz)
-        assert pixel is not None
-        seeing.points2D.append(pycolmap.Point2D(np.ravel(pixel)))
-        track.add_element(seeing.image_id, len(seeing.points2D) - 1)
-    return int(model.add_point3D(xyz, track, np.zeros(3, dtype=np.uint8)))
 
 
 class TestWithoutNoise:
@@ -244,13 +222,6 @@ class TestWithoutNoise:
         _, apart = survey.refine(survey.anchors(0.0, bias_stddev_m=0.001), errors=errors[1])
         assert all(abs(anchor.range_bias_m) < 0.04 for anchor in apart.anchors)
 
-    def test_points_and_poses_scale_together(self) -> None:
-        survey = make_survey()
-        refined, _ = survey.refine(survey.anchors(0.0), 1.05)
-        for point_id, point in survey.sfm.points3D.items():
-            expected = survey.metric_from_sfm.apply(np.array(point.xyz))
-            np.testing.assert_allclose(refined.point3D(point_id).xyz, expected, atol=1e-5)
-
     def test_ranges_between_keyframes_count_as_well(self) -> None:
         survey = make_survey(num_keyframes=41, radio=Radio(rate_hz=5.0), at_keyframes=False)
         between = survey.observations.before != survey.observations.after
@@ -285,24 +256,6 @@ class TestWithoutNoise:
         np.testing.assert_allclose(summary.predicted_m[placed], log.range_m[placed], atol=1e-2)
         with pytest.raises(InputError, match=r"expected \(3,\) or \(2, 3\)"):
             survey.refine(survey.anchors(0.0), observations=observations, tag_in_cam_m=np.zeros((3, 3)))
-
-    def test_the_model_given_stays_as_it_was(self) -> None:
-        survey = make_survey()
-        metric = rescale(survey.sfm, survey.metric_from_sfm)
-        before = survey.centers(metric)
-        refine_with_ranges(
-            metric,
-            survey.trajectory,
-            survey.observations,
-            survey.metric_from_sfm,
-            anchors := survey.anchors(np.inf),
-            known_errors(survey.observations, RANGE_STDDEV_M),
-            tag_in_cam_m=TAG_IN_CAM_M + 0.1,
-            first_pose_is_fixed=False,
-        )
-        np.testing.assert_array_equal(survey.centers(metric), before)
-        for anchor in anchors:
-            np.testing.assert_array_equal(anchor.position_m, survey.anchors_m[anchor.anchor_id])
 
     def test_a_rig_carries_the_tag_in_its_own_frame(self) -> None:
         pycolmap.set_random_seed(0)
@@ -353,19 +306,6 @@ class TestWhatIsKnownStays:
         assert summary.covariance is not None
         assert (loose.covariance.num_free_directions, summary.covariance.num_free_directions) == (1, 0)
         np.testing.assert_allclose(survey.centers(refined), survey.centers_m, atol=1e-5)
-
-    def test_a_first_keyframe_without_ranges(self) -> None:
-        survey = make_survey("first_camera", pixel_stddev=0.5)
-        far = survey.observations.before > 3
-        status = np.where(far, survey.observations.status, RangeStatus.NO_KEYFRAME_NEAR).astype(np.int8)
-        refined, summary = survey.refine(
-            survey.anchors(0.0), 1.05, observations=replace(survey.observations, status=status)
-        )
-        assert summary.converged
-        assert survey.scale_error(refined) == pytest.approx(0.0, abs=2e-3)
-        first = int(survey.trajectory.frame_ids[0])
-        start = rescale(survey.sfm, Similarity(1.05, np.eye(3), np.zeros(3)) @ survey.metric_from_sfm)
-        np.testing.assert_array_equal(pose_of(refined.frame(first)).params, pose_of(start.frame(first)).params)
 
     def test_anchors_without_uncertainty(self) -> None:
         survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
@@ -489,23 +429,6 @@ class TestDistances:
         without, _ = survey.refine(survey.anchors(0.0))
         np.testing.assert_array_equal(survey.centers(checked), survey.centers(without))
 
-    def test_markers_are_not_eliminated_with_the_points(
-        self, adjusters: list[pycolmap.CeresBundleAdjuster], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        # Keep the markers' points, because the problem refers to them and is solved once more below.
-        monkeypatch.setattr("rangesfm.refine.with_ranges.remove_marker_points", lambda model, marker_ids: None)
-        survey = make_survey("first_camera", pixel_stddev=0.5)
-        points = sorted(survey.sfm.points3D.values(), key=lambda point: point.track.length())[:2]
-        tape = Tape(
-            (TapedDistance(("door", "wall"), 3.0, 1.0, "control", 2),),
-            {"door": marker_of(survey.sfm, points[0]), "wall": marker_of(survey.sfm, points[1])},
-        )
-        observations = with_ranges_between_anchors(survey)
-        survey.refine(survey.anchors(np.inf), observations=observations, tape=tape)
-        summary = adjusters[-1].solve()
-        assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
-        assert summary.ceres_summary.schur_structure_used == "2,3,6"
-
     def test_ranges_between_anchors_put_unknown_ones_nearer_to_their_places(self) -> None:
         survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=0.3))
         observations, without = with_ranges_between_anchors(survey, error_m=0.05), survey.observations
@@ -540,40 +463,6 @@ def located_m(tape: Tape, model: pycolmap.Reconstruction) -> Array:
 
 
 class TestWithNoise:
-    def test_order_of_the_ranges_does_not_matter(self) -> None:
-        survey = make_survey("first_camera", pixel_stddev=0.5, radio=Radio(range_stddev_m=RANGE_STDDEV_M))
-        log = survey.observations.log
-        assert log.timestamp_s is not None
-        order = np.random.default_rng(0).permutation(len(log))
-        ids = [log.anchor_ids[k] for k in log.anchor_index[order]]
-        shuffled = associate(
-            RangeLog.from_arrays(ids, log.range_m[order], timestamp_s=log.timestamp_s[order]),
-            survey.trajectory,
-            TAG_IN_CAM_M,
-        )
-        first, first_summary = survey.refine(survey.anchors(0.0))
-        other = replace(survey, observations=shuffled)
-        second, second_summary = other.refine(other.anchors(0.0))
-        np.testing.assert_allclose(survey.centers(second), survey.centers(first), atol=1e-6)
-        np.testing.assert_allclose(second_summary.predicted_m, first_summary.predicted_m[order], atol=1e-6)
-
-    def test_the_unit_of_the_unscaled_model_does_not_matter(self) -> None:
-        radio = Radio(range_stddev_m=RANGE_STDDEV_M)
-        survey = make_survey(pixel_stddev=0.5, radio=radio, num_keyframes=41, at_keyframes=False)
-        small = Similarity(1e-3, np.eye(3), np.ones(3))
-        sfm = rescale(survey.sfm, small)
-        trajectory = trajectory_from_reconstruction(sfm, survey.timestamps_s)
-        other = replace(
-            survey,
-            sfm=sfm,
-            trajectory=trajectory,
-            observations=associate(survey.observations.log, trajectory, TAG_IN_CAM_M),
-            metric_from_sfm=survey.metric_from_sfm @ small.inverse(),
-        )
-        first, _ = survey.refine(survey.anchors(0.0))
-        second, _ = other.refine(other.anchors(0.0))
-        np.testing.assert_allclose(survey.centers(second), survey.centers(first), atol=1e-5)
-
     def test_the_pixel_stddev_is_found(self) -> None:
         survey = make_survey(pixel_stddev=0.7, num_keyframes=30, num_observations=150)
         _, summary = survey.refine(survey.anchors(0.0))
@@ -629,120 +518,6 @@ class TestWithNoise:
             errors=known_errors(observations, assumed_stddev_m, is_estimated=True),
         )
         assert rmse(survey.centers(refined) - survey.centers_m) < max_error_m
-
-    def test_a_map_of_photos_alone_is_not_pulled_by_what_its_mapper_left_of_a_gradient(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        survey = make_survey("first_camera", pixel_stddev=0.3, radio=Radio(range_stddev_m=0.1), seed=1)
-        told: dict[str, Any] = {"scale_error": 1.1, "errors": 0.1}
-        refined, _ = survey.refine(survey.anchors(0.0), **told)
-        rng = np.random.default_rng(0)
-        monkeypatch.setattr(
-            "rangesfm.refine.graph_presolve.photo_gradient", lambda _, poses: 1e5 * rng.standard_normal(6 * len(poses))
-        )
-        again, _ = survey.refine(survey.anchors(0.0), **told)
-        np.testing.assert_allclose(survey.centers(again), survey.centers(refined), atol=1e-4)
-        pulled, _ = survey.refine(survey.anchors(0.0), refined=refined, errors=0.1)
-        assert rmse(survey.centers(pulled) - survey.centers(refined)) > 1e-3, "so large a gradient is seen"
-
-    def test_a_refined_map_stays_where_it_is_and_its_errors_are_learnt_alike(self) -> None:
-        """The ranges of one anchor are noisier, which only residuals show."""
-        survey = make_survey("first_camera", pixel_stddev=0.3, radio=Radio(range_stddev_m=0.1), num_epochs=8, seed=1)
-        log, noise = survey.observations.log, np.random.default_rng(1).standard_normal(len(survey.observations.log))
-        log = replace(log, range_m=log.range_m + 0.4 * noise * (log.anchor_index == 0))
-        observations = replace(survey.observations, log=log, center_stddev=np.zeros(len(log)))
-        told: dict[str, Any] = {
-            "observations": observations,
-            "errors": known_errors(observations, 0.2, is_estimated=True),
-        }
-        refined, first = survey.refine(survey.anchors(0.0), scale_error=1.1, **told)
-        again, second = survey.refine(survey.anchors(0.0), refined=refined, **told)
-        assert rmse(survey.centers(again) - survey.centers(refined)) < 1e-4
-        np.testing.assert_allclose(second.errors.stddev_m, first.errors.stddev_m, rtol=0.02)
-        assert np.ptp(first.errors.stddev_m) > 0.2
-
-    def test_a_place_where_the_camera_lingered_draws_the_map_no_more_than_in_the_scale(self) -> None:
-        """Ranges of one place have the same error, and three of twenty places have most of the ranges."""
-        survey = make_survey("first_camera", pixel_stddev=0.3, num_epochs=60, seed=1)
-        log, rng = survey.observations.log, np.random.default_rng(1)
-        place = 4 * survey.observations.before + log.anchor_index
-        errors = 0.1 * rng.standard_normal(80)[place] + 0.03 * rng.standard_normal(len(log))
-        observations = replace(survey.observations, log=replace(log, range_m=log.range_m + errors))
-        taken = np.isin(observations.before, [2, 3, 9]) | (np.arange(len(log)) % 15 == 0)
-        status = np.where(taken, observations.status, RangeStatus.UNKNOWN_ANCHOR).astype(np.int8)
-        surveyed = [Anchor(name, survey.anchors_m[name]) for name in log.anchor_ids]
-        scale = initialize_scale(
-            replace(observations, status=status), survey.trajectory, surveyed, anchor_frame="first_camera"
-        )
-        moved = {}
-        # The noise is given, so that the shares stay as they are.
-        weighed = replace(scale.errors, given_m=scale.errors.stddev_m)
-        for name, errors in (("weighed", weighed), ("alike", replace(weighed, share=np.ones(len(log))))):
-            refined, _ = replace(survey, metric_from_sfm=scale.metric_from_sfm).refine(
-                scale.anchors,
-                observations=scale.observations,
-                errors=errors,
-            )
-            moved[name] = rmse(survey.centers(refined) - scale.metric_from_sfm.apply(survey.trajectory.centers))
-        assert moved["weighed"] < 0.003
-        assert moved["alike"] > 0.01
-
-    @pytest.mark.parametrize(("stddev_m", "errors_are_known"), [(0.3, False), (0.15, True)])
-    def test_a_map_that_stands_a_little_askew_is_turned_at_once(
-        self, stddev_m: float, errors_are_known: bool, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """The two cases test the first unbending, and the one after ranges are reweighted."""
-        if errors_are_known:
-            monkeypatch.setattr(with_ranges, "presolve", presolve_with_known_errors)
-        survey = make_survey(pixel_stddev=0.5, radio=Radio(range_stddev_m=stddev_m), num_epochs=4)
-        turn = Rotation.from_rotvec(np.deg2rad([0.5, -0.3, 0.4])).as_matrix()
-        askew = replace(
-            survey, metric_from_sfm=Similarity(1.0, turn, np.array([0.02, -0.03, 0.02])) @ survey.metric_from_sfm
-        )
-        refined, summary = askew.refine(survey.anchors(0.0), errors=stddev_m)
-        straight, _ = survey.refine(survey.anchors(0.0), errors=stddev_m)
-        # A rotation of the whole world is curved in Ceres' parameters, so that each of its steps gains less than
-        # expected.
-        assert summary.num_iterations <= 5
-        np.testing.assert_allclose(survey.centers(refined), survey.centers(straight), atol=2e-3)
-
-    def test_parts_that_hang_together_by_few_points_are_turned_at_once(self) -> None:
-        """The rotation is smaller than the ranges' noise; it, too, is curved in Ceres' parameters."""
-        stddev_m = 0.5
-        survey = make_survey(
-            path=sequence_path(59.0, seed=2),
-            num_keyframes=60,
-            pixel_stddev=1.0,
-            radio=Radio(range_stddev_m=stddev_m),
-            num_epochs=4,
-            max_track_length=6,
-            num_observations=100,
-        )
-        leave_few_links(survey.sfm, 30, num_links=8)
-        adjust_by_colmap(survey.sfm)
-        trajectory = trajectory_from_reconstruction(survey.sfm, survey.timestamps_s)
-        hinged = replace(
-            survey,
-            trajectory=trajectory,
-            observations=associate(survey.observations.log, trajectory, TAG_IN_CAM_M),
-            metric_from_sfm=align_points(trajectory.centers, survey.centers_m),
-        )
-        _, summary = hinged.refine(survey.anchors(0.0), errors=stddev_m)
-        assert 0.1 < summary.bend_m < stddev_m
-        assert summary.num_iterations <= 5
-
-    @pytest.mark.parametrize("depth_m", [0.01, 1e-5, 1e-6, 1e-10])
-    def test_a_point_in_a_camera_changes_nothing(self, depth_m: float) -> None:
-        """The point neither limits the solver's steps nor prevents the covariance from being found."""
-        path, radio = lap_path(60.0, share=0.1), Radio(range_stddev_m=RANGE_STDDEV_M)
-        survey = make_survey(path=path, num_keyframes=30, pixel_stddev=0.5, radio=radio, max_track_length=6)
-        without, summary_without = survey.refine(survey.anchors(0.0))
-        point_id = add_point_in_camera(survey.sfm, depth_m / survey.metric_from_sfm.scale)
-        refined, summary = survey.refine(survey.anchors(0.0))
-        np.testing.assert_allclose(survey.centers(refined), survey.centers(without), atol=1e-9)
-        assert summary.num_iterations == summary_without.num_iterations
-        assert summary.covariance is not None
-        assert point_id in refined.points3D
 
     def test_drift_is_bent_back(self) -> None:
         """No similarity can do this: the refined centres are nearer to the truth than after the best similarity."""
@@ -813,14 +588,6 @@ class TestBesideTheMap:
         assert summary.time_shift_s == pytest.approx(0.1, abs=0.01)
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.02
         assert rmse(survey.centers(refined) - survey.centers_m) < 0.5 * rmse(survey.centers(bent) - survey.centers_m)
-
-    def test_a_clock_offset_needs_times(self) -> None:
-        survey = make_survey()
-        untimed = replace(survey.trajectory, timestamps_s=None)
-        with pytest.raises(InputError, match="time_offset_stddev_s"):
-            replace(survey, trajectory=untimed).refine(
-                survey.anchors(0.0), options=RefineOptions(time_offset_stddev_s=0.1)
-            )
 
     def test_an_error_that_all_short_ranges_share_is_found(self) -> None:
         near = {"A": (3.0, 0.5, 0.5), "B": (-6.0, 1.0, 0.4), "C": (0.5, 4.0, 1.0), "D": (1.0, -3.5, 0.2)}
@@ -953,47 +720,9 @@ class TestProblem:
         ]
         assert reprojection[1] < reprojection[0]
 
-    @pytest.mark.parametrize(
-        ("num_keyframes", "num_anchors"), [(20, 1), (20, 4), (12, 20), (60, 5)], ids=lambda value: str(value)
-    )
-    def test_free_anchors_and_biases_leave_the_points_to_be_eliminated_alone(
-        self, adjusters: list[pycolmap.CeresBundleAdjuster], num_keyframes: int, num_anchors: int
-    ) -> None:
-        """Ceres' fastest kernels have blocks "2,3,6": 2 rows, points of 3, poses of 6; "d" would be any size."""
-        positions = np.random.default_rng(0).normal(size=(num_anchors, 3)) * [6.0, 6.0, 2.0]
-        survey = make_survey(
-            "first_camera",
-            num_keyframes=num_keyframes,
-            pixel_stddev=0.5,
-            anchors_m={f"N{k}": (x, y, z) for k, (x, y, z) in enumerate(positions.tolist())},
-        )
-        survey.refine(survey.anchors(np.inf, bias_stddev_m=0.05))
-        summary = adjusters[-1].solve()
-        assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
-        assert summary.ceres_summary.schur_structure_used == "2,3,6"
-
-    def test_options_pass_through_and_unknown_ones_are_named(self) -> None:
-        survey = make_survey(pixel_stddev=0.5)
-        anchors = survey.anchors(0.0)
-        options = RefineOptions(bundle_adjustment={"refine_focal_length": True})
-        refined, _ = survey.refine(anchors, options=options)
-        assert refined.camera(1).params[0] != survey.sfm.camera(1).params[0]
-        with pytest.raises(InputError, match=r"refine_focal_lenght.*refine\.bundle_adjustment.*refine_focal_length"):
-            survey.refine(anchors, options=RefineOptions(bundle_adjustment={"refine_focal_lenght": True}))
-
     def test_a_model_whose_points_nobody_sees_is_refused(self) -> None:
         survey = make_survey()
         for point_id in list(survey.sfm.points3D):
             survey.sfm.delete_point3D(point_id)
         with pytest.raises(SolverError, match="no photo of the model sees any of its points"):
             survey.refine(survey.anchors(0.0))
-
-    def test_too_few_iterations_are_told(self) -> None:
-        survey = make_survey(pixel_stddev=0.5)
-        rng = np.random.default_rng(0)
-        for point in survey.sfm.points3D.values():
-            point.xyz += 0.02 * rng.standard_normal(3)
-        _, summary = survey.refine(survey.anchors(0.0), 1.05, options=RefineOptions(max_num_iterations=1))
-        assert not summary.converged
-        assert ", not converged," in repr(summary)
-        assert summary.message

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,35 +80,6 @@ def test_local_maxima_are_those_found_by_counting_at_every_place() -> None:
         assert list(zip(middles, counts, strict=True)) == expected
 
 
-def test_intervals_hold_exactly_the_scales_that_agree() -> None:
-    rng = np.random.default_rng(0)
-    scales = np.linspace(0.0, 5.0, 4001)
-    num_double = 0
-    for _ in range(200):
-        center, offset = rng.normal(size=(1, 3)), 3 * rng.normal(size=(1, 3))
-        range_m, tolerance = rng.uniform(0.1, 6.0, 1), rng.uniform(0.05, 1.0, 1)
-        starts, ends = agreeing_intervals(center, offset, range_m, tolerance)
-        inside = np.any((scales[:, None] >= starts) & (scales[:, None] <= ends), axis=1)
-        distance = np.linalg.norm(scales[:, None] * center + offset, axis=1)
-        np.testing.assert_array_equal(inside, np.abs(distance - range_m) <= tolerance)
-        num_double += len(starts) == 2
-    assert num_double > 5
-
-
-def test_a_tolerance_larger_than_the_range_leaves_one_interval_about_the_anchor() -> None:
-    starts, ends = agreeing_intervals(
-        np.array([[1.0, 0.0, 0.0]]), np.array([[-2.0, 0.0, 0.0]]), np.array([0.5]), np.array([1.0])
-    )
-    assert (starts.tolist(), ends.tolist()) == ([0.5], [3.5])
-
-
-def test_scales_below_zero_are_none() -> None:
-    starts, _ = agreeing_intervals(
-        np.array([[1.0, 0.0, 0.0]]), np.array([[3.0, 0.0, 0.0]]), np.array([1.0]), np.array([0.2])
-    )
-    assert len(starts) == 0
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_sixty_percent_of_wild_ranges_do_not_move_it(make_survey: MakeSurvey, seed: int) -> None:
     survey = make_survey(scale=3.0, radio=Radio(range_stddev_m=STDDEV_M), seed=seed)
@@ -118,24 +88,6 @@ def test_sixty_percent_of_wild_ranges_do_not_move_it(make_survey: MakeSurvey, se
     wild = rng.random(len(ranges)) < 0.6
     best = consensus_scales(known_anchors(survey, np.where(wild, rng.uniform(0.5, 20.0, len(ranges)), ranges)))[0]
     assert best == pytest.approx(survey.site_from_sfm.scale, rel=0.03)
-
-
-def test_a_lower_hill_of_agreement_is_a_candidate_too(make_survey: MakeSurvey) -> None:
-    """Sixty ranges fit one scale, and fifty fit a second one."""
-    survey = make_survey(radio=Radio(range_stddev_m=0.02), anchors_m={"A": (12.0, 1.0, 2.0)}, num_keyframes=110)
-    problem = known_anchors(survey)
-    distance = np.linalg.norm(5.0 * problem.centers + problem.tag_from_center - problem.anchor_mean_m[0], axis=1)
-    scales = consensus_scales(replace(problem, range_m=np.where(np.arange(110) % 11 < 6, problem.range_m, distance)))
-    assert scales[0] == pytest.approx(survey.site_from_sfm.scale, rel=0.03)
-    assert min(abs(scale / 5.0 - 1) for scale in scales[1:]) < 0.03
-
-
-def test_candidates_are_distinct_and_positive(make_survey: MakeSurvey) -> None:
-    radio = Radio(range_stddev_m=STDDEV_M, obstructed_share=0.6, obstructed_mean_m=4.0)
-    scales = consensus_scales(known_anchors(make_survey(radio=radio)))
-    assert min(scales) > 0
-    ratios = np.exp(np.abs(np.subtract.outer(np.log(scales), np.log(scales))))
-    assert np.all(ratios[~np.eye(len(scales), dtype=bool)] > 1.01)
 
 
 def test_a_camera_that_stands_still_is_refused(make_survey: MakeSurvey) -> None:

@@ -12,8 +12,8 @@ import pytest
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 from tests.known import known
-from tests.scale.test_position_equations import known_positions
 from tests.simulated.path import orbit_path
+from tests.simulated.positions_at_origin import known_positions
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.distances.locate_lengths import LocatedDistances

@@ -1,4 +1,4 @@
-"""Least squares with correlated errors, and how well a mistake is seen in what they leave."""
+"""Least squares with correlated errors and priors is that of the textbook."""
 
 from __future__ import annotations
 

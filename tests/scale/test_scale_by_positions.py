@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.scale.test_position_equations import known_positions
+from tests.simulated.positions_at_origin import known_positions
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity

@@ -1,4 +1,4 @@
-"""The range problem of a survey: which ranges and anchors take part, in which frame, and with what is known of them."""
+"""The range problem of a survey: which anchors take part."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
-from rangesfm.scale import scale_problem as module
 from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
 
 Array = npt.NDArray[np.float64]
@@ -71,28 +70,9 @@ def posed(
     return scale_problem(observations, trajectory, anchors, frame, MODEL, **options)
 
 
-def usable(
-    places_m: Sequence[Sequence[float] | None], frame: str = "site", *, with_gravity: bool = False
-) -> tuple[list[bool], list[str]]:
-    anchors = [Anchor(str(k), None if at is None else np.array(at)) for k, at in enumerate(places_m)]
-    given = np.array([at is not None for at in places_m])
-    known_, notes = module._usable_positions(anchors, given, frame, with_gravity)
-    return known_.tolist(), notes
-
-
 @pytest.mark.parametrize(("num", "is_heard"), [(3, False), (4, True)])
 def test_an_unknown_anchor_needs_four_ranges(num: int, is_heard: bool) -> None:
     problem = posed(without(heard("ABC", path()), "B", num), [anchor("A"), Anchor("B"), anchor("C")], "first_camera")
     assert problem.left_out == (() if is_heard else ("B",))
     assert problem.ranges.anchor_stddev_m[1] == (np.inf if is_heard else 0.0)
     assert len(problem.ranges.range_m) == 12 + (num if is_heard else 0)
-
-
-@pytest.mark.parametrize("far_m", [100.0, 600.0, 60000.0])
-def test_an_anchor_that_is_far_off_makes_no_line_of_the_others(far_m: float) -> None:
-    places_m = [(far_m, 0, 1), (6, -5, 3), (6, 5, 1), (-6, 5, 4)]
-    assert usable(places_m) == ([True] * 4, [])
-    on_line = [(far_m, 0, 0), (0, 0, 0), (4, 0, 0), (8, 0, 0)]
-    known_, (note,) = usable(on_line)
-    assert known_ == [False] * 4
-    assert note.startswith("surveyed anchors on one line")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.scale import scale_verdict
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_estimate import ScaleUncertainty
@@ -181,44 +179,6 @@ def test_short_lengths_are_said_to_be_short() -> None:
         ("the measured lengths are too short for their standard deviations",),
     )
     assert doubted.advice == ("measure more and longer lengths",)
-
-
-ROOM = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3)) * [4.0, 3.0, 2.0]
-
-
-def survey_reasons(
-    centers: np.ndarray,
-    half_width: float,
-    stddevs_m: tuple[float, ...] = (np.inf, np.inf),
-    *,
-    frame_is_free: bool = False,
-    heard: int = 2,
-    left_out: tuple[str, ...] = (),
-    notes: tuple[str, ...] = (),
-    by_map: float = 0.0,
-) -> list[str]:
-    """The faults of a survey whose ranges are to the first ``heard`` of its anchors.
-
-    Args:
-        by_map: standard deviation of the scale that is due to the shape of the map.
-    """
-    ranges = SimpleNamespace(
-        centers=centers,
-        anchor_index=np.arange(len(centers)) % heard,
-        anchor_stddev_m=np.array(stddevs_m),
-        frame_is_free=frame_is_free,
-    )
-    posed: Any = SimpleNamespace(notes=notes, left_out=left_out)
-    solution: Any = SimpleNamespace(problem=ranges)
-    others = float(np.sqrt((half_width / 1.96) ** 2 - by_map**2))
-    uncertainty = ScaleUncertainty(0.0, {"white": others, "bending": 0.6 * by_map, "scale_drift": 0.8 * by_map})
-    return [doubt.reason for doubt in scale_verdict._doubts_of_survey(posed, solution, uncertainty)]
-
-
-def test_a_map_whose_shape_its_photos_leave_open_is_said_to_be_one() -> None:
-    shape = "ranges and photos leave the shape of the map open"
-    assert survey_reasons(ROOM, 2.5, by_map=1.01) == [shape]
-    assert survey_reasons(ROOM, 2.5, by_map=0.99) == ["the ranges do not show that the camera moved"]
 
 
 def test_a_scale_of_which_nothing_is_known_is_not_given_a_size() -> None:

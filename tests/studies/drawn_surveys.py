@@ -16,10 +16,10 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 from tests.simulated.path import look_at, loop_path, sequence_path
-from tests.studies.drifting_maps import drawn_errors, of_poses, truth_of
+from tests.studies.drifting_maps import drawn_errors, of_poses
 from tests.studies.known_positions import POINT_STDDEV_M, Receiver
 from tests.studies.measured_distances import marks_in
-from tests.studies.simulated_survey import TAG_IN_CAM_M, Survey, mapped, unit_pixel_errors
+from tests.studies.simulated_survey import TAG_IN_CAM_M, Survey, mapped, truth_of, unit_pixel_errors
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.demo.simulated_radio import CameraPath
@@ -118,7 +118,9 @@ class _Drawing:
         kinds = [kind for kind in ANCHORS if not (has & {"positions", "points"} and kind.endswith("first_camera"))]
         anchors_m, kind = self.anchors(size_m, kinds) if "ranges" in has else ({}, "")
         depth_range_m = (0.5 * size_m, 4 * size_m)
-        truth = truth_of(path, times, anchors_m, "site", 40 if has_points else 20, depth_range_m)
+        truth = truth_of(
+            path, times, anchors_m, "site", num_observations=40 if has_points else 20, depth_range_m=depth_range_m
+        )
         sfm, path_in_sfm = self.map(truth, has_points)
         names, frame_m = path_in_sfm.image_names, truth.model.centers_m
         self.mistake = self.choose(MISTAKES, "mistake") if "ranges" in has and self.rng.random() < 0.2 else "none"

@@ -39,7 +39,7 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import lap_path
 from tests.simulated.surveys import errors_of_radio
 from tests.studies.erring_surveys import METRES_PER_UNIT, OBSTRUCTED_MEAN_M, OBSTRUCTED_SHARE, SITES
-from tests.studies.simulated_survey import MIN_TRI_ANGLE_DEG, TAG_IN_CAM_M, mapped, rmse_bound_m, unit_pixel_errors
+from tests.studies.simulated_survey import TAG_IN_CAM_M, mapped, rmse_bound_m, truth_of, unit_pixel_errors
 from tests.studies.simulated_survey import Survey as Truth
 
 from rangesfm.colmap.transform import rescale
@@ -95,7 +95,7 @@ def lap_of_drift(
     num_observations = 150 if level_m < 3 else 60 if level_m < 10 else 40
     anchors_m = ROUND_THE_FIELD_M if frame == "site" else MAST_M
     path, times = lap_path(300.0, share=0.98), np.linspace(0.0, 300.0, num_keyframes)
-    survey = truth_of(path, times, anchors_m, frame, num_observations, (6.0, 40.0))
+    survey = truth_of(path, times, anchors_m, frame, num_observations=num_observations, depth_range_m=(6.0, 40.0))
     pixels = level_m / rmse_bound_m(survey, 1.0, with_ranges=False)
     return made(survey, path, np.repeat(times, len(anchors_m)), pixels, seed, 0.1, with_radio=with_radio)
 
@@ -104,7 +104,7 @@ def hall(seed: int) -> Made:
     site = SITES[0]
     path = site.path(seed)
     times = np.arange(path.start_s, path.end_s, 0.5)
-    survey = truth_of(path, times, site.anchors_m, "site", 120, (1.5, 9.0))
+    survey = truth_of(path, times, site.anchors_m, "site", num_observations=120, depth_range_m=(1.5, 9.0))
     num = int((path.end_s - path.start_s) * site.rate_hz) * len(site.anchors_m)
     at_s = path.start_s + (np.arange(num) + 0.5) / (site.rate_hz * len(site.anchors_m))
     return made(survey, path, at_s[at_s < times[-1]], HALL_PIXELS, seed, site.stddev_m, with_radio=True)
@@ -141,33 +141,6 @@ def desk(folder: Path, seed: int) -> Made:
     range_m = np.linalg.norm(tags_m - np.array(list(anchors_m.values()))[ids], axis=1) + 0.08 * rng.normal(size=len(at))
     log = RangeLog.from_arrays(np.array(list(anchors_m))[ids], range_m, timestamp_s=times[at])
     return Made(pycolmap.Reconstruction(), path, anchors_m, "site", log, TAG_IN_CAM_M, centers_m, refine=False)
-
-
-def truth_of(
-    path: CameraPath,
-    times: Array,
-    anchors_m: dict[str, tuple[float, float, float]],
-    frame: str,
-    num_observations: int,
-    depth_range_m: tuple[float, float],
-) -> Truth:
-    """A model without noise, in the world of the result."""
-    centers, world_from_cam = path.centers(times), path.world_from_cam(times)
-    rotation, origin = (np.eye(3), np.zeros(3)) if frame == "site" else (world_from_cam[0], centers[0])
-    model = synthetic_model(
-        times,
-        (centers - origin) @ rotation,
-        rotation.T @ world_from_cam,
-        num_observations=num_observations,
-        max_track_length=8,
-        depth_range_m=depth_range_m,
-        metric_from_sfm=IDENTITY,
-    )
-    points = model.reconstruction
-    pycolmap.ObservationManager(points).filter_points3D_with_small_triangulation_angle(
-        MIN_TRI_ANGLE_DEG, set(points.point3D_ids())
-    )
-    return Truth(model, {name: (np.array(at) - origin) @ rotation for name, at in anchors_m.items()}, frame, 0.1)
 
 
 def made(

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from tests.studies.drifting_maps import HALL_PIXELS, made, truth_of
+from tests.studies.drifting_maps import HALL_PIXELS, made
 from tests.studies.erring_surveys import Given, Run, Site, distances, radio_errors
+from tests.studies.simulated_survey import truth_of
 
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.similarity import align_points
@@ -54,7 +55,7 @@ def surveyed_with_photos(site: Site, seed: int) -> Given:
     """Simulate a clean survey in the site's frame, whose map comes from noisy features."""
     path = site.path(seed)
     times = np.arange(path.start_s, path.end_s, INTERVAL_S)
-    truth = truth_of(path, times, site.anchors_m, "site", NUM_FEATURES, DEPTH_RANGE_M)
+    truth = truth_of(path, times, site.anchors_m, "site", num_observations=NUM_FEATURES, depth_range_m=DEPTH_RANGE_M)
     mapped = made(truth, path, times, HALL_PIXELS, seed, site.stddev_m, with_radio=False)
     num = int((path.end_s - path.start_s) * site.rate_hz) * len(site.anchors_m)
     at_s = path.start_s + (np.arange(num) + 0.5) / (site.rate_hz * len(site.anchors_m))

@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import lap_path, loop_path, orbit_path, sequence_path
-from tests.studies.drifting_maps import MAST_M, Made, made, run, truth_of
+from tests.studies.drifting_maps import MAST_M, Made, made, run
 from tests.studies.erring_surveys import SITES
-from tests.studies.simulated_survey import SITE_ANCHORS_M
+from tests.studies.simulated_survey import SITE_ANCHORS_M, truth_of
 from tests.studies.simulated_survey import Survey as Truth
 
 from rangesfm.demo.simulated_radio import CameraPath
@@ -114,7 +114,14 @@ def simulated(kind: Kind, seed: int) -> tuple[Truth, Made]:
     """Simulate a survey, and map it."""
     path = kind.path(seed)
     times = np.arange(path.start_s, path.end_s - 1e-6, kind.interval_s)
-    truth = truth_of(path, times, kind.anchors_m, kind.frame, kind.num_observations, kind.depth_range_m)
+    truth = truth_of(
+        path,
+        times,
+        kind.anchors_m,
+        kind.frame,
+        num_observations=kind.num_observations,
+        depth_range_m=kind.depth_range_m,
+    )
     step_s = 1 / (kind.rate_hz * len(kind.anchors_m))
     at_s = np.arange(times[0] + step_s / 2, times[-1], step_s)
     return truth, made(truth, path, at_s, kind.pixel_stddev, seed, 0.1, with_radio=True)

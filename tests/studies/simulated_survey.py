@@ -18,7 +18,7 @@ from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.colmap.transform import rescale
 from rangesfm.costs import add_residual_block, joint_prior_cost, range_cost
 from rangesfm.demo.simulated_radio import CameraPath, Radio
-from rangesfm.geometry.similarity import IDENTITY, rmse
+from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -86,14 +86,13 @@ def lap_survey(
     """
     path = lap_path(300.0, share=0.98 * num_keyframes / 600)
     times = np.linspace(0.0, 300.0, num_keyframes)
-    return _survey(
+    return truth_of(
         path,
         times,
         {"A1": anchor_m},
         anchor_frame,
         range_stddev_m,
         num_observations=num_observations,
-        max_track_length=8,
         depth_range_m=(6.0, 40.0),
     )
 
@@ -105,22 +104,23 @@ def yard_survey(
     path = loop_path(40.0, height_amplitude_m=0.8, unsteadiness_m=0.1, seed=3)
     anchors = SITE_ANCHORS_M if anchor_frame == "site" else {"A1": SITE_ANCHORS_M["A1"]}
     times = np.linspace(0.0, 40.0, 60)
-    return _survey(
+    return truth_of(
         path, times, anchors, anchor_frame, range_stddev_m, num_observations=80, max_track_length=max_track_length
     )
 
 
-def _survey(
+def truth_of(
     path: CameraPath,
     times: Array,
     anchors_m: dict[str, tuple[float, float, float]],
     anchor_frame: str,
-    range_stddev_m: float,
+    range_stddev_m: float = 0.1,
     *,
     num_observations: int,
-    max_track_length: int | None = None,
+    max_track_length: int | None = 8,
     depth_range_m: tuple[float, float] = (2.0, 20.0),
 ) -> Survey:
+    """Return a survey without noise, in the world of the result."""
     centers, world_from_cam = path.centers(times), path.world_from_cam(times)
     rotation, origin = (np.eye(3), np.zeros(3)) if anchor_frame == "site" else (world_from_cam[0], centers[0])
     model = synthetic_model(
@@ -259,11 +259,6 @@ def run_stages(
     return Result(paths[0], paths[1], summary)
 
 
-def path_error_m(survey: Survey, path: Trajectory) -> float:
-    """Return the root mean square distance of the keyframes from the truth, without alignment."""
-    return rmse(path.centers - survey.model.centers_m)
-
-
 def rmse_bound_m(survey: Survey, pixel_stddev: float, *, with_ranges: bool = True) -> float:
     """Return the Cramer-Rao bound on the root mean square error of the keyframes' centres.
 
@@ -286,23 +281,6 @@ def covariance_at_truth(
         _add_ranges(adjuster, truth, survey, true_ranges_m(survey), anchors, biases, pixel_stddev)
     equations = NormalEquations.of(adjuster.problem, truth, num_reprojections, anchors, biases)
     return joint_covariance(equations, anchors=anchors, others=biases, residual_stddev=pixel_stddev)
-
-
-def likeliest_path(survey: Survey, pixel_errors: Array, log: RangeLog, *, pixel_stddev: float) -> Trajectory:
-    """Return the least-squares solution from the truth, with all noise known and Gaussian.
-
-    Where noise is small enough for the problem to be linear, its mean squared error equals the bound. Its error for the
-    same seeds has the same chance in it as that of the refinement, which the bound does not have.
-
-    Args:
-        log: of ``range_log``, in the order of time.
-    """
-    model = _with_noisy_features(survey, pixel_errors)
-    adjuster = photos_adjuster(survey, model)
-    ranges_m = {name: log.range_m[log.anchor_index == k] for k, name in enumerate(log.anchor_ids)}
-    _add_ranges(adjuster, model, survey, ranges_m, _anchor_blocks(survey), _bias_blocks(survey), pixel_stddev)
-    adjuster.solve()
-    return trajectory_from_reconstruction(model, survey.model.timestamps_s)
 
 
 def true_ranges_m(survey: Survey) -> dict[str, Array]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -105,27 +104,6 @@ def test_what_was_matched_before_an_interruption_is_kept_and_not_matched_again(
     match(photos, database, listener, 2)
     assert sum(asked) == NUM_PAIRS - num_kept
     assert listener.updates["again"][0] == (num_kept, NUM_PAIRS)
-
-
-@pytest.mark.parametrize("num_processes", [1, 3])
-def test_shares_are_of_bounded_size_hold_each_pair_once_and_are_of_few_photos(num_processes: int) -> None:
-    pairs = [(first, second) for second in range(1, 401) for first in range(1, second)]
-    shares = list(matching._shared_out(pairs, num_processes))
-    assert Counter(pair for share in shares for pair in share) == Counter(pairs)
-    assert max(map(len, shares)) <= matching._MAX_NUM_PAIRS
-    assert max(num_photos(share) for share in shares) < 300
-
-
-def test_processes_that_match_neighbours_share_few_photos() -> None:
-    """Each process indexes the features of all its photos again, so shared photos cost time."""
-    pairs = [(first, first + step) for first in range(1, 101) for step in range(1, 11)]
-    shares = list(matching._shared_out(pairs, 2))
-    assert len(shares) == 2
-    assert sum(num_photos(share) for share in shares) < 1.2 * num_photos(pairs)
-
-
-def num_photos(pairs: Sequence[tuple[int, int]]) -> int:
-    return len({photo for pair in pairs for photo in pair})
 
 
 def test_a_process_that_fails_is_told_of_and_ends_the_others(

@@ -17,7 +17,7 @@ from rangesfm.options import MapperOptions
 from rangesfm.vision import snapshots as snapshots_module
 from rangesfm.vision.incremental_mapping import Size, UnfinishedMapping
 from rangesfm.vision.reconstruct import reconstruct
-from rangesfm.vision.snapshots import Snapshots, newest_snapshot
+from rangesfm.vision.snapshots import Snapshots
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
@@ -152,24 +152,6 @@ def test_a_mapping_that_is_killed_loses_seconds(
         names += [name for name in kept if name not in names]
     assert 6 <= len(names) <= 20
     assert names == sorted(names)
-
-
-def test_what_earlier_models_have_is_kept_with_the_model_at_hand(undisturbed: Mapping, tmp_path: Path) -> None:
-    model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
-    few = pycolmap.Reconstruction(model)
-    for frame_id in sorted(few.reg_frame_ids())[4:]:
-        few.deregister_frame(frame_id)
-    (tmp_path / "scratch").mkdir()
-    kept = []
-    for growing in (model, few):
-        snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch", min_model_size=10)
-        snapshots._next_s = 0.0
-        snapshots.add_photo(UnfinishedMapping((model,), growing, Size(3, 5)))
-        newest = newest_snapshot(tmp_path / "kept")
-        assert newest is not None
-        kept.append(([found.num_reg_images() for found in newest.models], newest.size_at_adjustment))
-    # The second model is still too small to be kept by COLMAP, so that its snapshot does not replace the other.
-    assert kept == 2 * [([NUM_PHOTOS, NUM_PHOTOS], Size(3, 5))]
 
 
 def test_snapshots_of_the_user_are_left_alone(mapping: Mapping, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A point is fitted to ranges at known positions: the linear start, the cost, the noise, and the errors of the fit."""
+"""The residuals of a point fitted to ranges at known positions, and their derivatives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy.typing as npt
 
 from rangesfm.ranging.anchors.point_fit import (
     PointProblem,
-    _distinct,
 )
 
 Array = npt.NDArray[np.float64]
@@ -50,10 +49,3 @@ class TestProblem:
         np.testing.assert_allclose(problem.slopes(x), np.transpose(differences), atol=1e-7)
         halved = replace(problem, stddev_m=np.linspace(0.1, 0.6, 6))
         np.testing.assert_allclose(halved.jacobian(x), problem.slopes(x) / np.linspace(0.1, 0.6, 6)[:, None])
-
-
-class TestStart:
-    def test_of_points_within_the_noise_the_first_is_kept(self) -> None:
-        points = [np.zeros(4), np.array([0.0, 0.009, 0.0, 0.0]), np.array([0.0, 0.011, 0.0, 0.0]), np.zeros(4)]
-        kept = _distinct(points, 0.01)
-        assert [id(x) for x in kept] == [id(points[0]), id(points[2])]

@@ -13,13 +13,9 @@ from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.errors.bending import (
     WalkBending,
-    averaged,
-    bending_in_bins,
-    bent_path,
     by_poses,
     without_similarity,
 )
-from rangesfm.ranging.errors.range_bins import RangeBins, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 
@@ -63,15 +59,6 @@ def from_anchors_m(path: Trajectory) -> Array:
     centers, _, arms = placed(path)
     tags_m = METRIC_FROM_MODEL.apply(centers) + arms @ METRIC_FROM_MODEL.rotation.T
     return np.asarray(tags_m - ANCHORS_M[ANCHOR_INDEX])
-
-
-def in_bins(path: Trajectory) -> RangeBins:
-    _, rotations, _ = placed(path)
-    time_s = ON_PATH.before + ON_PATH.fraction
-    index = np.asarray(ANCHOR_INDEX, dtype=np.int64)
-    weight = RNG.uniform(0.5, 1.0, NUM_RANGES)
-    from_m = from_anchors_m(path)
-    return range_bins(index, 0 * index, time_s, from_m, np.swapaxes(rotations, 1, 2), weight, np.ones(3), 30)
 
 
 def slopes(path: Trajectory) -> Array:
@@ -121,36 +108,6 @@ def test_a_map_that_grows_turns_and_moves_as_a_whole_is_not_bent(
 
 
 @pytest.mark.parametrize("frame_is_free", [True, False])
-def test_a_loose_pose_does_not_move_what_is_seen_from_the_others(path: Trajectory, frame_is_free: bool) -> None:
-    of_others = slopes(path).reshape(-1, NUM_POSES, 6)
-    of_others[:, 4] = 0.0
-    is_firm = np.arange(NUM_POSES) != 4
-    given = of_others.reshape(len(of_others), -1)
-    for firm, is_moved in ((is_firm, False), (None, True)):
-        found = without_similarity(given, path, frame_is_free=frame_is_free, is_firm=firm)
-        assert np.any(found.reshape(of_others.shape)[:, 4]) == is_moved
-
-
-def test_bins_grow_by_each_step_of_a_walk_as_its_factors_say(path: Trajectory) -> None:
-    """Motions of the map as a whole are left out, because they are estimated otherwise."""
-    of_ranges, walk = in_bins(path), WalkBending(path)
-    by_range = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, *placed(path)[1:], ON_PATH)
-    by_bin = averaged(of_ranges, by_range, NUM_POSES)
-    factors = walk.factors(by_bin, frame_is_free=True)
-    starts, unit = walk._steps_of_path
-    functions = without_similarity(by_bin, path, frame_is_free=True)
-    for step, number in ((3, 0), (8, 2), (15, 5)):
-        steps = np.zeros((len(starts), 7))
-        steps[step, number] = STEP * unit[step, number]
-        moved = bent_path(path, starts, steps)
-        moves = np.zeros((NUM_POSES, 6))
-        turns = np.swapaxes(path.world_from_cam, 1, 2) @ moved.world_from_cam
-        moves[:, :3] = Rotation.from_matrix(turns).as_rotvec()
-        moves[:, 3:] = moved.centers - path.centers
-        np.testing.assert_allclose(functions @ moves.ravel() / STEP, factors[:, step, number], atol=1e-5)
-
-
-@pytest.mark.parametrize("frame_is_free", [True, False])
 def test_a_path_that_is_bent_back_is_as_large_as_it_came(path: Trajectory, frame_is_free: bool) -> None:
     steps = 0.3 * np.random.default_rng(5).standard_normal((NUM_POSES - 1, 7))
     bent = WalkBending(path, steps, frame_is_free).path
@@ -159,12 +116,3 @@ def test_a_path_that_is_bent_back_is_as_large_as_it_came(path: Trajectory, frame
     if not frame_is_free:
         np.testing.assert_allclose(bent.centers[0], path.centers[0], atol=1e-12)
         np.testing.assert_allclose(bent.world_from_cam[0], path.world_from_cam[0], atol=1e-12)
-
-
-def test_a_path_that_stands_still_is_not_bent(path: Trajectory) -> None:
-    still = replace(path, centers=np.zeros_like(path.centers))
-    of_ranges = in_bins(path)
-    by_range = by_poses(RangeGradient.of(from_anchors_m(path)), METRIC_FROM_MODEL, *placed(path)[1:], ON_PATH)
-    found = bending_in_bins(WalkBending(still), of_ranges, by_range, frame_is_free=False)
-    assert {component.name for component in found.components} <= {"heading_drift"}
-    assert not found.shift_m.any()

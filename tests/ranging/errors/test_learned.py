@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -15,9 +13,8 @@ from rangesfm.ranging.errors.learned import (
     ExpectedErrors,
     LearnedErrors,
     learn_errors,
-    usual_stddevs,
 )
-from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, range_bins
+from rangesfm.ranging.errors.range_bins import RangeBins, range_bins
 
 Array = npt.NDArray[np.float64]
 
@@ -137,46 +134,6 @@ def test_a_radio_with_far_more_noise_may_be_off_by_more_in_all_else(walked: Rang
     usual, bad = (learn_errors(walked, k * off_m, np.zeros((len(off_m), 1)), NO_MAP, k * 0.05) for k in (1, 16))
     ratio = [np.sqrt(each.covariances_m2[each.names.index("slope")].max()) for each in (usual, bad)]
     assert ratio[1] > 5 * ratio[0]
-
-
-def test_bins_are_few_and_hold_all_ranges_of_an_anchor_and_a_moment() -> None:
-    num = 50_000
-    time_s = np.linspace(0, 1000, num)
-    anchor_index = np.arange(num) % 5
-    from_anchor_m = np.column_stack([5 + 0.001 * time_s, np.zeros(num), np.ones(num)])
-    turns = np.broadcast_to(np.eye(3), (num, 3, 3))
-    found = range_bins(anchor_index, np.zeros(num, int), time_s, from_anchor_m, turns, np.ones(num), np.ones(5))
-    assert 0.5 * MAX_NUM_BINS < len(found) <= MAX_NUM_BINS
-    np.testing.assert_allclose(found.mean(time_s), found.time_s)
-    np.testing.assert_array_equal(found.anchor_index[found.of_range], anchor_index)
-    assert found.worth.sum() == pytest.approx(num)
-    assert np.ptp(time_s[found.of_range == 7]) < 15
-
-
-def test_ranges_of_some_rows_keep_their_bins(walked: RangeBins) -> None:
-    learned = learn(walked, 0.05 * np.random.default_rng(5).standard_normal(len(walked)))
-    rows = np.array([3, 8, 20])
-    spread = replace(learned, of_range=learned.of_range[rows]).spread(rows, 30)
-    np.testing.assert_array_equal(spread.of_range[rows], learned.of_range[rows])
-    assert np.count_nonzero(spread.of_range < 0) == 27
-
-
-def test_the_usual_size_of_a_component_is_the_root_of_its_mean_square_over_radios() -> None:
-    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
-    usual = usual_stddevs(is_calibrated=False)
-    for component in COMPONENTS:
-        of_radios = component.median * np.exp(component.spread * nodes)
-        assert usual[component.name] == pytest.approx(np.sqrt(weights @ of_radios**2 / weights.sum()), rel=1e-6)
-
-
-@pytest.mark.parametrize("most_unusual", [0.5, 3.0])
-def test_no_component_is_more_unusual_than_it_may_be(most_unusual: float) -> None:
-    """Errors a hundred times as large as usual make the component as large as is allowed."""
-    off_m = np.random.default_rng(0).standard_normal(30)
-    one_cause = ComponentLikelihood(
-        np.eye(30)[None], np.log([0.01]), np.array([0.4]), 1e-6 * np.eye(30), off_m, np.ones((30, 1)), np.zeros((0, 1))
-    )
-    assert one_cause.most_likely(most_unusual)[0] == pytest.approx(np.log(0.01) + 0.4 * most_unusual)
 
 
 def two_causes(num: int = 12) -> ComponentLikelihood:

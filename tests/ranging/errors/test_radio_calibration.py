@@ -10,7 +10,6 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.radio_calibration import (
     RadioCalibration,
-    _knots,
     calibrate_ranges,
 )
 from rangesfm.ranging.range_log import RangeLog
@@ -116,15 +115,6 @@ def test_a_tag_that_stands_on_an_anchor_but_for_rounding_is_no_end_of_the_curve(
     found = calibrate_ranges(log, tags, ANCHORS)
     assert found.num_ranges == len(log) - len(on_it)
     assert found.curve.distance_m[0] == pytest.approx(found.distance_m.min())
-
-
-def test_knots_are_a_sixth_of_an_e_fold_apart_at_most_from_the_shortest_range_to_the_longest() -> None:
-    knots = _knots(np.array([3.0, 20.0, 0.5, 7.0]))
-    np.testing.assert_allclose(knots[[0, -1]], [0.5, 20.0])
-    steps = np.diff(np.log(knots))
-    np.testing.assert_allclose(steps, steps[0])
-    assert len(knots) == int(np.ceil(6 * np.log(40.0))) + 1
-    assert steps[0] < 1 / 6
 
 
 def test_a_hundred_ranges_are_needed() -> None:

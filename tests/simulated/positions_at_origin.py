@@ -1,4 +1,4 @@
-"""Groups of known positions, the sizes of their errors, and the mistakes in them."""
+"""Known positions without geometry, for tests of what is made of their kinds, times and errors."""
 
 from __future__ import annotations
 
