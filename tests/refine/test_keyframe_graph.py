@@ -86,7 +86,7 @@ def anchor(k: int, is_free: bool) -> AnchorEstimate:
 def test_gradient_and_hessian_are_those_of_the_cost(chain: SyntheticModel) -> None:
     truth, _ = poses_and_rays(chain)
     graph = make_graph(chain, truth, stddev_m=0.1, anchors_are_free=True, held_frame=None)
-    graph = replace(graph, gravity=Gravity(truth.world_from_rig[0].T @ UP_IN_SITE, 0.05))
+    graph = replace(graph, gravity=Gravity(truth.world_from_rig[0].T @ UP_IN_SITE, 5e-4))
     first = replace(graph.anchors[0], prior_position_m=ANCHORS_M[0] + 0.1, prior_position_stddev_m=0.02)
     graph = replace(graph, anchors=(replace(first, prior_bias_m=0.03), *graph.anchors[1:]))
     # Each kind of prior is tight enough to have a share in the slope.
