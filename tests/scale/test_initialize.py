@@ -138,13 +138,18 @@ class TestWithOutliers:
         assert abs(survey.relative_error(estimate)) < 3 * stddev
         assert stddev < 0.02
 
-    def test_they_are_marked(self, make_survey: MakeSurvey) -> None:
+    def test_they_are_marked_and_have_no_say(self, make_survey: MakeSurvey) -> None:
         radio = Radio(range_stddev_m=0.1, obstructed_share=0.3, obstructed_mean_m=3.0)
         survey = make_survey(radio=radio)
-        status = survey.scale("first_camera", "ABCDE").observations.status
+        estimate = survey.scale("first_camera", "ABCDE")
+        status = estimate.observations.status
         too_long = survey.simulated.log.range_m - survey.simulated.distance_m
         assert np.all(status[too_long > 2.0] == RangeStatus.OUTLIER)
         assert np.mean(status[np.abs(too_long) < 0.1] == RangeStatus.USED) > 0.99
+        # By Geman-McClure's loss, far outliers pull by the inverse cube of their size; by Cauchy's, by the inverse.
+        weights = estimate.errors.robust_weights(too_long)
+        assert weights[np.abs(too_long) < 0.1].min() > 0.7
+        assert weights[too_long > 2.0].max() < 0.005
 
     def test_many_of_them_are_a_reason_to_doubt(self, make_survey: MakeSurvey) -> None:
         radio = Radio(range_stddev_m=0.05, obstructed_share=0.4, obstructed_mean_m=10.0)
