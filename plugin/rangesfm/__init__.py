@@ -53,7 +53,7 @@ _HOME = {
     "rescale": "rangesfm.colmap.transform",
     "run_survey": "rangesfm.workflows.run",
     "select_keyframes": "rangesfm.vision.keyframes",
-    "tag_positions": "rangesfm.ranging.association",
+    "tag_positions": "rangesfm.ranging.known_path",
     "trajectory_from_reconstruction": "rangesfm.geometry.trajectory",
     "trilaterate": "rangesfm.ranging.anchors.trilateration",
     "trilaterate_anchors": "rangesfm.ranging.anchors.trilateration",

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.comparison.comparison_page import write_comparison
 from rangesfm.comparison.many_models import ModelsComparison, compare_many, read_named_models
-from rangesfm.distances.tape import read_tape
+from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import read_reference
 from rangesfm.progress import SilentProgress

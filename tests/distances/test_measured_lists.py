@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from rangesfm.distances.measured_lists import LENGTHS, MARKS
-from rangesfm.distances.tape import read_markers, read_tape
+from rangesfm.distances.tape_file import read_markers, read_tape
 from rangesfm.errors import InputError
 from rangesfm.options import PointOptions
-from rangesfm.positions.control_points import read_control_points
+from rangesfm.positions.control_point_file import read_control_points
 from rangesfm.survey_discovery.found_files import POINTS, look_into
 from rangesfm.workflows.measure import read_point_pairs
 

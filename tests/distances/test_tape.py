@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rangesfm.distances.tape import read_tape
+from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import InputError
 
 

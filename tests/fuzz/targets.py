@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.distances.tape import Tape, read_tape
+from rangesfm.distances.tape import Tape
+from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.apply import apply_to
 from rangesfm.geometry.reference import Reference, read_reference

@@ -14,6 +14,7 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.positions.antenna_track import AntennaTrack
+from rangesfm.positions.clock import find_antenna_offset
 from rangesfm.positions.position_log import PositionLog
 
 Array = npt.NDArray[np.float64]
@@ -71,7 +72,7 @@ def photos(places: Places, times_s: Array = PHOTOS_S) -> Trajectory:
 def test_the_offset_of_a_walk_is_found_by_all_or_some_of_its_time_and_in_spite_of_outliers(
     end_s: float, num_wrong: int
 ) -> None:
-    search = track(walk, np.arange(0.0, end_s, 0.2), num_wrong).with_offset(photos(walk)).search
+    search = find_antenna_offset(track(walk, np.arange(0.0, end_s, 0.2), num_wrong), photos(walk)).search
     assert search is not None
     assert abs(search.value_s + AHEAD_S) < min(3 * search.stddev_s, 0.1)
     assert search.is_certain
@@ -85,7 +86,7 @@ def test_the_offset_on_a_path_that_repeats_itself_is_refused_or_told_with_its_ri
 ) -> None:
     search = None
     with contextlib.suppress(GeometryError):
-        search = track(places, np.arange(start_s, end_s, 0.2)).with_offset(photos(places)).search
+        search = find_antenna_offset(track(places, np.arange(start_s, end_s, 0.2)), photos(places)).search
     if search is None:
         return
     offsets_s = [search.value_s, *(rival.value_s for rival in search.rivals)]
@@ -100,7 +101,7 @@ def laps(times_s: Array) -> Array:
 
 
 def test_an_offset_that_explains_all_positions_is_likelier_than_those_that_explain_half_of_them() -> None:
-    search = track(laps, np.arange(0.0, 40.0, 0.2)).with_offset(photos(laps, PHOTOS_S[:80])).search
+    search = find_antenna_offset(track(laps, np.arange(0.0, 40.0, 0.2)), photos(laps, PHOTOS_S[:80])).search
     assert search is not None
     assert search.value_s == pytest.approx(-AHEAD_S, abs=0.05)
     assert all(search.probability > 10 * rival.probability for rival in search.rivals)
@@ -108,18 +109,18 @@ def test_an_offset_that_explains_all_positions_is_likelier_than_those_that_expla
 
 def test_positions_of_another_walk_are_refused() -> None:
     with pytest.raises(GeometryError, match=r"at no time offset do the positions|does not distinguish"):
-        track(other_walk, np.arange(0.0, 60.0, 0.2)).with_offset(photos(walk))
+        find_antenna_offset(track(other_walk, np.arange(0.0, 60.0, 0.2)), photos(walk))
 
 
 def test_few_positions_or_photos_tell_no_offset() -> None:
     with pytest.raises(GeometryError, match="too few positions along the camera's path"):
-        track(walk, np.array([3.0, 4.0])).with_offset(photos(walk))
+        find_antenna_offset(track(walk, np.array([3.0, 4.0])), photos(walk))
     with pytest.raises(GeometryError, match="3 photos and 300 positions are too few"):
-        track(walk, np.arange(0.0, 60.0, 0.2)).with_offset(photos(walk, PHOTOS_S[:3]))
+        find_antenna_offset(track(walk, np.arange(0.0, 60.0, 0.2)), photos(walk, PHOTOS_S[:3]))
 
 
 @pytest.mark.parametrize(("given_s", "other_s"), [(-AHEAD_S, None), (-AHEAD_S + 18.0, -AHEAD_S)])
 def test_a_given_offset_stays_unless_another_fits_much_better(given_s: float, other_s: float | None) -> None:
-    found = track(walk, np.arange(0.0, 60.0, 0.2), offset_s=given_s).with_offset(photos(walk))
+    found = find_antenna_offset(track(walk, np.arange(0.0, 60.0, 0.2), offset_s=given_s), photos(walk))
     assert found.offset_s == given_s
     assert found.other_offset_s == (other_s if other_s is None else pytest.approx(other_s, abs=0.05))

@@ -9,7 +9,8 @@ import pytest
 
 from rangesfm.errors import InputError
 from rangesfm.options import PointOptions
-from rangesfm.positions.control_points import ControlPoints, read_control_points
+from rangesfm.positions.control_point_file import read_control_points
+from rangesfm.positions.control_points import ControlPoints
 from rangesfm.ranging.readers.lists import UnclearListError
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
 from rangesfm.geometry.reference import Reference
-from rangesfm.ranging.association import tag_positions
+from rangesfm.ranging.known_path import tag_positions
 from rangesfm.ranging.range_log import RangeLog
 
 TIMES_S = np.array([0.0, 0.4, 0.8, 2.0, 2.4])

@@ -18,7 +18,7 @@ from tests.rendering.tagged_room import DICTIONARY, NUM_TAGS, SIDE_M, tagged_roo
 from tests.simulated.model import SyntheticModel
 
 from rangesfm.cli import main
-from rangesfm.distances.tape import read_tape
+from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import InputError
 from rangesfm.progress import SilentProgress
 from rangesfm.result.summary import ResultSummary

@@ -11,8 +11,7 @@ import pytest
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.ranging.clock.search import CostCurve
-from rangesfm.ranging.clock.time_offset import Rival, TimeOffset
+from rangesfm.ranging.clock.offset import CostCurve, Rival, TimeOffset
 from rangesfm.workflows.make_metric_map import scale_by_rivals
 
 VALUE_S, RIVAL_S = 1.0, 4.0

@@ -222,7 +222,7 @@ def _read_anchors(args: argparse.Namespace) -> tuple[Anchor, ...]:
 def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
     """Read the n ranges of one tag, and return them with the position of the tag at each, (n, 3); NaN if unknown."""
     from rangesfm.positions.true_positions import read_true_positions
-    from rangesfm.ranging.association import tag_positions
+    from rangesfm.ranging.known_path import tag_positions
     from rangesfm.survey.inputs import of_one_tag
 
     log, known = of_one_tag(_read_log(args), args.tag_id), read_true_positions(args.positions)

@@ -189,7 +189,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.comparison.many_models import compare_many, read_named_models
-    from rangesfm.distances.tape import read_tape
+    from rangesfm.distances.tape_file import read_tape
     from rangesfm.positions.true_positions import read_true_positions
     from rangesfm.workflows.ranges_for_models import ranges_of_survey
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rangesfm.colmap.colmap_log import colmap_log
+from rangesfm.colmap.glog import logging_into
 from rangesfm.errors import OptionError, nearest_known, printable, shown
 
 _EXPECTED = {
@@ -76,11 +76,11 @@ def _assign_value(options: Any, key: str, value: Any, kind: Any, table: str) -> 
 def _check(options: Any, table: str) -> None:
     """Let COLMAP check its values, and take the reason of a refusal from its log, the only place it is in."""
     with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "check.log"
-        with colmap_log(log):
+        with logging_into(Path(folder)):
             accepted = options.check()
         if not accepted:
-            found = re.search(r"Check failed: (.*)", log.read_text(errors="replace"))
+            log = "".join(part.read_text(errors="replace") for part in Path(folder).iterdir())
+            found = re.search(r"Check failed: (.*)", log)
             raise OptionError(f"[{table}] COLMAP refuses a value" + (f", expected {found[1]}" if found else ""), table)
 
 

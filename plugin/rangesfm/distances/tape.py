@@ -1,4 +1,4 @@
-"""Measured lengths: their file, the marks of their ends in photos, and their comparison with the map."""
+"""Measured lengths, and the marks of their ends in photos."""
 
 from __future__ import annotations
 
@@ -6,21 +6,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from rangesfm.arrays import Array
-from rangesfm.distances.measured_lists import LENGTHS, MARKS, MeasuredList
-from rangesfm.errors import InputError
-from rangesfm.files.contents import AnyPath
 from rangesfm.files.photo_names import photos_meant
-from rangesfm.files.text_tables import repeated
-from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 
 CONTROL, CHECK = "control", "check"
 # Kind of a length that contradicts the map and was rejected.
 LEFT_OUT = "left out"
-# Standard deviation of a length measured with care by a steel tape.
-DEFAULT_STDDEV_M = 0.01
 CLICKED_STDDEV_PX = 1.0
 """Standard deviation of a coordinate of a mark set by hand."""
 FOUND_STDDEV_PX = 0.3
@@ -104,62 +95,6 @@ class Tape:
         """Return the tape with the lengths of these indices marked as left out."""
         distances = (replace(taped, kind=LEFT_OUT) if k in rows else taped for k, taped in enumerate(self.distances))
         return replace(self, distances=tuple(distances))
-
-
-def read_tape(distances_path: AnyPath, markers_path: AnyPath | None = None) -> Tape:
-    """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``, or other tables of these.
-
-    A length without a kind is a control length. Without a standard deviation it gets DEFAULT_STDDEV_M.
-
-    Raises:
-        InputError: a file is not valid; the error gives the line.
-    """
-    listed = LENGTHS.read(Path(distances_path))
-    markers = {} if markers_path is None else read_markers(markers_path)
-    of_markers = None if markers_path is None else Path(markers_path)
-    return Tape(_distances(listed), markers, Path(distances_path), of_markers, listed.notes)
-
-
-def _distances(listed: MeasuredList) -> tuple[TapedDistance, ...]:
-    table = listed.table
-    if not len(table):
-        raise InputError("holds no distance, expected one per line", table.path)
-    starts, ends = listed.text("from"), listed.text("to")
-    kinds = [kind.lower() for kind in listed.text("kind", CONTROL)]
-    for row, (start, end, kind) in enumerate(zip(starts, ends, kinds, strict=True)):
-        if start == end:
-            raise table.error(row, listed.columns["to"], "another end than 'from'")
-        if kind not in (CONTROL, CHECK):
-            raise table.error(row, listed.columns["kind"], f"{CONTROL} or {CHECK}")
-    lengths = listed.metres("distance", LENGTH_M)
-    stddevs = listed.metres("stddev", STDDEV_M, DEFAULT_STDDEV_M)
-    rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
-    return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
-
-
-def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
-    """Read ``marker,image_name,x_px,y_px``, or another table of marks in photos.
-
-    Args:
-        path: the file.
-        stddev_px: standard deviation of each coordinate.
-
-    Raises:
-        InputError: the file is not valid; the error gives the line.
-    """
-    listed = MARKS.read(Path(path))
-    names, image_names = listed.text("marker"), listed.text("image_name")
-    pixels = np.column_stack([listed.table.numbers(listed.columns[axis], bounds=PIXEL) for axis in ("x", "y")])
-    rows_of: dict[str, list[int]] = {}
-    for row, name in enumerate(names):
-        rows_of.setdefault(name, []).append(row)
-    markers = {}
-    for name, rows in rows_of.items():
-        seen_in = tuple(image_names[row] for row in rows)
-        if again := repeated(seen_in):
-            raise listed.table.error(rows[again[0]], listed.columns["image_name"], "each photo once for this marker")
-        markers[name] = Marker(seen_in, pixels[rows], tuple(listed.table.line[rows].tolist()), stddev_px)
-    return markers
 
 
 def markers_of_photos(markers: Mapping[str, Marker], photos: Collection[str]) -> dict[str, Marker]:

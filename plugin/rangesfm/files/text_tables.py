@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from rangesfm.arrays import Categories
 from rangesfm.errors import InputError, printable
 from rangesfm.files.atomic import new_file
 from rangesfm.files.contents import AnyPath, open_regular
@@ -42,35 +43,6 @@ _WINDOWS = "cp1252"
 # Signs of Windows-1252 beside its letters that occur in tables: units, quotes, dashes, and the blank of thousands.
 _WINDOWS_SIGNS = "\xb0\xb2\xb3\xb5\xb1\xa7\xb7\xa0\u20ac\u2018\u2019\u201c\u201d\u201e\u2013\u2014\u2026"
 _UNPACKED = (".gz", ".bz2", ".xz")  # numpy unpacks files with these endings, even if they are not packed
-
-
-@dataclass(frozen=True)
-class Categories:
-    """n texts with few different values.
-
-    Attributes:
-        names: the different texts, in order of first appearance.
-        index: (n,) index of each text in ``names``.
-    """
-
-    names: tuple[str, ...]
-    index: npt.NDArray[np.int64]
-
-    @classmethod
-    def of(cls, texts: Sequence[str]) -> Categories:
-        index_of = {text: index for index, text in enumerate(dict.fromkeys(texts))}
-        return cls(tuple(index_of), np.fromiter(map(index_of.__getitem__, texts), np.int64, len(texts)))
-
-    def subset(self, rows: npt.NDArray[np.bool_]) -> Categories:
-        """Return the texts of the rows that are true in ``rows`` (n,), without the names that they do not use."""
-        if rows.all():
-            return self
-        chosen = self.index[rows]
-        used, first = np.unique(chosen, return_index=True)
-        order = used[np.argsort(first)]
-        rank = np.zeros(len(self.names), dtype=np.int64)
-        rank[order] = np.arange(len(order))
-        return Categories(tuple(self.names[k] for k in order.tolist()), rank[chosen])
 
 
 @dataclass(frozen=True)
@@ -122,11 +94,11 @@ class TextTable:
 
     def categories(self, column: str, *, empty: str | None = None) -> Categories:
         """Return the cells like ``text``, but as categories, which is fast where few texts differ."""
-        raw = Categories.of(self._raw(column))
+        raw = Categories.from_texts(self._raw(column))
         names = [_without_mark(name.strip()) for name in raw.names]
         if "" in names and empty is None:
             raise self.error(int(np.argmax(raw.index == names.index(""))), column, "some text")
-        kinds = Categories.of([name or str(empty) for name in names])
+        kinds = Categories.from_texts([name or str(empty) for name in names])
         return Categories(kinds.names, kinds.index[raw.index])
 
     def numbers(

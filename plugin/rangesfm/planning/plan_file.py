@@ -21,7 +21,8 @@ from rangesfm.planning.placement import places_in_box, places_on_walls, spread_a
 from rangesfm.planning.plan_checks import oddities, require_possible
 from rangesfm.planning.planned import PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
-from rangesfm.positions.control_points import ControlPoint, read_control_points
+from rangesfm.positions.control_point_file import read_control_points
+from rangesfm.positions.control_points import ControlPoint
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in

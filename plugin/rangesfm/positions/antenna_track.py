@@ -8,21 +8,16 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.errors import GeometryError, InputError
+from rangesfm.errors import InputError
 from rangesfm.files.clock_times import time_text
-from rangesfm.files.photo_names import rows_of_photos, told_none
+from rangesfm.files.photo_names import rows_of_photos
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import Trajectory, keyframes_around
 from rangesfm.options import AssociationOptions
-from rangesfm.positions.clock import POSITIONS, TimedPositions, residual_stddev_at
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.positions.position_log import PositionLog
-from rangesfm.progress import SilentProgress
 from rangesfm.ranging.association import is_too_long, places_on_path
-from rangesfm.ranging.clock.time_offset import Rival, TimeOffset, offset_of_motion, path_to_search, require_enough
-
-# A given offset is wrong if the residuals with it are at least so many times those with another one.
-_MUCH_WORSE = 3.0
+from rangesfm.ranging.clock.offset import Rival, TimeOffset
 
 
 @dataclass(frozen=True)
@@ -45,34 +40,6 @@ class AntennaTrack:
     offset_stddev_s: float = 0.0
     other_offset_s: float | None = None
     search: TimeOffset | None = None
-
-    def with_offset(self, path: Trajectory) -> AntennaTrack:
-        """Return the track with its time offset, which is searched for if it is not given.
-
-        Raises:
-            InputError: the positions are by time and the photos have none, or they are of other photos.
-            GeometryError: the motion does not determine the offset.
-        """
-        if self.log.timestamp_s is None:
-            listed = self.log.image_name or ()
-            if np.all(rows_of_photos(listed, path.image_names) < 0):
-                raise InputError(told_none("the file", listed, path.image_names), self.log.path)
-            return self
-        if path.timestamps_s is None:
-            raise InputError("the positions have times but the photos have none: give image times", self.log.path)
-        positions = TimedPositions(self.log.timestamp_s, self.log.position_m)
-        try:
-            require_enough(path, len(self.log), POSITIONS)
-            samples = path_to_search(path, self.antenna_in_cam_m[None], self.association)
-            found = offset_of_motion(positions, samples, POSITIONS, seed=0, progress=SilentProgress())
-        except GeometryError:
-            if self.offset_s is None:
-                raise
-            return self
-        if self.offset_s is None:
-            return replace(self, offset_s=found.value_s, offset_stddev_s=found.stddev_s, search=found)
-        off_m = [residual_stddev_at(positions, samples, each_s) for each_s in (self.offset_s, found.value_s)]
-        return replace(self, other_offset_s=found.value_s) if off_m[0] > _MUCH_WORSE * off_m[1] else self
 
     def of_rival(self, rival: Rival) -> AntennaTrack:
         """Return the track with another likely time offset."""

@@ -5,20 +5,28 @@ The rule by which offsets are found, compared and doubted is that of ranges (``r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.files.photo_names import rows_of_photos, told_none
 from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
 from rangesfm.geometry.similarity import Similarity, align_points, rounding_of, similarity_motions
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.positions.antenna_track import AntennaTrack
+from rangesfm.progress import SilentProgress
 from rangesfm.ranging.clock.fit import OffsetFit, Timing, refine_offset
 from rangesfm.ranging.clock.search import Cells, OffsetCurve, PathSamples, Scanned, centred_columns, scan_parts
 from rangesfm.ranging.clock.squares import residual_stddev
-from rangesfm.ranging.clock.time_offset import ObservedKind
+from rangesfm.ranging.clock.time_offset import ObservedKind, offset_of_motion, path_to_search, require_enough
 from rangesfm.ranging.errors.robust_loss import CAUCHY
+
+# A given offset is wrong if the residuals with it are at least so many times those with another one.
+_MUCH_WORSE = 3.0
 
 
 class TimedPositions(NamedTuple):
@@ -167,3 +175,32 @@ def _fit_clock(positions: TimedPositions, path: PathSamples, offset_s: float) ->
 POSITIONS = ObservedKind(
     "positions", "give the time offset (--positions_time_offset)", scan_positions, fit_positions, _fit_clock
 )
+
+
+def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
+    """Return the track with its time offset, which is searched for if it is not given.
+
+    Raises:
+        InputError: the positions are by time and the photos have none, or they are of other photos.
+        GeometryError: the motion does not determine the offset.
+    """
+    if track.log.timestamp_s is None:
+        listed = track.log.image_name or ()
+        if np.all(rows_of_photos(listed, path.image_names) < 0):
+            raise InputError(told_none("the file", listed, path.image_names), track.log.path)
+        return track
+    if path.timestamps_s is None:
+        raise InputError("the positions have times but the photos have none: give image times", track.log.path)
+    positions = TimedPositions(track.log.timestamp_s, track.log.position_m)
+    try:
+        require_enough(path, len(track.log), POSITIONS)
+        samples = path_to_search(path, track.antenna_in_cam_m[None], track.association)
+        found = offset_of_motion(positions, samples, POSITIONS, seed=0, progress=SilentProgress())
+    except GeometryError:
+        if track.offset_s is None:
+            raise
+        return track
+    if track.offset_s is None:
+        return replace(track, offset_s=found.value_s, offset_stddev_s=found.stddev_s, search=found)
+    off_m = [residual_stddev_at(positions, samples, each_s) for each_s in (track.offset_s, found.value_s)]
+    return replace(track, other_offset_s=found.value_s) if off_m[0] > _MUCH_WORSE * off_m[1] else track

@@ -53,14 +53,6 @@ class SurveyedPositions:
         """True if the photos' times are needed."""
         return self.antenna is not None and self.antenna.log.timestamp_s is not None
 
-    def on_path(self, path: Trajectory) -> SurveyedPositions:
-        """Return the positions with the time offset between the antenna's clock and that of the photos of a path.
-
-        Raises:
-            InputError: the photos have no times. GeometryError: the motion does not determine the offset.
-        """
-        return self if self.antenna is None else replace(self, antenna=self.antenna.with_offset(path))
-
     def located(self, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions | None:
         """Find the positions in a model; None if none of them is there. Those by a wrong clock are left out.
 

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.files.text_tables import Categories
+from rangesfm.arrays import Array, Categories, Indices, Mask
 
 DEFAULT_TAG_ID = "tag"
 # Two ranges between the same nodes cannot have the same time. If at least this share of successive ranges has, the
@@ -281,7 +280,11 @@ class RangeLog:
 
 
 def _categories(ids: Sequence[str] | npt.NDArray[np.str_] | Categories) -> Categories:
-    found = ids if isinstance(ids, Categories) else Categories.of(ids if isinstance(ids, Sequence) else ids.tolist())
+    found = (
+        ids
+        if isinstance(ids, Categories)
+        else Categories.from_texts(ids if isinstance(ids, Sequence) else ids.tolist())
+    )
     order = sorted(range(len(found.names)), key=lambda k: _as_people_count(found.names[k]))
     return Categories(tuple(found.names[k] for k in order), np.argsort(order)[found.index])
 

@@ -7,7 +7,6 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.ranging.errors.range_bins import RangeBins
-from rangesfm.ranging.readers.units import UNITS_PER_METRE
 from rangesfm.scale.range_equation import predicted_ranges, range_gradient
 from rangesfm.scale.scale_estimate import ScaleSensitivity
 from rangesfm.scale.scale_problem import ScaleProblem
@@ -29,7 +28,7 @@ def scale_sensitivity(solution: Solution, posed: ScaleProblem, known: KnownMap, 
         # The scale is half-way between that with the robust weights and that with the best weights.
         return 50 * float(robust @ range_error_m + known.best_by_bins @ bins.mean(range_error_m))
 
-    distance, centimetre = predicted_ranges(problem, state), 1 / UNITS_PER_METRE["cm"]
+    distance, centimetre = predicted_ranges(problem, state), 0.01
     world_from_cam = state.metric_from_model.rotation @ posed.model_from_cam
     along_x, along_y, along_z = range_gradient(problem, state).by_tag_in_cam(world_from_cam).T
     return ScaleSensitivity(

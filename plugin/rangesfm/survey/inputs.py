@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.distances.tape import Marker, Tape, markers_of_photos, read_tape
+from rangesfm.distances.tape import Marker, Tape, markers_of_photos
+from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.contents import sha256_of
 from rangesfm.files.folders import natural_order, walk
@@ -19,7 +20,7 @@ from rangesfm.geometry.reference import Reference
 from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
 from rangesfm.positions.antenna_track import AntennaTrack
-from rangesfm.positions.control_points import read_control_points
+from rangesfm.positions.control_point_file import read_control_points
 from rangesfm.positions.known_positions import LASTING_S
 from rangesfm.positions.position_formats import read_positions
 from rangesfm.positions.surveyed_positions import SurveyedPositions

@@ -17,7 +17,8 @@ from rangesfm.files.photo_names import told_none, told_unknown
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.clock.time_offset import TimeOffset, estimate_time_offset
+from rangesfm.ranging.clock.offset import TimeOffset
+from rangesfm.ranging.clock.time_offset import estimate_time_offset
 from rangesfm.ranging.errors.bending import MapBending
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out

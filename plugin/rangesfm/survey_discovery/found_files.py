@@ -19,7 +19,7 @@ from rangesfm.files.bags import is_bag, is_bag_folder
 from rangesfm.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
 from rangesfm.files.text_tables import has_columns, read_head
 from rangesfm.geometry.reference import is_reference_file
-from rangesfm.positions.control_points import is_point_file
+from rangesfm.positions.control_point_file import is_point_file
 from rangesfm.positions.position_formats import is_of_positions
 from rangesfm.ranging.anchors import anchor_file
 from rangesfm.ranging.errors.error_curve import is_error_curve_file

@@ -39,7 +39,8 @@ from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.join.join_models import ModelVerdict, join_models
 from rangesfm.positions.clock import POSITIONS
 from rangesfm.positions.surveyed_positions import SurveyedPositions
-from rangesfm.ranging.clock.time_offset import REMEDY, TimeOffset
+from rangesfm.ranging.clock.offset import TimeOffset
+from rangesfm.ranging.clock.time_offset import REMEDY
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.refine.photo_bending import PhotoBending, bending_of_model, by_photos

@@ -24,7 +24,7 @@ from rangesfm.loops.loop_closure import LoopClosure
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.clock.time_offset import TimeOffset
+from rangesfm.ranging.clock.offset import TimeOffset
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.refine.with_ranges import RefineSummary

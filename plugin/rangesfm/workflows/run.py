@@ -15,6 +15,7 @@ from rangesfm.distances.locate_lengths import locatable
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.atomic import sole_writer
+from rangesfm.positions.clock import find_antenna_offset
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress, SilentProgress
@@ -176,8 +177,10 @@ def _positions_on_path(run: SurveyRun, path: PathOfModel) -> SurveyedPositions:
         InputError: the photos have no times. GeometryError: nothing tells the offset, and nothing else is measured.
     """
     positions = run.inputs.positions
+    if positions.antenna is None:
+        return positions
     try:
-        return positions.on_path(path.trajectory)
+        return replace(positions, antenna=find_antenna_offset(positions.antenna, path.trajectory))
     except GeometryError as error:
         if not len(run.inputs.log) and positions.points is None:
             raise

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.clock.time_offset import TimeOffset, estimate_time_offset
+from rangesfm.ranging.clock.offset import TimeOffset
+from rangesfm.ranging.clock.time_offset import estimate_time_offset
 from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]

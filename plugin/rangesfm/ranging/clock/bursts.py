@@ -11,7 +11,8 @@ from scipy import special
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.clock.search import CostCurve, TimedRanges
+from rangesfm.ranging.clock.offset import CostCurve
+from rangesfm.ranging.clock.search import TimedRanges
 from rangesfm.ranging.clock.squares import fit_squares
 from rangesfm.ranging.errors.noise import MIN_NOISE_M
 

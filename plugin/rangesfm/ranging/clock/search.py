@@ -22,6 +22,7 @@ from rangesfm.geometry.similarity import rounding_of
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.ranging.association import associate
+from rangesfm.ranging.clock.offset import CostCurve
 from rangesfm.ranging.clock.squares import MIN_RANGE_M
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
@@ -137,20 +138,6 @@ def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: Associati
 def on_path(observed: AnyObserved, path: PathSamples, offset_s: float, max_num: int) -> AnyObserved:
     """Return the first observations that are on the path at an offset, at most ``max_num``."""
     return observed.take(np.flatnonzero(path.knows(observed.times_s + offset_s))[:max_num])
-
-
-@dataclass(frozen=True)
-class CostCurve:
-    """Cost of time offsets.
-
-    Attributes:
-        offsets_s: (m,) offsets at which log and photos overlap, increasing, and denser near the best one.
-        costs_m: (m,) root mean square of the residuals of the ranges on the path, with the anchors and the scale that
-            fit best at each offset; each range has its weight at the best offset.
-    """
-
-    offsets_s: Array
-    costs_m: Array
 
 
 @dataclass(frozen=True)

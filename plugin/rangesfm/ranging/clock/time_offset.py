@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,8 +27,8 @@ from rangesfm.ranging.clock.fit import (
     fit_clocks,
     refine_offset,
 )
+from rangesfm.ranging.clock.offset import Rival, TimeOffset
 from rangesfm.ranging.clock.search import (
-    CostCurve,
     Observed,
     OffsetCurve,
     PathSamples,
@@ -64,55 +63,6 @@ _MIN_SAME_SHARE = 0.95
 _MOST_UNCERTAIN_S = 0.5
 # To find the offset, poses are also interpolated across gaps up to this many times the median gap between photos.
 _MAX_GAPS = 1.5
-
-
-class Rival(NamedTuple):
-    """Another time offset that may be the right one: image time = range time + ``value_s``."""
-
-    value_s: float
-    probability: float
-
-
-@dataclass(frozen=True)
-class TimeOffset:
-    """Offset of the clocks: image time = range time + ``value_s``.
-
-    Attributes:
-        value_s: the offset; if the clocks drift, at the radio's time ``reference_s``.
-        stddev_s: its standard deviation, which accounts for correlated residuals.
-        curve: cost of all offsets, for the report.
-        offset_matters: False if any offset near the value puts the ranges at the same photos.
-        drift: gain of the camera's clock on the radio's, seconds per second.
-        drift_stddev: its standard deviation; infinite if no drift was estimated.
-        drift_is_followed: whether the drift is significant, so that ``at`` follows it.
-        reference_s: radio's time at which the clocks differ by ``value_s``.
-        note: message for the user, or None.
-        probability: probability that the value is the right offset, and none of the rivals is.
-        rivals: other offsets that cannot be ruled out, the most likely first.
-        is_certain: whether the error of a range due to ``stddev_s`` is smaller than its noise.
-    """
-
-    value_s: float
-    stddev_s: float
-    curve: CostCurve
-    offset_matters: bool = True
-    drift: float = 0.0
-    drift_stddev: float = np.inf
-    drift_is_followed: bool = False
-    reference_s: float = 0.0
-    note: str | None = None
-    probability: float = 1.0
-    rivals: tuple[Rival, ...] = ()
-    is_certain: bool = True
-
-    def of_rival(self, rival: Rival) -> TimeOffset:
-        """Return the offset with a rival's value; the drift was estimated for the present value and is not followed."""
-        return replace(self, value_s=rival.value_s, drift_is_followed=False, probability=rival.probability, rivals=())
-
-    def at(self, radio_times_s: Array) -> Array:
-        """Return the offsets (n,) at times (n,) of the radio's clock."""
-        drift = self.drift if self.drift_is_followed else 0.0
-        return self.value_s + drift * (radio_times_s - self.reference_s)
 
 
 @with_one_blas_thread

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.arrays import Array
-from rangesfm.files.text_tables import Categories, TextTable, read_table
+from rangesfm.arrays import Array, Categories
+from rangesfm.files.text_tables import TextTable, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.counters import continued
@@ -156,7 +156,7 @@ def _anchors(table: TextTable, name: Mapping[str, str], columns: RangeColumns) -
         _ids(table, said, columns, "") if (said := column_of_anchor(anchor_id)) else _repeated([anchor_id], len(table))
         for anchor_id, _ in columns.wide.values()
     ]
-    names = Categories.of([name for one in each for name in one.names])
+    names = Categories.from_texts([name for one in each for name in one.names])
     first = np.cumsum([0, *(len(one.names) for one in each)])
     index = np.column_stack([names.index[one.index + start] for one, start in zip(each, first)])
     return Categories(names.names, index.ravel())
@@ -172,7 +172,7 @@ def _tags(table: TextTable, name: Mapping[str, str], columns: RangeColumns) -> C
         antenna = _ids(table, name["antenna"], columns, "")
         if len(antenna.names) > 1:
             pairs = zip(tag.index.tolist(), antenna.index.tolist())
-            tag = Categories.of([f"{tag.names[one]}/{antenna.names[other]}" for one, other in pairs])
+            tag = Categories.from_texts([f"{tag.names[one]}/{antenna.names[other]}" for one, other in pairs])
     return Categories(tag.names, np.repeat(tag.index, max(1, len(columns.wide))))
 
 
@@ -186,7 +186,7 @@ def column_of_anchor(anchor_id: str) -> str | None:
 
 def _repeated(ids: list[str], num_rows: int) -> Categories:
     """Return the ids, repeated in every row."""
-    each = Categories.of(ids)
+    each = Categories.from_texts(ids)
     return Categories(each.names if num_rows else (), np.tile(each.index, num_rows))
 
 
@@ -197,7 +197,7 @@ def _ids(table: TextTable, column: str, columns: RangeColumns, empty: str | None
     ):
         return ids
     whole = [str(int(float(name))) if float(name) == int(float(name)) else name for name in ids.names]
-    merged = Categories.of(whole)
+    merged = Categories.from_texts(whole)
     return Categories(merged.names, merged.index[ids.index])
 
 

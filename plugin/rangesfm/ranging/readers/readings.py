@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Categories
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import Categories
 from rangesfm.options import TIME_S
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
@@ -52,7 +51,7 @@ def log_of_readings(
         InputError: there is no measurement, or the unit of the times is ambiguous.
     """
     ranges = np.array([reading.range_m for reading in found], np.float64)
-    link = Categories.of([f"{reading.tag_id} {reading.anchor_id}" for reading in found]).index
+    link = Categories.from_texts([f"{reading.tag_id} {reading.anchor_id}" for reading in found]).index
     measured, of_codes = which_are_measured(ranges, link, path)
     measured[measured], of_far = which_are_within_reach(ranges[measured], path)
     times, anchor_ids, ranges_m, lines, tag_ids, stddevs, los = zip(*compress(found, measured))
