@@ -14,7 +14,7 @@ from tests.export.models import synthesized
 from tests.result_document import result_document
 
 from rangesfm.comparison.before_after import compare_folder, compare_models
-from rangesfm.comparison.many_models import reprojection_rms_px
+from rangesfm.comparison.same_photos import reprojection_rms_px
 from rangesfm.comparison.with_reference import (
     compare,
     format_table,

@@ -26,7 +26,7 @@ from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import InputError
 from rangesfm.geometry.map_errors import Part
-from rangesfm.result.measurements import MeasuredMap
+from rangesfm.workflows.measured_map import MeasuredMap
 
 Array = npt.NDArray[np.float64]
 STEP = 1e-6

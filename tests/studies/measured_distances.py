@@ -38,7 +38,7 @@ from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.gravity import UP_IN_SITE
-from rangesfm.result.measurements import MeasuredMap, Measurement
+from rangesfm.workflows.measured_map import MeasuredMap, Measurement
 from rangesfm.workflows.metric_result import MetricResult
 
 Array = npt.NDArray[np.float64]

@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 
 from rangesfm.options import AnchorOptions, ImageOptions, RangesOptions, ReportOptions, ScaleOptions
-from rangesfm.survey.inputs import input_hashes
+from rangesfm.survey.input_hashes import input_hashes
 from rangesfm.survey.settings import Survey
 
 

@@ -341,7 +341,12 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
         from rangesfm.report.chart import write_picture
         from rangesfm.report.figures_ranges import plot_error_curve
 
-        write_picture(plot_error_curve(calibration), Path(args.plot))
+        write_picture(
+            plot_error_curve(
+                calibration.curve, calibration.distance_m, calibration.error_m, calibration.noise_stddev_m
+            ),
+            Path(args.plot),
+        )
         lines.append(f"drawn in {args.plot}")
     write_error_curve(calibration.curve, Path(args.output_path))
     return Outcome(lines)

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array, median, rms
-from rangesfm.comparison.many_models import Length, common_photos, lengths_along, reprojection_rms_px
+from rangesfm.comparison.same_photos import Length, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import format_table, papers_table
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.comparison.many_models import ModelsComparison, NamedModel, carried_by
+from rangesfm.comparison.many_models import ModelsComparison, NamedModel
+from rangesfm.comparison.same_photos import carried_by
 from rangesfm.export.metric_map import colored_points
 from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.trajectory import Trajectory

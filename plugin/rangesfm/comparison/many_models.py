@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, rms
 from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.model_ranges import ModelRanges, ranges_of_result
+from rangesfm.comparison.same_photos import Length, carried_by, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto, text_or_dash
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Tape, markers_of_photos
@@ -27,11 +28,8 @@ from rangesfm.report.report_tables import ReportTable
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
-from rangesfm.survey.inputs import times_of_model
+from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
-
-Length = tuple[str, str, tuple[float, ...]]
-"""A distance between two photos: their names, and the length in each model, in the unit of that model."""
 
 
 @dataclass(frozen=True)
@@ -290,14 +288,6 @@ def _row(
     )
 
 
-def common_photos(first: Trajectory, second: Trajectory) -> tuple[tuple[str, ...], Array, Array]:
-    """Return the names of the n photos in both paths, and their camera centres (n, 3) in each path."""
-    index = {name: i for i, name in enumerate(second.image_names)}
-    rows = [(i, index[name]) for i, name in enumerate(first.image_names) if name in index]
-    ours, theirs = np.array(rows, dtype=np.int64).reshape(-1, 2).T
-    return tuple(first.image_names[i] for i in ours), first.centers[ours], second.centers[theirs]
-
-
 def _onto(goal: Trajectory, path: Trajectory) -> Similarity | None:
     """Estimate the similarity that brings a path onto another one of the same photos."""
     _, target, source = common_photos(goal, path)
@@ -312,13 +302,6 @@ def _range_rms(
         return None
     as_it_is, carried = rms(own.residuals_m(model.path)), rms(ranges.residuals_m(carried_by(onto_ranges, model.path)))
     return None if np.isnan(as_it_is) else (as_it_is, carried)
-
-
-def carried_by(similarity: Similarity | None, path: Trajectory) -> Trajectory:
-    """Return a path transformed by a similarity, or unchanged where that is None."""
-    if similarity is None:
-        return path
-    return path.transformed(similarity.scale, similarity.rotation, similarity.translation)
 
 
 def _taped(
@@ -353,28 +336,6 @@ def _taped_lengths(
     places = np.array(list(anchors_m.values())).reshape(-1, 3)
     carried = unknown if onto_ranges is None else located.lengths_m(onto_ranges.scale, places).tolist()
     return list(zip(located.lengths_m(1.0, places).tolist(), carried))
-
-
-def lengths_along(paths: Sequence[Trajectory]) -> tuple[Length, ...]:
-    """Return distances between photos that all paths have: over the whole path, its halves and some of its quarters."""
-    places = [dict(zip(path.image_names, path.centers)) for path in paths]
-    names = [name for name in paths[0].image_names if all(name in place for place in places)]
-    quarters = [(len(names) - 1) * share // 4 for share in range(5)]
-    pairs = [(quarters[i], quarters[j]) for i, j in ((0, 4), (0, 2), (2, 4), (1, 3), (0, 1), (3, 4))]
-    distinct = dict.fromkeys((names[a], names[b]) for a, b in pairs if a != b)
-    return tuple((a, b, tuple(float(np.linalg.norm(place[a] - place[b])) for place in places)) for a, b in distinct)
-
-
-def reprojection_rms_px(reconstruction: pycolmap.Reconstruction) -> float:
-    """Return the root mean square distance between observed and projected points in pixels; NaN without points."""
-    errors = [np.zeros((0, 2))]
-    for image in reconstruction.images.values():
-        observed = list(image.get_observation_points2D()) if image.has_pose else []
-        if observed:
-            in_world = np.array([reconstruction.point3D(point.point3D_id).xyz for point in observed])
-            projected = image.camera.img_from_cam(image.cam_from_world() * in_world, check_cheirality=False)
-            errors.append(projected - np.array([point.xy for point in observed]))
-    return rmse(np.concatenate(errors))
 
 
 _TRUTH_HEADER = ("model", "keyframes", "RMSE m", "aligned by", "after SE(3) m", "after Sim(3) m", "scale / truth")

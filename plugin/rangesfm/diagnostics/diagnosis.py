@@ -15,9 +15,9 @@ from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized,
 from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
 from rangesfm.diagnostics.scale_bound import HiddenMistake
+from rangesfm.geometry.numerics import DOUBTFUL_ABOVE
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
-from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
 # Largest standard deviation, metres, of noise, and of lasting errors. Real radios show 0.03 to 0.15 m beside outliers,
 # old ones 0.2 m; more has another cause.

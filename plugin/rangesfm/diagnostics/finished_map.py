@@ -15,13 +15,12 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
-from rangesfm.geometry.numerics import NORMAL_95
+from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.scale.scale_verdict import DOUBTFUL_ABOVE
 
 # Allowance for comparing medians: ``_max_growth`` bounds sums of squares, while medians ignore a few large errors.
 _OF_MEDIANS = 1.5

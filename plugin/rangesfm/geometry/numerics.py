@@ -22,3 +22,6 @@ NUM_REWEIGHTINGS: Final = 6
 
 NORMAL_95: Final = 1.96
 """Half the width of a 95 % interval, in standard deviations of a normal distribution."""
+
+DOUBTFUL_ABOVE: Final = 0.04
+"""Half of the relative 95 % interval above which a scale is doubtful."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.files.clock_times import time_text
-from rangesfm.ranging.errors.radio_calibration import RadioCalibration
+from rangesfm.ranging.errors.error_curve import ErrorCurve
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.report.content import Content, in_natural_order
@@ -178,14 +178,17 @@ def plot_ranges(log: RangeLog) -> Figure:
     return figure_of("ranges", "", "Ranges over time", (label, "m"), series, y_range=y_range, size=_SIZE_ALONE)
 
 
-def plot_error_curve(calibration: RadioCalibration) -> Figure:
-    """Return the figure of a radio's error curve with two stddevs on either side, and the errors it was learnt from."""
-    curve = calibration.curve
-    shown = 5 * calibration.noise_stddev_m
+def plot_error_curve(curve: ErrorCurve, distance_m: Array, error_m: Array, noise_stddev_m: float) -> Figure:
+    """Return the figure of a radio's error curve with two stddevs on either side.
+
+    Args:
+        distance_m, error_m: (n,) of the ranges that it was learnt from. noise_stddev_m: of these about the curve.
+    """
+    shown = 5 * noise_stddev_m
 
     def line(name: str, kind: str, num_stddevs: int) -> Series:
-        error_m = curve.error_m + num_stddevs * curve.stddev_m
-        return Series(name, "after", np.column_stack([curve.distance_m, error_m]), kind)
+        at_m = curve.error_m + num_stddevs * curve.stddev_m
+        return Series(name, "after", np.column_stack([curve.distance_m, at_m]), kind)
 
     return figure_of(
         "error_curve",
@@ -193,7 +196,7 @@ def plot_error_curve(calibration: RadioCalibration) -> Figure:
         "Errors of ranges over their distance",
         ("distance, m", "measured minus true, m"),
         (
-            Series("errors", "rejected", np.column_stack([calibration.distance_m, calibration.error_m])),
+            Series("errors", "rejected", np.column_stack([distance_m, error_m])),
             line("curve", "line", 0),
             line("± two standard deviations", "dashed", 2),
             line("± two standard deviations", "dashed", -2),

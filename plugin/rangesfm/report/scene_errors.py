@@ -11,7 +11,6 @@ from rangesfm.arrays import Array
 from rangesfm.geometry.map_errors import MapErrors, PartErrors
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.packing import pack
-from rangesfm.result.measurements import up_in_map
 from rangesfm.result.summary import ResultSummary
 
 # Shifts by a mode are stored as whole steps, of which the largest shift by that mode has this number.
@@ -35,7 +34,7 @@ def errors_of_scene(
     left, sizes, _ = np.linalg.svd(modes.reshape(3 * len(modes), -1), full_matrices=False)
     shifts = left * sizes
     steps = np.maximum(np.abs(shifts).max(axis=0), 1e-12) / _NUM_STEPS
-    up = up_in_map(summary)
+    up = summary.up
     return {
         "num_modes": len(steps),
         "modes": pack(np.round(shifts / steps), "int16"),

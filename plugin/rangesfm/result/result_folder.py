@@ -14,7 +14,6 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import InputError
-from rangesfm.export import EXPORTED_NAMES, OFFSET_NAME
 from rangesfm.files.atomic import path_of, scratch_folder, sole_writer
 from rangesfm.files.folders import real_path
 from rangesfm.geometry.map_errors import MapErrors
@@ -23,9 +22,6 @@ from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME, read_map_err
 from rangesfm.result.places import input_beside, path_in
 from rangesfm.result.result_tables import RESULT_TABLES, PhotoTimes, TableFile
 from rangesfm.result.summary import ResultSummary
-from rangesfm.survey.settings import Survey
-from rangesfm.survey.survey_reader import input_paths
-from rangesfm.vision.steps import RECONSTRUCTION_NAMES
 
 _Table = TypeVar("_Table", bound=TableFile)
 
@@ -41,29 +37,6 @@ RESULT_FILES = (
 )
 RESULT_NAMES = (*RESULT_FILES, *MODEL_NAMES)
 """Names of all files and folders of a result. The first one is written last: where it is there, the result is whole."""
-
-
-def result_names(survey: Survey) -> set[str]:
-    """Return the names that a result of this survey takes in the output folder, export formats included."""
-    return {*RESULT_NAMES, OFFSET_NAME}.union(*(EXPORTED_NAMES[name] for name in survey.export.formats))
-
-
-def refuse_to_overwrite(survey: Survey) -> None:
-    """Check that the results will overwrite no input, and will not be written among the files of an input folder.
-
-    Raises:
-        InputError: they would; it names the input.
-    """
-    folder = real_path(survey.output.path)
-    maps = survey.images.model is None
-    places = {folder / name for name in result_names(survey)}
-    places.update(folder / name for name in (*RECONSTRUCTION_NAMES, *PHOTOS_NAMES) if maps)
-    for item in input_paths(survey):
-        path = real_path(item.path)
-        if not places.isdisjoint((path, *path.parents)):
-            raise InputError("the results would overwrite this input, expected another output path", item.path)
-        if path.is_dir() and path == folder:
-            raise InputError("the results would be written into this input, expected another output path", item.path)
 
 
 def places_for_photos(folder: Path) -> tuple[Path, Path]:

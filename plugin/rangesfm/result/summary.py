@@ -13,8 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from rangesfm.arrays import Array
 from rangesfm.errors import number_text
 from rangesfm.files.records import NumberOrNull, Record, Text
+from rangesfm.geometry.gravity import UP_IN_SITE, gravity_of
 from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.result import entries
 
@@ -84,6 +86,14 @@ class ResultSummary(Record):
     def has_ranges(self) -> bool:
         """Return whether there are ranges; otherwise the scale comes from measured lengths or known positions alone."""
         return self.ranges.num > 0
+
+    @property
+    def up(self) -> tuple[Array, float] | None:
+        """The upward unit vector (3,) of the map and its standard deviation (radians); None if unknown."""
+        if self.frame == "site":
+            return UP_IN_SITE, 0.0
+        gravity = gravity_of(self.settings.to_json().get("scale", {}).get("up_in_first_camera"))
+        return None if gravity is None else (gravity.up_in_first_camera, gravity.stddev_rad)
 
     def lines(self, folder: Path, table: str | None) -> Iterator[str]:
         """Yield the lines that the user sees at the end of a run.

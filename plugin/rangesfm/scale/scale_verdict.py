@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.numerics import NORMAL_95
+from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
@@ -23,8 +23,6 @@ from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import MANY_OUTLIERS, WHY_SCALE_IS_OPEN, Solution
 
-# A scale is doubtful if half of its relative 95 % interval is wider than this.
-DOUBTFUL_ABOVE = 0.04
 FEW_RANGES = 50
 """Number of ranges below which outliers and noise can hardly be told apart."""
 NOTHING_KNOWN = 1.0

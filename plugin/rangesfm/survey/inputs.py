@@ -1,12 +1,11 @@
-"""Inputs that a run reads first: log, anchors and reference. They are checked against each other, and hashed."""
+"""Inputs that a run reads first: log, anchors and reference. They are checked against each other."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +13,8 @@ from rangesfm.arrays import Array
 from rangesfm.distances.tape import Marker, Tape, markers_of_photos
 from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import InputError
-from rangesfm.files.contents import sha256_of
-from rangesfm.files.folders import natural_order, walk
+from rangesfm.files.folders import natural_order
 from rangesfm.geometry.reference import Reference
-from rangesfm.geometry.trajectory import photos_by_frame
 from rangesfm.options import LogOptions
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.control_point_file import read_control_points
@@ -33,19 +30,11 @@ from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.survey.settings import Survey
-from rangesfm.survey.survey_reader import input_paths
 from rangesfm.vision.exif_positions import read_exif_positions
-from rangesfm.vision.image_times import (
-    ImageTimes,
-    find_image_times,
-    list_images,
-    read_image_times_csv,
-    times_at_rate,
-)
 from rangesfm.vision.rigs import read_rigs
 
 if TYPE_CHECKING:
-    import pycolmap
+    pass
 
 
 # Distance between two anchors over the sum of the ranges to them. It is at most 1 where all are in metres; above each
@@ -378,25 +367,6 @@ def _anchors_of_log(log: RangeLog) -> tuple[Anchor, ...]:
     return tuple(by_id.get(anchor_id, Anchor(anchor_id)) for anchor_id in log.anchor_ids)
 
 
-def times_of_model(survey: Survey, sfm: pycolmap.Reconstruction, model_path: Path) -> ImageTimes:
-    """Return the times of the photos of a model. The table of times may have other photos, too."""
-    frames, images = photos_by_frame(sfm), survey.images
-    if images.times is not None:
-        return read_image_times_csv(images.times, frames=frames, columns=images.times_columns, unit=images.times_unit)
-    if images.rate_hz is None:
-        return find_image_times(images.path or model_path, tuple(sorted(frames)))
-    if images.path is None:
-        raise InputError("image_rate_hz counts all photos, also those that are not in the model: give --images FOLDER")
-    taken = read_rigs(images.rig_config).frames(list_images(images.path))
-    times = times_at_rate(tuple(taken), images.rate_hz)
-    time_of = {photo: time for first, time in times.by_name().items() for photo in taken[first]}
-    known = {first: time_of[photo] for first, photos in frames.items() for photo in photos if photo in time_of}
-    if not known:
-        raise InputError(f"none of the model's photos, such as {next(iter(frames))}, is in this folder", images.path)
-    ordered = sorted(known, key=known.__getitem__)
-    return replace(times, image_names=tuple(ordered), timestamps_s=np.array([known[name] for name in ordered]))
-
-
 def of_one_tag(log: RangeLog, tag_id: str | None) -> RangeLog:
     """Return the ranges between one tag and anchors.
 
@@ -480,34 +450,3 @@ def _warnings(log: RangeLog, anchors: Sequence[Anchor], survey: Survey) -> list[
     if (step_s := log.time_resolution_s) >= _COARSE_STEP_S:
         notes.append(f"the log's times have steps of {step_s:.2g} s: somebody who walks moves that many metres in one")
     return notes
-
-
-def input_hashes(survey: Survey) -> list[dict[str, Any]]:
-    """Return path, SHA-256, number of bytes and what was hashed, for each input that exists.
-
-    For a folder of photos, only names and sizes are hashed: reading gigabytes again would take too long.
-    """
-    entries: list[dict[str, Any]] = []
-    for item in input_paths(survey):
-        if item.role == "photos":
-            entries += [_folder(item.path)] if item.path.is_dir() else []
-        else:
-            files = sorted(item.path.glob("*.bin" if item.role == "model" else "*")) or [item.path]
-            entries += [
-                {"path": str(path), "sha256": sha256_of(path), "bytes": path.stat().st_size, "hashed": "content"}
-                for path in files
-                if path.is_file()
-            ]
-    return entries
-
-
-def _folder(path: Path) -> dict[str, Any]:
-    files = (parent / name for parent, _, names in walk(path) for name in names)
-    sizes = {file.relative_to(path).as_posix(): file.stat().st_size for file in files if file.is_file()}
-    listing = "".join(f"{name}\t{size}\n" for name, size in sorted(sizes.items()))
-    return {
-        "path": str(path),
-        "sha256": hashlib.sha256(listing.encode("utf-8", "surrogateescape")).hexdigest(),
-        "bytes": sum(sizes.values()),
-        "hashed": f"names and sizes of {len(sizes)} files",
-    }

@@ -16,7 +16,8 @@ from rangesfm.files.clock_times import span_text
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.sources.source import is_source, open_source
-from rangesfm.survey.inputs import RangingInputs, times_of_model
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options

@@ -28,7 +28,7 @@ from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.progress import Journal
-from rangesfm.result.result_folder import RESULT_NAMES, places_for_photos, refuse_to_overwrite
+from rangesfm.result.result_folder import RESULT_NAMES, places_for_photos
 from rangesfm.sources.extract import TIMES_NAME, earlier_photos, take_photos
 from rangesfm.sources.source import is_source
 from rangesfm.survey.inputs import read_ranging_inputs
@@ -39,6 +39,7 @@ from rangesfm.vision.keyframes import select_keyframes
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
+from rangesfm.workflows.place_of_result import refuse_to_overwrite
 from rangesfm.workflows.place_ranges import check_times
 
 

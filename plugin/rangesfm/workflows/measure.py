@@ -16,10 +16,10 @@ from rangesfm.errors import InputError, number_text
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import align_rows, write_table
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.result.measurements import Interval, MeasuredMap, Measurement, up_in_map
 from rangesfm.result.places import input_beside
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.result_tables import TagCorners
+from rangesfm.workflows.measured_map import Interval, MeasuredMap, Measurement
 
 _MEASURES = ("distance", "height_difference")
 _COLUMNS = (*PAIRS.required, *(f"{name}{end}_m" for name in _MEASURES for end in ("", "_low", "_high")))
@@ -90,7 +90,7 @@ def measure(
         _points_of(result, None if markers is None else Path(markers)),
         result.read_map_errors(),
         result.summary.scale.relative_stddev_empirical,
-        up_in_map(result.summary),
+        result.summary.up,
     )
     return Measurements(map_.measure(pairs), tuple(_notes(result, map_)))
 

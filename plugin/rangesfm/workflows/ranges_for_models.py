@@ -12,7 +12,8 @@ import pycolmap
 from rangesfm.comparison.model_ranges import ModelRanges
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.range_observations import USED
-from rangesfm.survey.inputs import read_ranging_inputs, times_of_model
+from rangesfm.survey.inputs import read_ranging_inputs
+from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.workflows.metric_result import MetricResult

@@ -19,9 +19,8 @@ from rangesfm.positions.clock import find_antenna_offset
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.progress import Journal, Progress, SilentProgress
-from rangesfm.result.result_folder import refuse_to_overwrite, result_names
 from rangesfm.result.summary import ResultSummary
-from rangesfm.survey.inputs import times_of_model
+from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.vision.image_times import list_images
@@ -39,6 +38,7 @@ from rangesfm.workflows.map_photos import (
     with_tags,
 )
 from rangesfm.workflows.metric_result import MetricResult
+from rangesfm.workflows.place_of_result import refuse_to_overwrite, result_names
 from rangesfm.workflows.place_ranges import place_ranges
 from rangesfm.workflows.plan_again import with_advice
 from rangesfm.workflows.run_results import RunResult, write_results

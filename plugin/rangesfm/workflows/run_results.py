@@ -23,7 +23,8 @@ from rangesfm.result.places import recorded_inputs, recorded_settings
 from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_result, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.scale.scale_by_lengths import BENDING
-from rangesfm.survey.inputs import RangingInputs, input_hashes
+from rangesfm.survey.input_hashes import input_hashes
+from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.steps import DATABASE_NAME
 from rangesfm.workflows.metric_result import MetricResult

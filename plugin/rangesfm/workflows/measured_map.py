@@ -10,10 +10,8 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.distances.map_points import MapPoint, MapPoints
-from rangesfm.geometry.gravity import UP_IN_SITE, gravity_of
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.numerics import NORMAL_95
-from rangesfm.result.summary import ResultSummary
 
 Interval = tuple[float, float]
 
@@ -35,14 +33,6 @@ class Measurement:
     distance_interval_m: Interval
     height_difference_m: float | None
     height_interval_m: Interval | None
-
-
-def up_in_map(summary: ResultSummary) -> tuple[Array, float] | None:
-    """Return the upward unit vector (3,) of a result's map and its standard deviation (radians); None if unknown."""
-    if summary.frame == "site":
-        return UP_IN_SITE, 0.0
-    gravity = gravity_of(summary.settings.to_json().get("scale", {}).get("up_in_first_camera"))
-    return None if gravity is None else (gravity.up_in_first_camera, gravity.stddev_rad)
 
 
 @dataclass(frozen=True)
