@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Final, Protocol
 
 
 class Progress(Protocol):
@@ -33,6 +33,9 @@ class SilentProgress:
 
     def message(self, text: str) -> None:
         pass
+
+
+SILENT: Final[Progress] = SilentProgress()
 
 
 @dataclass

@@ -197,10 +197,12 @@ def test_time_stamps_are_described_in_the_survey(folder: Path) -> None:
             "ranging_interval_s = 0.1\n",
         )
     ).ranges
-    assert StampOptions.of(ranges) == StampOptions(DW1000_TICK_S, 2**40 * DW1000_TICK_S, VACUUM_M_PER_S, 1e-8)
+    assert StampOptions.from_log_options(ranges) == StampOptions(
+        DW1000_TICK_S, 2**40 * DW1000_TICK_S, VACUUM_M_PER_S, 1e-8
+    )
     assert ranges.ranging_interval_s == 0.1
-    assert StampOptions.of(read_survey(write(folder, "")).ranges) == StampOptions()
-    speed = StampOptions.of(read_survey(write(folder, "[ranges]\npropagation_speed = 299.7e6\n")).ranges)
+    assert StampOptions.from_log_options(read_survey(write(folder, "")).ranges) == StampOptions()
+    speed = StampOptions.from_log_options(read_survey(write(folder, "[ranges]\npropagation_speed = 299.7e6\n")).ranges)
     assert speed.propagation_speed_m_per_s == 299.7e6
 
 

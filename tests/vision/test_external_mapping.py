@@ -19,6 +19,7 @@ from tests.outputs import unfinished
 
 from rangesfm.errors import InputError, OptionError, ReconstructionError
 from rangesfm.options import MapperOptions
+from rangesfm.progress import SILENT, Progress
 from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def output(matched: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(matched, tmp_path / "out"))
 
 
-def mapped(room: Room, output: Path, mapper: MapperOptions, listener: Listener | None = None) -> ReconstructionSummary:
+def mapped(room: Room, output: Path, mapper: MapperOptions, listener: Progress = SILENT) -> ReconstructionSummary:
     return reconstruct(room.folder, room.names, output, camera=room.camera, mapper=mapper, progress=listener)
 
 

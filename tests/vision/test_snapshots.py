@@ -14,6 +14,7 @@ import pytest
 from tests.outputs import names_in, unfinished
 
 from rangesfm.options import MapperOptions
+from rangesfm.progress import SILENT, Progress
 from rangesfm.vision import snapshots as snapshots_module
 from rangesfm.vision.incremental_mapping import Size, UnfinishedMapping
 from rangesfm.vision.reconstruct import reconstruct
@@ -34,7 +35,7 @@ class Mapping:
         self.room = room
         self.output = output
 
-    def run(self, listener: Listener | None = None, **pipeline: Any) -> pycolmap.Reconstruction:
+    def run(self, listener: Progress = SILENT, **pipeline: Any) -> pycolmap.Reconstruction:
         mapper = MapperOptions(features=MAPPER.features, pipeline=pipeline, reproducible=True)
         names, camera = self.room.names, self.room.camera
         found = reconstruct(self.room.folder, names, self.output, camera=camera, mapper=mapper, progress=listener)
@@ -139,7 +140,7 @@ def test_a_mapping_that_is_killed_loses_seconds(
     monkeypatch.setattr("time.monotonic", lambda: now_s)
     monkeypatch.setattr("time.time_ns", lambda: 1_700_000_000_000_000_000)  # all within one millisecond
     model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
-    mapping = UnfinishedMapping((), model, Size.of(model))
+    mapping = UnfinishedMapping((), model, Size.measured(model))
     (tmp_path / "scratch").mkdir()
     snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch", min_model_size=10)
     names: list[str] = []

@@ -40,7 +40,7 @@ class Parser(HelpParser):
 
     def __init__(self, **options: Any):
         super().__init__(**options)
-        self.later: list[Callable[[Parser], None]] = []
+        self.later: list[Callable[[Parser], object]] = []
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         while self.later:

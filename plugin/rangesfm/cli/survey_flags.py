@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
 from rangesfm.cli.arguments import Parser
 from rangesfm.errors import InputError
-from rangesfm.progress import Progress
+from rangesfm.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     from rangesfm.option_model import Key
@@ -211,7 +211,7 @@ def flags_given(args: argparse.Namespace, *keys: str) -> list[str]:
     return [f"--{item.flag}" for item in chosen_keys(keys) if getattr(args, item.dotted, None) is not None]
 
 
-def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = None) -> Survey:
+def survey_from_arguments(args: argparse.Namespace, progress: Progress = SILENT) -> Survey:
     """Return the survey that the arguments describe.
 
     It is the survey file, if there is one, with the given flags in place of its keys. For a folder without a survey
@@ -219,7 +219,7 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
 
     Args:
         args: of the command.
-        progress: is told the notes on a folder; None: they are not shown.
+        progress: is told the notes on a folder.
 
     Raises:
         InputError: the file cannot be read, or a key or a flag is wrong.
@@ -238,9 +238,8 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress | None = 
 
         given = {"output.path": free_output(path.absolute()), **overrides}
         understood = understand([path], given, getattr(args, "typed", None))
-        if progress is not None:
-            for note in understood.notes:
-                progress.message(note)
+        for note in understood.notes:
+            progress.message(note)
         return understood.survey()
     return read_survey(path, overrides, args.base_path)
 

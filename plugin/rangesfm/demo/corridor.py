@@ -124,7 +124,7 @@ class _Box:
     sides: dict[tuple[int, int], list[Array]]
 
     @classmethod
-    def of(cls, corners_m: Array, rng: np.random.Generator) -> _Box:
+    def textured(cls, corners_m: Array, rng: np.random.Generator) -> _Box:
         size = np.ceil(np.diff(corners_m, axis=0)[0] / _TEXEL_M).astype(np.int64)
         sides = {
             (axis, side): list(_halved(_spots(tuple(np.delete(size, axis)), rng)))
@@ -175,7 +175,7 @@ def _halved(picture: Array) -> Iterator[Array]:
 @cache
 def _boxes() -> tuple[_Box, _Box]:
     rng = np.random.default_rng(0)
-    return _Box.of(_HALL_M, rng), _Box.of(_BLOCK_M, rng)
+    return _Box.textured(_HALL_M, rng), _Box.textured(_BLOCK_M, rng)
 
 
 def render(center: Array, world_from_cam: Array) -> Array:

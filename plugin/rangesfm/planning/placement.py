@@ -13,7 +13,7 @@ from rangesfm.planning.expected import expect_roughly
 from rangesfm.planning.paths import places_on_way, way_along
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.progress import Progress, SilentProgress
+from rangesfm.progress import SILENT, Progress
 from rangesfm.ranging.anchors.anchor import Anchor
 
 # Numbers of places along x, y and z of a box. As many are tried along all walls together, at two heights.
@@ -67,14 +67,13 @@ def spread_anchors(num: int, places: Array, stddev_m: float) -> tuple[Anchor, ..
 
 
 @with_one_blas_thread
-def place_anchors(planned: PlannedSurvey, progress: Progress | None = None) -> PlannedSurvey:
+def place_anchors(planned: PlannedSurvey, progress: Progress = SILENT) -> PlannedSurvey:
     """Return the survey with its anchors moved to improve scale and position; the result is a local optimum.
 
     One anchor after the other is tried at every allowed place (Fedorov's exchange). The product of the scale's relative
     standard deviation and the least certain keyframe's standard deviation is minimized, or the first alone if the map
     is not placed in the site.
     """
-    progress = progress or SilentProgress()
     if planned.is_placed or planned.allowed_m is None:
         return planned
     best = _badness(planned)

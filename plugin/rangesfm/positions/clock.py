@@ -18,7 +18,7 @@ from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
 from rangesfm.geometry.similarity import Similarity, align_points, rounding_of, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.antenna_track import AntennaTrack
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import SILENT
 from rangesfm.ranging.clock.fit import OffsetFit, Timing, refine_offset
 from rangesfm.ranging.clock.search import Cells, OffsetCurve, PathSamples, Scanned, centred_columns, scan_parts
 from rangesfm.ranging.clock.squares import residual_stddev
@@ -111,7 +111,9 @@ def fit_positions(positions: TimedPositions, path: PathSamples, offset_s: float,
     rates = solved.scale * velocities @ solved.site_from_model.rotation.T
     axes = np.tile(np.arange(3), num)
     measured_m = positions.position_m.ravel()
-    return OffsetFit.of(offset_s, positions, measured_m, axes, solved, solved.residuals_m.ravel(), rates.ravel())
+    return OffsetFit.from_solution(
+        offset_s, positions, measured_m, axes, solved, solved.residuals_m.ravel(), rates.ravel()
+    )
 
 
 def residual_stddev_at(positions: TimedPositions, path: PathSamples, offset_s: float) -> float:
@@ -145,7 +147,7 @@ def _scan(positions: TimedPositions, weights: Array, path: PathSamples) -> Scann
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991. Its
     sums over pairs of points are correlations in time.
     """
-    cells = Cells.of(positions.times_s, path)
+    cells = Cells.from_times(positions.times_s, path)
     correlate = cells.correlate
     squared, *centers, known = centred_columns(path, cells.stride).T
     of_path = [correlate.transform(values) for values in (known, *centers, squared)]
@@ -195,7 +197,7 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
     try:
         require_enough(path, len(track.log), POSITIONS)
         samples = path_to_search(path, track.antenna_in_cam_m[None], track.association)
-        found = offset_of_motion(positions, samples, POSITIONS, seed=0, progress=SilentProgress())
+        found = offset_of_motion(positions, samples, POSITIONS, seed=0, progress=SILENT)
     except GeometryError:
         if track.offset_s is None:
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -45,12 +46,12 @@ def read_pose_priors(path: Path) -> PositionLog:
     is_geographic = systems == {pycolmap.PosePriorCoordinateSystem.WGS84}
     at = np.array([np.ravel(prior.position) for prior in priors], dtype=np.float64).reshape(-1, 3)
     covariances = np.array([prior.position_covariance for prior in priors], dtype=np.float64).reshape(-1, 3, 3)
-    return PositionLog.of(
+    log = PositionLog.in_time_order(
         path,
         "pose priors",
         at[:, [1, 0, 2]] if is_geographic else at,
         np.zeros(len(priors), dtype=np.int64),
         image_name=[names.get(prior.corr_data_id.id, "") for prior in priors],
         covariance_m2=np.full_like(covariances, np.nan) if is_geographic else covariances,
-        crs=GEOGRAPHIC if is_geographic else None,
     )
+    return replace(log, crs=GEOGRAPHIC if is_geographic else None)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -166,7 +167,7 @@ def _log_of_table(
         is_lost |= table.numbers(names["quality"], empty=0.0, missing=MISSING) == 0
     position[is_lost] = np.nan
     image_name = None if times is not None else [name for name, k in zip(table.text(names["image_name"]), kept) if k]
-    return PositionLog.of(
+    log = PositionLog.in_time_order(
         path,
         "table",
         position[kept],
@@ -174,9 +175,9 @@ def _log_of_table(
         times_s=None if times is None else times[kept],
         image_name=image_name,
         covariance_m2=_covariances(table, names, units)[kept],
-        crs=GEOGRAPHIC if are_degrees else crs,
         notes=notes,
     )
+    return replace(log, crs=GEOGRAPHIC if are_degrees else crs)
 
 
 def _are_degrees(names: Mapping[str, str], columns: Sequence[Array]) -> bool:
@@ -243,7 +244,7 @@ def _is_tum(head: str) -> bool:
 def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
     table = tum_table(path)
     times_s, *places = (table.numbers(name, empty=np.nan, missing=MISSING) for name in table.columns[:4])
-    return PositionLog.of(path, "tum", np.column_stack(places), table.line, times_s=times_s)
+    return PositionLog.in_time_order(path, "tum", np.column_stack(places), table.line, times_s=times_s)
 
 
 def _is_odm(head: str) -> bool:
@@ -281,7 +282,8 @@ def _read_odm(path: Path, options: PositionOptions) -> PositionLog:
     for axis, column in enumerate((6, 6, 7)):
         covariances[:, axis, axis] = np.where(rows[:, column] > 0, rows[:, column], np.nan) ** 2
     covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
-    return PositionLog.of(path, "odm", rows[:, :3], lines, image_name=names, covariance_m2=covariances, crs=crs)
+    log = PositionLog.in_time_order(path, "odm", rows[:, :3], lines, image_name=names, covariance_m2=covariances)
+    return replace(log, crs=crs)
 
 
 def _is_marvelmind(head: str) -> bool:
@@ -317,7 +319,9 @@ def _read_marvelmind(path: Path, options: PositionOptions) -> PositionLog:
         raise InputError(f"has positions of {', '.join(sorted(set(ids)))}: say which it is (--position_tag_id)", path)
     kept = np.array(ids) == wanted
     values = np.array(rows)[kept]
-    return PositionLog.of(path, "marvelmind", values[:, 1:], np.array(lines)[kept], times_s=values[:, 0] / 1e3)
+    return PositionLog.in_time_order(
+        path, "marvelmind", values[:, 1:], np.array(lines)[kept], times_s=values[:, 0] / 1e3
+    )
 
 
 def _is_nmea(head: str) -> bool:
@@ -358,9 +362,10 @@ def _read_nmea(path: Path, _options: PositionOptions) -> PositionLog:
     notes = [f"{num_broken} broken sentences are left out"] if num_broken else []
     values = np.array(rows).reshape(-1, 4)
     covariances = np.array([np.diag(stddev**2) for stddev in stddevs]).reshape(-1, 3, 3)
-    return PositionLog.of(
-        path, "nmea", values[:, 1:], lines, times_s=values[:, 0], covariance_m2=covariances, crs=GEOGRAPHIC, notes=notes
+    log = PositionLog.in_time_order(
+        path, "nmea", values[:, 1:], lines, times_s=values[:, 0], covariance_m2=covariances, notes=notes
     )
+    return replace(log, crs=GEOGRAPHIC)
 
 
 def _checksum(text: str) -> int:
@@ -434,16 +439,16 @@ def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
     values = np.array(rows).reshape(-1, 12)
     north_first = values[:, [2, 1, 3]] if is_geographic else values[:, 1:4]
     notes = ["times are GPS time, which is ahead of UTC by leap seconds"] if names[0] == "GPST" else []
-    return PositionLog.of(
+    log = PositionLog.in_time_order(
         path,
         "rtklib",
         north_first,
         at_lines,
         times_s=values[:, 0],
         covariance_m2=_covariance_of_rtklib(values[:, 6:12], is_geographic),
-        crs=GEOGRAPHIC if is_geographic else None,
         notes=notes,
     )
+    return replace(log, crs=GEOGRAPHIC if is_geographic else None)
 
 
 def _time_of_rtklib(first: str, second: str) -> float:

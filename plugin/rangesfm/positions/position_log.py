@@ -71,9 +71,8 @@ class PositionLog:
         """Return the log with other positions (n, 3)."""
         return replace(self, position_m=position_m)
 
-    @classmethod
-    def of(
-        cls,
+    @staticmethod
+    def in_time_order(
         path: Path,
         format: str,
         position_m: Array,
@@ -82,10 +81,11 @@ class PositionLog:
         times_s: Array | None = None,
         image_name: Sequence[str] | None = None,
         covariance_m2: Array | None = None,
-        crs: str | None = None,
         notes: Sequence[str] = (),
     ) -> PositionLog:
         """Make a log in the order of time, without rows that have no position or the time of an earlier one.
+
+        It has no coordinate system.
 
         Raises:
             InputError: there is no position.
@@ -104,7 +104,7 @@ class PositionLog:
             rows = order[np.append(True, np.diff(times_s[order]) > 0)]
             if len(rows) < num:
                 told.append(f"{num - len(rows)} of {num} positions have the time of an earlier one and are left out")
-        return cls(
+        return PositionLog(
             position_m[rows],
             covariance_m2[rows],
             None if times_s is None else times_s[rows],
@@ -112,6 +112,5 @@ class PositionLog:
             np.asarray(line, dtype=np.int64)[rows],
             path,
             format,
-            crs,
-            tuple(f"{path.name}: {note}" for note in told),
+            notes=tuple(f"{path.name}: {note}" for note in told),
         )

@@ -151,7 +151,7 @@ def child_command(module: str) -> list[str]:
 def supervise(
     command: Sequence[str],
     given: bytes,
-    listen: Callable[[dict[str, Any]], None],
+    listen: Callable[[dict[str, Any]], object],
     *,
     environment: Mapping[str, str],
     memory_limit_bytes: int | None,
@@ -187,7 +187,7 @@ def supervise(
 
 
 def run_children(
-    module: str, given: Iterable[object], num_at_once: int, update: Callable[[int], None]
+    module: str, given: Iterable[object], num_at_once: int, update: Callable[[int], object]
 ) -> Generator[None, None, None]:
     """Have each piece of work done by a process; yield once for each finished piece, in their order.
 
@@ -277,7 +277,7 @@ class _Watched:
             self.process.kill()
 
 
-def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], None]) -> dict[str, Any] | None:
+def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], object]) -> dict[str, Any] | None:
     """Send the input and listen until the process closes its stdout; return its last message."""
     process = watched.process
     assert process.stdin is not None

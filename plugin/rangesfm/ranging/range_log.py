@@ -238,9 +238,8 @@ class RangeLog:
         ids, first, second = chosen._ends()
         return chosen._between(ids, np.arange(len(ids)) < len(self.anchor_ids), first, second)
 
-    @classmethod
+    @staticmethod
     def from_arrays(
-        cls,
         anchor_id: Sequence[str] | npt.NDArray[np.str_] | Categories,
         range_m: npt.ArrayLike,
         *,
@@ -263,7 +262,7 @@ class RangeLog:
         n = np.size(range_m)
         anchor = _categories(anchor_id)
         tag = _categories([DEFAULT_TAG_ID] * n if tag_id is None else tag_id)
-        return cls(
+        return RangeLog(
             anchor_ids=anchor.names,
             anchor_index=anchor.index,
             range_m=np.asarray(range_m, np.float64),

@@ -40,7 +40,7 @@ class StampOptions:
     t_off_s: float = 0.0
 
     @classmethod
-    def of(cls, options: LogOptions) -> StampOptions:
+    def from_log_options(cls, options: LogOptions) -> StampOptions:
         speeds: dict[str | float, float] = {"air": AIR_M_PER_S, "vacuum": VACUUM_M_PER_S}
         speed = options.propagation_speed
         return cls(

@@ -34,7 +34,7 @@ class Frame:
     time_s: float
     suffix: str
     grey: Callable[[], Image]
-    write: Callable[[Path], None]
+    write: Callable[[Path], object]
 
     def sharpness(self) -> float:
         """Return the mean square difference between neighbouring pixels. Blur makes it smaller."""

@@ -103,7 +103,7 @@ def cameras_of_photos(options: CameraOptions, photos: Photos, rigs: Rigs = NO_RI
     place_of: dict[str, int] = {}
     guessed: list[str] = []
     for table in options.tables:
-        own = photos.of([name for name in photos.names if table_of[name] is table])
+        own = photos.subset([name for name in photos.names if table_of[name] is table])
         if not own.names and table.images is not None:
             raise InputError(
                 f"[[camera]] images is '{table.images}', expected a pattern that fits some photo's name, such as"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,16 +38,16 @@ def read_exif_positions(folder: Path) -> PositionLog:
         raise InputError("no photo in it has an EXIF position with an altitude", folder)
     stddevs_m = np.array([_stddevs_m(found[name]) for name in at])
     flat = f"{len(found) - len(at)} of {len(found)} EXIF positions have no altitude and are left out"
-    return PositionLog.of(
+    log = PositionLog.in_time_order(
         folder,
         "exif",
         np.array([*at.values()]),
         np.zeros(len(at), dtype=np.int64),
         image_name=[*at],
         covariance_m2=stddevs_m[:, :, None] ** 2 * np.eye(3),
-        crs=GEOGRAPHIC,
         notes=[flat] if len(at) < len(found) else [],
     )
+    return replace(log, crs=GEOGRAPHIC)
 
 
 def _is_fixed(data: GpsData) -> bool:

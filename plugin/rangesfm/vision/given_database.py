@@ -128,7 +128,7 @@ def _read(source: Path, path: Path, photos: Photos) -> GivenDatabase:
         note += f"; {len(others)} of its photos are not keyframes, the first is {others[0]}"
     if has_rigs:
         note += "; its rigs are ignored: rigs are taken from [images] rig_config"
-    return GivenDatabase(source, path, sha256_of(source), photos.of(ids), tuple(ids.values()), num_pairs, note)
+    return GivenDatabase(source, path, sha256_of(source), photos.subset(ids), tuple(ids.values()), num_pairs, note)
 
 
 @contextmanager

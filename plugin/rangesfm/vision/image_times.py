@@ -61,7 +61,7 @@ class ImageTimes:
     def __len__(self) -> int:
         return len(self.image_names)
 
-    def of(self, names: Sequence[str]) -> ImageTimes:
+    def subset(self, names: Sequence[str]) -> ImageTimes:
         """Return the times of the photos with these names."""
         rows = np.flatnonzero(np.isin(self.image_names, names))
         kept = tuple(self.image_names[row] for row in rows)

@@ -35,7 +35,7 @@ class Size:
     num_points: int
 
     @classmethod
-    def of(cls, model: pycolmap.Reconstruction) -> Size:
+    def measured(cls, model: pycolmap.Reconstruction) -> Size:
         return cls(model.num_reg_frames(), model.num_points3D())
 
 
@@ -63,7 +63,7 @@ def incremental_mapping(
     *,
     options: pycolmap.IncrementalPipelineOptions,
     unfinished: UnfinishedMapping | None = None,
-    callback: Callable[[UnfinishedMapping], None] = lambda unfinished: None,
+    callback: Callable[[UnfinishedMapping], object] = lambda unfinished: None,
     cancellation_token: pycolmap.CancellationToken | None = None,
 ) -> list[pycolmap.Reconstruction]:
     """Run the incremental mapping and return all models, in the order in which they were begun.
@@ -87,7 +87,7 @@ def incremental_mapping(
     def models() -> list[pycolmap.Reconstruction]:
         return [*finished, *(manager.get(index) for index in range(manager.size()))]
 
-    def call(note: Callable[[pycolmap.Reconstruction], None]) -> None:
+    def call(note: Callable[[pycolmap.Reconstruction], object]) -> None:
         *done, growing = models()
         note(growing)
         callback(UnfinishedMapping(tuple(done), growing, adjustments.size_at_last))
@@ -95,7 +95,7 @@ def incremental_mapping(
             raise _StoppedError
 
     def begin(growing: pycolmap.Reconstruction) -> None:
-        adjustments.begin(growing, left.pop().size_at_adjustment if left else Size.of(growing))
+        adjustments.begin(growing, left.pop().size_at_adjustment if left else Size.measured(growing))
 
     whens = pycolmap.IncrementalPipelineCallback
     pipeline.add_callback(whens.INITIAL_IMAGE_PAIR_REG_CALLBACK, partial(call, begin))
@@ -141,7 +141,7 @@ class _WholeAdjustments:
     def begin(self, model: pycolmap.Reconstruction, size_at_last: Size) -> None:
         """Begin with a model, new or continued."""
         self._poses, self.size_at_last = _poses(model), size_at_last
-        now, last = Size.of(model), size_at_last
+        now, last = Size.measured(model), size_at_last
         if now == last:
             self._count_as_usual()
             return
@@ -157,7 +157,7 @@ class _WholeAdjustments:
         """Note whether the model has been adjusted, which changes all poses."""
         before, self._poses = self._poses, _poses(model)
         if all(self._poses[id_] != pose for id_, pose in before.items() if id_ in self._poses):
-            self.size_at_last = Size.of(model)
+            self.size_at_last = Size.measured(model)
             self._count_as_usual()
 
     def _count_as_usual(self) -> None:

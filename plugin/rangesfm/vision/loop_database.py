@@ -19,7 +19,7 @@ from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.files.manifest import content_hash
 from rangesfm.files.output_folder import OutputFolder, remove
-from rangesfm.progress import Progress, SilentProgress
+from rangesfm.progress import SILENT, Progress
 from rangesfm.vision.matching import MatchingOptions, match_pairs
 from rangesfm.vision.steps import DATABASE_NAME, LOG_NAME, RECORD_NAME, Steps
 
@@ -66,7 +66,7 @@ class LoopDatabase:
     has_record: bool
 
     @classmethod
-    def of(cls, source: Path, output: OutputFolder) -> LoopDatabase:
+    def copied(cls, source: Path, output: OutputFolder) -> LoopDatabase:
         """Copy a database, unless an interrupted run has copied the same one and added matches to it."""
         folder, record = output.private / _FOLDER_NAME, output.newest(output.path / RECORD_NAME)
         has_record = record.is_file() and source == output.newest(output.path / DATABASE_NAME)
@@ -154,7 +154,7 @@ class LoopDatabase:
         remove(self.folder)
 
     def _record(self) -> Steps:
-        return Steps(self.folder / RECORD_NAME, SilentProgress())
+        return Steps(self.folder / RECORD_NAME, SILENT)
 
     def _tried(self) -> set[Pair]:
         return _noted(self._record(), _LOOPS)

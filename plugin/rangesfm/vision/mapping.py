@@ -46,7 +46,7 @@ class ExternalMapper:
     words: tuple[str, ...]
 
     @classmethod
-    def of(cls, command: str) -> ExternalMapper:
+    def from_command(cls, command: str) -> ExternalMapper:
         """Return the mapper of a command line.
 
         Raises:
@@ -88,7 +88,7 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
         InputError: a key or value that COLMAP does not have, or there is no such external mapper.
     """
     if mapper.command is not None:
-        return ExternalMapper.of(mapper.command)
+        return ExternalMapper.from_command(mapper.command)
     options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions
     # Several threads search for an initial pair until one of them has found some pair, and Ceres adds up what they
     # compute in the order in which they finish: every run gives another map.

@@ -171,7 +171,7 @@ def _require_matches(database_path: Path, photos: Photos) -> None:
 
 
 def _match_shares(
-    shares: Sequence[MatchingShare], database_path: Path, num_at_once: int, log: Path, update: Callable[[int], None]
+    shares: Sequence[MatchingShare], database_path: Path, num_at_once: int, log: Path, update: Callable[[int], object]
 ) -> None:
     begun: deque[MatchingShare] = deque()
 

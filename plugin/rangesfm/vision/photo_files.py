@@ -42,7 +42,7 @@ class Photos:
     sizes: tuple[tuple[int, int], ...]
     left_out: dict[str, str]
 
-    def of(self, names: Collection[str]) -> Photos:
+    def subset(self, names: Collection[str]) -> Photos:
         """Return the photos with these names."""
         wanted = set(names)
         kept = [(name, size) for name, size in zip(self.names, self.sizes, strict=True) if name in wanted]

@@ -13,7 +13,7 @@ from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.files.atomic import scratch_folder, sole_writer
 from rangesfm.files.contents import AnyPath
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.progress import Progress, SilentProgress
+from rangesfm.progress import SILENT, Progress
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.given_database import opened
@@ -23,7 +23,7 @@ from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
 from rangesfm.vision.renewed_database import RenewedDatabase
 from rangesfm.vision.rigs import NO_RIGS, Rigs
-from rangesfm.vision.steps import LOG_NAME, Workspace, fingerprint
+from rangesfm.vision.steps import Workspace, fingerprint
 from rangesfm.vision.unpublished import UnpublishedReconstruction
 
 
@@ -57,10 +57,7 @@ def reconstruct(
     mapper: MapperOptions,
     rigs: Rigs = NO_RIGS,
     seed: int = 0,
-    progress: Progress | None = None,
-    restart: bool = False,
-    superseded: Sequence[str] = (),
-    deferred: bool = False,
+    progress: Progress = SILENT,
 ) -> ReconstructionSummary:
     """Reconstruct photos.
 
@@ -78,9 +75,6 @@ def reconstruct(
         camera: which photos share a camera, and what is known of the cameras.
         rigs: the rigs that cameras are mounted on.
         seed: the same seed gives the same models.
-        restart: take nothing over.
-        superseded: names in the output folder of files made from the earlier models; they are removed with them.
-        deferred: leave the earlier reconstruction in its place until a result is published (``OutputFolder.defer``).
 
     Raises:
         InputError: COLMAP does not accept an option, a folder cannot be written to, or files that this tool did not
@@ -88,30 +82,43 @@ def reconstruct(
         ReconstructionError: the photos cannot be read, or do not give a model.
         KeyboardInterrupt: as soon as COLMAP has stopped.
     """
-    pipeline_options(camera, mapper, seed)  # so that bad options are refused before anything is computed
-    progress = progress or SilentProgress()
+    pipeline_options(camera, mapper, seed)  # so that bad options are refused before anything is written
     with (
         sole_writer(Path(output_path)) as output,
-        UnpublishedReconstruction(output, progress, restart=restart) as unpublished,
+        UnpublishedReconstruction(output, progress, restart=False) as unpublished,
     ):
-        space = unpublished.space
-        photos, inputs = match_photos(Path(image_path), image_names, camera, mapper, rigs, seed, space)
-        _map(space, photos, inputs, camera, mapper, rigs, seed)
-        found, log_path = read_mapped_models(unpublished.models_path), output.path / LOG_NAME
-        files = unpublished.files()
-        if files and deferred:
-            output.defer(files)
-            log_path = space.log
-        else:
-            if files:
-                output.publish(files, [output.path / name for name in superseded])
-            unpublished.discard()
+        summary = reconstruct_in(unpublished, Path(image_path), image_names, camera, mapper, rigs, seed)
+        unpublished.publish()
+        return summary
+
+
+def reconstruct_in(
+    unpublished: UnpublishedReconstruction,
+    image_path: Path,
+    image_names: Sequence[str],
+    camera: CameraOptions,
+    mapper: MapperOptions,
+    rigs: Rigs,
+    seed: int,
+) -> ReconstructionSummary:
+    """Reconstruct photos as ``reconstruct`` does, in a workspace that is not published yet.
+
+    The options have been checked by ``pipeline_options``.
+    """
+    space = unpublished.space
+    photos, inputs = match_photos(image_path, image_names, camera, mapper, rigs, seed, space)
+    _map(space, photos, inputs, camera, mapper, rigs, seed)
+    found = read_mapped_models(unpublished.models_path)
     if len(found) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in found)
-        progress.message(f"{len(found)} separate models of {sizes} photos")
-    steps = space.steps
+        space.progress.message(f"{len(found)} separate models of {sizes} photos")
     return ReconstructionSummary(
-        found, len(image_names), found[0].num_reg_images(), steps.seconds, steps.earlier_seconds, log_path
+        found,
+        len(image_names),
+        found[0].num_reg_images(),
+        space.steps.seconds,
+        space.steps.earlier_seconds,
+        unpublished.log_path,
     )
 
 

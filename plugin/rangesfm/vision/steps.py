@@ -43,7 +43,7 @@ class Steps:
         record_path: Path,
         progress: Progress,
         earlier: Steps | None = None,
-        begin: Callable[[Mapping[str, str]], None] = lambda passed: None,
+        begin: Callable[[Mapping[str, str]], object] = lambda passed: None,
     ):
         """Read the record of earlier runs.
 
@@ -68,8 +68,8 @@ class Steps:
         name: str,
         inputs: str,
         output: Path,
-        prepare: Callable[[], None],
-        work: Callable[[], None],
+        prepare: Callable[[], object],
+        work: Callable[[], object],
         *,
         unfinished: Path | None = None,
     ) -> None:
@@ -169,7 +169,7 @@ class Workspace:
         progress: Progress,
         *,
         earlier: Steps | None = None,
-        begin: Callable[[Mapping[str, str]], None] = lambda passed: None,
+        begin: Callable[[Mapping[str, str]], object] = lambda passed: None,
         log: Path | None = None,
     ):
         self.progress = progress

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rangesfm.files.output_folder import OutputFolder, remove
@@ -55,7 +55,31 @@ class UnpublishedReconstruction:
         """Folder of the models, once they exist."""
         return (self._folder if self.space.steps.has_begun else self._output.path) / self.space.models.name
 
-    def files(self) -> dict[Path, Path]:
+    @property
+    def log_path(self) -> Path:
+        """Place of COLMAP's log in the output folder."""
+        return self._output.path / LOG_NAME
+
+    def publish(self, superseded: Sequence[Path] = ()) -> None:
+        """Move the new files to their places in the output folder, and remove the workspace.
+
+        Args:
+            superseded: files made from the earlier models, which are removed with these.
+        """
+        files = self._files()
+        if files:
+            self._output.publish(files, superseded)
+        self.discard()
+
+    def defer(self) -> None:
+        """Leave the earlier reconstruction in its place until a result is published; see ``OutputFolder.defer``."""
+        files = self._files()
+        if files:
+            self._output.defer(files)
+        else:
+            self.discard()
+
+    def _files(self) -> dict[Path, Path]:
         """Return the files and folders to publish: for each path in the output folder, the one that goes there."""
         if not self.space.steps.has_begun:
             return {}

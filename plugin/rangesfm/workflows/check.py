@@ -13,7 +13,7 @@ import numpy as np
 
 from rangesfm.errors import RangesfmError
 from rangesfm.files.clock_times import span_text
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import SILENT, Journal
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.inputs import RangingInputs
@@ -68,7 +68,7 @@ class CheckedSurvey:
 def check_survey(survey: Survey) -> CheckedSurvey:
     """Read all inputs of a run as the run does, and return what they are and what is wrong with them."""
     checked = CheckedSurvey()
-    journal = Journal(SilentProgress(), warnings=checked.warnings, notes=checked.assumed)
+    journal = Journal(SILENT, warnings=checked.warnings, notes=checked.assumed)
     model = survey.images.model
     photos = None
     with checked.finding_faults():
@@ -92,7 +92,7 @@ def check_survey(survey: Survey) -> CheckedSurvey:
             check_taped_ends(run.with_photos(keyframes, "the map"), keyframes)
         _tell_of_times(survey, inputs, keyframes, times, checked)
         if photos is not None:
-            _check_mapper(survey, photos.of(keyframes), checked)
+            _check_mapper(survey, photos.subset(keyframes), checked)
     return checked
 
 

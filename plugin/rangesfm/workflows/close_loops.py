@@ -39,7 +39,7 @@ def close_loops(run: SurveyRun, metric: MetricResult, refine: Refine) -> MetricR
     if not run.survey.mapper.close_loops or not len(metric.observations.log) or metric.kept_refinement is None:
         return metric
     with sole_writer(run.survey.output.path) as output:
-        if (matching := LoopMatching.of(run, output)) is None:
+        if (matching := LoopMatching.for_survey(run, output)) is None:
             return metric
         if metric.map_errors is None:
             run.journal.warn("loops are not closed, because the covariance of the poses is not known")

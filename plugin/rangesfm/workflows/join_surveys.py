@@ -18,7 +18,7 @@ from rangesfm.files.folders import real_path
 from rangesfm.geometry.trajectory import Trajectory, is_one_after_the_other
 from rangesfm.positions.true_positions import read_true_positions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
-from rangesfm.progress import Journal, Progress, SilentProgress
+from rangesfm.progress import SILENT, Journal, Progress
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.anchors.site import local_site
@@ -235,7 +235,7 @@ def paths_of_surveys(
 
 
 @with_one_blas_thread
-def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress | None = None) -> RunResult:
+def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress = SILENT) -> RunResult:
     """Make one map of several surveys from the results of their runs.
 
     Args:
@@ -247,7 +247,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress 
         InputError: a folder is not a result, or the anchors of two surveys contradict each other.
         GeometryError: none of the others can be joined to the first one.
     """
-    journal = Journal(progress or SilentProgress())
+    journal = Journal(progress)
     check_formats(survey.export.formats)
     finished = read_finished_runs(folders)
     require_apart(folders, survey.output.path)

@@ -25,7 +25,7 @@ class LoopMatching:
     progress: Progress
 
     @classmethod
-    def of(cls, run: SurveyRun, output: OutputFolder) -> LoopMatching | None:
+    def for_survey(cls, run: SurveyRun, output: OutputFolder) -> LoopMatching | None:
         """Return the matching of a survey; None where loops are not to be closed."""
         survey, is_given = run.survey, run.survey.images.model is not None
         source = survey.mapper.database_path if is_given else output.newest(output.path / DATABASE_NAME)
@@ -36,7 +36,7 @@ class LoopMatching:
         options = matching_options(survey.mapper, num_photos, survey.output.seed)
         if not (is_given or options.is_in_time_only):
             return None
-        return cls(LoopDatabase.of(source, output), options, run.journal.progress)
+        return cls(LoopDatabase.copied(source, output), options, run.journal.progress)
 
     def match(self, pairs: list[Pair]) -> Mapping[Pair, Indices]:
         """Return the matches (m, 2) of those of the pairs that are verified by a two-view geometry."""

@@ -26,6 +26,7 @@ from rangesfm.distances.locate_lengths import check_ends
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
+from rangesfm.files.atomic import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.progress import Journal
 from rangesfm.result.result_folder import RESULT_NAMES, places_for_photos
@@ -36,9 +37,11 @@ from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images
 from rangesfm.vision.keyframes import select_keyframes
-from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.vision.mapping import pipeline_options
+from rangesfm.vision.reconstruct import reconstruct_in
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.vision.tags import find_tags
+from rangesfm.vision.unpublished import UnpublishedReconstruction
 from rangesfm.workflows.place_of_result import refuse_to_overwrite
 from rangesfm.workflows.place_ranges import check_times
 
@@ -173,7 +176,7 @@ def find_keyframes(
         keyframes = select_keyframes(image_times, survey.images)
         journal.note(*image_times.assumed)
         journal.warn(*image_times.notes)
-        return keyframes, image_times.of(keyframes)
+        return keyframes, image_times.subset(keyframes)
 
 
 def with_tags(run: SurveyRun, names: Sequence[str]) -> SurveyRun:
@@ -221,20 +224,19 @@ def map_keyframes(
     """
     rigs = read_rigs(survey.images.rig_config)
     frames = rigs.frames(list_images(survey.photos_path))
+    photos = [photo for keyframe in keyframes for photo in frames[keyframe]]
+    camera, mapper, seed = survey.camera, survey.mapper, survey.output.seed
     with survey.source.naming_lines():
-        summary = reconstruct(
-            survey.photos_path,
-            [photo for keyframe in keyframes for photo in frames[keyframe]],
-            survey.output.path,
-            camera=survey.camera,
-            mapper=survey.mapper,
-            rigs=rigs,
-            seed=survey.output.seed,
-            progress=journal.progress,
-            restart=restart,
-            superseded=RESULT_NAMES,
-            deferred=deferred,
-        )
+        pipeline_options(camera, mapper, seed)  # so that bad options are refused before anything is written
+        with (
+            sole_writer(survey.output.path) as output,
+            UnpublishedReconstruction(output, journal.progress, restart=restart) as unpublished,
+        ):
+            summary = reconstruct_in(unpublished, survey.photos_path, photos, camera, mapper, rigs, seed)
+            if deferred:
+                unpublished.defer()
+            else:
+                unpublished.publish([output.path / name for name in RESULT_NAMES])
     journal.seconds.update({**summary.earlier_seconds, **summary.seconds})
     if summary.num_registered < summary.num_keyframes:
         which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"

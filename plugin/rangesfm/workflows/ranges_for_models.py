@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.comparison.model_ranges import ModelRanges
-from rangesfm.progress import Journal, SilentProgress
+from rangesfm.progress import SILENT, Journal
 from rangesfm.ranging.range_observations import USED
 from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.photo_times import times_of_model
@@ -35,7 +35,7 @@ def ranges_of_survey(survey: Survey, model: pycolmap.Reconstruction, model_path:
         GeometryError: the ranges do not determine the time offset or the scale of the model.
     """
     survey = survey.changed({"images.model": model_path.absolute()})
-    run = SurveyRun(survey, read_ranging_inputs(survey), Journal(SilentProgress()))
+    run = SurveyRun(survey, read_ranging_inputs(survey), Journal(SILENT))
     times = None if run.inputs.log.image_name is not None else times_of_model(survey, model, model_path).by_name()
     return _ranges_of_map(*map_of_model(run, model, refine=False), times)
 

@@ -18,7 +18,7 @@ from rangesfm.files.atomic import sole_writer
 from rangesfm.positions.clock import find_antenna_offset
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
-from rangesfm.progress import Journal, Progress, SilentProgress
+from rangesfm.progress import SILENT, Journal, Progress
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
@@ -46,7 +46,7 @@ from rangesfm.workflows.tie_models import tie_by_photos
 
 
 @with_one_blas_thread
-def run_survey(survey: Survey, *, progress: Progress | None = None, restart: bool = False) -> RunResult:
+def run_survey(survey: Survey, *, progress: Progress = SILENT, restart: bool = False) -> RunResult:
     """Make the metric model of a survey and write the result folder, as ``rangesfm run`` does.
 
     Args:
@@ -68,8 +68,8 @@ def run_survey(survey: Survey, *, progress: Progress | None = None, restart: boo
     return (refine_model if survey.refine.enabled else scale_model)(survey, progress=progress)
 
 
-def _from_photos(survey: Survey, progress: Progress | None, *, restart: bool) -> RunResult:
-    run = begin_run(survey, Journal(progress or SilentProgress()))
+def _from_photos(survey: Survey, progress: Progress, *, restart: bool) -> RunResult:
+    run = begin_run(survey, Journal(progress))
     with sole_writer(survey.output.path) as output, at_most(survey.mapper.num_threads):
         output.require_own(output.path / name for name in result_names(survey))
         run = replace(run, survey=with_photos_in_folder(survey, run.journal, restart=restart))
@@ -83,9 +83,9 @@ def _from_photos(survey: Survey, progress: Progress | None, *, restart: bool) ->
         return with_results(*map_in_metres(run, paths, refine=survey.refine.enabled))
 
 
-def reconstruct_survey(survey: Survey, *, progress: Progress | None = None, restart: bool = False) -> list[str]:
+def reconstruct_survey(survey: Survey, *, progress: Progress = SILENT, restart: bool = False) -> list[str]:
     """Make an unscaled model from photos, and return a summary for the user."""
-    journal = Journal(progress or SilentProgress())
+    journal = Journal(progress)
     refuse_to_overwrite(survey)
     with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         survey = with_photos_in_folder(survey, journal, restart=restart)
@@ -95,19 +95,19 @@ def reconstruct_survey(survey: Survey, *, progress: Progress | None = None, rest
     return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
 
 
-def refine_model(survey: Survey, *, progress: Progress | None = None) -> RunResult:
+def refine_model(survey: Survey, *, progress: Progress = SILENT) -> RunResult:
     """Make a refined metric model from an existing model and ranges, and write the result folder."""
     return _from_model(survey, progress, refine=True)
 
 
-def scale_model(survey: Survey, *, progress: Progress | None = None) -> RunResult:
+def scale_model(survey: Survey, *, progress: Progress = SILENT) -> RunResult:
     """Scale an existing model, or a model with poses only, by ranges, and write the result folder."""
     return _from_model(survey, progress, refine=False)
 
 
 @with_one_blas_thread
-def _from_model(survey: Survey, progress: Progress | None, *, refine: bool) -> RunResult:
-    run = begin_run(survey, Journal(progress or SilentProgress()))
+def _from_model(survey: Survey, progress: Progress, *, refine: bool) -> RunResult:
+    run = begin_run(survey, Journal(progress))
     sfm = read_registered(survey.given_model_path, run.journal)
     if refine and not sfm.num_points3D():
         raise InputError("the model has no 3-D points to refine: a trajectory can only be scaled", survey.images.model)

@@ -48,7 +48,7 @@ def tie_by_photos(run: SurveyRun, paths: Sequence[PathOfModel], times: ImageTime
     if len(paths) == 1:
         return list(paths)
     with sole_writer(run.survey.output.path) as output:
-        if (matching := LoopMatching.of(run, output)) is None:
+        if (matching := LoopMatching.for_survey(run, output)) is None:
             return list(paths)
         with run.journal.stage("loops"):
             groups = [sorted(path.sfm.reg_image_ids()) for path in paths]

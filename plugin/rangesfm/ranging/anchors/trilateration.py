@@ -169,16 +169,16 @@ class _Found:
     errors: FitErrors
     inflation: float
 
-    @classmethod
-    def of(cls, fit: PointFit, errors: FitErrors) -> _Found:
-        inflation = errors.inflation_of_bias(fit)
-        problem = replace(fit.problem, prior=fit.problem.prior * inflation)
-        return cls(replace(fit, problem=problem, x=improve(problem, fit.x)), errors, inflation)
-
     def judged_by(self, inflation: float) -> PointProblem:
         """Return the problem with standard deviations that account for common errors, for comparing costs."""
         problem = self.fit.problem
         return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
+
+
+def _found(fit: PointFit, errors: FitErrors) -> _Found:
+    inflation = errors.inflation_of_bias(fit)
+    problem = replace(fit.problem, prior=fit.problem.prior * inflation)
+    return _Found(replace(fit, problem=problem, x=improve(problem, fit.x)), errors, inflation)
 
 
 @with_one_blas_thread
@@ -296,7 +296,7 @@ def _trilaterate_together(
         why_not: str | None = f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed"
         if name in fits:
             try:
-                found, why_not = _conclude(anchor, _Found.of(fits[name], errors_of[name]), options), None
+                found, why_not = _conclude(anchor, _found(fits[name], errors_of[name]), options), None
             except GeometryError as error:
                 why_not = str(error)
         placements.append(AnchorPlacement(name, num, found, why_not))

@@ -101,7 +101,7 @@ class OffsetFit:
     rates: Array
 
     @classmethod
-    def of(
+    def from_solution(
         cls,
         offset_s: float,
         observed: Observed,
@@ -221,7 +221,7 @@ def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale
     points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
     squares = fit_squares(points, ranges.range_m, ranges.anchor)
     rates = np.einsum("ni,ni->n", squares.gradient, velocities)
-    return OffsetFit.of(offset_s, ranges, ranges.range_m, ranges.anchor, squares, squares.residuals_m, rates)
+    return OffsetFit.from_solution(offset_s, ranges, ranges.range_m, ranges.anchor, squares, squares.residuals_m, rates)
 
 
 def refine_offset(

@@ -243,7 +243,7 @@ class Cells(NamedTuple):
     offsets_s: Array
 
     @classmethod
-    def of(cls, times_s: Array, path: PathSamples) -> Cells:
+    def from_times(cls, times_s: Array, path: PathSamples) -> Cells:
         """Lay a grid that is as fine as the samples of the path, or coarser for very long logs."""
         first_s, last_s = float(times_s.min()), float(times_s.max())
         span_s = len(path) * path.step_s + last_s - first_s
@@ -262,7 +262,7 @@ class Cells(NamedTuple):
 
 def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> Scanned:
     """Return the result for one part of the log."""
-    cells = Cells.of(ranges.times_s, path)
+    cells = Cells.from_times(ranges.times_s, path)
     columns = centred_columns(path, cells.stride)
     pairs = combinations_with_replacement(range(columns.shape[1]), 2)
     products = {(i, j): cells.correlate.transform(columns[:, i] * columns[:, j]) for i, j in pairs}

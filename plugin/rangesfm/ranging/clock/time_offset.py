@@ -14,7 +14,7 @@ from rangesfm.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.progress import Progress, SilentProgress
+from rangesfm.progress import SILENT, Progress
 from rangesfm.ranging.association import associate, is_too_long, lever_arms
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
 from rangesfm.ranging.clock.fit import (
@@ -73,7 +73,7 @@ def estimate_time_offset(
     *,
     association: AssociationOptions | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = SILENT,
 ) -> TimeOffset:
     """Find the offset at which the ranges follow the camera's path.
 
@@ -109,7 +109,7 @@ def estimate_time_offset(
             if found is not None:
                 return found
     path = path_to_search(trajectory, tags, association)
-    return offset_of_motion(ranges, path, _RANGES, seed=seed, progress=progress or SilentProgress())
+    return offset_of_motion(ranges, path, _RANGES, seed=seed, progress=progress)
 
 
 class ObservedKind(NamedTuple):

@@ -204,7 +204,7 @@ def _ids(table: TextTable, column: str, columns: RangeColumns, empty: str | None
 def _ranges(table: TextTable, name: Mapping[str, str], columns: RangeColumns, options: ReadOptions) -> Array:
     """Return the ranges (n,) in the unit of the file, row by row; one that is not positive means no measurement."""
     if "range" not in name and not columns.wide:
-        return _ranges_by_stamps(table, name, StampOptions.of(options))
+        return _ranges_by_stamps(table, name, StampOptions.from_log_options(options))
     unit = " of metres" if options.range_unit in (None, "m") else f" of {options.range_unit}"
     expected, names = f"a positive number{unit}; 0 means no measurement", columns.wide or [name["range"]]
     return np.column_stack([table.numbers(k, empty=0.0, missing=MISSING, expected=expected) for k in names]).ravel()
