@@ -214,9 +214,8 @@ class TestEarlierRun:
         [
             ({"mapper": MapperOptions(features=FEATURES, pipeline={"extract_colors": False})}, ["mapping"]),
             ({"seed": 1}, ["matching", "mapping"]),
-            ({"restart": True}, ["features", "matching", "mapping"]),
         ],
-        ids=["mapper option", "seed", "restart"],
+        ids=["mapper option", "seed"],
     )
     def test_is_taken_over_up_to_the_first_change(
         self, room: Room, output: Path, change: dict[str, Any], steps: list[str]
