@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 
-from rangesfm.options import RangeModelOptions
+from rangesfm.geometry.poses import model_poses
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.measurements.kind import MapState
+from rangesfm.measurements.table import ranges_of_map
+from rangesfm.options import RangeModelOptions, RefineOptions
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 
@@ -40,3 +48,17 @@ def known_errors(
         inflation=inflation,
     )
     return found.spread(rows, num)
+
+
+def predicted_by_model(
+    metric: pycolmap.Reconstruction,
+    trajectory: Trajectory,
+    observations: RangeObservations,
+    metric_from_sfm: Similarity,
+    tag_in_cam_m: npt.ArrayLike,
+    anchors: Sequence[AnchorEstimate],
+) -> Array:
+    """Return the (n,) ranges predicted by a metric model, NaN without a place; arguments as for a refinement."""
+    errors, options = known_errors(observations, 0.1), RefineOptions()
+    ranges = ranges_of_map(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors, errors, options)
+    return ranges.predicted_m(MapState(model_poses(metric, trajectory.frame_ids), ranges.blocks))

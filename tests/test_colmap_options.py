@@ -18,11 +18,11 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
 import rangesfm
+from rangesfm.ceres.bundle_adjustment import bundle_adjustment
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.loops.resection import resection_options
 from rangesfm.options import CameraOptions, MapperOptions, RefineOptions
 from rangesfm.progress import SilentProgress
-from rangesfm.refine.bundle_adjustment import bundle_adjustment
 from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.mapping import mapping_options, pipeline_options

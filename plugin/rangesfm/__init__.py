@@ -49,7 +49,7 @@ _HOME = {
     "read_reference": "rangesfm.geometry.reference",
     "read_survey": "rangesfm.survey.survey_reader",
     "reconstruct": "rangesfm.vision.reconstruct",
-    "refine_with_ranges": "rangesfm.refine.with_ranges",
+    "refine_with_ranges": "rangesfm.estimation.with_ranges",
     "rescale": "rangesfm.colmap.transform",
     "run_survey": "rangesfm.workflows.run",
     "select_keyframes": "rangesfm.vision.keyframes",

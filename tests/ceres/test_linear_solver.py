@@ -8,13 +8,13 @@ from scipy.sparse import bsr_array, csr_array
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import sequence_path
 
+from rangesfm.ceres.bundle_adjustment import bundle_adjustment
 from rangesfm.ceres.linear_solver import (
     normal_matrix,
     resized,
 )
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.refine.bundle_adjustment import bundle_adjustment
 
 
 def walk(num: int, num_observations: int) -> SyntheticModel:

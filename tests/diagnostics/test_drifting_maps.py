@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tests.known import known
+from tests.known_errors import predicted_by_model
 from tests.studies.drifting_maps import Made, lap_of_drift, run, without_points
 
 from rangesfm.geometry.similarity import align_points, rmse
-from rangesfm.refine.radio import ranges_predicted_by_model
 from rangesfm.workflows.metric_result import MetricResult
 
 NUM_KEYFRAMES = 100
@@ -60,7 +60,7 @@ def test_scale_and_ranges_are_those_of_the_delivered_map(lap: Made, refined: Met
     """After the refinement the map is moved as a whole, and its ranges with it."""
     centers_m = refined.trajectory.as_in(refined.final).centers
     assert align_points(refined.trajectory.centers, centers_m).scale == pytest.approx(refined.estimate.value, rel=1e-9)
-    predicted_m = ranges_predicted_by_model(
+    predicted_m = predicted_by_model(
         refined.final,
         refined.trajectory,
         refined.observations,

@@ -116,13 +116,13 @@ def use(survey: Path, number: int, model_path: Path) -> str:
 def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
     import pycolmap
 
+    from rangesfm.ceres.bundle_adjustment import bundle_adjustment, solve_bundle_adjustment
     from rangesfm.colmap.transform import rescale
     from rangesfm.errors import RangesfmError
     from rangesfm.export.ply import write_points
     from rangesfm.geometry.similarity import Similarity
     from rangesfm.geometry.trajectory import trajectory_from_reconstruction
     from rangesfm.options import CameraOptions, RefineOptions
-    from rangesfm.refine.bundle_adjustment import bundle_adjustment, solve_bundle_adjustment
 
     assert isinstance(model, pycolmap.Reconstruction)
     path = trajectory_from_reconstruction(model)

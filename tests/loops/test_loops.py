@@ -12,11 +12,12 @@ import pytest
 from tests.simulated.looped import Closed, LoopedSurvey, ScaledMap, close, two_aisles, two_laps
 from tests.studies.simulated_survey import range_log
 
+from rangesfm.estimation import drift, refinement
+from rangesfm.estimation.drift import _solve_with_own_noise
+from rangesfm.estimation.refinement import joint_errors
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.loops.loop_finder import LoopFinder
-from rangesfm.refine import graph_presolve, with_ranges
-from rangesfm.refine.graph_presolve import _solve_with_own_errors
 
 
 def error_m(survey: LoopedSurvey, model: pycolmap.Reconstruction) -> float:
@@ -58,14 +59,14 @@ def test_closed_loops_tie_the_laps_together(closed: Closed, laps: LoopedSurvey) 
 def test_a_robust_start_is_made_only_where_closing_bends_the_map_visibly(
     closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_far: bool
 ) -> None:
-    started, visible_m = [], with_ranges._just_visible_m
+    started, visible_m = [], refinement._just_visible_m
 
     def robust_start(*given: Any) -> Any:
         started.append(given)
-        return _solve_with_own_errors(*given)
+        return _solve_with_own_noise(*given)
 
-    monkeypatch.setattr(graph_presolve, "_solve_with_own_errors", robust_start)
-    monkeypatch.setattr(with_ranges, "_just_visible_m", lambda *of: 0.0 if is_far else visible_m(*of))
+    monkeypatch.setattr(drift, "_solve_with_own_noise", robust_start)
+    monkeypatch.setattr(refinement, "_just_visible_m", lambda *of: 0.0 if is_far else visible_m(*of))
     before = replace(closed.after, database_path=tmp_path / "again.db")
     loops, _ = before.finder.tested(before.matches_of(sorted(closed.tried.closed)))
     again = before.with_closed(loops, closed.tried)
@@ -77,8 +78,8 @@ def test_a_robust_start_is_made_only_where_closing_bends_the_map_visibly(
 def test_a_map_that_was_bent_to_its_ranges_is_not_bent_again() -> None:
     laps = two_laps(100, size_m=(24.0, 16.0), num_observations=40, pixel_stddev=1.0)
     scaled = ScaledMap.of(laps.survey, laps.chain(), range_log(laps.survey, 1))
-    refined, _ = scaled.refined()
-    again, _ = scaled.refined(refined)
+    refined = scaled.refined().problem.metric
+    again = scaled.refined(refined).problem.metric
     scaled_m, refined_m, again_m = (
         trajectory_from_reconstruction(model, laps.survey.model.timestamps_s).centers
         for model in (scaled.scaled, refined, again)
@@ -89,10 +90,10 @@ def test_a_map_that_was_bent_to_its_ranges_is_not_bent_again() -> None:
 def test_pairs_that_look_alike_in_two_aisles_are_contradicted_by_the_ranges() -> None:
     survey = two_aisles(num_keyframes=10, length_m=4.0)
     scaled = ScaledMap.of(survey.looped.survey, survey.looped.chain(), range_log(survey.looped.survey, 1))
-    refined, summary = scaled.refined()
-    assert summary.covariance is not None
-    errors = summary.covariance.errors
-    finder = LoopFinder.of(refined, scaled.trajectory, errors, summary.pixel_stddev, seed=0)
+    rest = scaled.refined()
+    covariance = joint_errors(rest, 1.0)
+    assert covariance is not None
+    finder = LoopFinder.of(rest.problem.metric, scaled.trajectory, covariance.errors, rest.pixel_stddev, seed=0)
     loops, contradicted = finder.tested(survey.alike)
     assert not loops
     assert len(contradicted) > 0.9 * len(survey.alike) > 10

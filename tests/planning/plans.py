@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import loop_path
 
+from rangesfm.estimation.free_fit import GraphBending
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.planning.expected import Expected
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.refine.keyframe_graph import GraphBending
 
 Array = npt.NDArray[np.float64]
 Place = tuple[float, float, float]

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import lap_path
 
+from rangesfm.estimation.vision_information import Observations, model_observations
+from rangesfm.geometry.poses import Poses, model_poses
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.refine.vision_information import Observations, Poses, model_observations, model_poses
 
 Array = npt.NDArray[np.float64]
 NUM_KEYFRAMES = 60

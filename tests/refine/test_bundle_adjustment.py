@@ -11,12 +11,12 @@ import pytest
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import orbit_path
 
-from rangesfm.errors import SolverError
-from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.refine.bundle_adjustment import (
+from rangesfm.ceres.bundle_adjustment import (
     BundleAdjustment,
     bundle_adjustment,
 )
+from rangesfm.errors import SolverError
+from rangesfm.options import CameraOptions, RefineOptions
 
 
 def orbit() -> pycolmap.Reconstruction:

@@ -6,9 +6,10 @@ import numpy as np
 from tests.refine.conftest import bent, poses_and_rays
 from tests.simulated.model import SyntheticModel
 
+from rangesfm.estimation.drift import carry_model
+from rangesfm.estimation.vision_information import project, ray_residuals
+from rangesfm.geometry.poses import model_poses
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.refine.graph_presolve import carry_model
-from rangesfm.refine.vision_information import model_poses, project, ray_residuals
 
 
 def test_points_follow_a_bend_and_a_growth_of_the_map(chain: SyntheticModel) -> None:

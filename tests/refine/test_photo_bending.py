@@ -10,10 +10,10 @@ import pytest
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
 
+from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
-from rangesfm.refine.photo_bending import PhotoBending, bending_of_model
 
 NUM = 16
 

@@ -8,22 +8,22 @@ import numpy as np
 import numpy.typing as npt
 import pyceres
 import pytest
-from scipy import sparse
 from scipy.spatial.transform import Rotation
-from tests.refine.test_keyframe_graph import errors_of
+from tests.known_errors import known_errors
 from tests.simulated.model import SyntheticModel
 
 from rangesfm.ceres import interpolated_range_cost
+from rangesfm.geometry.poses import Poses
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.measurements.kind import LEAST_SQUARES, MapState
+from rangesfm.measurements.table import ranges_of_map
+from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.point_fit import PointProblem
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.bending import by_poses
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.refine.keyframe_graph import GraphState, KeyframeGraph, _Layout, _range_rows
-from rangesfm.refine.radio import radio_as_given
-from rangesfm.refine.vision_information import Poses, VisionInformation
 from rangesfm.scale.range_equation import RangeProblem, RangeState, columns_of, predicted_ranges, range_gradient
 from rangesfm.scale.range_equation import range_jacobian as jacobian_of_map
 
@@ -57,11 +57,14 @@ class Scene:
         self.observations = replace(
             placed, centers=placed.centers + bow, center_offsets=placed.center_offsets + bow
         )  # the path is hardly curved between its keyframes
-        ranges, radio = radio_as_given(sfm, self.observations, self.metric_from_sfm, self.tag_in_cam_m, self.anchors)
-        self.antennas, self.sfm = ranges.antennas, sfm
+        errors = replace(known_errors(self.observations, 1.0), loss=LEAST_SQUARES)
+        self.ranges = ranges_of_map(
+            sfm, self.observations, self.metric_from_sfm, self.tag_in_cam_m, self.anchors, errors, RefineOptions()
+        )
+        self.places, self.sfm = self.ranges.places, sfm
         self.poses = Poses(metric.world_from_cam, metric.centers)
-        self.by_model = ranges.predicted_m(chain.reconstruction, radio) - self.log.range_m
-        self.tags_m, _ = ranges.places(metric, radio)
+        self.in_map = MapState(self.poses, self.ranges.blocks)
+        self.tags_m, _ = self.ranges.antennas_m(self.in_map)
 
     def compiled(self, poses: Poses, anchors_m: Array, biases_m: Array) -> Array:
         """Return the (n,) residuals of the compiled cost, metres."""
@@ -74,10 +77,10 @@ class Scene:
                 range_m=self.log.range_m[[row]],
                 stddev_m=[1.0],
                 tag_in_cam_m=self.tag_in_cam_m,
-                weight=self.antennas.fraction[[row]],
-                offset_in_world_m=self.antennas.offset_in_world_m[[row]],
+                weight=self.places.fraction[[row]],
+                offset_in_world_m=self.places.offset_m[[row]],
             )
-            ends = [blocks[self.antennas.before[row]], blocks[self.antennas.after[row]]]
+            ends = [blocks[self.places.before[row]], blocks[self.places.after[row]]]
             problem.add_residual_block(cost, None, [*ends, anchors[k], biases[k]])
         return np.asarray(problem.evaluate_residuals())
 
@@ -94,11 +97,11 @@ class Scene:
         num = len(self.poses)
         columns = [
             (self.moved(k, STEP * unit) - self.moved(k, -STEP * unit)) / (2 * STEP)
-            for k in np.unique([self.antennas.before, self.antennas.after]).tolist()
+            for k in np.unique([self.places.before, self.places.after]).tolist()
             for unit in np.eye(6)
         ]
         found = np.zeros((len(self.log), num, 6))
-        seen = np.unique([self.antennas.before, self.antennas.after])
+        seen = np.unique([self.places.before, self.places.after])
         found[:, seen] = np.stack(columns, axis=1).reshape(len(self.log), -1, 6)
         return found.reshape(len(self.log), -1)
 
@@ -115,32 +118,27 @@ class Scene:
     def state(self) -> RangeState:
         return RangeState(self.metric_from_sfm, self.anchors_m, self.biases_m)
 
-    @property
-    def graph(self) -> KeyframeGraph:
-        """The same ranges in the keyframe graph."""
-        nothing, none = np.zeros(0, dtype=np.int64), sparse.bsr_array((0, 0))
-        vision = VisionInformation(self.poses, nothing, nothing, none, np.zeros(0))
-        errors = errors_of(self.log.anchor_index, 1.0)
-        return KeyframeGraph(vision, self.antennas, self.log.range_m, errors, self.anchors, None, None)
-
 
 def test_all_models_predict_the_same_ranges(scene: Scene) -> None:
     expected, problem = scene.compiled(scene.poses, scene.anchors_m, scene.biases_m), scene.problem
-    np.testing.assert_allclose(scene.by_model, expected, atol=1e-9)
     np.testing.assert_allclose(predicted_ranges(problem, scene.state) - problem.range_m, expected, atol=1e-9)
-    in_graph = GraphState(scene.poses, scene.anchors_m, scene.biases_m, 0.0)
-    np.testing.assert_allclose(scene.graph.residuals_m(in_graph), expected, atol=1e-9)
+    in_map = scene.ranges.linearize(scene.in_map).residual[:, 0]
+    np.testing.assert_allclose(in_map, expected[scene.ranges.rows], atol=1e-9)
+    tags_m = np.empty_like(scene.tags_m)
+    tags_m[scene.ranges.rows] = scene.tags_m
     for k in range(3):
         rows, ones = scene.log.anchor_index == k, np.ones(np.sum(scene.log.anchor_index == k))
-        alone = PointProblem(scene.tags_m[rows], scene.log.range_m[rows], ones, 0 * ones, np.zeros(4), np.eye(4))
+        alone = PointProblem(tags_m[rows], scene.log.range_m[rows], ones, 0 * ones, np.zeros(4), np.eye(4))
         unknowns = np.append(scene.anchors_m[k], scene.biases_m[k])
         np.testing.assert_allclose(alone.residuals_m(unknowns), expected[rows], atol=1e-9)
 
 
 def test_all_models_change_alike_with_the_keyframes(scene: Scene) -> None:
-    expected, graph = scene.by_pose, scene.graph
-    _, rows = _range_rows(graph, _Layout.of(graph), graph.start())
-    np.testing.assert_allclose(rows.toarray()[:, : expected.shape[1]], expected, atol=1e-8)
+    expected, linear = scene.by_pose, scene.ranges.linearize(scene.in_map)
+    by_pose = np.zeros((len(scene.log), len(scene.poses), 6))
+    for k in range(2):
+        by_pose[np.arange(len(scene.log)), linear.pose[:, k]] += linear.by_pose[:, 0, k]
+    np.testing.assert_allclose(by_pose.reshape(expected.shape), expected[scene.ranges.rows], atol=1e-8)
     on_path, arms_m = scene.observations.on_path(np.arange(len(scene.log))), scene.observations.tag_from_center
     placed, turns = scene.metric_from_sfm, scene.sfm.world_from_cam[on_path.before]
     found = by_poses(range_gradient(scene.problem, scene.state), placed, turns, arms_m, on_path).toarray()
@@ -154,8 +152,6 @@ def test_all_models_change_alike_with_the_keyframes(scene: Scene) -> None:
 def test_all_models_change_alike_with_anchors_and_biases(scene: Scene) -> None:
     columns = columns_of([scene.problem])[0]
     of_map = jacobian_of_map(scene.problem, columns, scene.state, scene.state)
-    _, rows = _range_rows(scene.graph, _Layout.of(scene.graph), scene.graph.start())
-    of_graph = rows.toarray()[:, 6 * len(scene.poses) : -1]
     in_map = of_map[:, min(columns.anchor) :]
     differences = []
     for unit in np.eye(12):
@@ -165,5 +161,4 @@ def test_all_models_change_alike_with_anchors_and_biases(scene: Scene) -> None:
             for sign in (1, -1)
         )
         differences.append((next(ends) - next(ends)) / (2 * STEP))
-    for found in (of_graph, in_map):
-        np.testing.assert_allclose(found, np.stack(differences, axis=1), atol=1e-8)
+    np.testing.assert_allclose(in_map, np.stack(differences, axis=1), atol=1e-8)

@@ -7,9 +7,9 @@ import pycolmap
 import pytest
 from tests.refine.test_with_ranges import Survey, make_survey
 
+from rangesfm.ceres.bundle_adjustment import bundle_adjustment
+from rangesfm.estimation.map_problem import add_calibration, parameter_stddevs
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.refine.bundle_adjustment import bundle_adjustment
-from rangesfm.refine.refinement_problem import add_calibration, parameter_stddevs
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import numpy as np
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
+from rangesfm.ceres.bundle_adjustment import bundle_adjustment
 from rangesfm.colmap.transform import rescale
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.refine.bundle_adjustment import bundle_adjustment
 
 COLMAPS_OWN_LIMIT = 50_000  # residuals; above this number COLMAP uses several threads
 

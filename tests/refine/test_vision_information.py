@@ -9,12 +9,8 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.refine.vision_information import (
-    Observations,
-    Poses,
-    photo_gradient,
-    vision_information,
-)
+from rangesfm.estimation.vision_information import Observations, photo_gradient, vision_information
+from rangesfm.geometry.poses import Poses
 
 Array = npt.NDArray[np.float64]
 

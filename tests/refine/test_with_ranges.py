@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.known import known
-from tests.known_errors import known_errors
+from tests.known_errors import known_errors, predicted_by_model
 from tests.scale.robust_scale import metric_from_sfm_by_robust_weights
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path, sequence_path
@@ -26,6 +26,8 @@ from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
 from rangesfm.errors import InputError, SolverError
+from rangesfm.estimation.refine_summary import RefineSummary
+from rangesfm.estimation.with_ranges import refine_with_ranges
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
@@ -38,8 +40,6 @@ from rangesfm.ranging.errors.range_bins import range_bins
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
-from rangesfm.refine.radio import ranges_predicted_by_model
-from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 
 Array = npt.NDArray[np.float64]
@@ -241,7 +241,7 @@ class TestWithoutNoise:
         log, similarity = survey.observations.log, survey.metric_from_sfm
         places = [associate(log, survey.trajectory, tag) for tag in tags]
         each = [
-            ranges_predicted_by_model(metric, survey.trajectory, places[k], similarity, tags[k], survey.anchors(0.0))
+            predicted_by_model(metric, survey.trajectory, places[k], similarity, tags[k], survey.anchors(0.0))
             for k in range(2)
         ]
         assert np.nanmedian(np.abs(each[1] - each[0])) > 0.1
@@ -696,7 +696,7 @@ class TestProblem:
 
     def test_predictions_by_the_true_model_are_the_true_ranges(self) -> None:
         survey = make_survey(num_keyframes=41, radio=Radio(rate_hz=3.0), at_keyframes=False)
-        predicted = ranges_predicted_by_model(
+        predicted = predicted_by_model(
             rescale(survey.sfm, survey.metric_from_sfm),
             survey.trajectory,
             survey.observations,

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.gravity import gravity_of
+from rangesfm.geometry.robust_statistics import CAUCHY, GEMAN_MCCLURE, RobustLoss
 from rangesfm.geometry.similarity import IDENTITY, Similarity
-from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
 from rangesfm.scale import range_equation
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, solve
 

@@ -17,6 +17,8 @@ from tests.studies.simulated_survey import RANGE_MODEL, SITE_ANCHORS_M, TAG_IN_C
 
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.colmap.transform import rescale
+from rangesfm.estimation.map_problem import MapProblem, map_problem
+from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.geometry.reference import Reference, write_reference
 from rangesfm.geometry.similarity import IDENTITY, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
@@ -24,12 +26,12 @@ from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.resection import Loop
 from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
-from rangesfm.options import CameraOptions
+from rangesfm.measurements.table import Measured, ranges_of_map
+from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.refine.with_ranges import Learnt, LoopClosing, RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.vision.database import create_database
@@ -192,26 +194,39 @@ class ScaledMap:
         )
         return cls(survey, rescale(sfm, estimate.metric_from_sfm), trajectory, estimate)
 
-    def refined(
-        self, start: pycolmap.Reconstruction | None = None, closing: LoopClosing | None = None
-    ) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-        """Refine the scaled map, or another map in metres."""
+    @property
+    def measured(self) -> Measured:
         estimate = self.estimate
-        return refine_with_ranges(
-            self.scaled if start is None else start,
+        # The simulated ranges have no errors but noise.
+        errors = replace(estimate.errors, learned=None)
+        ranges = ranges_of_map(
             self.trajectory,
             estimate.observations,
             estimate.metric_from_sfm,
+            TAG_IN_CAM_M,
             estimate.anchors,
-            estimate.errors,
-            tag_in_cam_m=TAG_IN_CAM_M,
-            first_pose_is_fixed=self.survey.is_in_first_camera,
+            errors,
+            RefineOptions(),
+        )
+        return Measured(ranges)
+
+    def problem(self, model: pycolmap.Reconstruction, measured: Measured, *, is_refined: bool) -> MapProblem:
+        """Return the problem of a copy of a map in metres."""
+        return map_problem(
+            pycolmap.Reconstruction(model),
+            measured,
+            self.trajectory,
             camera=CameraOptions(refine_intrinsics=False),
-            learn=lambda rest: Learnt(None, 1.0),  # the simulated ranges have no errors but noise
-            closing=closing,
-            is_refined=start is not None,
+            options=RefineOptions(),
+            first_pose_is_fixed=self.survey.is_in_first_camera,
+            is_refined=is_refined,
             num_threads=1,
         )
+
+    def refined(self, start: pycolmap.Reconstruction | None = None) -> MapAtRest:
+        """Refine the scaled map, or another map in metres."""
+        model = self.scaled if start is None else start
+        return refine(self.problem(model, self.measured, is_refined=start is not None), {})
 
     def error_m(self, model: pycolmap.Reconstruction) -> float:
         """Return the root mean square error of the keyframes, without alignment."""
@@ -225,22 +240,26 @@ class SimulatedMap:
 
     Attributes:
         looped: the survey. scaled: its map before.
-        model: the map. summary: of its refinement.
+        at_rest: the map.
         matches: of all pairs that look alike. database_path: for the matches of those that are used.
     """
 
     looped: LoopedSurvey
     scaled: ScaledMap
-    model: pycolmap.Reconstruction
-    summary: RefineSummary
+    at_rest: MapAtRest
     matches: dict[Pair, Matches]
     database_path: Path
 
+    @property
+    def model(self) -> pycolmap.Reconstruction:
+        return self.at_rest.problem.metric
+
     @cached_property
     def finder(self) -> LoopFinder:
-        covariance = self.summary.covariance
+        covariance = joint_errors(self.at_rest, 1.0)
         assert covariance is not None
-        return LoopFinder.of(self.model, self.scaled.trajectory, covariance.errors, self.summary.pixel_stddev, seed=0)
+        pixel_stddev = self.at_rest.pixel_stddev
+        return LoopFinder.of(self.model, self.scaled.trajectory, covariance.errors, pixel_stddev, seed=0)
 
     def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
         return find_in(self.finder, self.matches_of, self.looped.known, tried)
@@ -252,10 +271,17 @@ class SimulatedMap:
         path = self.database_path
         path.unlink(missing_ok=True)
         write_matches(path, self.model, self.looped.neighbours | self.matches_of(sorted(tried.closed)))
-        closed = self.finder.relative_poses(loops)
-        closing = LoopClosing(closed, self.summary.errors, lambda model: merge_tracks(model, path, seed=0))
-        model, summary = self.scaled.refined(self.model, closing)
-        return replace(self, model=model, summary=summary)
+        scaled, measured = self.scaled, self.scaled.measured
+        at = replace(measured, ranges=measured.ranges.at_blocks(self.at_rest.state.blocks))
+        problem = scaled.problem(self.model, at, is_refined=True)
+        rest = refine_with_loops(
+            problem,
+            problem.like(self.at_rest.problem),
+            {},
+            self.finder.relative_poses(loops),
+            lambda model: merge_tracks(model, path, seed=0),
+        )
+        return replace(self, at_rest=rest)
 
 
 @dataclass(frozen=True)
@@ -288,7 +314,7 @@ def close(
     """
     scaled = ScaledMap.of(looped.survey, chain, log)
     matches = looped.matches | (alike or {})
-    before = SimulatedMap(looped, scaled, *scaled.refined(), matches, folder / "database.db")
+    before = SimulatedMap(looped, scaled, scaled.refined(), matches, folder / "database.db")
     after, tried = close_in_rounds(before)
     return Closed(before, after, tried)
 

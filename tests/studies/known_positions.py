@@ -43,6 +43,7 @@ from rangesfm.ceres.covariance import PhotosAlone
 from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, SolverError
+from rangesfm.estimation.photo_bending import PhotoBending
 from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.similarity import align_points, similarity_motions
 from rangesfm.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
@@ -57,7 +58,6 @@ from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
-from rangesfm.refine.photo_bending import PhotoBending
 from rangesfm.scale.scale_by_positions import scale_by_positions
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey

@@ -18,6 +18,8 @@ from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.colmap.transform import rescale
 from rangesfm.costs import add_residual_block, joint_prior_cost, range_cost
 from rangesfm.demo.simulated_radio import CameraPath, Radio
+from rangesfm.estimation.refine_summary import RefineSummary
+from rangesfm.estimation.with_ranges import refine_with_ranges
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction
 from rangesfm.options import CameraOptions, RangeModelOptions
@@ -26,7 +28,6 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.refine.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 

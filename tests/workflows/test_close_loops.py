@@ -14,6 +14,7 @@ from tests.simulated.looped import bent_laps, two_laps, write_matches, write_sur
 from tests.studies.simulated_survey import TAG_IN_CAM_M
 
 from rangesfm.errors import InputError
+from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.files.manifest import content_hash
 from rangesfm.geometry.similarity import rmse
 from rangesfm.loops.loop_finder import LoopFinder
@@ -24,7 +25,7 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.loop_database import LoopDatabase
-from rangesfm.workflows.close_loops import close_loops
+from rangesfm.workflows.close_loops import RefinedMap, close_loops_of_survey
 from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.run import refine_model
 from rangesfm.workflows.run_results import RunResult, write_results
@@ -168,8 +169,8 @@ def test_where_no_loops_are_found_the_map_is_refined_once(laps: Laps, tmp_path: 
 def test_loops_stay_open_where_that_is_asked_for(laps: Laps) -> None:
     survey = laps.survey.changed({"mapper.close_loops": False})
     run = SurveyRun(survey, cast("RangingInputs", None), Journal(SilentProgress()))
-    metric = cast("MetricResult", None)
-    assert close_loops(run, metric, lambda *_: pytest.fail("it is refined again")) is metric
+    refined = RefinedMap(cast("MetricResult", None), cast("MapAtRest", None))
+    assert close_loops_of_survey(run, refined, lambda *_: pytest.fail("it is refined again")) is refined.metric
 
 
 def test_a_database_of_another_model_is_refused(laps: Laps, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ pycolmap, pyceres and the compiled part exchange C++ objects, which only works b
 from typing import TYPE_CHECKING, Any
 
 from rangesfm.ceres.adjuster_problem import (
+    MAX_NUM_SHARED,
     PlacedRanges,
     RangeBlocks,
     Step,
@@ -27,7 +28,6 @@ from rangesfm.ceres.adjuster_problem import (
     add_residual_block,
     keep_from_elimination,
     num_columns,
-    shared_blocks,
     solve_adjuster,
     tangent_jacobian,
 )
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "MAX_NUM_SHARED",
     "PlacedRanges",
     "RangeBlocks",
     "Step",
@@ -59,7 +60,6 @@ __all__ = [
     "num_columns",
     "position_cost",
     "range_cost",
-    "shared_blocks",
     "solve_adjuster",
     "tangent_jacobian",
 ]

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _NUM_POSE_PARAMS = 7
 _NUM_POSE_COLUMNS = 6
+MAX_NUM_SHARED = _NUM_POSE_COLUMNS
+"""Largest size of a block of numbers that all ranges share: as many as a pose has columns."""
 # Objects that residuals refer to. The problem refers to its adjuster, so only a weak key lets both be freed in the end.
 _used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()
 
@@ -121,11 +123,6 @@ def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, 
         _used_by_adjuster[adjuster].append(manifold)
 
 
-def shared_blocks(numbers: Array) -> list[Array]:
-    """Return k numbers that all ranges share as blocks of as many as a pose has columns; the last may be smaller."""
-    return [numbers[first : first + _NUM_POSE_COLUMNS].copy() for first in range(0, len(numbers), _NUM_POSE_COLUMNS)]
-
-
 @dataclass(frozen=True)
 class PlacedRanges:
     """n ranges, each at one keyframe (``before == after``) or between two.
@@ -169,8 +166,8 @@ class RangeBlocks:
         time_shift: (1,) seconds by which the ranges were taken later than assumed; None: not estimated. It affects
             ranges between two keyframes, also those with a weight of 0 or 1.
         amplitude: (1,) excess of short ranges at distance 0; given exactly if ``short_range_length_m`` is.
-        shared: numbers that all ranges share, as many as ``PlacedRanges.loadings_m`` has columns, as
-            ``shared_blocks`` divides them.
+        shared: numbers that all ranges share, together as many as ``PlacedRanges.loadings_m`` has columns, in blocks of
+            at most ``MAX_NUM_SHARED``.
     """
 
     poses: Sequence[Array]

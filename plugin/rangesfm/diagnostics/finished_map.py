@@ -15,11 +15,11 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
+from rangesfm.estimation.refine_summary import RefineSummary
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 # Allowance for comparing medians: ``_max_growth`` bounds sums of squares, while medians ignore a few large errors.

@@ -9,11 +9,11 @@ from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
+from rangesfm.geometry.robust_statistics import MIN_STDDEV_M, robust_stddev
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
 from rangesfm.ranging.errors.components import DRIFT_S, PLACES, WANDERING, OtherError
 from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
-from rangesfm.ranging.errors.noise import MIN_STDDEV_M, robust_stddev
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath

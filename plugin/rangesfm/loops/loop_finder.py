@@ -12,12 +12,12 @@ import pycolmap
 from rangesfm.arrays import Indices
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.colmap.point_observations import overlaps_in
+from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.loops.candidates import Views, propose_pairs
 from rangesfm.loops.relative_errors import RelativeErrors
 from rangesfm.loops.resection import MAX_CHANCE, Loop, Resection, loop_poses
-from rangesfm.refine.vision_information import LoopPoses
 from rangesfm.vision.loop_database import Pair
 
 

@@ -12,11 +12,11 @@ from scipy.special import chdtrc
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
+from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.loops.candidates import Views
 from rangesfm.loops.relative_errors import RelativeErrors
-from rangesfm.refine.vision_information import LoopPoses
 
 MAX_CHANCE = 1e-6
 """Probability by chance of a difference between photos and map below which a loop is taken for a wrong one. A survey

@@ -18,6 +18,8 @@ from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.diagnostics.linearized import ranges_on_map, slopes_by_poses
 from rangesfm.distances.tape import CHECK
 from rangesfm.errors import GeometryError
+from rangesfm.estimation.free_fit import GraphBending
+from rangesfm.estimation.vision_information import VisionInformation
 from rangesfm.geometry.similarity import IDENTITY, similarity_motions
 from rangesfm.geometry.trajectory import in_first_camera
 from rangesfm.options import LENGTH_M, ScaleOptions
@@ -27,8 +29,6 @@ from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.learned import ErrorParts, LearnedErrors, usual_stddevs
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.refine.keyframe_graph import GraphBending
-from rangesfm.refine.vision_information import VisionInformation
 from rangesfm.scale.anchor_plane import mirrored_map
 from rangesfm.scale.linear_map import LinearMap, regular
 from rangesfm.scale.placement_prior import PlacementPrior

@@ -19,11 +19,12 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.locate_lengths import images_by_name, triangulate_marker
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError, InputError
+from rangesfm.estimation.vision_information import Observations, VisionInformation, vision_information
+from rangesfm.geometry.poses import Poses
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import KeyMeta, Options
 from rangesfm.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.positions.known_positions import KnownPositions, locate_points
-from rangesfm.refine.vision_information import Observations, Poses, VisionInformation, vision_information
 
 MAX_NUM_PHOTOS = 2000
 """Largest number of photos; more would take minutes, and with fewer photos the path bends in the same way."""

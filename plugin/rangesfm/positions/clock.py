@@ -15,6 +15,7 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.photo_names import rows_of_photos, told_none
 from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
+from rangesfm.geometry.robust_statistics import CAUCHY
 from rangesfm.geometry.similarity import Similarity, align_points, rounding_of, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.antenna_track import AntennaTrack
@@ -23,7 +24,6 @@ from rangesfm.ranging.clock.fit import OffsetFit, Timing, refine_offset
 from rangesfm.ranging.clock.search import Cells, OffsetCurve, PathSamples, Scanned, centred_columns, scan_parts
 from rangesfm.ranging.clock.squares import residual_stddev
 from rangesfm.ranging.clock.time_offset import ObservedKind, offset_of_motion, path_to_search, require_enough
-from rangesfm.ranging.errors.robust_loss import CAUCHY
 
 # A given offset is wrong if the residuals with it are at least so many times those with another one.
 _MUCH_WORSE = 3.0

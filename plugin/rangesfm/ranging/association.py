@@ -13,10 +13,10 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import InputError
 from rangesfm.files.photo_names import rows_of_photos
 from rangesfm.geometry.motion_prior import learn_motion
+from rangesfm.geometry.robust_statistics import robust_stddev
 from rangesfm.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
 from rangesfm.options import AssociationOptions
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.ranging.errors.noise import robust_stddev
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
 

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
+from rangesfm.geometry.robust_statistics import CAUCHY
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, align_points, path_shape, rmse
-from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.starts import MAX_NUM_STARTS, each_once
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array
+from rangesfm.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, MIN_COST_GAP
 from rangesfm.scale.range_equation import RangeProblem, RangeState, solve
 from rangesfm.scale.scale_problem import MIN_RANGES
 from rangesfm.scale.solution import Solution

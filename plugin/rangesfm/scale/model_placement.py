@@ -9,12 +9,12 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.robust_statistics import MIN_COST_GAP, wider
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import Similarity, path_shape, rmse
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.point_fit import ENOUGH_TO_SEARCH
-from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP, wider
 from rangesfm.scale.anchor_alignment import SAME_SHARE, PlacedAnchor, align_by_anchors
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
 from rangesfm.scale.scale_estimate import ScaleEstimate

@@ -23,10 +23,10 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
+from rangesfm.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.geometry.rotations import left_jacobian
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.errors.noise import bias_whitening
-from rangesfm.ranging.errors.robust_loss import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.placement_prior import PlacementPrior
 

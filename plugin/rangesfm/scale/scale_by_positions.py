@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, UNDETERMINED
+from rangesfm.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions
@@ -27,8 +28,6 @@ from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.bending import BendingOfBins, ErrorPart, MapBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.ranging.errors.learned import ErrorParts
-from rangesfm.ranging.errors.noise import MIN_STDDEV_M
-from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import is_line
 from rangesfm.scale.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, LinearMap

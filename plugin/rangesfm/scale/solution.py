@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
+from rangesfm.geometry.robust_statistics import MIN_COST_GAP
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
 from rangesfm.ranging.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
 from rangesfm.ranging.errors.range_errors import RangeErrors, fit_with_own_errors
-from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import is_on_side, mirrored_map, on_side
 from rangesfm.scale.range_equation import (

@@ -18,11 +18,10 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS, UNDETERMINED
+from rangesfm.geometry.robust_statistics import SAME_COST, robust_stddevs
 from rangesfm.geometry.similarity import IDENTITY, Similarity, off_origin, path_shape, round_middle, rounding_of
 from rangesfm.processes.threads import side_by_side
 from rangesfm.ranging.anchors.point_fit import ENOUGH_TO_SEARCH, multilaterate
-from rangesfm.ranging.errors.noise import robust_stddevs
-from rangesfm.ranging.errors.robust_loss import SAME_COST
 from rangesfm.scale.range_equation import RangeProblem, RangeState, antenna_positions, solve
 
 _T = TypeVar("_T")

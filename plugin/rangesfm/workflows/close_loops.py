@@ -10,6 +10,8 @@ import pycolmap
 
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import InputError
+from rangesfm.estimation.refinement import MapAtRest
+from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.files.output_folder import sole_writer
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.loops.loop_closure import LoopClosure
@@ -17,26 +19,36 @@ from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.resection import Loop
 from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
-from rangesfm.refine.with_ranges import LoopClosing
 from rangesfm.scale.at_map import half_way
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.workflows.loop_matching import LoopMatching
 from rangesfm.workflows.metric_result import MetricResult
 
-Refine = Callable[[MetricResult, LoopClosing], MetricResult]
-"""Refines a map with loops that are to be closed."""
+
+@dataclass(frozen=True)
+class RefinedMap:
+    """A refined map as a result, and at rest with its equations."""
+
+    metric: MetricResult
+    at_rest: MapAtRest
 
 
-def close_loops(run: SurveyRun, metric: MetricResult, refine: Refine) -> MetricResult:
+MergeTracks = Callable[[pycolmap.Reconstruction], None]
+Refine = Callable[[SurveyRun, RefinedMap, LoopPoses, MergeTracks], RefinedMap]
+"""Closes loops of a map and refines it again."""
+
+
+def close_loops_of_survey(run: SurveyRun, refined: RefinedMap, refine: Refine) -> MetricResult:
     """Return a refined map with its loops closed; the same map where they are not to be closed.
 
     Args:
-        run: the survey. metric: the map. refine: refines it again.
+        run: the survey. refine: closes loops and refines the map again.
 
     Raises:
         InputError: the given database does not belong to the given model.
     """
-    if not run.survey.mapper.close_loops or not len(metric.observations.log) or metric.kept_refinement is None:
+    metric = refined.metric
+    if not run.survey.mapper.close_loops or metric.kept_refinement is None:
         return metric
     with sole_writer(run.survey.output.path) as output:
         if (matching := LoopMatching.for_survey(run, output)) is None:
@@ -49,10 +61,10 @@ def close_loops(run: SurveyRun, metric: MetricResult, refine: Refine) -> MetricR
             if run.survey.images.model is not None:
                 raise InputError(why_not, run.survey.mapper.database_path)
             return metric
-        last, tried = close_in_rounds(_RefinedMap(run, metric, matching, refine))
+        last, tried = close_in_rounds(_RefinedMap(run, refined, matching, refine))
         last.keep(tried)
         matching.database.publish(output)
-        return _told(run, metric, last.metric, tried)
+        return _told(run, metric, last.refined.metric, tried)
 
 
 @dataclass(frozen=True)
@@ -60,7 +72,7 @@ class _RefinedMap:
     """A refined map with the matching of its photos."""
 
     run: SurveyRun
-    metric: MetricResult
+    refined: RefinedMap
     matching: LoopMatching
     refine: Refine
 
@@ -74,26 +86,24 @@ class _RefinedMap:
         self.keep(tried)
         finder, database = self._finder, self.matching.database
         assert finder is not None, "it has found the loops"
-        assert self.metric.kept_refinement is not None, "its map is refined"
 
         def merge(model: pycolmap.Reconstruction) -> None:
             with colmap_log(database.log):
                 merge_tracks(model, database.path, seed=finder.seed)
 
         with self.run.journal.stage("refinement"):
-            closing = LoopClosing(finder.relative_poses(loops), self.metric.kept_refinement.errors, merge)
-            refined = self.refine(self.metric, closing)
-        if refined.why_broken:
-            self.run.journal.warn(f"loops are left open, because the map broke: {'; '.join(refined.why_broken)}")
+            refined = self.refine(self.run, self.refined, finder.relative_poses(loops), merge)
+        if why := refined.metric.why_broken:
+            self.run.journal.warn(f"loops are left open, because the map broke: {'; '.join(why)}")
             return None
-        return replace(self, metric=refined)
+        return replace(self, refined=refined)
 
     def keep(self, tried: TriedPairs) -> None:
         self.matching.database.keep(tried.proposed, tried.verified, tried.closed)
 
     @cached_property
     def _finder(self) -> LoopFinder | None:
-        metric = self.metric
+        metric = self.refined.metric
         if metric.map_errors is None or metric.kept_refinement is None:
             return None
         pixel_stddev, seed = metric.kept_refinement.pixel_stddev, self.run.survey.output.seed

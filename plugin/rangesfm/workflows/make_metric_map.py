@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pycolmap
@@ -32,21 +31,28 @@ from rangesfm.diagnostics.position_tests import diagnose_positions
 from rangesfm.distances.locate_lengths import locate_distances, surveyed_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
+from rangesfm.estimation.map_problem import MapProblem, map_problem
+from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model, by_photos
+from rangesfm.estimation.refine_summary import summarize
+from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
+from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.numerics import NORMAL_95
-from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.poses import model_poses
+from rangesfm.geometry.similarity import IDENTITY, align_points
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.join.join_models import ModelVerdict, join_models
+from rangesfm.measurements.kind import MapState
+from rangesfm.measurements.positions import antenna_at
+from rangesfm.measurements.ranges import anchors_at
+from rangesfm.measurements.table import Measured, UsedPositions, ranges_of, ranges_of_map
 from rangesfm.positions.clock import POSITIONS
 from rangesfm.positions.surveyed_positions import SurveyedPositions
+from rangesfm.processes.threads import at_most
 from rangesfm.ranging.clock.offset import TimeOffset
 from rangesfm.ranging.clock.time_offset import REMEDY
 from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.refine.photo_bending import PhotoBending, bending_of_model, by_photos
-from rangesfm.refine.positions import HeldPositions
-from rangesfm.refine.radio import ranges_predicted_by_model
-from rangesfm.refine.with_ranges import AtRest, Learn, Learnt, LoopClosing, RefineSummary, refine_with_ranges
 from rangesfm.result.result_folder import is_refined_model
 from rangesfm.scale.at_map import MapWithRanges, estimate_at, estimate_by_positions_at
 from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
@@ -56,7 +62,7 @@ from rangesfm.scale.scale_problem import first_camera_from
 from rangesfm.scale.scale_verdict import NOTHING_KNOWN, refuse_unknown
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
-from rangesfm.workflows.close_loops import close_loops
+from rangesfm.workflows.close_loops import RefinedMap, close_loops_of_survey
 from rangesfm.workflows.metric_result import MetricResult, Rivals
 
 # Two likely time offsets whose scales differ by more than this fraction leave the scale undetermined, ...
@@ -107,8 +113,8 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         metric = scale_by_survey(run, path, is_a_start=refine)
     if refine:
         with run.journal.stage("refinement"):
-            metric = _with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))
-        metric = close_loops(run, metric, partial(refine_map, run))
+            refined = _with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))
+        metric = close_loops_of_survey(run, refined, refine_closed_map)
     with run.journal.stage("judgement"):
         return judge_map(run, metric, of_pieces)
 
@@ -151,14 +157,16 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
         estimate = replace(estimate, anchors=sides.of(estimate.anchors))
     rivals = _by_rivals(run, path, estimate)
     scaled = rescale(path.sfm, estimate.metric_from_sfm)
-    predicted = ranges_predicted_by_model(
-        scaled,
+    ranges = ranges_of_map(
         path.trajectory,
         estimate.observations,
         estimate.metric_from_sfm,
         inputs.tag_in_cam_m,
         estimate.anchors,
+        estimate.errors,
+        survey.refine,
     )
+    predicted = ranges.predicted_m(MapState(model_poses(scaled, path.trajectory.frame_ids), ranges.blocks))
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     tape = inputs.tape
@@ -293,51 +301,124 @@ def scale_by_rivals(
     return Rivals(tuple(doubts), max(float(np.sqrt(variance)), farthest / NORMAL_95))
 
 
-def refine_map(run: SurveyRun, metric: MetricResult, closing: LoopClosing | None = None) -> MetricResult:
-    """Refine a scaled map with its ranges. Where the refinement breaks the map, the scaled map stays the result.
-
-    Args:
-        run: the survey.
-        metric: the scaled map, or the refined one.
-        closing: loops to be closed in the refined map; None where it is refined for the first time.
+def refine_map(run: SurveyRun, metric: MetricResult) -> RefinedMap:
+    """Refine a scaled map with all that was measured. Where that breaks the map, the scaled map stays the result.
 
     Raises:
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
+    run = _with_open_clock(run, metric)
+    measured = _measured(run, metric)
+    with at_most(run.survey.mapper.num_threads):
+        problem = _problem(run, metric, measured, metric.scaled, is_refined=is_refined_model(run.survey.images.model))
+        return _finished(run, metric, measured, refine(problem, measured.markers))
+
+
+def refine_closed_map(
+    run: SurveyRun, refined: RefinedMap, loops: LoopPoses, merge_tracks: Callable[[pycolmap.Reconstruction], None]
+) -> RefinedMap:
+    """Close the loops of a refined map, and refine it again.
+
+    Args:
+        loops: measured relative poses, by ids of frames. merge_tracks: makes one of points that two passes saw apart,
+            in place.
+
+    Raises:
+        SolverError: as for ``refine_map``.
+    """
+    metric, run = refined.metric, _with_open_clock(run, refined.metric)
+    measured = _measured(run, metric)
+    with at_most(run.survey.mapper.num_threads):
+        problem = _problem(run, metric, measured, metric.final, is_refined=True)
+        known = problem.like(refined.at_rest.problem)
+        rest = refine_with_loops(problem, known, measured.markers, loops, merge_tracks)
+        return _finished(run, metric, measured, rest)
+
+
+def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
+    """Return the survey with the time offset to be estimated where it is not certain."""
     offset = metric.time_offset
-    if offset is not None and not offset.is_certain and not run.survey.refine.time_offset_stddev_s:
-        run = run.changed({"refine.time_offset_stddev_s": offset.stddev_s})
-    survey, inputs = run.survey, run.inputs
+    if offset is None or offset.is_certain or run.survey.refine.time_offset_stddev_s:
+        return run
+    return run.changed({"refine.time_offset_stddev_s": offset.stddev_s})
+
+
+def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
+    """Return all that was measured of a scaled map."""
+    estimate, inputs, options = metric.estimate, run.inputs, run.survey.refine
     tape = metric.tape or Tape()
-    if inputs.anchor_frame == "site" and metric.estimate.frame != "site":
+    if inputs.anchor_frame == "site" and estimate.frame != "site":
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
-    at_rest: list[MapWithRanges] = []
-    placed: list[PositionScale] = []
-    held = HeldPositions.of(metric.estimate.positions, metric.positions, metric.trajectory)
+    ranges = ranges_of_map(
+        metric.trajectory,
+        estimate.observations,
+        estimate.metric_from_sfm,
+        inputs.tag_in_cam_m,
+        metric.anchors,
+        estimate.errors,
+        options,
+    )
+    gravity = gravity_of(run.survey.scale.up_in_first_camera)
+    upward = () if gravity is None or estimate.frame != "site" else (gravity,)
+    used = () if estimate.positions is None else (_used_positions(estimate.positions, metric.positions),)
+    return Measured(replace(ranges, shared_errors_m=estimate.shared_errors_m), tape.control(), upward, used)
 
-    def learn_of_positions(rest: AtRest) -> Learnt:
-        lengths = _lengths_at_rest(metric, rest)
-        placed.append(_positions_at_rest(held.refined(metric.positions), rest, lengths))
-        return Learnt(None, placed[0].bending_factor)
 
-    def learn(rest: AtRest) -> Learnt:
-        if metric.estimate.positions is not None:
-            # Without the measured lengths, which take part beside the ranges and would count twice.
-            placed.append(_positions_at_rest(held.refined(metric.positions), rest, None))
-        at_rest.append(_at_rest(metric, rest, placed[0] if placed else None))
-        learned = at_rest[0].learned()
-        factor = at_rest[0].bending_factor(learned)
-        return Learnt(learned.without(CLOCKS) if survey.refine.time_offset_stddev_s else learned, factor)
+def _used_positions(found: PositionScale, surveyed: SurveyedPositions) -> UsedPositions:
+    return UsedPositions(
+        found.known,
+        found.is_used,
+        found.stddev_m,
+        found.inflation,
+        found.site_from_model,
+        surveyed.markers,
+        () if surveyed.antenna is None else (surveyed.antenna,),
+    )
 
-    estimate = metric.estimate
-    learn_of_others = None if estimate.positions is None else learn_of_positions
-    learn_of_all = learn if estimate.problem is not None else learn_of_others
-    refined, summary = _refined(run, metric, tape, held, learn_of_all, closing)
-    if survey.refine.covariance and summary.covariance is None:
-        run.journal.warn(
-            "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
-        )
+
+def _problem(
+    run: SurveyRun, metric: MetricResult, measured: Measured, model: pycolmap.Reconstruction, *, is_refined: bool
+) -> MapProblem:
+    survey = run.survey
+    return map_problem(
+        pycolmap.Reconstruction(model),
+        measured,
+        metric.trajectory,
+        camera=survey.camera,
+        options=survey.refine,
+        first_pose_is_fixed=metric.estimate.frame != "site",
+        is_refined=is_refined,
+        num_threads=survey.mapper.num_threads,
+    )
+
+
+def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> RefinedMap:
+    """Learn the errors at a map at rest, and return it as a result with its covariance."""
+    survey, estimate = run.survey, metric.estimate
+    positions, on_map, factor = None, None, 1.0
+    if estimate.positions is not None:
+        # Beside ranges without the measured lengths, which take part beside the ranges and would count twice.
+        lengths = None if estimate.problem is not None else _lengths_at_rest(metric, rest)
+        positions = _positions_at_rest(_surveyed_at_rest(metric.positions, rest), metric.trajectory, rest, lengths)
+        factor = positions.bending_factor
+    if estimate.problem is not None:
+        on_map = _ranges_at_rest(metric, rest, positions)
+        learned = on_map.learned()
+        factor = on_map.bending_factor(learned)
+        kept = learned.without(CLOCKS) if survey.refine.time_offset_stddev_s else learned
+        rest = rest.with_learnt({"range": kept})
+    covariance = None
+    if survey.refine.covariance:
+        # Measurements too coarse to see any bending do not make it smaller than the noise of the features does.
+        covariance = joint_errors(rest, max(factor, 1.0))
+        if covariance is None:
+            run.journal.warn(
+                "no covariance of the poses: too many keyframes, or photos and ranges do not determine all poses"
+            )
+    refined = rest.problem.metric
+    refined.update_point_3d_errors()
+    summary = summarize(rest, measured.ranges, covariance, factor)
     broken = why_broken(metric.scaled, refined, metric.trajectory, estimate, summary, survey.refine.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
         raise SolverError(
@@ -345,121 +426,101 @@ def refine_map(run: SurveyRun, metric: MetricResult, closing: LoopClosing | None
             "photos: check that model, photos and camera parameters belong together (rangesfm scale gives the path "
             "alone)"
         )
-    return replace(
-        metric,
-        refined=refined,
-        refinement=summary,
-        why_broken=broken,
-        refined_with_ranges=at_rest[0] if at_rest else None,
-        positions_at_refined=placed[0] if placed else None,
+    return RefinedMap(
+        replace(
+            metric,
+            refined=refined,
+            refinement=summary,
+            why_broken=broken,
+            refined_with_ranges=on_map,
+            positions_at_refined=positions,
+        ),
+        rest,
     )
 
 
-def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, metric: MetricResult) -> MetricResult:
+def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, refined: RefinedMap) -> RefinedMap:
     """Return the refined map, refined again if the ranges say that an unknown anchor is on the other side of the path.
 
     If that breaks the map, the first refinement stays.
 
     Args:
-        start: the scaled map. metric: the refined map.
+        start: the scaled map.
     """
+    metric = refined.metric
     at = metric.refined_with_ranges
     if at is None or metric.kept_refinement is None:
-        return metric
+        return refined
     sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
     estimate = replace(start.estimate, anchors=sides.of(start.estimate.anchors))
     if sides.has_crossed:
         again = refine_map(run, replace(start, estimate=estimate))
-        return metric if again.kept_refinement is None else again
+        return refined if again.metric.kept_refinement is None else again
     refinement = replace(metric.kept_refinement, anchors=sides.of(metric.kept_refinement.anchors))
-    return replace(metric, estimate=estimate, refinement=refinement)
+    return replace(refined, metric=replace(metric, estimate=estimate, refinement=refinement))
 
 
-def _refined(
-    run: SurveyRun,
-    metric: MetricResult,
-    tape: Tape,
-    positions: HeldPositions,
-    learn: Learn | None,
-    closing: LoopClosing | None,
-) -> tuple[pycolmap.Reconstruction, RefineSummary]:
-    """Call ``refine_with_ranges`` with the options of a survey and the results of the scale stage."""
-    survey, estimate = run.survey, metric.estimate
-    return refine_with_ranges(
-        metric.scaled if closing is None else metric.final,
-        metric.trajectory,
-        estimate.observations,
-        estimate.metric_from_sfm,
-        metric.anchors,
-        estimate.errors,
-        tag_in_cam_m=run.inputs.tag_in_cam_m,
-        first_pose_is_fixed=estimate.frame != "site",
-        gravity=gravity_of(survey.scale.up_in_first_camera),
-        camera=survey.camera,
-        options=survey.refine,
-        tape=tape,
-        positions=positions,
-        shared_errors_m=estimate.shared_errors_m,
-        learn=learn,
-        closing=closing,
-        is_refined=is_refined_model(survey.images.model),
-        num_threads=survey.mapper.num_threads,
-    )
+def _surveyed_at_rest(surveyed: SurveyedPositions, rest: MapAtRest) -> SurveyedPositions:
+    """Return all positions with the antenna's lever arm and time offset as a map at rest has them."""
+    track, found = surveyed.antenna, antenna_at(rest.state)
+    if track is None or found is None:
+        return surveyed
+    arm_m, later_s = found
+    offset_s = None if track.offset_s is None else track.offset_s + later_s
+    return replace(surveyed, antenna=replace(track, offset_s=offset_s, antenna_in_cam_m=arm_m))
 
 
-def _positions_at_rest(surveyed: SurveyedPositions, rest: AtRest, lengths: LengthScale | None) -> PositionScale:
-    known = surveyed.located(rest.metric, rest.trajectory_m)
+def _positions_at_rest(
+    surveyed: SurveyedPositions, trajectory: Trajectory, rest: MapAtRest, lengths: LengthScale | None
+) -> PositionScale:
+    path = trajectory.as_in(rest.problem.metric)
+    known = surveyed.located(rest.problem.metric, path)
     assert known is not None, "the positions placed the map"
-    return scale_by_positions(
-        known,
-        rest.trajectory_m,
-        _bending_at_rest(rest, 1.0),
-        lengths=lengths,
-        refined=IDENTITY,
-        lasting_s=surveyed.lasting_s,
-    )
+    bending = _bending_at_rest(rest, path, 1.0)
+    return scale_by_positions(known, path, bending, lengths=lengths, refined=IDENTITY, lasting_s=surveyed.lasting_s)
 
 
-def _lengths_at_rest(metric: MetricResult, rest: AtRest) -> LengthScale | None:
+def _lengths_at_rest(metric: MetricResult, rest: MapAtRest) -> LengthScale | None:
     """Return the scale of a refined map by the measured lengths that took part; None without any."""
     if metric.tape is None:
         return None
-    anchor_ids = metric.observations.log.anchor_ids
-    return scale_by_lengths(locate_distances(metric.tape, rest.metric, anchor_ids), rest.trajectory_m.centers)
+    anchor_ids, model = metric.observations.log.anchor_ids, rest.problem.metric
+    return scale_by_lengths(locate_distances(metric.tape, model, anchor_ids), metric.trajectory.as_in(model).centers)
 
 
-def _bending_at_rest(rest: AtRest, metres_per_unit: float) -> MapBending:
+def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) -> MapBending:
     """Return the bending of a refined map; ``metres_per_unit``: of the model to which the measurements refer."""
     if rest.equations is not None:
         try:
             return by_photos(
-                rest.equations,
-                rest.pixel_stddev,
-                rest.trajectory_m,
-                metres_per_unit,
-                rest.firm_frame_ids,
-                is_at_optimum=False,
+                rest.equations, rest.pixel_stddev_at_rest, path, metres_per_unit, rest.firm_ids, is_at_optimum=False
             )
         except GeometryError:
             pass
-    return WalkBending(in_first_camera(rest.trajectory_m, metres_per_unit))
+    return WalkBending(in_first_camera(path, metres_per_unit))
 
 
-def _at_rest(metric: MetricResult, rest: AtRest, positions: PositionScale | None) -> MapWithRanges:
-    path = rest.trajectory_m
+def _ranges_at_rest(metric: MetricResult, rest: MapAtRest, positions: PositionScale | None) -> MapWithRanges:
+    """Return the ranges on a map at rest, as a scale problem in the unit of the unscaled model."""
+    path = metric.trajectory.as_in(rest.problem.metric)
+    is_firm = np.isin(path.frame_ids, rest.firm_ids)
+    scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
+    ranges = ranges_of(rest.problem.kinds)
+    tags_m, centers_m = ranges.antennas_m(rest.state)
+    anchors = anchors_at(ranges.anchors, rest.state.blocks)
     # The model's frame is that of the first camera, in the unit of the unscaled model.
-    model_from_map = replace(IDENTITY, scale=1 / rest.scale) @ first_camera_from(path)
+    model_from_map = replace(IDENTITY, scale=1 / scale) @ first_camera_from(path)
     return MapWithRanges.of(
         metric.estimate,
-        rest.trajectory_m,
-        rest.scale,
-        rest.tags_m,
-        rest.centers_m,
-        np.array([anchor.position_m for anchor in rest.anchors]),
-        np.array([anchor.range_bias_m for anchor in rest.anchors]),
-        rest.errors,
-        rest.shared_m,
-        _bending_at_rest(rest, rest.scale),
+        path,
+        scale,
+        tags_m,
+        centers_m,
+        np.array([anchor.position_m for anchor in anchors]),
+        np.array([anchor.range_bias_m for anchor in anchors]),
+        ranges.errors,
+        ranges.shared_m(rest.state)[ranges.rows],
+        _bending_at_rest(rest, path, scale),
         placement=None if positions is None else positions.prior(path, model_from_map),
         lengths=_lengths_at_rest(metric, rest),
     )

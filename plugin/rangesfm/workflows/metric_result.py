@@ -16,6 +16,7 @@ from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.finished_map import Place
 from rangesfm.diagnostics.linearized import RangesOnMap
 from rangesfm.distances.tape import Tape
+from rangesfm.estimation.refine_summary import RefineSummary
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
@@ -27,7 +28,6 @@ from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.clock.offset import TimeOffset
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.refine.with_ranges import RefineSummary
 from rangesfm.scale.at_map import MapWithRanges
 from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.scale.scale_diagnostics import ScaleDiagnostics, scale_diagnostics

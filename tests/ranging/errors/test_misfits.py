@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from tests.ranging.errors.test_range_errors import NUM_EACH, make_errors, noise
 
+from rangesfm.geometry.robust_statistics import CAUCHY
 from rangesfm.ranging.errors.range_errors import RangeErrors, misfits
-from rangesfm.ranging.errors.robust_loss import CAUCHY
 
 
 def test_noise_is_no_misfit() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from rangesfm.geometry.robust_statistics import GEMAN_MCCLURE, RobustLoss
 from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, RobustLoss
 
 Array = npt.NDArray[np.float64]
 NUM_EACH = 400

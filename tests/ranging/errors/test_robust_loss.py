@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.ranging.errors.robust_loss import CAUCHY, GEMAN_MCCLURE, RobustLoss
+from rangesfm.geometry.robust_statistics import CAUCHY, GEMAN_MCCLURE, RobustLoss
 
 BOTH = pytest.mark.parametrize("loss", [CAUCHY, GEMAN_MCCLURE], ids=["Cauchy", "Geman-McClure"])
 

@@ -16,11 +16,11 @@ from scipy.optimize import least_squares
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
+from rangesfm.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss, robust_stddevs
 from rangesfm.geometry.similarity import path_shape
 from rangesfm.ranging.errors.learned import learn_errors
-from rangesfm.ranging.errors.noise import MIN_ORDINARY, START_STDDEV_M, inlier_noise, robust_stddevs
+from rangesfm.ranging.errors.noise import MIN_ORDINARY, START_STDDEV_M, inlier_noise
 from rangesfm.ranging.errors.range_bins import noisiness, range_bins
-from rangesfm.ranging.errors.robust_loss import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.ranging.range_gradient import RangeGradient
 
 # Rounds of reweighting in the linear solution.

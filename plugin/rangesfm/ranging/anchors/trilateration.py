@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.numerics import UNDETERMINED
+from rangesfm.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP, MIN_STDDEV_M, SAME_COST
 from rangesfm.geometry.similarity import NEARLY_STRAIGHT, PathShape, oriented, path_shape
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -28,8 +29,7 @@ from rangesfm.ranging.anchors.point_fit import (
     fit_with_own_noise,
     improve,
 )
-from rangesfm.ranging.errors.noise import MIN_STDDEV_M, short_range_stddev
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, MIN_COST_GAP, SAME_COST
+from rangesfm.ranging.errors.noise import short_range_stddev
 from rangesfm.ranging.range_log import RangeLog
 
 # Three ranges determine a position, and a fourth one checks it.

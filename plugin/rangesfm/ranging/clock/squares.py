@@ -14,8 +14,8 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
-from rangesfm.ranging.errors.noise import MIN_NOISE_M, START_STDDEV_M, robust_stddev
-from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.geometry.robust_statistics import CAUCHY, robust_stddev
+from rangesfm.ranging.errors.noise import MIN_NOISE_M, START_STDDEV_M
 
 # Shorter ranges get the weight of a range of this length, because the derivative of their square is near 0. They are no
 # longer than their errors may be.

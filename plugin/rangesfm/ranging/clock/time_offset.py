@@ -11,6 +11,7 @@ import numpy.typing as npt
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
+from rangesfm.geometry.robust_statistics import MIN_COST_GAP
 from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.processes.threads import with_one_blas_thread
@@ -37,7 +38,6 @@ from rangesfm.ranging.clock.search import (
     on_path,
     scan_offsets,
 )
-from rangesfm.ranging.errors.robust_loss import MIN_COST_GAP
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 

@@ -10,12 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
-from scipy import special
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NUM_REWEIGHTINGS, ROUNDING, SIGNIFICANT_STDDEVS
-from rangesfm.ranging.errors.robust_loss import CAUCHY
+from rangesfm.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M, robust_stddev, robust_stddevs, stddevs_within
 from rangesfm.ranging.range_log import RangeLog
 
 # Standard deviation, metres, at distance 0, and its decay length: radios read up to 0.15 m short below about 2 m, all
@@ -29,8 +27,6 @@ MIN_NUM_OF_SCATTER = 20
 """Smallest number of residuals that show a scatter, or a share of outliers."""
 MIN_ORDINARY = 0.3
 """Smallest share of ranges without a large common error for which the noise is estimated from these alone."""
-MIN_STDDEV_M = 1e-9
-"""Smallest standard deviation, metres; what is divided by is at least as large."""
 MIN_NOISE_M = 1e-3
 """Smallest noise of a range, metres: radios resolve only about a centimetre."""
 # Root mean square of residuals, in standard deviations, below which they are only rounding and the solver's tolerance.
@@ -48,22 +44,6 @@ _WINDOW = 11
 _MAX_STRETCH = 3.0  # a window longer than this many typical ones has a gap in it
 _STEPS_M = (0.1, 0.01)
 _ROUNDING = np.finfo(np.float32).eps  # of a log with 32-bit numbers, relative
-
-
-def robust_stddev(residuals: npt.ArrayLike) -> float:
-    """Return the stddev of the Gaussian bulk of (n,) residuals: scaled median absolute deviation from 0, never 0."""
-    return float(robust_stddevs(np.reshape(residuals, (1, -1)))[0, 0]) if np.size(residuals) else MIN_STDDEV_M
-
-
-def robust_stddevs(residuals: Array) -> Array:
-    """Return the (..., 1) robust standard deviations of the rows of (..., n) residuals."""
-    stddevs: Array = np.median(np.abs(residuals), axis=-1, keepdims=True) / _stddevs_within(1 / 2)
-    return np.maximum(stddevs, MIN_STDDEV_M)
-
-
-def _stddevs_within(share: float) -> float:
-    """Return the distance from the mean, in standard deviations, within which a share of a normal distribution is."""
-    return float(special.ndtri((1 + share) / 2))
 
 
 def short_range_stddev(range_m: Array) -> Array:
@@ -144,7 +124,7 @@ def inlier_noise(residuals: Array) -> InlierNoise:
     thinned = np.sort(residuals)[
         np.linspace(0, len(residuals) - 1, min(len(residuals), _MAX_NUM_SAMPLES)).astype(np.int64)
     ]
-    stddev = max(float(np.quantile(sizes, _FIRST_SHARE)) / _stddevs_within(_FIRST_SHARE), MIN_STDDEV_M)
+    stddev = max(float(np.quantile(sizes, _FIRST_SHARE)) / stddevs_within(_FIRST_SHARE), MIN_STDDEV_M)
     means = np.maximum([_mean_or_zero(sizes[residuals > 0]), _mean_or_zero(sizes[residuals < 0])], stddev)
     shares = np.array([0.5, 0.25, 0.25])
     before = np.zeros(6)

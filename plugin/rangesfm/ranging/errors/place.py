@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.robust_statistics import RobustLoss
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER, NO_ERROR
-from rangesfm.ranging.errors.robust_loss import RobustLoss
 
 # Edge of a place, metres: some wavelengths, the scale at which echoes that overlap the direct path change. On real logs
 # any value from 0.1 to 0.5 m gives scales within 0.7 % of each other.

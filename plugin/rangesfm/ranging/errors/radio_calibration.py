@@ -11,14 +11,14 @@ from scipy.linalg import cho_factor, cho_solve
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, ROUNDING
+from rangesfm.geometry.robust_statistics import CAUCHY, robust_stddev
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import MIN_DISTANCE_M
 from rangesfm.ranging.errors.error_curve import ErrorCurve
 from rangesfm.ranging.errors.learned import ExpectedErrors
-from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER, robust_stddev
+from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
-from rangesfm.ranging.errors.robust_loss import CAUCHY
 from rangesfm.ranging.range_log import RangeLog
 
 # Components that depend on the distance alone: their sum is the curve.

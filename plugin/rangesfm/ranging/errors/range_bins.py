@@ -9,7 +9,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER, robust_stddev
+from rangesfm.geometry.robust_statistics import robust_stddev
+from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER
 
 # The covariance of the bins is a full matrix, and learning it takes some twenty inversions.
 MAX_NUM_BINS = 450

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array, Indices, Mask, rows_by_key
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, SIGNIFICANT_STDDEVS
+from rangesfm.geometry.robust_statistics import GEMAN_MCCLURE, RobustLoss, robust_stddev
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import (
@@ -22,12 +23,10 @@ from rangesfm.ranging.errors.noise import (
     InlierNoise,
     correlation_inflation,
     inlier_noise,
-    robust_stddev,
     shared_stddev,
     stretch_labels,
 )
 from rangesfm.ranging.errors.place import place_labels, shares_by_residuals
-from rangesfm.ranging.errors.robust_loss import GEMAN_MCCLURE, RobustLoss
 from rangesfm.ranging.range_observations import RangeObservations
 
 _Errors = TypeVar("_Errors")

@@ -1,14 +1,18 @@
-"""Robust losses, which limit the effect of outliers, as functions of residuals in standard deviations."""
+"""Robust statistics: losses that limit the effect of outliers, and the scatter of values with outliers among them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
+from scipy import special
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.numerics import SIGNIFICANT_STDDEVS
 
+MIN_STDDEV_M = 1e-9
+"""Smallest standard deviation, metres; what is divided by is at least as large."""
 # Relative difference of costs below which two fits are equal: rounding and the solver's tolerance.
 SAME_COST = 1e-6
 
@@ -68,3 +72,19 @@ GEMAN_MCCLURE = RobustLoss(3.46, is_bounded=True)
 def wider(bounded: RobustLoss) -> RobustLoss:
     """Return Cauchy's loss that corresponds to a bounded loss as CAUCHY does to GEMAN_MCCLURE."""
     return CAUCHY.scaled(bounded.width / GEMAN_MCCLURE.width)
+
+
+def robust_stddev(residuals: npt.ArrayLike) -> float:
+    """Return the stddev of the Gaussian bulk of (n,) residuals: scaled median absolute deviation from 0, never 0."""
+    return float(robust_stddevs(np.reshape(residuals, (1, -1)))[0, 0]) if np.size(residuals) else MIN_STDDEV_M
+
+
+def robust_stddevs(residuals: Array) -> Array:
+    """Return the (..., 1) robust standard deviations of the rows of (..., n) residuals."""
+    stddevs: Array = np.median(np.abs(residuals), axis=-1, keepdims=True) / stddevs_within(1 / 2)
+    return np.maximum(stddevs, MIN_STDDEV_M)
+
+
+def stddevs_within(share: float) -> float:
+    """Return the distance from the mean, in standard deviations, within which a share of a normal distribution is."""
+    return float(special.ndtri((1 + share) / 2))

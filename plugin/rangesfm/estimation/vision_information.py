@@ -7,7 +7,7 @@ common turn or shift costs nothing, and neither does a common scale, which the p
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,10 +20,11 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.point_observations import seen_in
 from rangesfm.errors import SolverError
 from rangesfm.geometry.numerics import ROUNDING
+from rangesfm.geometry.poses import Poses, relative_poses
+from rangesfm.geometry.robust_statistics import RobustLoss
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.processes.threads import side_by_side
-from rangesfm.ranging.errors.robust_loss import RobustLoss
 
 # A long track is cut into overlapping pieces of this length; distant keyframes are linked through those in between.
 _MAX_PIECE = 8
@@ -42,22 +43,6 @@ _MIN_DEPTH = 0.01
 _FARTHEST = 10.0
 # Largest plausible ratio of depths of a point in two photos: features of so different sizes are not matched.
 _MAX_DEPTH_RATIO = 10.0
-
-
-@dataclass(frozen=True)
-class Poses:
-    """Rig poses of n keyframes in a metric world.
-
-    Attributes:
-        world_from_rig: (n, 3, 3) rotations.
-        centers: (n, 3) origins of the rig frames (for a single camera, its projection centre).
-    """
-
-    world_from_rig: Array
-    centers: Array
-
-    def __len__(self) -> int:
-        return len(self.centers)
 
 
 @dataclass(frozen=True)
@@ -153,21 +138,6 @@ class VisionInformation:
         if self.loops is not None:
             turn[self.num_from_points :], shift[self.num_from_points :] = self.loops.turn, self.loops.shift
         return turn, shift
-
-
-def relative_poses(poses: Poses, reference: Indices, frame: Indices) -> tuple[Array, Array]:
-    """Return turns and shifts of keyframes relative to others, in the frames of these."""
-    to_reference = np.swapaxes(poses.world_from_rig[reference], 1, 2)
-    shift = np.einsum("uij,uj->ui", to_reference, poses.centers[frame] - poses.centers[reference])
-    return to_reference @ poses.world_from_rig[frame], shift
-
-
-def model_poses(metric: pycolmap.Reconstruction, frame_ids: Iterable[int]) -> Poses:
-    """Return the poses of the given frames."""
-    rigid = [pose_of(metric.frame(int(frame_id))) for frame_id in frame_ids]
-    world_from_rig = np.array([pose.rotation.matrix().T for pose in rigid])
-    translations = np.array([pose.translation for pose in rigid])
-    return Poses(world_from_rig, -np.einsum("nij,nj->ni", world_from_rig, translations))
 
 
 def model_observations(metric: pycolmap.Reconstruction, frame_ids: Indices) -> Observations:

@@ -20,11 +20,10 @@ from rangesfm.colmap.passthrough import apply_options
 from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.errors import SolverError
 from rangesfm.geometry.numerics import NEGLIGIBLE_STDDEVS, ROUNDING
+from rangesfm.geometry.poses import model_poses
+from rangesfm.geometry.robust_statistics import cost_of_deviation, robust_stddev
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.ranging.errors.noise import robust_stddev
-from rangesfm.ranging.errors.robust_loss import cost_of_deviation
-from rangesfm.refine.vision_information import model_poses
 
 # Ceres' default of 1e4 damps the scale, which all poses share, so strongly that it changes slowly and seems converged.
 # 1e8 does the same to the bending of a path of 2000 keyframes.

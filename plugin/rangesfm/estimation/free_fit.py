@@ -1,0 +1,381 @@
+"""The free fit: all poses by the photos' information between neighbours and by all measurements (sections 3 and 5.3).
+
+It is the joint problem with the points eliminated once, stated so that bending a map costs only its local deformation.
+Solved before the full bundle adjustment, it removes drift in cheap steps. The full problem needs many steps for this,
+because its points have to follow every turn of the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.ceres.bundle_adjustment import farthest, still_to_come
+from rangesfm.ceres.linear_solver import factor, normal_matrix, resized
+from rangesfm.ceres.nested_dissection import NestedFactor, SingularError
+from rangesfm.estimation.vision_information import VisionInformation
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
+from rangesfm.geometry.poses import Poses, relative_poses
+from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.geometry.similarity import rounding_of
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.measurements.kind import Block, Linearization, MapState, Measurements
+from rangesfm.ranging.errors.bending import BendingOfBins, bending_part, without_similarity
+
+_INITIAL_DAMPING = 1e-8
+_MAX_DAMPING = 1e6
+# Number of random vectors for the estimated trace (number of parameters that the measurements determine).
+_NUM_PROBES = 12
+
+
+@dataclass(frozen=True)
+class KeyframeGraph:
+    """The least squares problem.
+
+    Attributes:
+        vision: information from the photos.
+        kinds: the measurements, priors among them.
+        held_frame: index of a keyframe that is held fixed; negative: none is.
+        blocks: start values of all blocks.
+    """
+
+    vision: VisionInformation
+    kinds: tuple[Measurements, ...]
+    held_frame: int
+    blocks: Mapping[Block, Array]
+
+    @property
+    def start(self) -> MapState:
+        """The map as it was given."""
+        return MapState(self.vision.origin, self.blocks)
+
+
+@dataclass(frozen=True)
+class GraphSolution:
+    """The solution of a keyframe graph.
+
+    Attributes:
+        state: the estimate. num_steps: accepted and rejected ones.
+        num_absorbed: degrees of freedom of each kind that the parameters absorb, at the start of the last step.
+    """
+
+    state: MapState
+    num_steps: int
+    num_absorbed: tuple[float, ...]
+
+
+def solve_graph(graph: KeyframeGraph, start: MapState, *, tolerance_m: float) -> GraphSolution:
+    """Solve the graph by Levenberg-Marquardt steps.
+
+    Args:
+        tolerance_m: the solver stops when no keyframe moves further in a successful step, or in all steps to come.
+    """
+    layout = _Layout.of(graph, start)
+    state, damping = start, _INITIAL_DAMPING
+    terms = solved = _Terms.at(graph, layout, state)
+    factored, used, step_count, movement = None, damping, 0, 0.0
+    while step_count < MAX_NUM_ROUNDS and damping < _MAX_DAMPING:
+        step_count += 1
+        solved, used, factored = terms, damping, _factor(terms.hessian_of_free, damping, layout.parts)
+        step = factored.solve(-terms.gradient[layout.free])
+        trial = _moved(state, layout, step)
+        trial_terms = _Terms.at(graph, layout, trial)
+        if not trial_terms.cost < terms.cost:
+            damping *= 10
+            continue
+        last, movement = movement, farthest(trial.poses.centers, state.poses.centers)
+        state, terms, damping = trial, trial_terms, max(damping / 10, ROUNDING)
+        if min(movement, still_to_come(movement, last)) < tolerance_m:
+            break
+    if factored is None or used > _INITIAL_DAMPING:  # more would hide what the measurements determine
+        factored = _factor(solved.hessian_of_free, 0.0, layout.parts)
+    absorbed = tuple(_num_absorbed(rows[:, layout.free], factored) for rows in solved.whitened)
+    return GraphSolution(state, step_count, absorbed)
+
+
+@dataclass(frozen=True)
+class GraphBending:
+    """Bending of a map as the photos' information on relative poses allows it.
+
+    Attributes:
+        vision: of a map with the same poses, in any world. path: of the map, in its first camera's frame.
+    """
+
+    vision: VisionInformation
+    path: Trajectory
+
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+        functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)
+        parts = functions.reshape(len(by_pose), -1, 6)
+        parts[:, :, 3:] = parts[:, :, 3:] @ self.vision.origin.world_from_rig[0].T
+        covariance = functions @ self._factored.solve(np.ascontiguousarray(functions.T))
+        found = bending_part("bending", covariance, 1.0, 0.0)
+        return BendingOfBins(() if found is None else (found,), covariance, np.zeros(len(by_pose)))
+
+    @cached_property
+    def _factored(self) -> NestedFactor:
+        return _photos_alone(self.vision)[0]
+
+
+def with_gradient(vision: VisionInformation, gradient: Array) -> VisionInformation:
+    """Return the information with the gradient (6 n,) of the photos' cost at its origin, where they need not fit best.
+
+    In a map that was bent to its ranges they do not. The gradient has to be that of all observations: those of a part
+    of the tracks, or with other weights, have their minimum elsewhere.
+    """
+    factored, by_pose = _photos_alone(vision)
+    return replace(vision, from_optimum=by_pose @ factored.solve(gradient))
+
+
+def _photos_alone(vision: VisionInformation) -> tuple[NestedFactor, sparse.bsr_array]:
+    """Return the factor of the photos' normal equations of n poses, and the relative poses' derivatives by these."""
+    _, by_pose = _relative_poses(vision, vision.origin)
+    num = len(vision.origin)
+    blocks = 6 * np.arange(num + 1), np.zeros(num, dtype=bool)
+    return _factor(resized(normal_matrix(by_pose, vision.matrix), 6 * num), 0.0, blocks), by_pose
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Columns of the derivatives of one kind.
+
+    Attributes:
+        of_groups: (g, e) columns of each group: of its keyframes, then of its blocks.
+        order, starts: order of the groups in which those with equal columns are together, and the first of each such
+            run, whose derivatives are multiplied at once.
+    """
+
+    of_groups: Indices
+    order: Indices
+    starts: Indices
+
+    @classmethod
+    def of(cls, linear: Linearization, first_of: dict[Block, int]) -> _Columns:
+        num = len(linear.residual)
+        parts = [(6 * linear.pose[:, :, None] + np.arange(6)).reshape(num, -1)]
+        for by in linear.by_block:
+            # A group that depends on no block has derivatives of 0, by whatever column.
+            first = np.array([first_of[name] for name in by.blocks] + [0])[by.index]
+            parts.append(first[:, None] + np.arange(by.values.shape[2]))
+        of_groups = np.concatenate(parts, axis=1).astype(np.int64)
+        alike = np.unique(of_groups, axis=0, return_inverse=True)[1].ravel()
+        order = np.argsort(alike, kind="stable")
+        return cls(of_groups, order, np.flatnonzero(np.diff(alike[order], prepend=-1)))
+
+    def rows(self, values: Array, num: int) -> sparse.csr_array:
+        """Return (g, d, e) values as (g d, num) sparse rows."""
+        num_groups, size, width = values.shape
+        columns = np.broadcast_to(self.of_groups[:, None], values.shape)
+        starts = np.arange(0, values.size + 1, width) if width else np.zeros(num_groups * size + 1, dtype=np.int64)
+        return sparse.csr_array((values.ravel(), columns.ravel(), starts), shape=(num_groups * size, num))
+
+    def squares(self, values: Array, num: int) -> sparse.coo_array:
+        """Return J^T J of (g, d, e) derivatives, from dense products within each run of equal columns."""
+        sorted_ = values[self.order]
+        runs = np.split(sorted_, self.starts[1:])
+        blocks = np.array([run.reshape(-1, run.shape[2]).T @ run.reshape(-1, run.shape[2]) for run in runs])
+        column = self.of_groups[self.order[self.starts]]
+        places = np.broadcast_to(column[:, :, None], blocks.shape), np.broadcast_to(column[:, None], blocks.shape)
+        return sparse.coo_array((blocks.ravel(), tuple(place.ravel() for place in places)), shape=(num, num))
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Order of the unknowns: 6 per pose (turn in its own frame, shift), then all blocks.
+
+    Attributes:
+        blocks: names, in order. first_of: first column of each. num: of all columns.
+        free: columns that are estimated. num_poses: n. world_is_free: whether no keyframe is held fixed.
+        of_kinds: columns of each kind.
+    """
+
+    first_of: dict[Block, int]
+    num: int
+    free: Indices
+    num_poses: int
+    world_is_free: bool
+    of_kinds: tuple[_Columns, ...]
+
+    @classmethod
+    def of(cls, graph: KeyframeGraph, start: MapState) -> _Layout:
+        linear = [kind.linearize(start) for kind in graph.kinds]
+        used = {by.blocks[k] for each in linear for by in each.by_block for k in np.unique(by.index[by.index >= 0])}
+        fixed = frozenset[Block]().union(*(kind.fixed for kind in graph.kinds))
+        n = len(graph.vision.origin)
+        first_of, num, free = dict[Block, int](), 6 * n, [np.arange(6 * n)]
+        if graph.held_frame >= 0:
+            free = [np.delete(free[0], 6 * graph.held_frame + np.arange(6))]
+        for name, at in start.blocks.items():
+            first_of[name] = num
+            num += len(at)
+            if name in used and name not in fixed:
+                free.append(np.arange(num - len(at), num))
+        of_kinds = tuple(_Columns.of(each, first_of) for each in linear)
+        return cls(first_of, num, np.concatenate(free), n, graph.held_frame < 0, of_kinds)
+
+    @property
+    def parts(self) -> tuple[Indices, Mask]:
+        """Return the first free column of each pose, and of all else, and whether it is all else, which comes last."""
+        num_of_poses = np.count_nonzero(self.free < 6 * self.num_poses)
+        ends = np.union1d(np.arange(0, num_of_poses + 1, 6), len(self.free))
+        return ends, ends[1:] > num_of_poses
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """Cost (half the robust sum of squares), gradient and Gauss-Newton Hessian over all columns.
+
+    Attributes:
+        seen: derivatives of the relative poses. vision: their information matrix.
+        values: for each kind the (g, d, e) derivatives of its residuals in standard deviations, times the roots of the
+            robust weights. whitened: the same as sparse rows.
+    """
+
+    cost: float
+    gradient: Array
+    layout: _Layout
+    seen: sparse.bsr_array
+    vision: sparse.bsr_array
+    values: tuple[Array, ...]
+    whitened: tuple[sparse.csr_array, ...]
+
+    @classmethod
+    def at(cls, graph: KeyframeGraph, layout: _Layout, state: MapState) -> _Terms:
+        residuals, jacobian = _relative_poses(graph.vision, state.poses)
+        bound = graph.vision.matrix @ residuals
+        cost = 0.5 * float(residuals @ bound)
+        gradient = np.zeros(layout.num)
+        gradient[: 6 * layout.num_poses] = jacobian.T @ bound
+        values, whitened = [], []
+        for kind, columns in zip(graph.kinds, layout.of_kinds, strict=True):
+            linear, weights = kind.linearize(state), kind.weights
+            scaled = weights.whitened(linear.residual)
+            rho, first, _ = weights.share * weights.loss.rho(np.sum(scaled**2, axis=1))
+            cost += 0.5 * float(rho.sum())
+            root = np.sqrt(first)[:, None]
+            own = root[:, :, None] * (weights.root_information @ _derivatives(linear))
+            rows = columns.rows(own, layout.num)
+            gradient = gradient + rows.T @ (root * scaled).ravel()
+            values.append(own)
+            whitened.append(rows)
+        return cls(cost, gradient, layout, jacobian, graph.vision.matrix, tuple(values), tuple(whitened))
+
+    @cached_property
+    def hessian(self) -> Array | sparse.csr_array:
+        """Gauss-Newton Hessian; computed only for states from which a step is taken."""
+        total = resized(normal_matrix(self.seen, self.vision), self.layout.num)
+        for columns, values in zip(self.layout.of_kinds, self.values, strict=True):
+            total = total + columns.squares(values, self.layout.num)
+        return total
+
+    @property
+    def hessian_of_free(self) -> Array | sparse.csr_array:
+        return self.hessian[self.layout.free][:, self.layout.free]
+
+
+def _derivatives(linear: Linearization) -> Array:
+    """Return the (g, d, e) derivatives by the columns of ``_Columns.of_groups``."""
+    num, size = linear.residual.shape
+    of_blocks = [np.where(by.index[:, None, None] >= 0, by.values, 0.0) for by in linear.by_block]
+    return np.concatenate([linear.by_pose.reshape(num, size, -1), *of_blocks], axis=2)
+
+
+def _relative_poses(vision: VisionInformation, poses: Poses) -> tuple[Array, sparse.bsr_array]:
+    """Return (6 u,) turns and shifts of relative poses against their origin, in the reference's frame, with derivative.
+
+    The derivative is by the n poses, in blocks of 6 by 6, whose products are several times faster than of single
+    numbers. Shifts are divided by the local scale of the map around the reference, because photos do not see that
+    scale.
+    """
+    r, k = vision.reference, vision.frame
+    turn, shift = relative_poses(poses, r, k)
+    turn_before, shift_before = vision.measured()
+    scale = _local_scale(vision, shift, shift_before)[r][:, None]
+    angles = Rotation.from_matrix(np.swapaxes(turn_before, 1, 2) @ turn).as_rotvec()
+    residuals = np.concatenate([angles, shift / scale - shift_before], axis=1).ravel() + vision.from_optimum
+    # d log(Exp(a) Exp(d)) to first order in a: Solà et al., "A micro Lie theory", eq. 144.
+    spread = np.eye(3) + 0.5 * cross_matrices(angles)
+    to_reference, to_frame = np.zeros((2, len(r), 6, 6))
+    to_frame[:, :3, :3] = spread
+    to_reference[:, :3, :3] = -spread @ np.swapaxes(turn, 1, 2)
+    to_frame[:, 3:, 3:] = np.swapaxes(poses.world_from_rig[r], 1, 2) / scale[:, :, None]
+    to_reference[:, 3:, 3:] = -to_frame[:, 3:, 3:]
+    to_reference[:, 3:, :3] = cross_matrices(shift) / scale[:, :, None]
+    blocks = np.stack([to_reference, to_frame], axis=1).reshape(-1, 6, 6)
+    columns, starts = np.stack([r, k], axis=1).ravel(), np.arange(0, 2 * len(r) + 1, 2)
+    return residuals, sparse.bsr_array((blocks, columns, starts), shape=(6 * len(r), 6 * len(poses)))
+
+
+def _local_scale(vision: VisionInformation, shift: Array, shift_before: Array) -> Array:
+    """Return the (n,) growth of the map around each keyframe, where loops do not count."""
+    n, near = len(vision.origin), slice(vision.num_from_points)
+    now = np.bincount(vision.reference[near], np.sum(shift[near] ** 2, axis=1), minlength=n)
+    before = np.bincount(vision.reference[near], np.sum(shift_before[near] ** 2, axis=1), minlength=n)
+    least = rounding_of(vision.origin.centers) ** 2  # keyframes in one place have no scale
+    known = (now > least) & (before > least)
+    return np.sqrt(np.divide(now, before, where=known, out=np.ones(n)))
+
+
+def local_scales(vision: VisionInformation, poses: Poses) -> Array:
+    """Return the (n,) scale of the map around each keyframe relative to the origin, from its neighbours."""
+    _, shift = relative_poses(poses, vision.reference, vision.frame)
+    _, shift_before = vision.measured()
+    return _local_scale(vision, shift, shift_before)
+
+
+def _factor(hessian: Array | sparse.csr_array, damping: float, blocks: tuple[Indices, Mask]) -> NestedFactor:
+    """Factor a Hessian, with more damping if rounding makes it indefinite, as happens in a meaningless map.
+
+    Args:
+        blocks: as ``_Layout.parts``.
+    """
+    diagonal = hessian.diagonal()
+    # The floor keeps a pose without constraints in place.
+    damped = hessian + sparse.diags_array(damping * diagonal + ROUNDING * diagonal.max())
+    try:
+        return factor(damped, *blocks)
+    except SingularError:
+        if damping > _MAX_DAMPING:  # then the matrix has entries that are not finite
+            raise
+        return _factor(hessian, max(10 * damping, _INITIAL_DAMPING), blocks)
+
+
+def _moved(state: MapState, layout: _Layout, free_step: Array) -> MapState:
+    step = np.zeros(layout.num)
+    step[layout.free] = free_step
+    turns, shifts = np.split(step[: 6 * layout.num_poses].reshape(-1, 6), 2, axis=1)
+    moved = _turned(state.poses, turns, shifts, is_free=layout.world_is_free)
+    first_of = layout.first_of
+    return MapState(
+        moved, {name: at + step[first_of[name] : first_of[name] + len(at)] for name, at in state.blocks.items()}
+    )
+
+
+def _turned(poses: Poses, turns: Array, shifts: Array, *, is_free: bool) -> Poses:
+    """Return the poses after (n, 3) turns, each in its own frame, and shifts.
+
+    In a free map, the mean turn of all poses moves their centres on arcs, not on straight lines: photos are indifferent
+    to a turn of the whole world, but not to the deformation that straight lines would cause.
+    """
+    in_world = np.einsum("nij,nj->ni", poses.world_from_rig, turns)
+    common = in_world.mean(axis=0) if is_free else np.zeros(3)
+    arms = poses.centers - poses.centers.mean(axis=0)
+    around = Rotation.from_rotvec(common).as_matrix()
+    own = Rotation.from_rotvec(in_world - common).as_matrix()
+    arcs = arms @ (around - np.eye(3)).T - np.cross(common, arms)
+    return Poses(around @ own @ poses.world_from_rig, poses.centers + shifts + arcs)
+
+
+def _num_absorbed(whitened: sparse.csr_array, factored: NestedFactor) -> float:
+    """Estimate the trace of the hat matrix of a kind's rows with random vectors (Hutchinson 1990)."""
+    rng = np.random.default_rng(0)
+    probes = rng.choice([-1.0, 1.0], (whitened.shape[0], _NUM_PROBES))
+    back = whitened.T @ probes
+    solved = factored.solve(np.ascontiguousarray(back))
+    return float(np.sum(back * solved) / _NUM_PROBES)

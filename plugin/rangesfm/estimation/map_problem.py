@@ -1,0 +1,245 @@
+"""MapProblem: a map and its measurements, as every step of a refinement has them (sections 1 and 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pycolmap
+from scipy.optimize import approx_fprime
+
+from rangesfm import ceres
+from rangesfm.arrays import Array, Indices
+from rangesfm.ceres.bundle_adjustment import BundleAdjustment, bundle_adjustment
+from rangesfm.ceres.normal_equations import NormalEquations
+from rangesfm.colmap.calibrated_cameras import cameras_as_given
+from rangesfm.errors import InputError
+from rangesfm.geometry.numerics import ROUNDING
+from rangesfm.geometry.poses import model_poses
+from rangesfm.geometry.trajectory import Trajectory, pose_of
+from rangesfm.measurements.kind import Block, MapState, Measurements
+from rangesfm.measurements.table import Measured
+from rangesfm.options import CameraOptions, RefineOptions
+
+
+@dataclass(frozen=True)
+class MapProblem:
+    """A model, which changes in place, and its measurements.
+
+    Attributes:
+        metric: the model.
+        kinds: the measurements, priors among them.
+        timed_ids: ids of the frames to whose indices the measurements refer, in this order.
+        first_pose_is_fixed: the gauge. is_placed: whether measurements place the map in their world.
+        is_refined: whether the model was refined with its measurements before, which pull it from the photos' optimum.
+        marker_ids: 3-D points of the model that are marks, by name.
+        left_out_ids: 3-D points that do not take part.
+    """
+
+    metric: pycolmap.Reconstruction
+    kinds: tuple[Measurements, ...]
+    timed_ids: Indices
+    camera: CameraOptions
+    options: RefineOptions
+    first_pose_is_fixed: bool
+    is_placed: bool
+    num_threads: int
+    is_refined: bool = False
+    marker_ids: Mapping[str, int] = field(default_factory=dict)
+    left_out_ids: frozenset[int] = frozenset()
+
+    @property
+    def frame_ids(self) -> Indices:
+        """Ids of all frames: those to whose indices the measurements refer, then the others."""
+        others = np.setdiff1d(np.array(self.metric.reg_frame_ids(), dtype=np.int64), self.timed_ids)
+        return np.concatenate([self.timed_ids, others])
+
+    @property
+    def held_frame(self) -> int:
+        """Index of the frame that is held while nothing else places the map; -1 where measurements do."""
+        return 0 if self.first_pose_is_fixed or not self.is_placed else -1
+
+    @property
+    def start(self) -> MapState:
+        """The model as it is, with the start values of all blocks."""
+        return MapState(
+            model_poses(self.metric, self.frame_ids), {name: at for of in self.kinds for name, at in of.blocks.items()}
+        )
+
+    def replaced(self, change: Callable[[int, Measurements], Measurements]) -> MapProblem:
+        """Return the problem with each kind changed, given its index and the kind."""
+        return replace(self, kinds=tuple(change(k, kind) for k, kind in enumerate(self.kinds)))
+
+    def residuals(self, state: MapState) -> list[Array]:
+        """Return the (g, d) residuals of each kind."""
+        return [kind.linearize(state).residual for kind in self.kinds]
+
+    def like(self, other: MapProblem) -> MapProblem:
+        """Return the problem with the noise of the same measurements in another one."""
+        return self.replaced(lambda k, kind: kind.like(other.kinds[k]))
+
+    def with_noise_of(self, state: MapState, num_absorbed: Sequence[float]) -> MapProblem:
+        """Return the problem with the noise that the residuals of a state show; arguments as for each kind."""
+        residuals = self.residuals(state)
+        return self.replaced(lambda k, kind: kind.with_noise_of(residuals[k], num_absorbed[k]))
+
+    def change(self, other: MapProblem) -> float:
+        """Return the largest difference of the logarithms of the roots of a measurement's information."""
+        return max((a.change(b) for a, b in zip(self.kinds, other.kinds, strict=True)), default=0.0)
+
+    @property
+    def smallest_stddev(self) -> float:
+        """Smallest standard deviation of a measurement, metres."""
+        return min(float(of.min()) for of in self._stddevs_m)
+
+    @property
+    def usual_stddev(self) -> float:
+        """Smallest, among the kinds, of their median standard deviations, metres."""
+        return min(float(np.median(of)) for of in self._stddevs_m)
+
+    @property
+    def _stddevs_m(self) -> list[Array]:
+        """Standard deviations of the measurements, the root of the mean variance of their coordinates, by kind."""
+        roots = [kind.weights.root_information for kind in self.kinds if kind.counts_in_metres]
+        return [np.linalg.norm(np.linalg.inv(of), axis=(1, 2)) / np.sqrt(of.shape[1]) for of in roots]
+
+    def of_photos(self, max_num_iterations: int) -> BundleAdjustment:
+        """Set up the bundle adjustment of the photos alone."""
+        return bundle_adjustment(
+            self.metric,
+            self.camera,
+            self.options.changed(max_num_iterations=max_num_iterations),
+            fixed_frame_id=int(self.timed_ids[0]) if self.first_pose_is_fixed else None,
+            num_threads=self.num_threads,
+            marker_ids=self.marker_ids.values(),
+            left_out_ids=self.left_out_ids - set(self.marker_ids.values()),
+        )
+
+    def add_to(self, adjustment: BundleAdjustment, start: Mapping[Block, Array]) -> AddedMeasurements:
+        """Add all measurements and the priors of calibrated cameras, with their blocks at start values."""
+        problem = adjustment.adjuster.problem
+        poses = [pose_of(self.metric.frame(int(frame_id))).params for frame_id in self.timed_ids]
+        marks = {("mark", name): self.metric.point3D(id_).xyz for name, id_ in self.marker_ids.items()}
+        own = {name: np.array(at, dtype=np.float64) for name, at in start.items() if name[0] != "mark"}
+        blocks: dict[Block, Array] = {**own, **marks}
+        rows = tuple(kind.add_to(adjustment, poses, blocks) for kind in self.kinds)
+        fixed = frozenset[Block]().union(*(kind.fixed for kind in self.kinds))
+        for name, block in blocks.items():
+            if not problem.has_parameter_block(block):
+                continue
+            if name in fixed:
+                problem.set_parameter_block_constant(block)
+            else:
+                adjustment.keep_from_elimination(block)
+        add_calibration(adjustment, self.camera)
+        return AddedMeasurements(blocks, rows)
+
+
+def map_problem(
+    metric: pycolmap.Reconstruction,
+    measured: Measured,
+    trajectory: Trajectory,
+    *,
+    camera: CameraOptions,
+    options: RefineOptions,
+    first_pose_is_fixed: bool,
+    is_refined: bool,
+    num_threads: int,
+) -> MapProblem:
+    """Return the problem of a metric model, with the noise of the measurements to begin with.
+
+    Args:
+        trajectory: of the unscaled model. Others as in the problem.
+
+    Raises:
+        InputError: the offset of a clock is to be estimated without times.
+    """
+    if options.time_offset_stddev_s and trajectory.timestamps_s is None:
+        raise InputError("[refine] time_offset_stddev_s needs a log with times, this one names photos")
+    problem = MapProblem(
+        metric,
+        (),
+        trajectory.frame_ids,
+        camera,
+        options,
+        first_pose_is_fixed,
+        measured.is_placed,
+        num_threads,
+        is_refined,
+    )
+    kinds = measured.kinds(model_poses(metric, problem.frame_ids), metric, problem.frame_ids, trajectory)
+    return replace(problem, kinds=kinds)
+
+
+@dataclass(frozen=True)
+class AddedMeasurements:
+    """Measurements in a bundle adjustment.
+
+    Attributes:
+        blocks: parameter blocks by name, which the solver changes in place.
+        rows: for each kind the indices of its residuals among those of the problem.
+    """
+
+    blocks: Mapping[Block, Array]
+    rows: tuple[Indices, ...]
+
+    def state(self, metric: pycolmap.Reconstruction, frame_ids: Sequence[int] | Indices) -> MapState:
+        """Return the values that the solver has found."""
+        return MapState(
+            model_poses(metric, [int(frame_id) for frame_id in frame_ids]),
+            {name: block.copy() for name, block in self.blocks.items()},
+        )
+
+    def of_kind(self, what: str) -> list[Array]:
+        """Return the blocks whose names begin with ``what``."""
+        return [block for name, block in self.blocks.items() if name[0] == what]
+
+    @property
+    def others(self) -> list[Array]:
+        """Return the blocks that are no points of the world."""
+        return [block for name, block in self.blocks.items() if name[0] not in ("anchor", "mark")]
+
+    def equations(self, adjustment: BundleAdjustment) -> NormalEquations:
+        """Return the normal equations of the bundle adjustment at its present state."""
+        return NormalEquations.of(
+            adjustment.adjuster.problem,
+            adjustment.metric,
+            adjustment.num_reprojections,
+            self.of_kind("anchor"),
+            self.others,
+        )
+
+
+def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
+    """Add priors for the parameters of each camera that was given calibrated, if the adjustment refines it."""
+    metric, problem = bundle.metric, bundle.adjuster.problem
+    images = [metric.image(image_id) for image_id in metric.reg_image_ids()]
+    as_given = cameras_as_given(options, ((image.name, metric.camera(image.camera_id)) for image in images))
+    for camera_id, (table, given) in as_given.items():
+        params = metric.camera(camera_id).params
+        if problem.has_parameter_block(params) and not problem.is_parameter_block_constant(params):
+            stddev = parameter_stddevs(given, table.calibration_stddev_px(given.mean_focal_length()))
+            ceres.add_normal_prior(bundle.adjuster, params, given.params, stddev / bundle.pixel_stddev)
+
+
+def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) -> Array:
+    """Return the (n,) standard deviations of a camera's parameters, given that of the focal length.
+
+    One standard deviation of any parameter moves a feature at the photo's edge equally far, because an error of the
+    calibration seen there does not tell which parameter is wrong.
+    """
+    focal_length = camera.mean_focal_length()
+    edge = np.array([[0.5 * camera.width / focal_length, 0.5 * camera.height / focal_length, 1.0]])
+
+    def image_of_edge(params: Array) -> Array:
+        other = pycolmap.Camera(camera.todict())
+        other.params[:] = params
+        return np.ravel(other.img_from_cam(edge))
+
+    shifts_px = np.linalg.norm(approx_fprime(camera.params, image_of_edge, 1e-6), axis=0)
+    of_focal_lengths = np.linalg.norm(shifts_px[list(camera.focal_length_idxs())])
+    smallest = ROUNDING * of_focal_lengths  # a parameter without any effect gets a very large stddev
+    stddevs: Array = focal_length_stddev_px * of_focal_lengths / np.maximum(shifts_px, smallest)
+    stddevs[list(camera.focal_length_idxs())] = focal_length_stddev_px
+    return stddevs

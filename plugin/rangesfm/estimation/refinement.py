@@ -1,0 +1,260 @@
+"""The refinement: bundle adjustment of photos and all measurements, from a scaled map to one at rest (section 5)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from scipy import sparse
+from scipy.linalg import block_diag
+from scipy.sparse import csr_array
+
+from rangesfm.arrays import Indices
+from rangesfm.ceres.bundle_adjustment import (
+    BundleAdjustment,
+    SolverRun,
+    pixel_stddev_of,
+    solve_bundle_adjustment,
+    solve_until_still,
+)
+from rangesfm.ceres.covariance import JointCovariance, ResidualErrors, joint_covariance
+from rangesfm.ceres.normal_equations import NormalEquations
+from rangesfm.colmap.pieces import frames_of_largest_part
+from rangesfm.distances.tape import Marker
+from rangesfm.errors import GeometryError
+from rangesfm.estimation.drift import SAME_NOISE, Straightened, close_in_graph, straighten, straighten_again
+from rangesfm.estimation.map_problem import AddedMeasurements, MapProblem
+from rangesfm.estimation.vision_information import (
+    LoopPoses,
+    Observations,
+    misplaced_points,
+    model_observations,
+    project,
+)
+from rangesfm.geometry.poses import Poses, model_poses
+from rangesfm.measurements.kind import Block, MapState
+from rangesfm.measurements.marks import add_marks, errors_beyond_features, remove_marks
+
+# Largest number of solutions of the full problem, between which the noise is estimated again.
+_MAX_NUM_ROUNDS = 3
+# Largest movement of a keyframe left at the end, as a share of the smallest standard deviation of a measurement.
+_MAX_LAST_MOVEMENT = 0.01
+
+
+@dataclass(frozen=True)
+class MapAtRest:
+    """A refined map that has come to rest, with its equations; everything that is said of it follows from these.
+
+    Attributes:
+        problem: with the noise of the measurements at the end.
+        state: of the map. added: its blocks, to which the equations refer.
+        equations: of photos and all measurements; None if the photos are too many.
+        refined_params: which parameters of each camera are adjusted, by its id.
+        firm_ids: of the frames that the photos hold together, which are the map as a whole.
+        pixel_stddev: standard deviation of a reprojection error's coordinate before the solution, the unit of the
+            equations. pixel_stddev_at_rest: the same after it.
+        reprojection_rms_px: root mean square length of the reprojection errors.
+        solutions: runs of the solver. is_still: whether the keyframes came to rest.
+        bend_m, num_graph_steps: as of ``Straightened``.
+    """
+
+    problem: MapProblem
+    state: MapState
+    added: AddedMeasurements
+    equations: NormalEquations | None
+    refined_params: dict[int, list[int]]
+    firm_ids: Indices
+    pixel_stddev: float
+    pixel_stddev_at_rest: float
+    reprojection_rms_px: float
+    solutions: tuple[SolverRun, ...]
+    is_still: bool
+    bend_m: float
+    num_graph_steps: int
+
+    def is_estimated(self, block: Block) -> bool:
+        """Return whether a block was free."""
+        return block in self.state.blocks and not any(block in kind.fixed for kind in self.problem.kinds)
+
+    def with_learnt(self, errors: Mapping[str, object]) -> MapAtRest:
+        """Return the map with the errors that were learnt at it, by kind."""
+        return replace(
+            self,
+            problem=self.problem.replaced(
+                lambda _, kind: kind.with_learnt(errors[kind.kind]) if kind.kind in errors else kind
+            ),
+        )
+
+    @property
+    def converged(self) -> bool:
+        """Return whether the keyframes came to rest."""
+        return self.solutions[-1].converged and self.is_still
+
+
+def refine(problem: MapProblem, markers: Mapping[str, Marker], closed: Straightened | None = None) -> MapAtRest:
+    """Refine a model in place, and return it at rest.
+
+    Misplaced points (see ``misplaced_points``), as wrong matches make them, do not take part.
+
+    Args:
+        markers: that the measurements refer to, by name.
+        closed: the map straightened before, as by closing its loops; None: it is straightened here.
+
+    Raises:
+        SolverError: the solver failed. InputError: an option passed through to COLMAP is unknown.
+    """
+    with _marks_in_map(problem, markers) as marked:
+        marked, adjustment, rays = _without_misplaced(marked, markers)
+        start = straighten(marked, rays) if closed is None else replace(closed, problem=marked.like(closed.problem))
+        return _adjusted(adjustment, start)
+
+
+@contextmanager
+def _marks_in_map(problem: MapProblem, markers: Mapping[str, Marker]) -> Iterator[MapProblem]:
+    """Add marks to the map as points inside the block."""
+    marker_ids = add_marks(problem.metric, markers)
+    yield replace(problem, marker_ids=marker_ids)
+    remove_marks(problem.metric, marker_ids)
+
+
+def _without_misplaced(
+    problem: MapProblem, markers: Mapping[str, Marker]
+) -> tuple[MapProblem, BundleAdjustment, Observations]:
+    """Return the problem without the misplaced points, its bundle adjustment, and the observations of all points."""
+    frame_ids = problem.frame_ids
+    rays = model_observations(problem.metric, frame_ids)
+    misplaced = misplaced_points(rays, model_poses(problem.metric, frame_ids))
+    problem = replace(problem, left_out_ids=frozenset(rays.point_ids[misplaced].tolist()))
+    adjustment = problem.of_photos(problem.options.max_num_iterations)
+    beyond_m2 = errors_beyond_features(adjustment, markers, problem.marker_ids)
+    problem = problem.replaced(lambda _, kind: kind.with_errors_of_marks(beyond_m2))
+    return problem, adjustment, rays.with_pixel_stddev(adjustment.pixel_stddev)
+
+
+def refine_with_loops(
+    problem: MapProblem,
+    known: MapProblem,
+    markers: Mapping[str, Marker],
+    loops: LoopPoses,
+    merge_tracks: Callable[[pycolmap.Reconstruction], None],
+) -> MapAtRest:
+    """Move a refined model so that its loops close, in place, and refine it again.
+
+    Args:
+        problem, known: with the noise to begin with, and with which the model was refined.
+        markers: as for ``refine``.
+        loops: measured relative poses, by ids of frames in place of indices.
+        merge_tracks: makes one point of those that two passes saw apart, in place.
+    """
+    place = {frame_id: k for k, frame_id in enumerate(problem.frame_ids.tolist())}
+    reference, frame = (
+        np.array([place[frame_id] for frame_id in ids.tolist()], dtype=np.int64)
+        for ids in (loops.reference, loops.frame)
+    )
+    seen, _, rays = _without_misplaced(problem, {})
+    visible_m = _just_visible_m(rays, model_poses(problem.metric, problem.frame_ids))
+    at_indices = replace(loops, reference=reference, frame=frame)
+    closed, is_near = close_in_graph(seen, seen.like(known), rays, at_indices, visible_m)
+    merge_tracks(problem.metric)
+    if is_near:
+        return refine(problem, markers, closed)
+    # Tracks become one only where their points agree to some pixels. In a map that was bent by metres, all of them do
+    # so only when those that have merged have straightened it.
+    with _marks_in_map(problem, markers) as marked:
+        marked, adjustment, _ = _without_misplaced(marked, markers)
+        added = marked.add_to(adjustment, closed.blocks)
+        solve_bundle_adjustment(adjustment, _MAX_LAST_MOVEMENT * marked.smallest_stddev)
+        blocks = added.state(problem.metric, problem.frame_ids).blocks
+    merge_tracks(problem.metric)
+    return refine(problem.replaced(lambda _, kind: kind.at_blocks(blocks)), markers)
+
+
+def _just_visible_m(rays: Observations, poses: Poses) -> float:
+    """Return the movement of a camera that moves a feature at median depth by its standard deviation."""
+    _, in_cam, _ = project(rays, poses, rays.points)
+    return float(np.median(np.abs(in_cam[:, 2]) / rays.root_information))
+
+
+def _adjusted(adjustment: BundleAdjustment, start: Straightened) -> MapAtRest:
+    """Alternate between solving the full problem and estimating the noise from its residuals."""
+    problem, blocks = start.problem, start.blocks
+    solutions: list[SolverRun] = []
+    num_left = problem.options.max_num_iterations
+    for num_round in range(_MAX_NUM_ROUNDS):
+        if num_round:
+            rays = model_observations(problem.metric, problem.frame_ids).with_pixel_stddev(adjustment.pixel_stddev)
+            blocks = straighten_again(problem, rays, blocks).blocks
+            adjustment = problem.of_photos(num_left)
+        added = problem.add_to(adjustment, blocks)
+        solutions.append(solve_bundle_adjustment(adjustment, _MAX_LAST_MOVEMENT * problem.smallest_stddev))
+        num_left -= solutions[-1].num_iterations
+        state = added.state(problem.metric, problem.frame_ids)
+        blocks = dict(state.blocks)
+        seen = problem.with_noise_of(state, start.num_absorbed)
+        if problem.change(seen) < SAME_NOISE or not solutions[-1].converged or num_left <= 0:
+            break
+        if num_round < _MAX_NUM_ROUNDS - 1:
+            problem = seen
+    tolerance_m = _MAX_LAST_MOVEMENT * problem.smallest_stddev
+    more, is_still = solve_until_still(adjustment, solutions[-1], tolerance_m, num_left)
+    return MapAtRest(
+        problem=problem,
+        state=added.state(problem.metric, problem.frame_ids),
+        added=added,
+        equations=added.equations(adjustment) if adjustment.has_covariance else None,
+        refined_params=adjustment.refined_params,
+        firm_ids=frames_of_largest_part(problem.metric),
+        pixel_stddev=adjustment.pixel_stddev,
+        pixel_stddev_at_rest=pixel_stddev_of(adjustment.adjuster, adjustment.num_reprojections),
+        reprojection_rms_px=adjustment.reprojection_rms_px,
+        solutions=(*solutions, *more),
+        is_still=is_still,
+        bend_m=start.bend_m,
+        num_graph_steps=start.num_steps,
+    )
+
+
+def joint_errors(rest: MapAtRest, bending_factor: float) -> JointCovariance | None:
+    """Return the covariance of all that a map at rest has estimated (section 7); None where it is not determined.
+
+    Args:
+        bending_factor: of the errors of the photos' residuals.
+    """
+    if rest.equations is None:
+        return None
+    try:
+        return joint_covariance(
+            rest.equations,
+            anchors=rest.added.of_kind("anchor"),
+            others=rest.added.others,
+            residual_stddev=bending_factor * rest.pixel_stddev,
+            errors=_errors_of_residuals(rest, bending_factor),
+            anchor_ids=[name for what, name in rest.added.blocks if what == "anchor"],
+            refined_params=rest.refined_params,
+            firm_frame_ids=rest.firm_ids,
+        )
+    except GeometryError as error:
+        logging.getLogger(__name__).info("%s", error)
+        return None
+
+
+def _errors_of_residuals(rest: MapAtRest, bending_factor: float) -> ResidualErrors | None:
+    """Return the learnt errors of the measurements' residuals, in units of those of the photos; None without any."""
+    kinds, residuals = rest.problem.kinds, rest.problem.residuals(rest.state)
+    found = [(rows, kind.learnt_errors(of)) for rows, kind, of in zip(rest.added.rows, kinds, residuals, strict=True)]
+    learnt = [(rows, errors) for rows, errors in found if errors is not None]
+    if not learnt:
+        return None
+    priors = frozenset[Block]().union(*(errors.priors for _, errors in learnt))
+    exact = [rows for rows, kind in zip(rest.added.rows, kinds, strict=True) if kind.is_prior_of(priors)]
+    return ResidualErrors(
+        np.concatenate([rows for rows, _ in learnt]),
+        csr_array(sparse.block_diag([errors.by_error for _, errors in learnt])),
+        block_diag(*(errors.covariance for _, errors in learnt)) / bending_factor**2,
+        np.concatenate([np.zeros(0, dtype=np.int64), *exact]),
+        bending_factor**-2,
+    )

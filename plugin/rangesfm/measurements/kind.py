@@ -1,0 +1,194 @@
+"""What a kind of measurement gives, so that each stage is one code for all kinds (section 2 of examples/model.md)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.ceres.bundle_adjustment import BundleAdjustment
+from rangesfm.geometry.poses import Poses
+from rangesfm.geometry.robust_statistics import RobustLoss
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+Block = tuple[str, str]
+"""Name of a parameter besides the poses: what it is, and whose, as ``("anchor", "A1")``."""
+
+
+@dataclass(frozen=True)
+class MapState:
+    """Values of all that is estimated.
+
+    Attributes:
+        poses: of the n keyframes, in the metric world.
+        blocks: further parameters by name, each (size,).
+    """
+
+    poses: Poses
+    blocks: Mapping[Block, Array]
+
+
+@dataclass(frozen=True)
+class ByBlock:
+    """Derivatives of g groups of d residuals by blocks of one size.
+
+    Attributes:
+        blocks: the blocks. index: (g,) which of them each group depends on; -1: on none.
+        values: (g, d, size) derivatives.
+    """
+
+    blocks: tuple[Block, ...]
+    index: Indices
+    values: Array
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Residuals of g groups of d numbers at a state, and their derivatives.
+
+    Attributes:
+        residual: (g, d) predicted minus measured, in the unit of the measurement.
+        pose: (g, q) indices of the keyframes that each group depends on; one may be there twice.
+        by_pose: (g, d, q, 6) derivatives by a turn of each keyframe's rig in its own frame and a shift of its origin.
+        by_block: derivatives by blocks.
+    """
+
+    residual: Array
+    pose: Indices
+    by_pose: Array
+    by_block: tuple[ByBlock, ...]
+
+    @classmethod
+    def without_poses(cls, residual: Array, by_block: tuple[ByBlock, ...]) -> Linearization:
+        """Return groups that depend on blocks alone."""
+        g, d = residual.shape
+        return cls(residual, np.zeros((g, 0), dtype=np.int64), np.zeros((g, d, 0, 6)), by_block)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much each of g groups of d residuals counts (section 4): half of ``share * loss(|root_information @ e|^2)``.
+
+    Attributes:
+        root_information: (g, d, d) inverse root of the covariance.
+        share: (g,) number of independent groups that each counts as.
+        loss: of the length of a group in standard deviations; least squares if its width is infinite.
+    """
+
+    root_information: Array
+    share: Array
+    loss: RobustLoss
+
+    def whitened(self, residual: Array) -> Array:
+        """Return (g, d) residuals in standard deviations."""
+        return np.asarray(np.einsum("gij,gj->gi", self.root_information, residual))
+
+
+LEAST_SQUARES = RobustLoss(np.inf, is_bounded=True)
+"""The loss of what has no outliers."""
+
+
+class Measurements(ABC):
+    """Measurements of one kind. By default they have no blocks of their own and no outliers."""
+
+    kind: ClassVar[str]
+    """Name of the kind."""
+    counts_in_metres: ClassVar[bool] = False
+    """Whether they say with what precision, in metres, the map is to be found; priors and directions do not."""
+
+    @property
+    @abstractmethod
+    def weights(self) -> Weights:
+        """Weights of the measurements."""
+
+    @abstractmethod
+    def linearize(self, state: MapState) -> Linearization:
+        """Return residuals and derivatives at a state."""
+
+    @abstractmethod
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+        """Add their costs to a bundle adjustment, in pixels.
+
+        Args:
+            poses: rig_from_world (7,) of each keyframe. blocks: parameter blocks by name.
+
+        Returns:
+            Index of each residual among those of the problem.
+        """
+
+    @property
+    def blocks(self) -> Mapping[Block, Array]:
+        """Start values of the blocks that they bring along, which are estimated or held."""
+        return {}
+
+    @property
+    def fixed(self) -> frozenset[Block]:
+        """Those of the blocks that are held at their start values."""
+        return frozenset()
+
+    def is_prior_of(self, blocks: frozenset[Block]) -> bool:
+        """Return whether they are a prior of nothing but some of these blocks."""
+        return False
+
+    def at_blocks(self, blocks: Mapping[Block, Array]) -> Self:
+        """Return the measurements with other start values of their blocks."""
+        return self
+
+    def with_errors_of_marks(self, beyond_m2: Mapping[str, Array]) -> Self:
+        """Return the measurements with the (3, 3) covariances of errors of marks that no residual has, by name."""
+        return self
+
+    def like(self, other: Self) -> Self:
+        """Return the measurements with the noise of the same ones elsewhere."""
+        return self
+
+    def under(self, loss: RobustLoss) -> Self:
+        """Return the measurements with another loss, if they may have outliers."""
+        return self
+
+    def with_noise_of(self, residual: Array, num_absorbed: float) -> Self:
+        """Return the measurements with the noise that (g, d) residuals of a map show which may bend.
+
+        Args:
+            num_absorbed: degrees of freedom of the residuals that the map has absorbed.
+        """
+        return self
+
+    def change(self, other: Self) -> float:
+        """Return the largest difference of the logarithms of the roots of a measurement's information."""
+        return 0.0
+
+    def log_likelihood(self, residual: Array) -> float:
+        """Return how likely (g, d) residuals are, whatever the noise, to compare two maps."""
+        return 0.0
+
+    def with_learnt(self, learned: object) -> Self:
+        """Return the measurements with errors that were learnt at the map at rest, of whatever type is theirs."""
+        return self
+
+    def learnt_errors(self, residual: Array) -> LearntErrors | None:
+        """Return the learnt errors of the residuals in a bundle adjustment, given (g, d) residuals at rest.
+
+        None where each residual errs on its own, as its weight says.
+        """
+        return None
+
+
+class LearntErrors(NamedTuple):
+    """Errors of n residuals that are not independent with their standard deviations.
+
+    Attributes:
+        by_error: (n, m) sparse derivatives of the residuals, in their standard deviations, by m errors.
+        covariance: (m, m) of these errors.
+        priors: blocks whose priors stand for the same errors in the estimate, and have none of their own.
+    """
+
+    by_error: csr_array
+    covariance: Array
+    priors: frozenset[Block]

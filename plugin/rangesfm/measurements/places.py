@@ -1,0 +1,90 @@
+"""Places of an antenna on the path of the keyframes, on which ranges and positions depend alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.poses import Poses
+
+
+@dataclass(frozen=True)
+class AntennaPlaces:
+    """Places of an antenna at n times.
+
+    Each is ``(1 - fraction) * p_before + fraction * p_after + offset`` with ``p = center + world_from_rig @ arm``.
+
+    Attributes:
+        before, after: (n,) indices of keyframes; -1 where there is no place.
+        fraction: (n,) of the later one, in [0, 1].
+        interval_s: (n,) time between the two, 0 at a keyframe.
+        offset_m: (n, 3) deviation of the curved path from the straight line, in the metric world.
+    """
+
+    before: Indices
+    after: Indices
+    fraction: Array
+    interval_s: Array
+    offset_m: Array
+
+    def subset(self, rows: Indices) -> AntennaPlaces:
+        """Return some of the places."""
+        return AntennaPlaces(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def at(self, poses: Poses, arms_m: Array, later_s: float = 0.0) -> Array:
+        """Return the (n, 3) places.
+
+        Args:
+            arms_m: (n, 3) antennas in the rig's frame. later_s: how much later than assumed the antenna was there.
+        """
+        first, last = (self._at_keyframe(poses, index, arms_m) for index in (self.before, self.after))
+        fraction = self._fraction(later_s)[:, None]
+        return np.asarray((1 - fraction) * first + fraction * last + self.offset_m)
+
+    def centers(self, poses: Poses, later_s: float = 0.0) -> Array:
+        """Return the (n, 3) places of the rig's origin on the straight lines between keyframes."""
+        fraction = self._fraction(later_s)[:, None]
+        return np.asarray((1 - fraction) * poses.centers[self.before] + fraction * poses.centers[self.after])
+
+    def _fraction(self, later_s: float) -> Array:
+        if not later_s:
+            return self.fraction
+        is_between = self.before != self.after
+        return self.fraction + later_s * np.divide(
+            1.0, self.interval_s, where=is_between, out=np.zeros(len(is_between))
+        )
+
+    @staticmethod
+    def _at_keyframe(poses: Poses, index: Indices, arms_m: Array) -> Array:
+        turned: Array = np.einsum("nij,nj->ni", poses.world_from_rig[index], arms_m)
+        return poses.centers[index] + turned
+
+    @property
+    def keyframes(self) -> Indices:
+        """(n, 2) keyframes before and after."""
+        return np.column_stack([self.before, self.after])
+
+    def by_pose(self, poses: Poses, arms_m: Array, directions: Array, later_s: float = 0.0) -> Array:
+        """Return the derivatives (n, d, 2, 6) by the two keyframes of the places along (n, d, 3) directions."""
+        fraction = self._fraction(later_s)
+        found = np.empty((*directions.shape[:2], 2, 6))
+        for k, (index, share) in enumerate(((self.before, 1 - fraction), (self.after, fraction))):
+            in_rig = directions @ poses.world_from_rig[index]
+            found[:, :, k, :3] = share[:, None, None] * np.cross(arms_m[:, None], in_rig)
+            found[:, :, k, 3:] = share[:, None, None] * directions
+        return found
+
+    def by_arm(self, poses: Poses, directions: Array, later_s: float = 0.0) -> Array:
+        """Return the derivatives (n, d, 3) by the lever arm of the places along (n, d, 3) directions."""
+        fraction = self._fraction(later_s)[:, None, None]
+        first, last = (directions @ poses.world_from_rig[index] for index in (self.before, self.after))
+        return np.asarray((1 - fraction) * first + fraction * last)
+
+    def by_time(self, poses: Poses, arms_m: Array, directions: Array) -> Array:
+        """Return the derivatives (n, d, 1) by the time, per second, of the places along (n, d, 3) directions."""
+        first, last = (self._at_keyframe(poses, index, arms_m) for index in (self.before, self.after))
+        is_between = self.before != self.after
+        per_second = np.divide(1.0, self.interval_s, where=is_between, out=np.zeros(len(is_between)))
+        return np.asarray(np.einsum("ndi,ni->nd", directions, (last - first) * per_second[:, None])[:, :, None])

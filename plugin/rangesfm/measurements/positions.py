@@ -1,0 +1,142 @@
+"""Known positions of an antenna on the camera, as measurements of the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy import special
+
+from rangesfm import ceres
+from rangesfm.arrays import Array, Indices, rows_by_key
+from rangesfm.ceres.bundle_adjustment import BundleAdjustment
+from rangesfm.geometry.robust_statistics import RobustLoss
+from rangesfm.measurements.kind import Block, ByBlock, Linearization, MapState, Measurements, Weights
+from rangesfm.measurements.places import AntennaPlaces
+from rangesfm.measurements.prior import Prior
+
+ARM: Block = ("lever_arm", "positions")
+CLOCK: Block = ("clock", "positions")
+# Half of all vectors of three normally distributed numbers are shorter than this.
+_MEDIAN_LENGTH = float(np.sqrt(special.chdtri(3, 0.5)))
+# Share of the degrees of freedom that is left, at least, where a map absorbs nearly all of the positions.
+_LEAST_LEFT = 0.1
+
+
+@dataclass(frozen=True)
+class AntennaPositions(Measurements):
+    """k positions of an antenna, with their errors as learnt on a rigid map.
+
+    Attributes:
+        places: on the path.
+        position_m: (k, 3) in the metric world.
+        root_information: (k, 3, 3) inverse roots of the covariances as learnt.
+        stated_share: (k,) factor of the standard deviations with which they are those that the log states, which is the
+            smallest one; 0 where it states none.
+        share: number of independent positions that each counts as, for errors that last.
+        arm_m: (3,) lever arm as given. arm_stddev_m: of its coordinates; 0 holds it.
+        clock_stddev_s: of the time offset; 0: it was given.
+        loss: of the length of an error, in standard deviations of its coordinates.
+        factor: of the standard deviations, as residuals of a map that may bend show it.
+    """
+
+    kind: ClassVar[str] = "position"
+    counts_in_metres: ClassVar[bool] = True
+
+    places: AntennaPlaces
+    position_m: Array
+    root_information: Array
+    stated_share: Array
+    share: float
+    arm_m: Array
+    arm_stddev_m: float
+    clock_stddev_s: float
+    loss: RobustLoss
+    factor: float = 1.0
+
+    @property
+    def blocks(self) -> Mapping[Block, Array]:
+        return {ARM: self.arm_m, CLOCK: np.zeros(1)}
+
+    @property
+    def fixed(self) -> frozenset[Block]:
+        held = ((ARM, self.arm_stddev_m), (CLOCK, self.clock_stddev_s))
+        return frozenset(name for name, stddev in held if not stddev > 0)
+
+    def priors(self) -> Iterator[Prior]:
+        """Yield what is known of the blocks."""
+        if self.arm_stddev_m > 0:
+            yield Prior.of_one(ARM, self.arm_m, self.arm_stddev_m)
+        if self.clock_stddev_s > 0:
+            yield Prior.of_one(CLOCK, np.zeros(1), self.clock_stddev_s)
+
+    @property
+    def _root_information(self) -> Array:
+        return self.root_information / np.maximum(self.factor, self.stated_share)[:, None, None]
+
+    @property
+    def weights(self) -> Weights:
+        return Weights(self._root_information, np.full(len(self.position_m), self.share), self.loss)
+
+    def linearize(self, state: MapState) -> Linearization:
+        num, later_s = len(self.position_m), float(state.blocks[CLOCK][0])
+        arms_m, axes = np.tile(state.blocks[ARM], (num, 1)), np.tile(np.eye(3), (num, 1, 1))
+        all_of_one = np.zeros(num, dtype=np.int64)
+        by_block = (
+            ByBlock((ARM,), all_of_one, self.places.by_arm(state.poses, axes, later_s)),
+            ByBlock((CLOCK,), all_of_one, self.places.by_time(state.poses, arms_m, axes)),
+        )
+        return Linearization(
+            self.places.at(state.poses, arms_m, later_s) - self.position_m,
+            self.places.keyframes,
+            self.places.by_pose(state.poses, arms_m, axes, later_s),
+            by_block,
+        )
+
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+        first, at, roots = adjustment.adjuster.problem.num_residuals(), self.places, self._root_information
+        arm_is_free, clock_is_free = self.arm_stddev_m > 0, self.clock_stddev_s > 0
+        for rows in rows_by_key(at.before, at.after):
+            ends = list(dict.fromkeys((int(at.before[rows[0]]), int(at.after[rows[0]]))))
+            is_between = len(ends) == 2
+            cost = ceres.position_cost(
+                position_m=self.position_m[rows],
+                whitening=roots[rows],
+                tag_in_cam_m=None if arm_is_free else self.arm_m,
+                weight=at.fraction[rows] if is_between else None,
+                offset_in_world_m=at.offset_m[rows] if is_between else None,
+                interval_s=at.interval_s[rows[0]] if is_between and clock_is_free else None,
+                share=adjustment.pixel_stddev**2 * self.share,
+                loss_scale=self.loss.width,
+            )
+            further = [blocks[ARM]] if arm_is_free else []
+            further += [blocks[CLOCK]] if is_between and clock_is_free else []
+            ceres.add_residual_block(adjustment.adjuster, cost, None, [*(poses[end] for end in ends), *further])
+        return np.arange(first, adjustment.adjuster.problem.num_residuals())
+
+    def like(self, other: AntennaPositions) -> AntennaPositions:
+        return replace(self, factor=other.factor)
+
+    def under(self, loss: RobustLoss) -> AntennaPositions:
+        return replace(self, loss=loss)
+
+    def with_noise_of(self, residual: Array, num_absorbed: float) -> AntennaPositions:
+        scaled = np.einsum("gij,gj->gi", self.root_information, residual)
+        freedom = scaled.size / max(scaled.size - num_absorbed, _LEAST_LEFT * scaled.size)
+        shown = float(np.median(np.linalg.norm(scaled, axis=1))) / _MEDIAN_LENGTH
+        return replace(self, factor=float(np.sqrt(freedom)) * shown)
+
+    def change(self, other: AntennaPositions) -> float:
+        ratios = np.maximum(self.factor, self.stated_share) / np.maximum(other.factor, other.stated_share)
+        return float(np.max(np.abs(np.log(ratios))))
+
+    def log_likelihood(self, residual: Array) -> float:
+        shown = self.with_noise_of(residual, 0.0)
+        return -residual.size * float(np.log(max(shown.factor, 1e-300)))
+
+
+def antenna_at(state: MapState) -> tuple[Array, float] | None:
+    """Return the antenna's lever arm (3,) in a state, and how much later it was there than assumed; None without."""
+    return (state.blocks[ARM], float(state.blocks[CLOCK][0])) if ARM in state.blocks else None

@@ -1,0 +1,68 @@
+"""Prior: what was known of some blocks before, as one more kind of measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from rangesfm import ceres
+from rangesfm.arrays import Array, Indices
+from rangesfm.ceres.bundle_adjustment import BundleAdjustment
+from rangesfm.measurements.kind import LEAST_SQUARES, Block, ByBlock, Linearization, MapState, Measurements, Weights
+
+
+@dataclass(frozen=True)
+class Prior(Measurements):
+    """Joint normal distribution of m blocks of one size.
+
+    Attributes:
+        names: of the blocks. mean: (m, size).
+        root_information: (m, m) inverse root of the covariance of one number of each; all numbers of a block are alike.
+    """
+
+    kind: ClassVar[str] = "prior"
+
+    names: tuple[Block, ...]
+    mean: Array
+    root_information: Array
+
+    @classmethod
+    def of_one(cls, name: Block, mean: Array, stddev: float) -> Prior:
+        """Return the prior of one block, all of whose numbers have this standard deviation."""
+        return cls((name,), mean[None], np.array([[1 / stddev]]))
+
+    def is_prior_of(self, blocks: frozenset[Block]) -> bool:
+        return blocks.issuperset(self.names)
+
+    @property
+    def weights(self) -> Weights:
+        root = np.asarray(np.kron(self.root_information, np.eye(self.mean.shape[1])), dtype=np.float64)
+        return Weights(root[None], np.ones(1), LEAST_SQUARES)
+
+    def linearize(self, state: MapState) -> Linearization:
+        num, size = self.mean.shape
+        off = np.array([state.blocks[name] for name in self.names]) - self.mean
+        slopes = np.eye(num * size).reshape(num * size, num, size)
+        by_block = tuple(
+            ByBlock((name,), np.zeros(1, dtype=np.int64), slopes[None, :, k]) for k, name in enumerate(self.names)
+        )
+        return Linearization.without_poses(off.reshape(1, -1), by_block)
+
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+        """Add the prior, if the problem has all of its blocks."""
+        first, problem = adjustment.adjuster.problem.num_residuals(), adjustment.adjuster.problem
+        own = [blocks[name] for name in self.names]
+        if not all(problem.has_parameter_block(block) for block in own):
+            return np.zeros(0, dtype=np.int64)
+        if len(own) == 1:
+            stddev = 1 / (self.root_information[0, 0] * adjustment.pixel_stddev)
+            ceres.add_normal_prior(adjustment.adjuster, own[0], self.mean[0], stddev)
+        else:
+            cost = ceres.joint_prior_cost(
+                mean=self.mean[:, 0], whitening=adjustment.pixel_stddev * self.root_information
+            )
+            ceres.add_residual_block(adjustment.adjuster, cost, None, own)
+        return np.arange(first, problem.num_residuals())
