@@ -36,11 +36,11 @@ def main() -> None:
         columns=images.times_columns,
         unit=images.times_unit,
     )
-    keyframes = times.of(rangesfm.select_keyframes(times, images))
+    keyframes = times.subset(rangesfm.select_keyframes(times, images))
     tables = with_absolute_paths(parse_toml(survey_path)[0], base_folder)
     tables |= {"images": {"path": "images", "times": "images.csv"}, "output": {"path": "out"}}
     for k, rows in enumerate(np.array_split(np.arange(len(keyframes)), num_parts), 1):
-        write_part(folder / f"part_{k}", photos, keyframes.of([keyframes.image_names[row] for row in rows]), tables)
+        write_part(folder / f"part_{k}", photos, keyframes.subset([keyframes.image_names[row] for row in rows]), tables)
         print(f"part_{k}: {len(rows)} photos")
 
 

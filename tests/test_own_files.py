@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING
 import pytest
 from tests.outputs import names_in, paths_below
 
-from rangesfm.result import result_folder as result_folder
-
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey
 
@@ -169,7 +167,7 @@ def test_a_full_disk_costs_no_earlier_result(
     flags = ("scale", *own_survey.flags, *ANCHORS, "--output_path", "out")
     before = bytes_in(own_survey.folder / "out")
     with monkeypatch.context() as patched:
-        patched.setattr(result_folder, moment, full)
+        patched.setattr(run_results, moment, full)
         done = rangesfm_command(*flags, "--check_share", "0.2", cwd=own_survey.folder, status=None)
     assert done.returncode in (2, 4)
     assert "No space left on device" in done.stderr

@@ -203,7 +203,7 @@ def test_a_run_joins_what_the_mapper_left_in_pieces(
     def reconstruct(*_: Any, **__: Any) -> ReconstructionSummary:
         return ReconstructionSummary(models, len(names), HALF, {}, {}, tmp_path / "mapper.log")
 
-    monkeypatch.setattr("rangesfm.workflows.map_photos.reconstruct", reconstruct)
+    monkeypatch.setattr("rangesfm.workflows.map_photos.reconstruct_in", reconstruct)
     survey = exact.write(tmp_path).changed({"images.path": tmp_path / "photos"})
     result = run_survey(survey, progress=SilentProgress()).summary
     path = trajectory_from_reconstruction(read_model(tmp_path / "out" / "sparse_scaled" / "0"))

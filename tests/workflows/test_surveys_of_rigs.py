@@ -155,10 +155,10 @@ def test_a_frame_is_one_keyframe_with_the_time_of_its_photos_and_all_of_them_are
     mapped: list[str] = []
     summary = SimpleNamespace(seconds={}, earlier_seconds={}, num_registered=2, num_keyframes=2, models=())
 
-    def reconstruct(folder: Path, chosen: list[str], *_: object, **__: object) -> SimpleNamespace:
+    def reconstruct_in(_: object, folder: Path, chosen: list[str], *__: object, **___: object) -> SimpleNamespace:
         mapped.extend(chosen)
         return summary
 
-    monkeypatch.setattr(map_photos, "reconstruct", reconstruct)
+    monkeypatch.setattr(map_photos, "reconstruct_in", reconstruct_in)
     map_keyframes(survey, keyframes[1:], journal, restart=False, deferred=False)
     assert mapped == names[2:]
