@@ -119,3 +119,14 @@ def test_importing_the_package_imports_neither_pycolmap_nor_scipy() -> None:
     code = "import sys, rangesfm; print(*({'pycolmap', 'pyceres', 'scipy', 'numpy'} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
+    """Whoever adds a kind writes its module and its line in the table; no stage has to know of it."""
+    generic = {"kind", "marks", "places", "points", "prior", "table"}
+    kinds = {module for module in MODULES if folder_of(module) == "measurements"} - {"measurements"}
+    kinds -= {f"measurements.{name}" for name in generic}
+    assert {"measurements.ranges", "measurements.lengths", "measurements.positions"} <= kinds
+    knowing = {(module, name) for module in MODULES for name in own_imports(module) & kinds if module not in kinds}
+    assert {module for module, _ in knowing} == {"measurements.table"}
+    assert not {(module, name) for module in kinds for name in own_imports(module) & kinds - {module}}

@@ -10,8 +10,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.covariance import JointCovariance
 from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.measurements import positions
-from rangesfm.measurements.ranges import CLOCK, SHORT, Ranges, anchors_at
+from rangesfm.measurements.table import CLOCK, POSITIONS_CLOCK, SHORT, Ranges, anchors_at, antenna_at, ranges_of
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import Misfit, RangeErrors, misfits
 from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
@@ -111,7 +110,7 @@ def summarize(
         rest: the map at rest. given: the ranges before, which may be none.
         covariance, bending_factor: as in the summary.
     """
-    ranges = next((kind for kind in rest.problem.kinds if isinstance(kind, Ranges)), given)
+    ranges = ranges_of(rest.problem.kinds, given)
     state, solutions = rest.state, rest.solutions
     if not len(ranges.rows):
         state = replace(state, blocks={**ranges.blocks, **state.blocks})
@@ -122,7 +121,7 @@ def summarize(
     weights[rows] = errors.robust_weights(residuals_m[rows])
     status[rows] = status_by_weight(weights[rows])
     times = observations.before + observations.fraction if log.timestamp_s is None else log.timestamp_s
-    arm_m, clock_s = state.blocks.get(positions.ARM), state.blocks.get(positions.CLOCK)
+    antenna = antenna_at(state)
     return RefineSummary(
         num_iterations=sum(solution.num_iterations for solution in solutions),
         num_graph_steps=rest.num_graph_steps,
@@ -138,12 +137,12 @@ def summarize(
         misfits=misfits(errors, residuals_m[rows], times[rows]),
         anchors=_with_stddevs(anchors_at(ranges.anchors, state.blocks), covariance),
         tags_in_cam_m=ranges.arms_m(state),
-        time_shift_s=float(state.blocks[CLOCK][0]) if CLOCK in state.blocks else None,
-        short_range_error_m=float(state.blocks[SHORT][0]) if SHORT in state.blocks else None,
+        time_shift_s=ranges.estimated(state, CLOCK),
+        short_range_error_m=ranges.estimated(state, SHORT),
         covariance=covariance,
         bending_factor=bending_factor,
-        antenna_in_cam_m=arm_m,
-        position_time_shift_s=float(clock_s[0]) if clock_s is not None and rest.is_estimated(positions.CLOCK) else None,
+        antenna_in_cam_m=None if antenna is None else antenna[0],
+        position_time_shift_s=antenna[1] if antenna is not None and rest.is_estimated(POSITIONS_CLOCK) else None,
         observations=replace(observations, status=status),
         predicted_m=predicted_m,
         weights=weights,

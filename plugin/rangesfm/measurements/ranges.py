@@ -185,6 +185,10 @@ class Ranges(Measurements):
         sizes = np.concatenate([np.zeros(0), *(state.blocks[name] for name, _, _ in self._shared)])
         return np.asarray(self.shared_errors_m @ sizes)
 
+    def estimated(self, state: MapState, block: Block) -> float | None:
+        """Return a number of the radio, ``CLOCK`` or ``SHORT``; None if it is not estimated."""
+        return float(state.blocks[block][0]) if block in state.blocks else None
+
     def antennas_m(self, state: MapState) -> tuple[Array, Array]:
         """Return the (k, 3) places of tag and camera at the ranges that take part."""
         places, later_s = self.places.subset(self.rows), self._later_s(state)

@@ -23,14 +23,28 @@ from rangesfm.measurements.kind import MapState, Measurements
 from rangesfm.measurements.lengths import Lengths
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import NamedPoints
-from rangesfm.measurements.positions import AntennaPositions
-from rangesfm.measurements.ranges import Ranges, antenna_places
+from rangesfm.measurements.positions import CLOCK as POSITIONS_CLOCK
+from rangesfm.measurements.positions import AntennaPositions, antenna_at
+from rangesfm.measurements.ranges import CLOCK, SHORT, Ranges, anchors_at, antenna_places
 from rangesfm.options import RefineOptions
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
+
+__all__ = [
+    "CLOCK",
+    "POSITIONS_CLOCK",
+    "SHORT",
+    "Measured",
+    "Ranges",
+    "UsedPositions",
+    "anchors_at",
+    "antenna_at",
+    "ranges_of",
+    "ranges_of_map",
+]
 
 
 def ranges_of_map(
@@ -215,6 +229,6 @@ def _whitenings(covariances_m2: Array, stddevs_m: Array) -> Array:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(shapes * stddevs_m[:, None, None] ** 2)))
 
 
-def ranges_of(kinds: Sequence[Measurements]) -> Ranges:
-    """Return the ranges among the measurements of a map that has some."""
-    return next(kind for kind in kinds if isinstance(kind, Ranges))
+def ranges_of(kinds: Sequence[Measurements], given: Ranges) -> Ranges:
+    """Return the ranges among the measurements of a map; those that were given if none takes part."""
+    return next((kind for kind in kinds if isinstance(kind, Ranges)), given)

@@ -43,9 +43,7 @@ from rangesfm.geometry.similarity import IDENTITY, align_points
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.join.join_models import ModelVerdict, join_models
 from rangesfm.measurements.kind import MapState
-from rangesfm.measurements.positions import antenna_at
-from rangesfm.measurements.ranges import anchors_at
-from rangesfm.measurements.table import Measured, UsedPositions, ranges_of, ranges_of_map
+from rangesfm.measurements.table import Measured, UsedPositions, anchors_at, antenna_at, ranges_of, ranges_of_map
 from rangesfm.positions.clock import POSITIONS
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most
@@ -403,7 +401,7 @@ def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: Ma
         positions = _positions_at_rest(_surveyed_at_rest(metric.positions, rest), metric.trajectory, rest, lengths)
         factor = positions.bending_factor
     if estimate.problem is not None:
-        on_map = _ranges_at_rest(metric, rest, positions)
+        on_map = _ranges_at_rest(metric, measured, rest, positions)
         learned = on_map.learned()
         factor = on_map.bending_factor(learned)
         kept = learned.without(CLOCKS) if survey.refine.time_offset_stddev_s else learned
@@ -500,12 +498,14 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) 
     return WalkBending(in_first_camera(path, metres_per_unit))
 
 
-def _ranges_at_rest(metric: MetricResult, rest: MapAtRest, positions: PositionScale | None) -> MapWithRanges:
+def _ranges_at_rest(
+    metric: MetricResult, measured: Measured, rest: MapAtRest, positions: PositionScale | None
+) -> MapWithRanges:
     """Return the ranges on a map at rest, as a scale problem in the unit of the unscaled model."""
     path = metric.trajectory.as_in(rest.problem.metric)
     is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
-    ranges = ranges_of(rest.problem.kinds)
+    ranges = ranges_of(rest.problem.kinds, measured.ranges)
     tags_m, centers_m = ranges.antennas_m(rest.state)
     anchors = anchors_at(ranges.anchors, rest.state.blocks)
     # The model's frame is that of the first camera, in the unit of the unscaled model.
