@@ -79,7 +79,6 @@ def compared(*paths: Path) -> ModelsComparison:
 def test_a_known_similarity_is_found_and_nothing_has_moved_after_it(models: tuple[Path, Path, Path]) -> None:
     _, row = compared(*models[:2]).rows
     assert row.base_from_model is not None
-    assert row.moved_aligned is not None
     assert row.base_from_model.scale == pytest.approx(2.0, rel=1e-9)
     assert row.rotation_deg == pytest.approx(np.rad2deg(TURN.magnitude()), abs=1e-6)
     assert row.moved_aligned.max() < 1e-9
@@ -92,8 +91,6 @@ def test_a_moved_camera_is_named(models: tuple[Path, Path, Path]) -> None:
     assert row.moved[10] == pytest.approx(1.0)
     assert np.delete(row.moved, 10).max() == 0.0
     (base, _) = compared(models[0], models[2]).rows
-    assert row.reprojection_rms_px is not None
-    assert base.reprojection_rms_px is not None
     assert row.reprojection_rms_px > 10 * base.reprojection_rms_px
 
 
@@ -105,8 +102,6 @@ def test_distances_are_in_each_models_own_unit(models: tuple[Path, Path, Path]) 
 
 def test_ranges_tell_the_metric_model_from_the_unscaled(result: Path, models: tuple[Path, Path, Path]) -> None:
     metric, unscaled, _ = compared(result, models[0], models[1]).rows
-    assert metric.range_rms_m is not None
-    assert unscaled.range_rms_m is not None
     assert metric.range_rms_m[0] < 0.1  # the radio's 0.05 m, and the interpolation between photos
     assert unscaled.range_rms_m[0] > 3 * metric.range_rms_m[0]
     assert unscaled.range_rms_m[1] == pytest.approx(metric.range_rms_m[0], rel=1e-6)
@@ -114,7 +109,6 @@ def test_ranges_tell_the_metric_model_from_the_unscaled(result: Path, models: tu
 
 def test_a_results_ranges_fit_its_own_model_as_its_file_says(result: Path, models: tuple[Path, Path, Path]) -> None:
     own, _ = compared(result, models[0]).rows
-    assert own.range_rms_m is not None
     said = json.loads((result / "result.json").read_text())["ranges"]["rms_m"]
     assert own.range_rms_m[0] == pytest.approx(said, rel=1e-4)
 
@@ -130,7 +124,6 @@ def test_a_results_row_is_the_same_whatever_it_is_compared_with(
     alone, _ = compared(result, files / "sparse" / "0").rows
     other, beside = compared(tmp_path / "other", result).rows
     for row, folder in ((alone, result), (beside, result), (other, tmp_path / "other")):
-        assert row.range_rms_m is not None
         said = json.loads((folder / "result.json").read_text())["ranges"]["rms_m"]
         assert row.range_rms_m[0] == pytest.approx(said, rel=1e-3)
 
@@ -144,7 +137,7 @@ def test_a_log_is_held_against_models_that_no_run_has_made(
     assert named[0].model is not None
     ranges = ranges_of_survey(survey, named[0].model, models[0])
     (first, similar, moved) = compare_many(named, ranges).rows
-    rms = [row.range_rms_m for row in (first, similar, moved) if row.range_rms_m is not None]
+    rms = [row.range_rms_m for row in (first, similar, moved) if np.isfinite(row.range_rms_m[0])]
     assert len(rms) == 3
     assert rms[0][1] < 0.1  # the radio's 0.05 m, and the interpolation between photos
     assert rms[0][0] > 3 * rms[0][1]
@@ -156,7 +149,7 @@ def test_a_path_without_orientations_has_no_antenna_and_so_no_range_residuals(
     result: Path, walked_survey: WalkedSurvey
 ) -> None:
     _, row = compared(result, walked_survey.folder / "reference.csv").rows
-    assert row.range_rms_m is None
+    assert np.isnan(row.range_rms_m).all()
 
 
 def test_a_taped_distance_is_found_in_each_model_and_placed_by_the_ranges(
@@ -172,7 +165,7 @@ def test_a_taped_distance_is_found_in_each_model_and_placed_by_the_ranges(
     assert row.lengths_m == pytest.approx((metric, metric, metric), rel=1e-6)
     assert row.measured_m == 5.0
     (unplaced,) = compare_many(read_named_models(models[:2]), tape=read_tape(taped)).taped
-    assert unplaced.lengths_m is None
+    assert unplaced.lengths_m == ()
     taped.write_text(f"from,to,distance_m\n{first},nowhere,5.0\n")
     with pytest.raises(InputError, match=r"taped.csv:2: an end is 'nowhere'.*model"):
         compare_many(read_named_models(models[:2]), tape=read_tape(taped))
@@ -221,7 +214,7 @@ def test_a_file_of_positions_is_a_model_too(models: tuple[Path, Path, Path], wal
     reference = walked_survey.folder / "reference.csv"
     _, row = compared(models[0], reference).rows
     assert row.base_from_model is not None
-    assert row.reprojection_rms_px is None
+    assert np.isnan(row.reprojection_rms_px)
     assert row.base_from_model.scale == pytest.approx(1 / walked_survey.site_from_sfm.scale, rel=1e-6)
     base, row = compared(reference, models[0]).rows
     assert row.scale_ratio == pytest.approx(1 / walked_survey.site_from_sfm.scale, rel=1e-6)

@@ -49,7 +49,7 @@ def turned(map_: MetricMap, rotation_vector: list[float]) -> MetricMap:
     """Return the same map in a world that is tilted."""
     rotation = Rotation.from_rotvec(rotation_vector).as_matrix()
     askew = Similarity(1.0, rotation, np.array([1.0, 2.0, 3.0]))
-    anchors = {name: askew.apply(at) for name, at in (map_.anchors_m or {}).items()}
+    anchors = {name: askew.apply(at) for name, at in map_.anchors_m.items()}
     return replace(map_, reconstruction=rescale(map_.reconstruction, askew), anchors_m=anchors, metric_from_sfm=None)
 
 
@@ -221,7 +221,6 @@ def test_one_anchor_and_a_heading_place_the_map(heading_deg: float, map_: Metric
         heading_deg=heading_deg,
     )
     enu = in_frame(turned(map_, [0.0, 0.0, 1.0]), options)
-    assert enu.anchors_m is not None
     np.testing.assert_allclose(enu.anchors_m["A1"], 0, atol=1e-9)
     ahead = enu.trajectory.world_from_cam[0][:, 2]
     assert np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360 == pytest.approx(heading_deg)
@@ -257,7 +256,7 @@ def test_laz_without_a_place_is_in_the_maps_own_metres(map_: MetricMap, tmp_path
 
 def places_of(map_: MetricMap) -> dict[str, Array]:
     named = dict(zip(map_.trajectory.image_names, map_.trajectory.centers, strict=True))
-    return {**named, **(map_.anchors_m or {})}
+    return {**named, **map_.anchors_m}
 
 
 def test_geojson_holds_longitude_and_latitude(on_earth: MetricMap, tmp_path: Path) -> None:

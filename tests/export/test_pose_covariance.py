@@ -45,20 +45,20 @@ def test_beside_the_poses_stand_the_covariances_row_by_row(map_: MetricMap, tmp_
     header, *rows = [line.split(",") for line in table.read_text().splitlines()]
     assert header == ["image_name", *(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))]
     assert tuple(row[0] for row in rows) == map_.trajectory.image_names
-    expected = [upper((map_.center_covariance_m2 or {})[image]) for image in map_.trajectory.image_names]
+    expected = [upper(map_.center_covariance_m2[image]) for image in map_.trajectory.image_names]
     np.testing.assert_allclose([list(map(float, row[1:])) for row in rows], expected, rtol=1e-8)
 
 
 def test_it_turns_and_grows_with_the_world(map_: MetricMap) -> None:
     turn = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
-    there = moved(map_, Similarity(2.0, turn, np.ones(3))).center_covariance_m2 or {}
+    there = moved(map_, Similarity(2.0, turn, np.ones(3))).center_covariance_m2
     assert len(there) == 6
-    for name, covariance in (map_.center_covariance_m2 or {}).items():
+    for name, covariance in map_.center_covariance_m2.items():
         np.testing.assert_allclose(there[name], 4.0 * turn @ covariance @ turn.T, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", COVARIANCE_FORMATS)
 def test_without_covariances_there_is_nothing_to_write(map_: MetricMap, tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match="pose covariance"):
-        export_map(replace(map_, center_covariance_m2=None), tmp_path, ExportOptions(formats=(name,)))
+        export_map(replace(map_, center_covariance_m2={}), tmp_path, ExportOptions(formats=(name,)))
     assert not list(tmp_path.iterdir())

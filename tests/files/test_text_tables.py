@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import TextTable, header_names, read_table, read_text, write_table
+from rangesfm.files.text_tables import FOUND, TextTable, header_names, read_table, read_text, write_table
 
 
 def write(folder: Path, content: str | bytes) -> Path:
@@ -69,7 +69,7 @@ def test_quoted_cells_may_hold_the_separator(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["a;b\n1;2\n", "a\tb\n1\t2\n", "a   b\n 1  2 \n"])
 def test_separator_is_told_from_the_header_row(tmp_path: Path, content: str) -> None:
-    table = read_table(write(tmp_path, content), ["a", "b"], separator=None)
+    table = read_table(write(tmp_path, content), ["a", "b"], separator=FOUND)
     np.testing.assert_array_equal(table.numbers("b"), [2])
 
 

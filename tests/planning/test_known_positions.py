@@ -81,8 +81,13 @@ def test_the_gain_of_three_control_points_is_advised_and_kept() -> None:
 
 
 def test_positions_of_the_camera_give_scale_and_place_and_their_errors_may_last() -> None:
-    alone = replace(planned((), "site", WALK), antenna=PlannedAntenna(1.0, 0.05, (0.0, -0.3, 0.0)))
-    expected, often = expect(alone), expect(replace(alone, antenna=PlannedAntenna(10.0, 0.05, (0.0, -0.3, 0.0))))
+    alone = replace(
+        planned((), "site", WALK), antenna=PlannedAntenna(rate_hz=1.0, stddev_m=0.05, antenna_in_cam_m=(0.0, -0.3, 0.0))
+    )
+    expected, often = (
+        expect(alone),
+        expect(replace(alone, antenna=PlannedAntenna(rate_hz=10.0, stddev_m=0.05, antenna_in_cam_m=(0.0, -0.3, 0.0)))),
+    )
     assert expected.worst_keyframe_m < 0.2
     # Errors that last do not average out.
     assert 0.5 * expected.worst_keyframe_m < often.worst_keyframe_m < expected.worst_keyframe_m
@@ -134,7 +139,7 @@ def test_points_and_positions_are_read_from_the_plan(tmp_path: Path) -> None:
     plan = read_plan(file)
     assert plan.anchors == ()
     assert [(point.name, point.kind) for point in plan.points] == [("a", CONTROL), ("b", CHECK)]
-    assert plan.antenna == PlannedAntenna(5.0, 0.02)
+    assert plan.antenna == PlannedAntenna(rate_hz=5.0, stddev_m=0.02)
     known = plan.antenna.located(plan.trajectory)
     np.testing.assert_allclose(known.misclosures_m(IDENTITY), 0.0, atol=1e-12)
     file.write_text('[anchors]\nframe = "first_camera"\nplaces = {A = [0, 0, 2]}\n' + walk + "[positions]\n")

@@ -154,5 +154,5 @@ def test_every_path_that_is_read_is_in_one_list(tmp_path: Path) -> None:
     assert all(item.role for item in KEYS if item.type is Path)
     read = {**{item.dotted: item.dotted for item in files}, "images.model": "sparse", "images.path": "photos"}
     survey = Survey().changed({key: tmp_path / name for key, name in {**read, "output.path": "out"}.items()})
-    listed = {item.path.name: item.role for item in input_paths(survey)}
+    listed = {path.name: role for _, role, path in input_paths(survey)}
     assert listed == {"sparse": "model", "photos": "photos", **{item.dotted: "file" for item in files}}

@@ -305,7 +305,7 @@ def test_log_may_be_files_in_a_folder_and_an_empty_one_is_refused(folder: Path) 
         (folder / "logs" / f"anchor_{anchor_id}.csv").touch()
     for path in ("logs", "logs/anchor_*.csv"):
         survey = read_survey(write(folder, f"[ranges]\npath = '{path}'\n"))
-        assert [item.path.name for item in input_paths(survey)] == ["anchor_1.csv", "anchor_2.csv"]
+        assert [path.name for _, _, path in input_paths(survey)] == ["anchor_1.csv", "anchor_2.csv"]
 
 
 def test_folder_in_place_of_a_file_is_named_as_one(folder: Path) -> None:

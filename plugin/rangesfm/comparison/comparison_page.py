@@ -83,7 +83,7 @@ def _moved_figure(comparison: ModelsComparison) -> list[Figure]:
     number = {name: i for i, name in enumerate(comparison.models[0].path.image_names)}
     series = []
     for i, row in enumerate(comparison.rows[1:], start=1):
-        if row.moved_aligned is not None:
+        if np.isfinite(row.moved_aligned).all():
             points = np.column_stack([[number[name] + 1 for name in row.common_names], row.moved_aligned])
             series.append(Series(row.name, _color(i), points, "line"))
     if not series:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -30,6 +31,8 @@ from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
+
+_NO_RANGES = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -68,12 +71,12 @@ class ModelRow:
         base_from_model: best similarity from this model to the first; None with fewer than three common photos.
         common_names: names of the photos in both, in the order of the first model.
         moved, moved_aligned: (n,) distance of each common camera from its position in the first model, before and after
-            that similarity, in the unit of the first model; ``moved_aligned`` is None without a similarity.
-        reprojection_rms_px: None for a file of positions, NaN for a model without points.
+            that similarity, in the unit of the first model; ``moved_aligned`` is NaN without a similarity.
+        reprojection_rms_px: NaN for a file of positions and for a model without points.
         range_rms_m: RMS of range residuals. First with the cameras as they are; if the model is a result and no log is
             given, of the ranges and anchors of its own run, so that it does not depend on the other models. Then of the
             ranges that all models share, with the cameras moved by the similarity that brings them closest to
-            ``ModelRanges.metric_path``. None without ranges.
+            ``ModelRanges.metric_path``. NaN without ranges.
     """
 
     name: str
@@ -82,20 +85,20 @@ class ModelRow:
     base_from_model: Similarity | None
     common_names: tuple[str, ...]
     moved: Array
-    moved_aligned: Array | None
-    reprojection_rms_px: float | None
-    range_rms_m: tuple[float, float] | None
+    moved_aligned: Array
+    reprojection_rms_px: float
+    range_rms_m: tuple[float, float]
 
     @property
-    def scale_ratio(self) -> float | None:
-        """Return the lengths in the model divided by those in the first model; None without a similarity."""
-        return None if self.base_from_model is None else 1.0 / self.base_from_model.scale
+    def scale_ratio(self) -> float:
+        """Return the lengths in the model divided by those in the first model; NaN without a similarity."""
+        return math.nan if self.base_from_model is None else 1.0 / self.base_from_model.scale
 
     @property
-    def rotation_deg(self) -> float | None:
-        """Return the rotation angle of the similarity in degrees; None without a similarity."""
+    def rotation_deg(self) -> float:
+        """Return the rotation angle of the similarity in degrees; NaN without a similarity."""
         if self.base_from_model is None:
-            return None
+            return math.nan
         return float(np.rad2deg(Rotation.from_matrix(self.base_from_model.rotation).magnitude()))
 
 
@@ -106,14 +109,14 @@ class TapedRow:
     Attributes:
         ends: names of both ends.
         measured_m: taped length.
-        lengths: length in each model, in the unit of that model; None for a model that is only a path.
-        lengths_m: the same with the scale that brings the model onto ``ModelRanges.metric_path``; None without ranges.
+        lengths: length in each model, in the unit of that model; NaN for a model that is only a path.
+        lengths_m: the same with the scale that brings the model onto ``ModelRanges.metric_path``; empty without ranges.
     """
 
     ends: tuple[str, str]
     measured_m: float
-    lengths: tuple[float | None, ...]
-    lengths_m: tuple[float | None, ...] | None
+    lengths: tuple[float, ...]
+    lengths_m: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -281,11 +284,16 @@ def _row(
         num_photos=len(other.path),
         base_from_model=similarity,
         common_names=names,
-        moved=np.linalg.norm(theirs - ours, axis=1),
-        moved_aligned=None if similarity is None else np.linalg.norm(similarity.apply(theirs) - ours, axis=1),
-        reprojection_rms_px=None if other.model is None else reprojection_rms_px(other.model),
-        range_rms_m=_range_rms(own or ranges, ranges, other, onto_ranges) if ranges and onto_ranges else None,
+        moved=_apart(theirs, ours),
+        moved_aligned=np.full(len(ours), np.nan) if similarity is None else _apart(similarity.apply(theirs), ours),
+        reprojection_rms_px=math.nan if other.model is None else reprojection_rms_px(other.model),
+        range_rms_m=_range_rms(own or ranges, ranges, other, onto_ranges) if ranges and onto_ranges else _NO_RANGES,
     )
+
+
+def _apart(first: Array, second: Array) -> Array:
+    """Return the distances (n,) between points (n, 3)."""
+    return np.asarray(np.linalg.norm(first - second, axis=1))
 
 
 def _onto(goal: Trajectory, path: Trajectory) -> Similarity | None:
@@ -296,12 +304,12 @@ def _onto(goal: Trajectory, path: Trajectory) -> Similarity | None:
 
 def _range_rms(
     own: ModelRanges, ranges: ModelRanges, model: NamedModel, onto_ranges: Similarity
-) -> tuple[float, float] | None:
+) -> tuple[float, float]:
     """Return ``ModelRow.range_rms_m``, given the model's own ranges and those that all models share."""
     if not model.has_orientations:
-        return None
+        return _NO_RANGES
     as_it_is, carried = rms(own.residuals_m(model.path)), rms(ranges.residuals_m(carried_by(onto_ranges, model.path)))
-    return None if np.isnan(as_it_is) else (as_it_is, carried)
+    return _NO_RANGES if np.isnan(as_it_is) else (as_it_is, carried)
 
 
 def _taped(
@@ -314,18 +322,18 @@ def _taped(
     of_models = [_taped_lengths(model, tape, onto, anchors_m) for model, onto in zip(models, onto_ranges)]
     for taped, of_row in zip(tape.distances, zip(*of_models)):
         lengths, lengths_m = zip(*of_row)
-        yield TapedRow(taped.ends, taped.distance_m, lengths, None if ranges is None else lengths_m)
+        yield TapedRow(taped.ends, taped.distance_m, lengths, () if ranges is None else lengths_m)
 
 
 def _taped_lengths(
     model: NamedModel, tape: Tape, onto_ranges: Similarity | None, anchors_m: Mapping[str, Array]
-) -> list[tuple[float | None, float | None]]:
+) -> list[tuple[float, float]]:
     """Return each taped distance in a model, in the unit of the model and in metres by ``onto_ranges``.
 
     Raises:
         InputError: an end of a distance is not in the model.
     """
-    unknown = [None] * len(tape.distances)
+    unknown = [math.nan] * len(tape.distances)
     if model.model is None:
         return list(zip(unknown, unknown))
     try:
@@ -373,7 +381,7 @@ def _truth_cells(model: NamedModel, reference: Reference) -> Sequence[str]:
 
 def _cells(row: ModelRow, first: NamedModel) -> list[tuple[str, str]]:
     """Return name and text of each cell of a row about a model and the first; the name is that of the column."""
-    aligned, range_rms_m = row.moved_aligned, row.range_rms_m or (None, None)
+    aligned = row.moved_aligned
     moved = rmse(row.moved[:, None]) if row.is_metric == (first.frame is not None) else None
     return [
         ("model", row.name),
@@ -381,14 +389,14 @@ def _cells(row: ModelRow, first: NamedModel) -> list[tuple[str, str]]:
         ("scale / first", text_or_dash(row.scale_ratio, ".6g")),
         ("turn deg", text_or_dash(row.rotation_deg, ".3f")),
         (first.heading("moved"), text_or_dash(moved, ".4f")),
-        (first.heading("after Sim(3)"), text_or_dash(None if aligned is None else rmse(aligned[:, None]), ".4f")),
-        (first.heading("most"), text_or_dash(None if aligned is None else float(aligned.max()), ".4f")),
+        (first.heading("after Sim(3)"), text_or_dash(rmse(aligned[:, None]), ".4f")),
+        (first.heading("most"), text_or_dash(float(aligned.max()), ".4f")),
         ("reproj. px", text_or_dash(row.reprojection_rms_px, ".4f")),
-        ("range RMS m", text_or_dash(range_rms_m[0] if row.is_metric else None, ".4f")),
-        ("after Sim(3) m", text_or_dash(range_rms_m[1], ".4f")),
+        ("range RMS m", text_or_dash(row.range_rms_m[0] if row.is_metric else None, ".4f")),
+        ("after Sim(3) m", text_or_dash(row.range_rms_m[1], ".4f")),
     ]
 
 
 def _taped_cells(row: TapedRow) -> list[str]:
-    lengths = (row.measured_m, *row.lengths, *(row.lengths_m or ()))
+    lengths = (row.measured_m, *row.lengths, *row.lengths_m)
     return ["{} to {}".format(*row.ends), *(text_or_dash(length, ".4f") for length in lengths)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
-from rangesfm.files.text_tables import TextTable, header_names, is_plain_table, read_head, read_table
+from rangesfm.files.text_tables import FOUND, TextTable, header_names, is_plain_table, read_head, read_table
 from rangesfm.option_model import Bounds
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.layout import MISSING, ColumnSample, Layout, find_layout
@@ -79,7 +79,7 @@ class ListForm:
         """
         head = read_head(path)
         if is_plain_table(head, self.required.values()):
-            table = read_table(path, [*self.required.values()], [*self.optional.values()], separator=None)
+            table = read_table(path, [*self.required.values()], [*self.optional.values()], separator=FOUND)
             both = {**self.required, **self.optional}
             columns = {quantity: name for quantity, name in both.items() if name in table}
             return MeasuredList(table, columns, dict.fromkeys(columns))

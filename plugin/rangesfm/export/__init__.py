@@ -66,7 +66,7 @@ EXPORTERS: dict[str, Exporter] = {
     ),
     "ply": lambda map_, folder: write_points(map_.reconstruction, folder / "points.ply"),
     "ply_cameras": lambda map_, folder: write_cameras(map_.trajectory, folder / "cameras.ply"),
-    "ply_anchors": lambda map_, folder: write_anchor_vertices(map_.anchors_m or {}, folder / "anchors.ply"),
+    "ply_anchors": lambda map_, folder: write_anchor_vertices(map_.anchors_m, folder / "anchors.ply"),
     "laz": lambda map_, folder: write_laz(map_, folder / "points.laz"),
     "gpkg": lambda map_, folder: write_features(map_, folder / "survey.gpkg", "GPKG"),
     "geojson": lambda map_, folder: write_features(map_, folder / "survey.geojson", "GeoJSON"),
@@ -133,7 +133,7 @@ def export_model(
     Raises:
         InputError: a format is unknown or needs something that is not given, or the folder cannot be written to.
     """
-    map_ = MetricMap(reconstruction, timestamps_s, anchors_m, metric_from_sfm)
+    map_ = MetricMap(reconstruction, timestamps_s, anchors_m or {}, metric_from_sfm)
     return export_map(map_, Path(output_path), ExportOptions(formats=tuple(formats)))
 
 

@@ -97,7 +97,7 @@ def write_pose_priors(map_: MetricMap, path: Path) -> Path:
     """
     if map_.database_path is None or not map_.database_path.is_file():
         raise InputError("the format 'pose_priors' needs the photos' database (database.db), which is not there")
-    covariances = map_.center_covariance_m2 or {}
+    covariances = map_.center_covariance_m2
     with new_file(path) as temporary, tempfile.TemporaryDirectory() as scratch:
         copy = Path(shutil.copy(map_.database_path, Path(scratch) / "copy.db"))
         with pycolmap.Database.open(copy) as database:

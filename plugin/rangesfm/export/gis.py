@@ -71,7 +71,7 @@ def write_features(map_: MetricMap, path: Path, driver: str) -> Path:
         import pyogrio.raw
     except ImportError:
         raise missing_extra(f"the format {path.suffix[1:]!r} needs pyogrio", "geo") from None
-    anchors = map_.anchors_m or {}
+    anchors = map_.anchors_m
     trajectory = map_.trajectory
     places = np.concatenate([trajectory.centers, np.array(list(anchors.values())).reshape(-1, 3)])
     is_projected = driver == "GPKG"

@@ -44,27 +44,27 @@ class MetricMap:
     Attributes:
         reconstruction: model in metres.
         timestamps_s: time of each photo on the camera's clock, by name; None if unknown.
-        anchors_m: position (3,) of each anchor by id, in the world of the model; None if unknown.
+        anchors_m: position (3,) of each anchor by id, in the world of the model; empty if unknown.
         metric_from_sfm: similarity from the world of the unscaled model to that of this model; None if unknown.
         relative_scale_stddev: relative stddev that the scale gives every length in the map; inf if unknown.
         images_path: folder of the photos; None if unknown.
         database_path: COLMAP's database of the photos; None if unknown.
         is_site: whether the world of the model is the site frame of the anchors, where z is up by convention.
         georeference: place of the model's world on the Earth; None if unknown.
-        center_covariance_m2: covariance (3, 3) of each keyframe's projection centre by photo; None if unknown.
+        center_covariance_m2: covariance (3, 3) of each keyframe's projection centre by photo; empty if unknown.
         offset_m: (3,) what was subtracted from all coordinates, to have the origin near the cameras.
     """
 
     reconstruction: pycolmap.Reconstruction
     timestamps_s: Mapping[str, float] | None = None
-    anchors_m: Mapping[str, Array] | None = None
+    anchors_m: Mapping[str, Array] = field(default_factory=dict)
     metric_from_sfm: Similarity | None = None
     relative_scale_stddev: float = math.inf
     images_path: Path | None = None
     database_path: Path | None = None
     is_site: bool = False
     georeference: Georeference | None = None
-    center_covariance_m2: Mapping[str, Array] | None = None
+    center_covariance_m2: Mapping[str, Array] = field(default_factory=dict)
     offset_m: Array = field(default_factory=lambda: np.zeros(3))
 
     @cached_property
@@ -159,19 +159,19 @@ def moved(map_: MetricMap, new_from_old: Similarity) -> MetricMap:
     return replace(
         map_,
         reconstruction=rescale(map_.reconstruction, new_from_old),
-        anchors_m={name: new_from_old.apply(at) for name, at in (map_.anchors_m or {}).items()},
+        anchors_m={name: new_from_old.apply(at) for name, at in map_.anchors_m.items()},
         metric_from_sfm=None if known is None else new_from_old @ known,
         georeference=georeference,
-        center_covariance_m2=covariance_m2 and {name: turn @ of @ turn.T for name, of in covariance_m2.items()},
+        center_covariance_m2={name: turn @ of @ turn.T for name, of in covariance_m2.items()},
     )
 
 
 def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
     georeference = map_.georeference
     if options.origin_anchor is not None:
-        anchor = (map_.anchors_m or {}).get(options.origin_anchor)
+        anchor = map_.anchors_m.get(options.origin_anchor)
         if anchor is None:
-            known = ", ".join(map_.anchors_m or {}) or "none"
+            known = ", ".join(map_.anchors_m) or "none"
             raise InputError(f"origin_anchor is {options.origin_anchor!r}, expected one with a position: {known}")
         if options.origin_lat_lon_height is None or options.heading_deg is None:
             raise InputError("origin_anchor needs origin_lat_lon_height and heading_deg as well")

@@ -55,7 +55,7 @@ def write_covariances(map_: MetricMap, path: Path) -> Path:
     Raises:
         InputError: the map has no covariances.
     """
-    known, names = map_.center_covariance_m2 or {}, map_.trajectory.image_names
+    known, names = map_.center_covariance_m2, map_.trajectory.image_names
     missing = [name for name in names if name not in known]
     if missing:
         raise InputError(

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import compress
 from pathlib import Path
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +35,11 @@ from rangesfm.option_model import Bounds
 
 MAX_NUMBER = 1e100
 """The largest number in any file; its squares are finite."""
+A_NUMBER: Final = Bounds(-MAX_NUMBER, MAX_NUMBER, "")
+"""Bounds of every number that can be squared."""
+NO_ALIASES: Final[Mapping[str, str]] = MappingProxyType({})
+FOUND: Final = ""
+"""Separator that is found from the header row."""
 _HEAD_BYTES = 1 << 16
 _GZIP_MARK = b"\x1f\x8b"
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -107,21 +114,22 @@ class TextTable:
         *,
         empty: float | None = None,
         missing: Collection[str] = ("",),
-        bounds: Bounds | None = None,
-        expected: str | None = None,
+        bounds: Bounds = A_NUMBER,
+        expected: str = "",
     ) -> npt.NDArray[np.float64]:
         """Return the cells as finite numbers (n,).
 
         Args:
             empty: value of empty cells and of a missing column; if it is None, empty cells are refused.
             missing: texts of a cell that counts as empty, in small letters.
-            bounds: bounds of valid numbers; None: every number that can be squared.
-            expected: description of a valid cell, for messages; None: by the bounds.
+            bounds: bounds of valid numbers; A_NUMBER: every number that can be squared.
+            expected: description of a valid cell, for messages; empty: by the bounds.
 
         Raises:
             InputError: a cell is not valid; the error gives the line.
         """
-        expected = expected or str(bounds or "a number") + ", or nothing" * (empty is not None)
+        any_number = bounds is A_NUMBER
+        expected = expected or ("a number" if any_number else str(bounds)) + ", or nothing" * (empty is not None)
         if column not in self and empty is not None:
             return np.full(len(self), empty)
         cells = self.cells[column]
@@ -132,9 +140,9 @@ class TextTable:
             if empty is None or raw[row].strip().lower() not in missing:
                 raise self.error(row, column, expected)
             values[row] = empty
-        wrong = ~(np.abs(values) <= MAX_NUMBER if bounds is None else bounds.hold(values))
+        wrong = ~bounds.hold(values)
         wrong[bad] = False
-        self.refuse(wrong, column, f"{expected}, at most {MAX_NUMBER:g}" if bounds is None else expected)
+        self.refuse(wrong, column, f"{expected}, at most {MAX_NUMBER:g}" if any_number else expected)
         return values
 
     def error(self, row: int, column: str, expected: str) -> InputError:
@@ -162,8 +170,8 @@ def read_table(
     optional: Sequence[str] = (),
     *,
     text: Sequence[str] = (),
-    aliases: Mapping[str, str] | None = None,
-    separator: str | None = ",",
+    aliases: Mapping[str, str] = NO_ALIASES,
+    separator: str = ",",
 ) -> TextTable:
     """Read the named columns of a file; other columns are ignored.
 
@@ -173,7 +181,7 @@ def read_table(
         text: the columns that are not numbers. Any column can later be read as text or as numbers; this only makes
             reading fast.
         aliases: other names of columns in the file, ``{name in the file: name}``.
-        separator: one character; a blank means any run of blanks; None: found from the header row.
+        separator: one character; a blank means any run of blanks; FOUND: by the header row.
 
     Raises:
         InputError: the file is missing, empty or not text, lacks a column, or has a row with too
@@ -183,11 +191,10 @@ def read_table(
     header_row, header_line, body = _split_header(read_text(path))
     if not header_row:
         raise InputError(f"the file is empty, expected a header row with {_listed(required)}", path)
-    if separator is None:
-        separator = guess_separator(header_row)
+    separator = separator or guess_separator(header_row)
     if len(separator) != 1 or separator in '"\r\n\0#':
         raise InputError(f"separator is {separator!r}, expected one character", path)
-    known, aliases = (*required, *optional), aliases or {}
+    known = (*required, *optional)
     found = [cell.strip() for cell in _split_row(header_row, separator, path, header_line)]
     names = [name if name in known else aliases.get(name, name) for name in found]
     if all(_number(name) is not None for name in names):
@@ -300,21 +307,21 @@ def read_head(path: AnyPath) -> str:
     return data.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
 
-def header_names(text: str, separator: str | None = None) -> list[str]:
+def header_names(text: str, separator: str = FOUND) -> list[str]:
     """Return the cells of the first line that is neither blank nor a comment; empty if it is not a row of cells."""
     row = next(filter(_has_content, text.split("\n")), "")
     try:
-        return [cell.strip() for cell in _split_row(row, separator or guess_separator(row))]
+        return [cell.strip() for cell in _split_row(row, separator or guess_separator(row), Path(), 1)]
     except InputError:
         return []
 
 
-def has_columns(text: str, required: Collection[str], aliases: Mapping[str, str] | None = None) -> bool:
+def has_columns(text: str, required: Collection[str], aliases: Mapping[str, str] = NO_ALIASES) -> bool:
     """Return whether the header row in a file's beginning names the required columns, as ``read_table`` reads it."""
-    return {*required} <= {(aliases or {}).get(name, name) for name in header_names(text)}
+    return {*required} <= {aliases.get(name, name) for name in header_names(text)}
 
 
-def is_plain_table(text: str, required: Collection[str], aliases: Mapping[str, str] | None = None) -> bool:
+def is_plain_table(text: str, required: Collection[str], aliases: Mapping[str, str] = NO_ALIASES) -> bool:
     """Return whether a file's beginning has the required columns and no decimal commas, as ``read_table`` reads it."""
     header_row = next(filter(_has_content, text.split("\n")), "")
     return has_columns(text, required, aliases) and ("," in header_row or "," not in text)
@@ -383,7 +390,7 @@ def _split_header(text: str) -> tuple[str, int, str]:
     return "", line, ""
 
 
-def _split_row(row: str, separator: str, path: Path | None = None, line: int | None = None) -> list[str]:
+def _split_row(row: str, separator: str, path: Path, line: int) -> list[str]:
     if '"' not in row:
         return row.split(None if separator == " " else separator)
     try:

@@ -17,6 +17,7 @@ from rangesfm.files.clock_times import span_text
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.photo_names import rows_of_photos
 from rangesfm.files.text_tables import (
+    FOUND,
     TextTable,
     guess_separator,
     has_columns,
@@ -169,7 +170,7 @@ def read_reference(path: AnyPath) -> Reference:
         found = printable(", ".join(names))
         raise InputError(f"no column image_name or timestamp_s; found {found}; expected one of them", path)
     key = "image_name" if "image_name" in names else "timestamp_s"
-    return _from_table(read_table(path, [key, *POSITION_COLUMNS], QUATERNION_COLUMNS, separator=None), key)
+    return _from_table(read_table(path, [key, *POSITION_COLUMNS], QUATERNION_COLUMNS, separator=FOUND), key)
 
 
 def write_reference(reference: Reference, path: Path) -> Path:

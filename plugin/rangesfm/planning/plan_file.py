@@ -19,7 +19,7 @@ from rangesfm.options import LENGTH_M, PointOptions, RangeModelOptions, TagOptio
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
 from rangesfm.planning.placement import places_in_box, places_on_walls, spread_anchors
 from rangesfm.planning.plan_checks import oddities, require_possible
-from rangesfm.planning.planned import PlannedAntenna, PlannedSurvey
+from rangesfm.planning.planned import Coordinate, Place, PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
 from rangesfm.positions.control_point_file import read_control_points
 from rangesfm.positions.control_points import ControlPoint
@@ -28,9 +28,7 @@ from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
 from rangesfm.survey.survey_reader import absolute_value, parse_toml, refuse_unknown_tables
 
-_Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]  # national grids go up to 1e7
-_Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
-_Spot = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False)]
+_Spot = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 # A plan with more anchors, or of a longer survey (seconds), would take minutes.
 _MAX_NUM_ANCHORS, _MAX_DURATION_S = 64, 1e5
 # Keys in [path] that give a path, each instead of the others.
@@ -49,7 +47,7 @@ def _corners(corners: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[tupl
     return corners
 
 
-_Heights = Annotated[tuple[_Coordinate, _Coordinate], Field(strict=False), AfterValidator(ascending)]
+_Heights = Annotated[tuple[Coordinate, Coordinate], Field(strict=False), AfterValidator(ascending)]
 _HEIGHTS = KeyMeta(expected="a list of 2 numbers, the larger one last")
 _Corners = Annotated[tuple[_Spot, ...], Field(strict=False), AfterValidator(_going_somewhere)]
 
@@ -59,8 +57,8 @@ class PlannedAnchorOptions(Options, table="anchors"):
 
     path: Annotated[Path | None, KeyMeta(role="file")] = None
     """CSV file anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m], each with a position."""
-    places: Annotated[dict[str, _Place], KeyMeta(expected="a table in which each value is a list of 3 numbers")] = (
-        Field(default_factory=dict)
+    places: Annotated[dict[str, Place], KeyMeta(expected="a table in which each value is a list of 3 numbers")] = Field(
+        default_factory=dict
     )
     """Positions x, y, z by anchor id, instead of path."""
     frame: Literal["site", "first_camera", "unknown"] = "site"
@@ -70,7 +68,7 @@ class PlannedAnchorOptions(Options, table="anchors"):
     num_to_place: Annotated[int, Field(ge=1, le=_MAX_NUM_ANCHORS)] | None = None
     """Number of anchors to place where they help most, in the region or on the walls, instead of places and path."""
     region_m: Annotated[
-        Annotated[tuple[_Place, _Place], Field(strict=False), AfterValidator(_corners)] | None,
+        Annotated[tuple[Place, Place], Field(strict=False), AfterValidator(_corners)] | None,
         KeyMeta(expected="two places, the second one in no coordinate smaller"),
     ] = None
     """Two opposite corners x, y, z of the box in which anchors may be placed."""
@@ -87,7 +85,7 @@ class PlannedPathOptions(Options, table="path"):
     """Planned path of the camera: waypoints, a loop, a trajectory, or a model."""
 
     waypoints: Annotated[
-        Annotated[tuple[_Place, ...], Field(strict=False)] | None, KeyMeta(expected="a list of lists of 3 numbers")
+        Annotated[tuple[Place, ...], Field(strict=False)] | None, KeyMeta(expected="a list of lists of 3 numbers")
     ] = None
     """Points x, y, z in the site that the camera passes; it looks ahead, and its path is rounded off at corners."""
     loop_inside_m: Annotated[
@@ -118,26 +116,13 @@ class PlannedPointOptions(Options, table="points"):
 
     path: Annotated[Path | None, KeyMeta(role="file")] = None
     """CSV file marker,x_m,y_m,z_m[,stddev_m,kind]."""
-    places: Annotated[dict[str, _Place], KeyMeta(expected="a table in which each value is a list of 3 numbers")] = (
-        Field(default_factory=dict)
+    places: Annotated[dict[str, Place], KeyMeta(expected="a table in which each value is a list of 3 numbers")] = Field(
+        default_factory=dict
     )
     """Coordinates x, y, z of control points by name, instead of path. Photos must show them ([photos], its defaults
     without that table)."""
     stddev_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.01
     """Standard deviation of each coordinate of a point for which the file has none."""
-
-
-class PlannedPositionOptions(Options, table="positions"):
-    """Planned positions of an antenna on the camera: by satellites, a radio or a total station."""
-
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
-    """Positions per second."""
-    stddev_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.03
-    """Standard deviation of each coordinate."""
-    antenna_in_cam_m: _Place = (0.0, 0.0, 0.0)
-    """Lever arm: position of the antenna in the camera frame (right, down, forward), metres."""
-    lasting_s: Annotated[float, Field(ge=1e-2, le=1e5)] | None = None
-    """Time for which an error of the positions lasts (default: a mixture of 3, 30 and 300 s)."""
 
 
 class PlannedRadioOptions(RangeModelOptions, table="radio"):
@@ -160,7 +145,7 @@ PLAN_TABLES: dict[str, type[Options]] = {
     "tag": TagOptions,
     "photos": PlannedPhotos,
     "points": PlannedPointOptions,
-    "positions": PlannedPositionOptions,
+    "positions": PlannedAntenna,
 }
 # Tables that say nothing where they are missing.
 _OPTIONAL_TABLES = ("photos", "points", "positions")
@@ -227,7 +212,7 @@ def _planned(
     tag: TagOptions,
     photos: PlannedPhotos | None = None,
     points: PlannedPointOptions | None = None,
-    positions: PlannedPositionOptions | None = None,
+    positions: PlannedAntenna | None = None,
 ) -> PlannedSurvey:
     if tag.lever_arms_m:
         raise tag.refused("lever_arms_m", "is given, expected tag_in_cam_m: a plan has one tag")
@@ -250,7 +235,7 @@ def _planned(
         component_stddevs=({} if radio.like is None else stddevs_in(radio.like)) | radio.stddevs,
         photos=photos,
         points=() if points is None else _points(points),
-        antenna=None if positions is None else PlannedAntenna(**positions.model_dump()),
+        antenna=positions,
         heights_m=anchors.heights_m,
         path_is_level=path.is_level,
         allowed_m=allowed_m,

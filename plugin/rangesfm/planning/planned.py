@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.option_model import Options
 from rangesfm.options import AssociationOptions, RangeModelOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.positions.antenna_track import AntennaTrack
@@ -32,19 +35,21 @@ from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
 _OFF_LINE_M = (0.07, 0.07, 0.1)
 
 
-@dataclass(frozen=True)
-class PlannedAntenna:
-    """Positions of an antenna on the camera that will be known.
+Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]  # national grids go up to 1e7
+Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 
-    Attributes:
-        rate_hz: positions per second. stddev_m: standard deviation of each coordinate.
-        antenna_in_cam_m: (3,) lever arm. lasting_s: time for which errors last; None: a mixture.
-    """
 
-    rate_hz: float
-    stddev_m: float
-    antenna_in_cam_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    lasting_s: float | None = None
+class PlannedAntenna(Options, table="positions"):
+    """Planned positions of an antenna on the camera: by satellites, a radio or a total station."""
+
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
+    """Positions per second."""
+    stddev_m: Annotated[float, Field(ge=1e-4, le=1e3)] = 0.03
+    """Standard deviation of each coordinate."""
+    antenna_in_cam_m: Place = (0.0, 0.0, 0.0)
+    """Lever arm: position of the antenna in the camera frame (right, down, forward), metres."""
+    lasting_s: Annotated[float, Field(ge=1e-2, le=1e5)] | None = None
+    """Time for which an error of the positions lasts (default: a mixture of 3, 30 and 300 s)."""
 
     def located(self, path: Trajectory) -> KnownPositions:
         """Return the positions without errors on a path."""

@@ -13,6 +13,7 @@ from rangesfm.distances.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker
 from rangesfm.distances.tape_file import read_markers
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import (
+    FOUND,
     TextTable,
     has_columns,
     is_number,
@@ -80,7 +81,7 @@ def is_point_file(head: str) -> bool:
 
 def _table(path: Path, options: PointOptions, head: str) -> ControlPoints:
     if not options.columns and options.unit is None and is_plain_table(head, POINT_COLUMNS):
-        table = read_table(path, POINT_COLUMNS, ["stddev_m", "kind"], separator=None)
+        table = read_table(path, POINT_COLUMNS, ["stddev_m", "kind"], separator=FOUND)
         return _points(table, _CANONICAL, dict.fromkeys(QUANTITIES, "m"), ("",), options, [])
     layout = find_layout(path)
     if layout is None:

@@ -17,6 +17,7 @@ import numpy as np
 from rangesfm.arrays import Array, Mask
 from rangesfm.errors import InputError, nearest_known, printable
 from rangesfm.files.text_tables import (
+    FOUND,
     TextTable,
     has_columns,
     header_names,
@@ -107,7 +108,7 @@ def _read_canonical(path: Path, options: PositionOptions) -> PositionLog:
     key = "timestamp" if has_columns(read_head(path), [_CANONICAL["timestamp"]]) else "image_name"
     optional = [name for quantity, name in _CANONICAL.items() if quantity not in (key, *AXES)]
     text = ["image_name"]
-    table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, text=text, separator=None)
+    table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, text=text, separator=FOUND)
     names = {quantity: name for quantity, name in _CANONICAL.items() if name in table}
     times = table.numbers(names["timestamp"], bounds=TIME_S) if key == "timestamp" else None
     return _log_of_table(table, names, dict.fromkeys(QUANTITIES, "m"), times, path, [], options)

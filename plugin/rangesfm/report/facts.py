@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import datetime, timezone
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,23 +11,16 @@ from rangesfm.report.content import Content
 from rangesfm.report.text import count, duration, fixed
 
 
-class Fact(NamedTuple):
-    """One of the facts, with its name."""
-
-    name: str
-    text: str
-
-
-def facts_of(content: Content) -> list[Fact]:
-    """Return the facts about a result that are known."""
+def facts_of(content: Content) -> list[tuple[str, str]]:
+    """Return the facts about a result that are known: the name and the text of each."""
     found = (
-        Fact("What was done", _what(content)),
-        Fact("When", _when(content)),
-        Fact("By", content.by or ""),
-        Fact("Coordinates", _coordinates(content)),
-        Fact("Computed", _computed(content)),
+        ("What was done", _what(content)),
+        ("When", _when(content)),
+        ("By", content.by or ""),
+        ("Coordinates", _coordinates(content)),
+        ("Computed", _computed(content)),
     )
-    return [fact for fact in found if fact.text]
+    return [(name, text) for name, text in found if text]
 
 
 def _what(content: Content) -> str:

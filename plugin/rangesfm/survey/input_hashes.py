@@ -18,11 +18,11 @@ def input_hashes(survey: Survey) -> list[dict[str, Any]]:
     For a folder of photos, only names and sizes are hashed: reading gigabytes again would take too long.
     """
     entries: list[dict[str, Any]] = []
-    for item in input_paths(survey):
-        if item.role == "photos":
-            entries += [_folder(item.path)] if item.path.is_dir() else []
+    for _, role, given in input_paths(survey):
+        if role == "photos":
+            entries += [_folder(given)] if given.is_dir() else []
         else:
-            files = sorted(item.path.glob("*.bin" if item.role == "model" else "*")) or [item.path]
+            files = sorted(given.glob("*.bin" if role == "model" else "*")) or [given]
             entries += [
                 {"path": str(path), "sha256": sha256_of(path), "bytes": path.stat().st_size, "hashed": "content"}
                 for path in files

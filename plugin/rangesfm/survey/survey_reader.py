@@ -6,7 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -158,37 +158,24 @@ def _require_files(survey: Survey) -> None:
         paths = [*input_paths(survey)]
     except InputError as error:
         raise OptionError(f"[ranges] path: {error}", "ranges", "path") from None
-    for item in paths:
-        if item.role == "file" and not os.path.isfile(item.path):
-            is_folder = os.path.isdir(item.path)
-            found = f"{item.path} is a folder, expected a file" if is_folder else f"there is no file {item.path}"
-            table, _, name = item.key.partition(".")
+    for key, role, path in paths:
+        if role == "file" and not os.path.isfile(path):
+            found = f"{path} is a folder, expected a file" if os.path.isdir(path) else f"there is no file {path}"
+            table, _, name = key.partition(".")
             raise OptionError(f"[{table}] {name}: {found}", table, name)
 
 
-@dataclass(frozen=True)
-class InputPath:
-    """A path that a survey reads.
+def input_paths(survey: Survey) -> Iterator[tuple[str, PathRole, Path]]:
+    """Yield every path that a survey reads: its dotted key, its kind of file or folder, and the absolute path.
 
-    Attributes:
-        key: dotted key of the survey file.
-        role: kind of file or folder.
-        path: absolute.
+    It must exist, it is hashed, and no result may overwrite it.
     """
-
-    key: str
-    role: PathRole
-    path: Path
-
-
-def input_paths(survey: Survey) -> Iterator[InputPath]:
-    """Yield every path that a survey reads. It must exist, it is hashed, and no result may overwrite it."""
     for dotted_key, role in ROLE_OF_PATH.items():
         table, _, name = dotted_key.partition(".")
         path = getattr(getattr(survey, table), name)
         if path is not None and role == "log":
-            yield from (InputPath(dotted_key, "log" if file.is_dir() else "file", file) for file in files_of_log(path))
+            yield from ((dotted_key, "log" if file.is_dir() else "file", file) for file in files_of_log(path))
         elif path is not None and role == "file_or_photos":
-            yield InputPath(dotted_key, "photos" if path.is_dir() else "file", path)
+            yield dotted_key, "photos" if path.is_dir() else "file", path
         elif path is not None and role != "output":
-            yield InputPath(dotted_key, role, path)
+            yield dotted_key, role, path

@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,9 +30,8 @@ _UNITS_PER_SECOND = (1, 10**3, 10**6, 10**9)
 _MIN_DECIMALS = 3  # a number with fewer decimals, as in scan_1.2, is more likely a version than seconds
 
 
-class _Stamp(NamedTuple):
-    time_s: float
-    resolution_s: float
+_Stamp = tuple[float, float]
+"""Time of a photo and the resolution of that time, seconds."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +181,7 @@ def read_image_times_csv(
             column = listed.columns["image_name"]
             raise table.error(unknown[0], column, f"the name of a photo in the folder, like '{names[0]}'")
     stamps = {
-        name: _Stamp(time, resolution)
+        name: (time, resolution)
         for name, time, resolution in zip(image_names, times.tolist(), listed.resolution_s.tolist(), strict=True)
         if name in known
     }
@@ -229,9 +227,9 @@ def times_from_file_names(names: Sequence[str]) -> ImageTimes:
 
 def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: str) -> ImageTimes:
     """Sort the photos by time; of photos with the same time, keep the first by name."""
-    ordered = sorted(stamps, key=lambda name: (stamps[name].time_s, name))
-    kept = [n for i, n in enumerate(ordered) if i == 0 or stamps[n].time_s > stamps[ordered[i - 1]].time_s]
-    resolution_s = max(min(stamp.resolution_s for stamp in stamps.values()), _FINEST_RESOLUTION_S)
+    ordered = sorted(stamps, key=lambda name: (stamps[name][0], name))
+    kept = [n for i, n in enumerate(ordered) if i == 0 or stamps[n][0] > stamps[ordered[i - 1]][0]]
+    resolution_s = max(min(resolution_s for _, resolution_s in stamps.values()), _FINEST_RESOLUTION_S)
     notes = []
     if missing := [name for name in names if name not in stamps]:
         notes.append(f"{len(missing)} of {len(names)} photos have no time and are left out, the first is {missing[0]}")
@@ -244,7 +242,7 @@ def _in_time_order(stamps: Mapping[str, _Stamp], names: Sequence[str], source: s
         notes.append("image times are whole seconds: at walking pace that is up to half a metre of path")
     return ImageTimes(
         image_names=tuple(kept),
-        timestamps_s=np.array([stamps[name].time_s for name in kept], dtype=np.float64),
+        timestamps_s=np.array([stamps[name][0] for name in kept], dtype=np.float64),
         resolution_s=resolution_s,
         source=source,
         num_left_out=len(names) - len(kept),
@@ -303,7 +301,7 @@ def _exif_stamp(exif: Mapping[int, str], default_offset: timedelta) -> _Stamp | 
         return None
     digits = exif.get(_SUB_SEC_TIME_ORIGINAL, "")
     fraction = f"0.{digits}" if digits.isdecimal() and digits.isascii() else "0"
-    return _Stamp(seconds + float(fraction), _resolution(fraction))
+    return seconds + float(fraction), _resolution(fraction)
 
 
 def _utc_offset(exif: Mapping[int, str]) -> timedelta | None:
@@ -320,8 +318,8 @@ def _name_stamp(name: str) -> _Stamp | None:
         return None
     whole, decimals = int(number[1]), (number[2] or ".")[1:]
     if len(decimals) >= _MIN_DECIMALS:
-        return _Stamp(float(number[0]), _resolution(number[0])) if TIME_S.hold(float(number[0])) else None
+        return (float(number[0]), _resolution(number[0])) if TIME_S.hold(float(number[0])) else None
     for units_per_second in _UNITS_PER_SECOND:
         if not decimals and are_seconds_since_1970(whole / units_per_second):
-            return _Stamp(whole / units_per_second, 1 / units_per_second)
+            return whole / units_per_second, 1 / units_per_second
     return None

@@ -13,7 +13,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.contents import AnyPath
-from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, read_table
+from rangesfm.files.text_tables import FOUND, TextTable, is_plain_table, read_head, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.readers.columns import read_timestamps
 from rangesfm.ranging.readers.guess import Guess, find_time, is_range, is_rising, named_photos
@@ -68,7 +68,7 @@ def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] | None = None, 
     if not head.strip():
         raise InputError(f"the file is empty, {_EXPECTED}", path)
     if not columns and unit is None and is_canonical_photo_list(head):
-        table = read_table(path, [*_CANONICAL.values()], text=["image_name"], separator=None)
+        table = read_table(path, [*_CANONICAL.values()], text=["image_name"], separator=FOUND)
         times_s = table.numbers("timestamp_s", bounds=TIME_S)
         return _photo_list(table, _CANONICAL, times_s, "s", ())
     layout = find_layout(path)

@@ -123,5 +123,5 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
         database_path=result.path / DATABASE_NAME,
         is_site=summary.frame == "site",
         georeference=None if summary.georeference is None else summary.georeference.georeference,
-        center_covariance_m2=None if covariances is None else covariances.by_photo_m2,
+        center_covariance_m2={} if covariances is None else covariances.by_photo_m2,
     )

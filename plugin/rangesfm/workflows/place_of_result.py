@@ -26,9 +26,9 @@ def refuse_to_overwrite(survey: Survey) -> None:
     maps = survey.images.model is None
     places = {folder / name for name in result_names(survey)}
     places.update(folder / name for name in (*RECONSTRUCTION_NAMES, *PHOTOS_NAMES) if maps)
-    for item in input_paths(survey):
-        path = real_path(item.path)
+    for _, _, given in input_paths(survey):
+        path = real_path(given)
         if not places.isdisjoint((path, *path.parents)):
-            raise InputError("the results would overwrite this input, expected another output path", item.path)
+            raise InputError("the results would overwrite this input, expected another output path", given)
         if path.is_dir() and path == folder:
-            raise InputError("the results would be written into this input, expected another output path", item.path)
+            raise InputError("the results would be written into this input, expected another output path", given)

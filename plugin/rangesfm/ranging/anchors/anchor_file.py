@@ -11,7 +11,15 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.contents import AnyPath
-from rangesfm.files.text_tables import TextTable, is_plain_table, read_head, read_table, repeated, write_user_table
+from rangesfm.files.text_tables import (
+    FOUND,
+    TextTable,
+    is_plain_table,
+    read_head,
+    read_table,
+    repeated,
+    write_user_table,
+)
 from rangesfm.option_model import Bounds
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -86,7 +94,7 @@ def read_anchor_list(path: AnyPath, *, columns: Mapping[str, str] | None = None,
     if not head.strip():
         raise InputError(f"the file is empty, {_EXPECTED}", path)
     if not columns and unit is None and is_canonical_anchor_file(head):
-        table = read_table(path, _REQUIRED, _OPTIONAL, aliases=_ALIASES, separator=None)
+        table = read_table(path, _REQUIRED, _OPTIONAL, aliases=_ALIASES, separator=FOUND)
         return AnchorList(_anchors(table, _CANONICAL, dict.fromkeys(QUANTITIES, "m"), ("",)))
     layout = find_layout(path)
     if layout is None:

@@ -10,7 +10,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.contents import AnyPath
-from rangesfm.files.text_tables import has_columns, read_table, write_table
+from rangesfm.files.text_tables import FOUND, has_columns, read_table, write_table
 from rangesfm.options import BIAS_M, LENGTH_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.range_log import RangeLog
 
@@ -87,7 +87,7 @@ def read_error_curve(path: AnyPath) -> ErrorCurve:
         InputError: with the line, for distances that do not ascend, negative stddevs, and a curve so steep
             that two distances would give the same range.
     """
-    table = read_table(path, COLUMNS[:3], COLUMNS[3:], separator=None)
+    table = read_table(path, COLUMNS[:3], COLUMNS[3:], separator=FOUND)
     if len(table) < 2:
         raise InputError(f"has {len(table)} distances, expected two or more", path)
     distance, error = table.numbers("distance_m", bounds=LENGTH_M), table.numbers("error_m", bounds=BIAS_M)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array, Categories
-from rangesfm.files.text_tables import TextTable, read_table
+from rangesfm.files.text_tables import FOUND, TextTable, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.range_log import DEFAULT_TAG_ID, RangeLog
 from rangesfm.ranging.readers.counters import continued
@@ -89,7 +89,9 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
     if layout is None:
         required = dict.fromkeys([*columns.required.values(), *columns.wide, *anchors])
         texts = [*(named[key] for key in _TEXTS if key in named), *anchors]
-        table = read_table(path, [*required], [*columns.optional.values()], text=texts, separator=options.separator)
+        table = read_table(
+            path, [*required], [*columns.optional.values()], text=texts, separator=options.separator or FOUND
+        )
     else:
         table, more = layout.read()
         notes += more

@@ -212,7 +212,7 @@ def layout_without_header(path: Path, header: Sequence[str], separator: str) -> 
     return Layout(columns, True, lambda every_row: _read_rows(path, header, separator, 0, (), every_row))
 
 
-def find_layout(path: Path, separator: str | None = None) -> Layout | None:
+def find_layout(path: Path, separator: str = "") -> Layout | None:
     """Find the layout of a file; None if it has no table."""
     if table := _read_records(path):
         first_rows = (ColumnSample(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
