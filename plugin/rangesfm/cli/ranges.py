@@ -279,7 +279,7 @@ def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
         f"all ranges are multiples of {step_m} m: rounded": step_m,
     }
     # The noise is known only where an anchor has enough ranges.
-    has_noise = any(anchor.noise_stddev_m is not None for anchor in summary.anchors)
+    has_noise = any(math.isfinite(anchor.noise_stddev_m) for anchor in summary.anchors)
     rows = [["anchor", *_LENGTHS, *(["noise m"] if has_noise else []), "largest gap s"]]
     for anchor in summary.anchors:
         noise = [_number(anchor.noise_stddev_m)] if has_noise else []
@@ -305,10 +305,10 @@ def _places(anchors: Sequence[Anchor]) -> list[str]:
 
 
 def _time(summary: RangeSummary) -> str:
-    if summary.start_s is None or summary.end_s is None:
+    if math.isnan(summary.start_s):
         return "by photo name"
     span = f"{span_text(summary.start_s, summary.end_s)}, {summary.end_s - summary.start_s:.3f} s long"
-    rate = f", {summary.rate_hz:.1f} ranges a second" if summary.rate_hz is not None else ""
+    rate = f", {summary.rate_hz:.1f} ranges a second" if math.isfinite(summary.rate_hz) else ""
     return span + rate + f", largest gap {_number(summary.largest_gap_s)} s"
 
 
@@ -316,8 +316,8 @@ def _lengths(ranges: LinkSummary) -> list[str]:
     return [str(ranges.num), *map(_number, (ranges.min_m, ranges.median_m, ranges.max_m))]
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"
 
 
 def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:

@@ -237,7 +237,7 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress = SILENT)
         from rangesfm.survey_discovery.understood import understand
 
         given = {"output.path": free_output(path.absolute()), **overrides}
-        understood = understand([path], given, getattr(args, "typed", None))
+        understood = understand([path], given, getattr(args, "typed", ()))
         for note in understood.notes:
             progress.message(note)
         return understood.survey()

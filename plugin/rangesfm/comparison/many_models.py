@@ -166,7 +166,7 @@ class ModelsComparison:
         return "\n\n".join(align_rows([table.header, *table.rows]) for table in self.tables if table.rows)
 
 
-def read_named_models(paths: Sequence[Path], survey: Survey | None = None) -> tuple[NamedModel, ...]:
+def read_named_models(paths: Sequence[Path], survey: Survey = Survey()) -> tuple[NamedModel, ...]:
     """Read COLMAP models, final models of result folders, and files of camera positions (CSV or TUM), in any order.
 
     Args:
@@ -181,7 +181,7 @@ def read_named_models(paths: Sequence[Path], survey: Survey | None = None) -> tu
     if not folders:
         raise InputError("only files of positions are given, expected a model or a result folder too", paths[0])
     models = {path: _read_model(path) for path in folders}
-    times_s = _photo_times(models, survey or Survey())
+    times_s = _photo_times(models, survey)
     timed = {path: replace(model, path=_timed(model.path, times_s)) for path, model in models.items()}
     return tuple(timed[path] if path in timed else _read_positions(path, timed[folders[0]].path) for path in paths)
 

@@ -79,7 +79,7 @@ def with_true_scale(path: Trajectory, reference: Reference, *, frame: str = "sit
     return path if found is None else path.resized(found.scale, frame)
 
 
-def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str | None = "site") -> Reference | None:
+def reference_in_frame(path: Trajectory, reference: Reference, *, frame: str) -> Reference | None:
     """Return the reference positions of a path's keyframes by photo, in the world of the path, without fitting.
 
     Returns:

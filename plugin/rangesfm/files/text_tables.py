@@ -37,7 +37,7 @@ MAX_NUMBER = 1e100
 """The largest number in any file; its squares are finite."""
 A_NUMBER: Final = Bounds(-MAX_NUMBER, MAX_NUMBER, "")
 """Bounds of every number that can be squared."""
-NO_ALIASES: Final[Mapping[str, str]] = MappingProxyType({})
+NO_NAMES: Final[Mapping[str, str]] = MappingProxyType({})
 FOUND: Final = ""
 """Separator that is found from the header row."""
 _HEAD_BYTES = 1 << 16
@@ -170,7 +170,7 @@ def read_table(
     optional: Sequence[str] = (),
     *,
     text: Sequence[str] = (),
-    aliases: Mapping[str, str] = NO_ALIASES,
+    aliases: Mapping[str, str] = NO_NAMES,
     separator: str = ",",
 ) -> TextTable:
     """Read the named columns of a file; other columns are ignored.
@@ -316,12 +316,12 @@ def header_names(text: str, separator: str = FOUND) -> list[str]:
         return []
 
 
-def has_columns(text: str, required: Collection[str], aliases: Mapping[str, str] = NO_ALIASES) -> bool:
+def has_columns(text: str, required: Collection[str], aliases: Mapping[str, str] = NO_NAMES) -> bool:
     """Return whether the header row in a file's beginning names the required columns, as ``read_table`` reads it."""
     return {*required} <= {aliases.get(name, name) for name in header_names(text)}
 
 
-def is_plain_table(text: str, required: Collection[str], aliases: Mapping[str, str] = NO_ALIASES) -> bool:
+def is_plain_table(text: str, required: Collection[str], aliases: Mapping[str, str] = NO_NAMES) -> bool:
     """Return whether a file's beginning has the required columns and no decimal commas, as ``read_table`` reads it."""
     header_row = next(filter(_has_content, text.split("\n")), "")
     return has_columns(text, required, aliases) and ("," in header_row or "," not in text)

@@ -104,7 +104,6 @@ def georeference_of_anchor(
     up_in_world: Array,
     forward_in_world: Array,
     heading_deg: float,
-    crs: str = GEOGRAPHIC,
 ) -> Georeference:
     """Return the georeference of a map from the place of one anchor on the Earth and the heading of one direction.
 
@@ -114,7 +113,6 @@ def georeference_of_anchor(
         up_in_world: (3,) direction opposite to gravity.
         forward_in_world: (3,) direction whose heading is known.
         heading_deg: azimuth of that direction, from north through east.
-        crs: coordinate system of coordinates in files.
 
     Raises:
         InputError: the direction is vertical.
@@ -132,7 +130,7 @@ def georeference_of_anchor(
     rotation = np.stack([np.cross(north, up), north, up])
     enu_from_world = Similarity(1.0, rotation, -rotation @ anchor_in_world_m)
     lat_deg, lon_deg, height_m = place
-    return Georeference(lat_deg, lon_deg, height_m, crs, enu_from_world)
+    return Georeference(lat_deg, lon_deg, height_m, GEOGRAPHIC, enu_from_world)
 
 
 def check_crs(crs: str) -> None:

@@ -34,7 +34,7 @@ def associate(
     tag_in_cam_m: npt.ArrayLike,
     *,
     time_offset_s: float | Array = 0.0,
-    options: AssociationOptions | None = None,
+    options: AssociationOptions = AssociationOptions(),
     anchor_ids: Collection[str] | None = None,
 ) -> RangeObservations:
     """Find the camera pose at which each range was taken.
@@ -60,7 +60,6 @@ def associate(
     Raises:
         InputError: the log needs image times and there are none, or the log has more tags than lever arms.
     """
-    options = options or AssociationOptions()
     status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
     if log.image_name is not None:
         before = after = rows_of_photos(log.image_name, trajectory.image_names)

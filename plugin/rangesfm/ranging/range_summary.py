@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -21,9 +22,9 @@ class LinkSummary:
         ids: the anchor, or both ends.
         num: number of ranges.
         min_m, median_m, max_m: shortest, median and longest range.
-        largest_gap_s: longest time without such a range; None without times, or if the kind is not "tag-anchor".
+        largest_gap_s: longest time without such a range; NaN without times, or if the kind is not "tag-anchor".
         noise_stddev_m: standard deviation of the noise, estimated from the log itself, at least that of its rounding;
-            None in the same cases, and with too few ranges.
+            NaN in the same cases, and with too few ranges.
     """
 
     kind: str
@@ -32,13 +33,13 @@ class LinkSummary:
     min_m: float
     median_m: float
     max_m: float
-    largest_gap_s: float | None = None
-    noise_stddev_m: float | None = None
+    largest_gap_s: float = math.nan
+    noise_stddev_m: float = math.nan
 
 
 @dataclass(frozen=True)
 class RangeSummary:
-    """Summary of a whole log; times are None if it has image names instead.
+    """Summary of a whole log; times are NaN if it has image names instead.
 
     Attributes:
         format: name of the reader.
@@ -46,7 +47,7 @@ class RangeSummary:
         num_no_measurement: number of records that contain no measurement.
         num_duplicates: ranges that repeat an earlier one, with the same time, tag, anchor and range.
         num_out_of_order: ranges that are earlier than the one before them.
-        quantization_m: step to which all ranges seem to be rounded; None if there is none.
+        quantization_m: step to which all ranges seem to be rounded; 0 if there is none.
         tag_ids: ids of the tags.
         start_s, end_s: first and last time on the radio's clock.
         rate_hz: ranges per second over the whole time.
@@ -60,23 +61,23 @@ class RangeSummary:
     num_no_measurement: int
     num_duplicates: int
     num_out_of_order: int
-    quantization_m: float | None
+    quantization_m: float
     tag_ids: tuple[str, ...]
-    start_s: float | None
-    end_s: float | None
-    rate_hz: float | None
-    largest_gap_s: float | None
+    start_s: float
+    end_s: float
+    rate_hz: float
+    largest_gap_s: float
     anchors: tuple[LinkSummary, ...]
     pairs: tuple[LinkSummary, ...]
 
 
 def summarize_ranges(log: RangeLog) -> RangeSummary:
     """Compute the summary of a log."""
-    start = end = rate = None
+    start = end = rate = math.nan
     if log.timestamp_s is not None and len(log):
         start, end = float(log.timestamp_s.min()), float(log.timestamp_s.max())
-        rate = (len(log) - 1) / (end - start) if end > start else None
-    quantization = find_quantization_m(log.range_m)
+        rate = (len(log) - 1) / (end - start) if end > start else math.nan
+    quantization = find_quantization_m(log.range_m) or 0.0
     return RangeSummary(
         format=log.format,
         num=len(log),
@@ -88,7 +89,7 @@ def summarize_ranges(log: RangeLog) -> RangeSummary:
         start_s=start,
         end_s=end,
         rate_hz=rate,
-        largest_gap_s=_largest_gap(log.timestamp_s),
+        largest_gap_s=_largest_gap(np.zeros(0) if log.timestamp_s is None else log.timestamp_s),
         anchors=tuple(
             _summarize_anchor(log, index, quantization)
             for index in np.unique(log.anchor_index[log.kind == RangeKind.TAG_ANCHOR]).tolist()
@@ -110,9 +111,9 @@ def _summarize_pairs(log: RangeLog, name: str, kind: RangeKind) -> Iterator[Link
         yield LinkSummary(name, ranges.end_ids[mine[0]], *_lengths(log.range_m[ranges.rows[mine]]))
 
 
-def _summarize_anchor(log: RangeLog, index: int, quantization_m: float | None) -> LinkSummary:
+def _summarize_anchor(log: RangeLog, index: int, quantization_m: float) -> LinkSummary:
     mine = (log.anchor_index == index) & (log.kind == RangeKind.TAG_ANCHOR)
-    gap_s = _largest_gap(None if log.timestamp_s is None else log.timestamp_s[mine])
+    gap_s = _largest_gap(np.zeros(0) if log.timestamp_s is None else log.timestamp_s[mine])
     noise_m = _noise(log, mine, quantization_m)
     return LinkSummary("tag-anchor", (log.anchor_ids[index],), *_lengths(log.range_m[mine]), gap_s, noise_m)
 
@@ -121,18 +122,16 @@ def _lengths(range_m: Array) -> tuple[int, float, float, float]:
     return len(range_m), float(range_m.min()), float(np.median(range_m)), float(range_m.max())
 
 
-def _noise(log: RangeLog, mine: Mask, quantization_m: float | None) -> float | None:
+def _noise(log: RangeLog, mine: Mask, quantization_m: float) -> float:
     """Return the noise of the ranges between one anchor and the tag with the most ranges to it.
 
     Only one tag is used, because each tag has a path of its own.
     """
     if log.timestamp_s is None:
-        return None
+        return math.nan
     mine = mine & (log.tag_index == np.argmax(np.bincount(log.tag_index[mine])))
     noise = estimate_noise_m(log.timestamp_s[mine], log.range_m[mine])
-    if noise is None or quantization_m is None:
-        return noise
-    return max(noise, quantization_stddev_m(quantization_m))
+    return math.nan if noise is None else max(noise, quantization_stddev_m(quantization_m))
 
 
 def _num_duplicates(log: RangeLog) -> int:
@@ -144,7 +143,5 @@ def _num_duplicates(log: RangeLog) -> int:
     return int(np.count_nonzero(same))
 
 
-def _largest_gap(timestamps_s: Array | None) -> float | None:
-    if timestamps_s is None or len(timestamps_s) < 2:
-        return None
-    return float(np.diff(np.sort(timestamps_s)).max())
+def _largest_gap(timestamps_s: Array) -> float:
+    return float(np.diff(np.sort(timestamps_s)).max()) if len(timestamps_s) > 1 else math.nan

@@ -97,7 +97,7 @@ def _frames(path: Path, topic: str, is_stamped: bool) -> Iterator[Frame]:
             time_s = stamp_s(message) if is_stamped else received_s
             if kind == _COMPRESSED:
                 content, suffix = _image_file(message, path)
-                grey = partial(_opened, content, path, reduced_to_px=MAX_SIDE_PX)
+                grey = partial(_opened, content, path)
                 yield Frame(number, time_s, suffix, grey, partial(_write_file, content))
             else:
                 yield Frame(number, time_s, ".png", partial(_grey, message, path), partial(_write, message, path))
@@ -159,22 +159,20 @@ def _image_file(message: Any, path: Path) -> tuple[bytes, str]:
     return content, suffix
 
 
-def _opened(content: bytes, path: Path, *, reduced_to_px: int | None = None) -> Image.Image:
-    """Decode an image file.
+def _opened(content: bytes, path: Path) -> Image.Image:
+    """Decode an image file in grey, and at about MAX_SIDE_PX, which is much faster for JPEG.
 
     Args:
         content: of the file.
         path: of the bag, for messages.
-        reduced_to_px: decode in grey and at about this size, which is much faster for JPEG; None: in full.
 
     Raises:
         InputError: it cannot be decoded.
     """
     try:
         image: Image.Image = Image.open(io.BytesIO(content))
-        if reduced_to_px is not None:
-            image.draft("L", (reduced_to_px, reduced_to_px))
-            image = image.convert("L")
+        image.draft("L", (MAX_SIDE_PX, MAX_SIDE_PX))
+        image = image.convert("L")
         image.load()
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"a compressed image that cannot be read ({error})", path) from None

@@ -8,7 +8,8 @@ import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Final
 
 from rangesfm.errors import InputError, OptionError, nearest_known, printable, shown
 from rangesfm.files.atomic import path_of
@@ -24,6 +25,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+NO_OVERRIDES: Final[Mapping[str, object]] = MappingProxyType({})
 # A flag for the first key replaces the second key in the file, because both give lever arms.
 _INSTEAD_OF = {"tag.tag_in_cam_m": "lever_arms_m", "tag.lever_arms_m": "tag_in_cam_m"}
 
@@ -73,18 +75,18 @@ def read_survey(
     """
     tables, source = parse_toml(Path(path))
     folder = Path(path).absolute().parent if base_folder is None else base_folder
-    return survey_from_tables(tables, folder, overrides, source)
+    return survey_from_tables(tables, folder, overrides or {}, source)
 
 
 def survey_from_tables(
     tables: Mapping[str, Any],
     base_folder: AnyPath,
-    overrides: Mapping[str, object] | None = None,
-    source: OptionsOrigin | None = None,
+    overrides: Mapping[str, object] = NO_OVERRIDES,
+    source: OptionsOrigin = OptionsOrigin(),
 ) -> Survey:
     """Make a survey from tables in memory, otherwise as ``read_survey``; ``source`` names the file for messages."""
-    folder, overrides = Path(base_folder).absolute(), overrides or {}
-    source = replace(source or OptionsOrigin(), overridden=tuple(overrides))
+    folder = Path(base_folder).absolute()
+    source = replace(source, overridden=tuple(overrides))
     with source.naming_lines():
         tables, other_cameras = _with_one_camera(tables)
         refuse_unknown_tables(tables, SURVEY_TABLES)

@@ -68,15 +68,13 @@ class Understood:
         return survey_from_tables({}, Path.cwd(), self.values)
 
 
-def understand(
-    folders: Sequence[Path], given: Mapping[str, object], command: Sequence[str] | None = None
-) -> Understood:
+def understand(folders: Sequence[Path], given: Mapping[str, object], command: Sequence[str] = ()) -> Understood:
     """Look into folders and choose the inputs of a run.
 
     Args:
         folders: to look into.
         given: values by dotted key from the user; inputs of these keys are not looked for.
-        command: words of the command that the user has typed, for advice; None: rangesfm init with the folders.
+        command: words of the command that the user has typed, for advice; empty: rangesfm init with the folders.
 
     Raises:
         InputError: there are no inputs, or there are several of a kind and it is not clear which one to take, or a

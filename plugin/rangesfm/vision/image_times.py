@@ -164,7 +164,7 @@ def read_image_times_csv(
         InputError: with the line: a column is missing, a cell is not a time in seconds, a photo does not exist while
             one of ``names`` has no time, or a photo or a time appears twice.
     """
-    listed = read_photo_list(path, columns=columns, unit=unit)
+    listed = read_photo_list(path, columns=columns or {}, unit=unit)
     table, times = listed.table, listed.times_s
     frames = frames or {}
     frame_of = {photo: first for first, photos in frames.items() for photo in photos}

@@ -13,7 +13,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.contents import AnyPath
-from rangesfm.files.text_tables import FOUND, TextTable, is_plain_table, read_head, read_table
+from rangesfm.files.text_tables import FOUND, NO_NAMES, TextTable, is_plain_table, read_head, read_table
 from rangesfm.options import TIME_S
 from rangesfm.ranging.readers.columns import read_timestamps
 from rangesfm.ranging.readers.guess import Guess, find_time, is_range, is_rising, named_photos
@@ -50,7 +50,7 @@ class PhotoList:
     notes: tuple[str, ...] = ()
 
 
-def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None) -> PhotoList:
+def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] = NO_NAMES, unit: str | None = None) -> PhotoList:
     """Read ``image_name,timestamp_s``, or another table with names of photos and times.
 
     Args:

@@ -27,7 +27,7 @@ def export_result(
     formats: Iterable[str],
     destination: AnyPath,
     *,
-    options: ExportOptions | None = None,
+    options: ExportOptions = ExportOptions(),
     images_path: AnyPath | None = None,
 ) -> tuple[Path, ...]:
     """Export the final metric model of a result folder: the refined one, else the scaled one.
@@ -36,7 +36,7 @@ def export_result(
         output_path: result folder of a run.
         formats: names of export formats.
         destination: folder to write to.
-        options: all options but the formats; None: the defaults.
+        options: all options but the formats.
         images_path: folder of the photos; None: that of the run, if it is beside the result.
 
     Returns:
@@ -46,7 +46,7 @@ def export_result(
         InputError: as in ``export_model``; or the folder is not a result with a metric model; or a run is writing to
             the destination.
     """
-    options = (options or ExportOptions()).changed(formats=tuple(formats))
+    options = options.changed(formats=tuple(formats))
     check_formats(options.formats)
     result, folder = read_result_folder(Path(output_path)), Path(destination)
     with sole_writer(folder):
@@ -54,7 +54,7 @@ def export_result(
 
 
 def apply_result(
-    output_path: Path, paths: Iterable[Path], destination: Path, *, options: ExportOptions | None = None
+    output_path: Path, paths: Iterable[Path], destination: Path, *, options: ExportOptions
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Transform files that were made from the unscaled model of a run into the frame of its metric model.
 
@@ -62,7 +62,7 @@ def apply_result(
         output_path: result folder of the run.
         paths: meshes and point clouds (PLY, OBJ), camera files (JSON), folders of COLMAP models.
         destination: folder to write to.
-        options: of the frame; None: the defaults.
+        options: of the frame.
 
     Returns:
         Paths of the files written, and notes for the user.
@@ -71,7 +71,7 @@ def apply_result(
         InputError: a file cannot be transformed, is in metres already, or lies on none of the maps; or the result lacks
             its models.
     """
-    options, paths = options or ExportOptions(), list(paths)
+    paths = list(paths)
     result = read_result_folder(output_path)
     map_ = _read_map(result, None)
     notes = list[str]()

@@ -380,4 +380,4 @@ def test_damaged_logs_are_read_or_refused(tmp_path: Path, data: st.DataObject) -
     with contextlib.suppress(InputError):
         assert len(read_ranges(path, format=format)) > 0
     with contextlib.suppress(InputError):
-        read_anchors_in_log(path, format=format)
+        read_anchors_in_log(path, format=format or "")

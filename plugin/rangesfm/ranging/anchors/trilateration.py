@@ -186,7 +186,7 @@ def trilaterate(
     tag_positions_m: npt.ArrayLike,
     range_m: npt.ArrayLike,
     *,
-    options: TrilaterationOptions | None = None,
+    options: TrilaterationOptions = TrilaterationOptions(),
     height_m: float | None = None,
     **known: npt.ArrayLike | None,
 ) -> Trilateration:
@@ -210,7 +210,7 @@ def trilaterate(
         name: None if values is None else np.asarray(values, dtype=np.float64) for name, values in known.items()
     }
     anchor = AnchorRanges(positions, ranges, height_m=height_m, **arrays)
-    (placement,) = _trilaterate_together({"": anchor}, options or TrilaterationOptions())
+    (placement,) = _trilaterate_together({"": anchor}, options)
     if placement.found is None:
         raise GeometryError(str(placement.why_not))
     return placement.found
@@ -250,7 +250,7 @@ def trilaterate_anchors(
     *,
     toward: Mapping[str, Sequence[float]] | None = None,
     height_m: Mapping[str, float] | None = None,
-    options: TrilaterationOptions | None = None,
+    options: TrilaterationOptions = TrilaterationOptions(),
 ) -> tuple[AnchorPlacement, ...]:
     """Locate every anchor of a log; the errors of the ranges are learnt from all anchors together.
 
@@ -278,7 +278,7 @@ def trilaterate_anchors(
         )
         for anchor_id, own in zip(log.anchor_ids, rows, strict=True)
     }
-    return _trilaterate_together(anchors, options or TrilaterationOptions())
+    return _trilaterate_together(anchors, options)
 
 
 def _trilaterate_together(

@@ -71,7 +71,7 @@ def estimate_time_offset(
     trajectory: Trajectory,
     tag_in_cam_m: npt.ArrayLike,
     *,
-    association: AssociationOptions | None = None,
+    association: AssociationOptions = AssociationOptions(),
     seed: int = 0,
     progress: Progress = SILENT,
 ) -> TimeOffset:
@@ -98,7 +98,6 @@ def estimate_time_offset(
     if trajectory.timestamps_s is None:
         raise InputError("the photos have no times, so that no time offset can be found: give image times")
     require_enough(trajectory, len(log), _RANGES)
-    association = association or AssociationOptions()
     tags = lever_arms(log, tag_in_cam_m)
     ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
     ranges = ranges.take(log.own_order[log.kind[log.own_order] == RangeKind.TAG_ANCHOR])

@@ -39,7 +39,7 @@ def reader_names() -> tuple[str, ...]:
 
 def read_ranges(
     path: AnyPath | Sequence[AnyPath],
-    options: LogOptions | None = None,
+    options: LogOptions = LogOptions(),
     *,
     anchor_ids: Collection[str] = (),
     tag_ids: Collection[str] = (),
@@ -67,9 +67,9 @@ def read_ranges(
             has no usable range. The error gives the line if there is one.
     """
     paths = _paths(path)
-    table = {} if options is None else {name: getattr(options, name) for name in LogOptions.model_fields}
+    table = {name: getattr(options, name) for name in LogOptions.model_fields}
     reading = ReadOptions(**{**table, **said, "given": tuple(map(str, paths))})
-    chosen = _choose_readers(paths, reading, reading.format or ("mapped" if reading.columns else None))
+    chosen = _choose_readers(paths, reading, reading.format or ("mapped" if reading.columns else ""))
     logs = [reader.read(file, reading) for file, reader in chosen]
     for one in logs:
         _check_numbers(one)
@@ -81,7 +81,7 @@ def read_ranges(
     return replace(log, range_stddev_m=np.maximum(log.range_stddev_m, least_m))
 
 
-def read_anchors_in_log(path: AnyPath | Sequence[AnyPath], *, format: str | None = None) -> tuple[Anchor, ...]:
+def read_anchors_in_log(path: AnyPath | Sequence[AnyPath], *, format: str = "") -> tuple[Anchor, ...]:
     """Return the anchors whose positions a log contains, as logs of the DWM1001 do; empty if it contains none.
 
     The position of an anchor is the median of its positions in the log. It is unknown if several anchors have the same
@@ -89,7 +89,7 @@ def read_anchors_in_log(path: AnyPath | Sequence[AnyPath], *, format: str | None
 
     Args:
         path: as for ``read_ranges``.
-        format: one of ``reader_names()``; None: recognized by content.
+        format: one of ``reader_names()``; empty: recognized by content.
 
     Raises:
         InputError: the file is missing, empty, or of no known format.
@@ -124,7 +124,7 @@ def _paths(path: AnyPath | Sequence[AnyPath]) -> list[Path]:
     return [*map(Path, paths)]
 
 
-def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str | None) -> list[tuple[Path, Reader]]:
+def _choose_readers(paths: Sequence[Path], options: ReadOptions, format: str) -> list[tuple[Path, Reader]]:
     """Return every file of the log with its reader; other files in a folder are left out."""
     files = [file for path in paths for file in files_of_log(path)]
     is_folder = len(paths) == 1 and len(files) > 1 and paths[0].is_dir()
@@ -192,17 +192,17 @@ def files_of_log(path: Path) -> list[Path]:
     return sorted(found, key=lambda file: natural_order(file.name))
 
 
-def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: str | None = None) -> Reader:
+def find_log_reader(path: Path, options: ReadOptions = _NOTHING_SAID, format: str = "") -> Reader:
     """Find the reader of a file.
 
     Args:
         options: options of reading, for tables.
-        format: name of the reader; None: recognized by content.
+        format: name of the reader; empty: recognized by content.
 
     Raises:
         InputError: no reader recognizes the file for sure; for a table the error has advice.
     """
-    if format is not None and format != TABLE.name:
+    if format not in ("", TABLE.name):
         named = next((reader for reader in _READERS if reader.name == format), None)
         if named is None:
             raise InputError(f"no log format is named '{format}', expected one of {', '.join(reader_names())}", path)
