@@ -26,6 +26,7 @@ from tests.studies.real_room import interpolated, path_and_truth
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangesOptions
+from rangesfm.positions.antenna_places import locate_antenna
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.clock import find_antenna_offset
 from rangesfm.positions.position_log import PositionLog
@@ -93,7 +94,7 @@ def main() -> int:
         noise_m = NOISE_M * np.random.default_rng(seed).standard_normal(at_m.shape)
         log = PositionLog(at_m + noise_m, np.full((len(at_s), 3, 3), np.nan), at_s, None, np.arange(len(at_s)))
         track = AntennaTrack(log, ANTENNA_IN_CAM_M, None, RangesOptions())
-        found = scale_by_positions(find_antenna_offset(track, path).located(path), path, bending)
+        found = scale_by_positions(locate_antenna(find_antenna_offset(track, path), path), path, bending)
         told("scaled", found.value, found.uncertainty)
         if seed < asked.num_refined:
             told("refined", *refined(whole, track))

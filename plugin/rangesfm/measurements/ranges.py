@@ -22,7 +22,6 @@ from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.prior import Prior
 from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.association import lever_arms
 from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M, bias_whitening
@@ -292,7 +291,7 @@ def antenna_places(
         trajectory, observations: of the unscaled model. metric_from_sfm: from its world to that of the map.
         tag_in_cam_m: (3,), or (num_tags, 3) in the order of the log's tags.
     """
-    tags_in_cam_m, times = lever_arms(observations.log, tag_in_cam_m), trajectory.timestamps_s
+    tags_in_cam_m, times = observations.log.lever_arms(tag_in_cam_m), trajectory.timestamps_s
     before, after = observations.before, observations.after
     interval_s = np.zeros(len(before)) if times is None else times[after] - times[before]
     on_line = AntennaPlaces(before, after, observations.fraction, interval_s, np.zeros((len(before), 3)))

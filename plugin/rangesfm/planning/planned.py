@@ -16,6 +16,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import Options
 from rangesfm.options import AssociationOptions, RangeModelOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
+from rangesfm.positions.antenna_places import locate_antenna
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.control_points import ControlPoint
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions, joined_positions
@@ -58,7 +59,7 @@ class PlannedAntenna(Options, table="positions"):
         covariance_m2 = np.tile(self.stddev_m**2 * np.eye(3), (len(times_s), 1, 1))
         nowhere, lines = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.int64)
         log = PositionLog(nowhere, covariance_m2, times_s, None, lines)
-        found = AntennaTrack(log, np.array(self.antenna_in_cam_m), 0.0, AssociationOptions()).located(path)
+        found = locate_antenna(AntennaTrack(log, np.array(self.antenna_in_cam_m), 0.0, AssociationOptions()), path)
         return replace(found, position_m=found.predicted_m(IDENTITY))
 
 

@@ -24,7 +24,8 @@ from rangesfm.geometry.poses import Poses
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.option_model import KeyMeta, Options
 from rangesfm.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.positions.known_positions import KnownPositions, locate_points
+from rangesfm.positions.known_marks import locate_points
+from rangesfm.positions.known_positions import KnownPositions
 
 MAX_NUM_PHOTOS = 2000
 """Largest number of photos; more would take minutes, and with fewer photos the path bends in the same way."""

@@ -11,9 +11,11 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.distances.tape import Marker
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.positions.antenna_places import locate_antenna
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.control_points import ControlPoints, marks_seen
-from rangesfm.positions.known_positions import LASTING_S, KnownPositions, joined_positions, locate_points
+from rangesfm.positions.known_marks import locate_points
+from rangesfm.positions.known_positions import LASTING_S, KnownPositions, joined_positions
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class SurveyedPositions:
         """
         marks = None if self.points is None else locate_points(self.points, model, path)
         is_on_path = self.antenna is not None and self.antenna.other_offset_s is None
-        return joined_positions([marks, self.antenna.located(path) if self.antenna and is_on_path else None])
+        return joined_positions([marks, locate_antenna(self.antenna, path) if self.antenna and is_on_path else None])
 
     def with_more_markers(self, markers: Mapping[str, Marker]) -> SurveyedPositions:
         """Return the positions with more marks in photos."""

@@ -79,7 +79,7 @@ def associate(
     before, after = np.where(placed, before, -1), np.where(placed, after, -1)
     fraction = np.where(placed, fraction, 0.0)
     # The last row is for the tag index -1, which means no tag.
-    tags_in_cam_m = np.vstack([lever_arms(log, tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
+    tags_in_cam_m = np.vstack([log.lever_arms(tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
     centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
     offsets, stddev, arm_stddev_m = np.zeros((len(log), 3)), np.zeros(len(log)), np.zeros(len(log))
     on_path = places_on_path(
@@ -99,25 +99,6 @@ def associate(
 def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
     """Return which gaps between keyframes (n,) are too long for interpolation, with a tolerance for rounded times."""
     return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
-
-
-def lever_arms(log: RangeLog, tag_in_cam_m: npt.ArrayLike) -> Array:
-    """Return the lever arm of each tag (num_tags, 3), in the order of ``log.tag_ids``.
-
-    Args:
-        tag_in_cam_m: (3,) one lever arm for all tags, or (num_tags, 3) one for each.
-
-    Raises:
-        InputError: it has another shape.
-    """
-    given = np.asarray(tag_in_cam_m, dtype=np.float64)
-    num_tags = len(log.tag_ids)
-    if given.shape not in ((3,), (num_tags, 3)):
-        raise InputError(
-            f"lever arms of shape {given.shape} for a log of {num_tags} tag(s), expected (3,) or ({num_tags}, 3)",
-            log.source,
-        )
-    return np.broadcast_to(given, (num_tags, 3))
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rangesfm.arrays import Array, Categories, Indices, Mask
+from rangesfm.errors import InputError
 
 DEFAULT_TAG_ID = "tag"
 # Two ranges between the same nodes cannot have the same time. If at least this share of successive ranges has, the
@@ -237,6 +238,24 @@ class RangeLog:
         chosen = replace(self, **columns)
         ids, first, second = chosen._ends()
         return chosen._between(ids, np.arange(len(ids)) < len(self.anchor_ids), first, second)
+
+    def lever_arms(self, tag_in_cam_m: npt.ArrayLike) -> Array:
+        """Return the lever arm of each tag (num_tags, 3), in the order of ``tag_ids``.
+
+        Args:
+            tag_in_cam_m: (3,) one lever arm for all tags, or (num_tags, 3) one for each.
+
+        Raises:
+            InputError: it has another shape.
+        """
+        given = np.asarray(tag_in_cam_m, dtype=np.float64)
+        num_tags = len(self.tag_ids)
+        if given.shape not in ((3,), (num_tags, 3)):
+            raise InputError(
+                f"lever arms of shape {given.shape} for a log of {num_tags} tag(s), expected (3,) or ({num_tags}, 3)",
+                self.source,
+            )
+        return np.broadcast_to(given, (num_tags, 3))
 
     @staticmethod
     def from_arrays(

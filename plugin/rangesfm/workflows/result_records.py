@@ -21,7 +21,7 @@ from rangesfm.distances.tape import CHECK, CONTROL, LEFT_OUT
 from rangesfm.errors import number_text
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.join.join_models import ModelVerdict
-from rangesfm.positions.known_positions import locate_points
+from rangesfm.positions.known_marks import locate_points
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.ranging.range_observations import USED, RangeStatus
 from rangesfm.result import entries

@@ -16,7 +16,7 @@ from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
 from rangesfm.options import AssociationOptions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.progress import SILENT, Progress
-from rangesfm.ranging.association import associate, is_too_long, lever_arms
+from rangesfm.ranging.association import associate, is_too_long
 from rangesfm.ranging.clock.bursts import Bursts, curve_of, find_bursts, offsets_that_keep, pair_bursts
 from rangesfm.ranging.clock.fit import (
     SEPARATION_S,
@@ -98,7 +98,7 @@ def estimate_time_offset(
     if trajectory.timestamps_s is None:
         raise InputError("the photos have no times, so that no time offset can be found: give image times")
     require_enough(trajectory, len(log), _RANGES)
-    tags = lever_arms(log, tag_in_cam_m)
+    tags = log.lever_arms(tag_in_cam_m)
     ranges = TimedRanges(log.timestamp_s, log.range_m, log.anchor_index, log.tag_index)
     ranges = ranges.take(log.own_order[log.kind[log.own_order] == RangeKind.TAG_ANCHOR])
     if is_too_long(float(np.median(np.diff(trajectory.timestamps_s))), association):
