@@ -20,6 +20,7 @@ from rangesfm.cli import main
 from rangesfm.colmap.model_files import read_model
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.demo.simulated_radio import CameraPath, Radio
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
@@ -73,7 +74,7 @@ class Halves:
             positions = {name: (at - self.centers_m[0]) @ self.first_camera for name, at in positions.items()}
         anchors = [Anchor(name, None if frame == "unknown" else positions.get(name)) for name in self.log.anchor_ids]
         arms, (site, _) = np.array([TAG_IN_CAM_M]), local_site((), "unknown", None)
-        inputs = RangingInputs(self.log, arms, tuple(anchors), frame, site, None, None, ())
+        inputs = RangingInputs(self.log, arms, tuple(anchors), frame, site, Tape(), None, ())
         survey = Survey().changed({"scale.max_relative_stddev": 0.2})
         return join_models(SurveyRun(survey, inputs, Journal(SilentProgress())), self.parts)
 

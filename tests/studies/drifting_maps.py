@@ -44,6 +44,7 @@ from tests.studies.simulated_survey import Survey as Truth
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.demo.simulated_radio import CameraPath
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
@@ -199,7 +200,7 @@ def run(survey: Made, seed: int) -> MetricResult:
     settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
     anchors = tuple(Anchor(name, None if survey.frame == "unknown" else at) for name, at in survey.anchors_m.items())
     inputs = RangingInputs(
-        survey.log, survey.tag_in_cam_m[None], anchors, survey.frame, Site(np.zeros(3)), None, None, ()
+        survey.log, survey.tag_in_cam_m[None], anchors, survey.frame, Site(np.zeros(3)), Tape(), None, ()
     )
     observations = associate(survey.log, survey.trajectory, survey.tag_in_cam_m)
     sfm = survey.sfm if survey.sfm.num_reg_images() else of_poses(survey.trajectory)

@@ -9,6 +9,7 @@ from tests.studies.drifting_maps import HALL_PIXELS, made
 from tests.studies.erring_surveys import Given, Run, Site, distances, radio_errors
 from tests.studies.simulated_survey import truth_of
 
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.progress import Journal, SilentProgress
@@ -79,7 +80,9 @@ def run_with_photos(given: Given, seed: int) -> RunOfPhotos:
     log = RangeLog.from_arrays(ids, np.maximum(given.range_m, 0.02), timestamp_s=given.time_s)
     settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
     anchors = tuple(Anchor(name, at) for name, at in given.anchors_m.items())
-    inputs = RangingInputs(log, given.tag_in_cam_m[None], anchors, given.frame, SiteFrame(np.zeros(3)), None, None, ())
+    inputs = RangingInputs(
+        log, given.tag_in_cam_m[None], anchors, given.frame, SiteFrame(np.zeros(3)), Tape(), None, ()
+    )
     observations = associate(log, given.trajectory, given.tag_in_cam_m, time_offset_s=given.time_offset_s)
     path = PathOfModel("sparse/0", given.sfm, given.trajectory, observations)
     try:

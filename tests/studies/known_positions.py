@@ -42,6 +42,7 @@ from tests.studies.simulated_survey import Survey as Truth
 from rangesfm.ceres.covariance import PhotosAlone
 from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.demo.simulated_radio import CameraPath
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.photo_bending import PhotoBending
 from rangesfm.geometry.numerics import NORMAL_95
@@ -200,7 +201,7 @@ class Known:
         survey, frame = self.survey, "site" if "anchors" in self.names else "unknown"
         log, arms = (survey.log, survey.tag_in_cam_m[None]) if "ranges" in self.names else (NO_RANGES, np.zeros((0, 3)))
         anchors = tuple(Anchor(name, survey.anchors_m[name] if frame == "site" else None) for name in log.anchor_ids)
-        inputs = RangingInputs(log, arms, anchors, frame, Site(np.zeros(3)), None, None, (), positions=surveyed)
+        inputs = RangingInputs(log, arms, anchors, frame, Site(np.zeros(3)), Tape(), None, (), positions=surveyed)
         path = PathOfModel("sparse/0", survey.sfm, survey.trajectory, associate(log, survey.trajectory, arms))
         return map_in_metres(SurveyRun(settings, inputs, Journal(SilentProgress())), [path], refine=True)[1]
 

@@ -23,6 +23,7 @@ import pycolmap
 from tests.studies.known_positions import NO_RANGES
 from tests.studies.real_room import interpolated, path_and_truth
 
+from rangesfm.distances.tape import Tape
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import RangesOptions
@@ -51,7 +52,7 @@ def refined(survey_path: PathOfModel, track: AntennaTrack) -> tuple[float, Scale
     """Return the scale of the refined map, with all defaults."""
     known = SurveyedPositions(antenna=track)
     inputs = RangingInputs(
-        NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), None, None, (), positions=known
+        NO_RANGES, np.zeros((0, 3)), (), "unknown", Site(np.zeros(3)), Tape(), None, (), positions=known
     )
     metric = map_in_metres(SurveyRun(SETTINGS, inputs, Journal(SilentProgress())), [survey_path], refine=True)[1]
     return metric.estimate.value, metric.estimate.uncertainty

@@ -13,6 +13,7 @@ from tests.simulated.model import random_similarity
 from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
 
 from rangesfm.colmap.transform import rescale, without_photos
+from rangesfm.distances.tape import Tape
 from rangesfm.files.output_folder import sole_writer
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.progress import Journal, SilentProgress
@@ -32,7 +33,7 @@ def run_of(looped: LoopedSurvey, folder: Path) -> SurveyRun:
     survey = looped.survey
     (site, _), log = local_site((), "unknown", None), range_log(survey, 1, num_each=4)
     anchors = tuple(Anchor(name, position) for name, position in survey.anchors_m.items())
-    inputs = RangingInputs(log, TAG_IN_CAM_M[None], anchors, survey.anchor_frame, site, None, None, ())
+    inputs = RangingInputs(log, TAG_IN_CAM_M[None], anchors, survey.anchor_frame, site, Tape(), None, ())
     write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
     changes = {"output.path": folder, "mapper.matching": "sequential", "ranges.time_offset": 0.0}
     return SurveyRun(Survey().changed(changes), inputs, Journal(SilentProgress()))

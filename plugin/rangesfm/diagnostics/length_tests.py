@@ -19,14 +19,14 @@ from rangesfm.scale.scale_estimate import ScaleEstimate
 _MEASURE_AGAIN = "look whether it was mistyped, or measure it again"
 
 
-def diagnose_lengths(estimate: ScaleEstimate, tape: Tape | None) -> Diagnosis:
+def diagnose_lengths(estimate: ScaleEstimate, tape: Tape) -> Diagnosis:
     """Return the tests of measured lengths; empty if there are none.
 
     Args:
         tape: the lengths that the scale was estimated with; ``estimate.lengths`` refers to its rows.
     """
     lengths = estimate.lengths
-    if lengths is None or tape is None:
+    if lengths is None:
         return Diagnosis((), ())
     taped = [tape.distances[row] for row in lengths.rows.tolist()]
     rows = list(_of_each(lengths, taped))

@@ -74,8 +74,7 @@ def notes_before_work(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
     surveyed = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors if anchor.position_m is not None}
     yield from _on_positions(surveyed, inputs.site if inputs.anchor_frame == "site" else None)
     yield from notes_on_distances(inputs.log, inputs.anchors)
-    if inputs.tape is not None:
-        yield from _on_taped_anchors(inputs.tape, inputs.anchors)
+    yield from _on_taped_anchors(inputs.tape, inputs.anchors)
 
 
 def check_units(survey: Survey, inputs: RangingInputs) -> None:

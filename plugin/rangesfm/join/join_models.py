@@ -122,12 +122,11 @@ def scaled_alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -
 
     For a model without the first photo, anchors in that photo's frame are like anchors in a site frame.
     """
-    frame, tape = run.inputs.anchor_frame, run.inputs.tape
+    frame = run.inputs.anchor_frame
     if not has_first_camera:
         frame = "site" if frame == "first_camera" else frame
         run = run.changed({"scale.up_in_first_camera": None})
-    if tape is not None:
-        tape = distances_within(locatable(tape, part.sfm), part.sfm, part.observations.log.anchor_ids)
+    tape = distances_within(locatable(run.inputs.tape, part.sfm), part.sfm, part.observations.log.anchor_ids)
     run = replace(run, inputs=replace(run.inputs, anchor_frame=frame, tape=tape))
     estimate = run.estimate_scale(part)
     is_given = frame == "first_camera"

@@ -58,7 +58,7 @@ class RangingInputs:
         anchors: all anchors of the log, and those of the file that the log does not have.
         anchor_frame: "site", "first_camera" or "unknown".
         site: frame of the anchors' positions.
-        tape: taped distances; None if not given.
+        tape: taped distances; empty if not given.
         reference: true positions; None if not given.
         notes: warnings for the user.
         assumed: lines about how the files were read.
@@ -70,7 +70,7 @@ class RangingInputs:
     anchors: tuple[Anchor, ...]
     anchor_frame: str
     site: Site
-    tape: Tape | None
+    tape: Tape
     reference: Reference | None
     notes: tuple[str, ...]
     assumed: tuple[str, ...] = ()
@@ -86,7 +86,7 @@ class RangingInputs:
         points, antenna, tape = self.positions.points, self.positions.antenna, self.tape
         if points is not None:
             yield f"marks in {_name(points.markers_path or points.path)}", _photos_of(points.markers)
-        elif tape is not None:
+        elif tape.markers:
             yield f"marks in {_name(tape.markers_path)}", _photos_of(tape.markers)
         if antenna is not None and antenna.log.image_name is not None:
             yield f"positions in {_name(antenna.log.path)}", antenna.log.image_name
@@ -98,8 +98,7 @@ class RangingInputs:
         points, tape = self.positions.points, self.tape
         if points is not None:
             points = replace(points, markers=markers_of_photos(points.markers, photos))
-        if tape is not None:
-            tape = replace(tape, markers=markers_of_photos(tape.markers, photos))
+        tape = replace(tape, markers=markers_of_photos(tape.markers, photos))
         return replace(self, tape=tape, positions=replace(self.positions, points=points))
 
 
@@ -149,7 +148,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     curve_path, curve_notes = survey.ranges.error_curve, list[str]()
     if curve_path is not None:
         log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
-    tape = None if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
+    tape = Tape() if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
     notes = (*_warnings(log, anchors, survey), *curve_notes)
     assumed = (
@@ -158,7 +157,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         *(["the anchor positions are those in the log"] if listed is None and is_placed else ()),
         *(() if listed is None else listed.notes),
         *positions.notes,
-        *(() if tape is None else tape.notes),
+        *tape.notes,
         *(() if reference is None else reference.notes),
     )
     log = log.in_time_order()

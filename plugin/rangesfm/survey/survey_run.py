@@ -128,7 +128,7 @@ class SurveyRun:
             GeometryError: the scale is not determined.
         """
         survey, inputs, distances = self.survey, self.inputs, None
-        if inputs.tape is not None:
+        if inputs.tape.distances:
             distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
         return initialize_scale(
             path.observations,

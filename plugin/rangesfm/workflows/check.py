@@ -171,7 +171,7 @@ def _tell_of_radio(survey: Survey, inputs: RangingInputs, checked: CheckedSurvey
 
 
 def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
-    if inputs.tape is not None:
+    if inputs.tape.distances:
         only = "" if len(inputs.log) else ", which alone determine the scale (no ranges)"
         yield f"taped distances: {len(inputs.tape.distances)}{only}"
     yield from inputs.positions.facts()

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import require_apart, sole_writer
@@ -258,7 +259,7 @@ def join_surveys(survey: Survey, folders: Sequence[Path], *, progress: Progress 
     arms = {tag_id: arm for one in finished for tag_id, arm in one.tags_in_cam_m.items()}
     tags_in_cam_m = np.array([arms[tag_id] for tag_id in log.tag_ids])
     reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
-    inputs = RangingInputs(log, tags_in_cam_m, anchors, frame, site, None, reference, ())
+    inputs = RangingInputs(log, tags_in_cam_m, anchors, frame, site, Tape(), reference, ())
     as_joined = survey.changed(
         {
             "images.path": _images_path(finished),

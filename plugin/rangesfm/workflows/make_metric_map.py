@@ -29,7 +29,6 @@ from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.diagnostics.position_tests import diagnose_positions
 from rangesfm.distances.locate_lengths import locate_distances, surveyed_distances
-from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model, by_photos
@@ -168,7 +167,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
     tape = inputs.tape
-    if tape is not None and (lengths := estimate.lengths) is not None:
+    if (lengths := estimate.lengths) is not None:
         tape = tape.without(lengths.rows[~lengths.is_kept].tolist())
     known = inputs.positions.without(() if estimate.positions is None else estimate.positions.names_left_out)
     return MetricResult(
@@ -344,7 +343,7 @@ def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
 def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
     """Return all that was measured of a scaled map."""
     estimate, inputs, options = metric.estimate, run.inputs, run.survey.refine
-    tape = metric.tape or Tape()
+    tape = metric.tape
     if inputs.anchor_frame == "site" and estimate.frame != "site":
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
@@ -480,7 +479,7 @@ def _positions_at_rest(
 
 def _lengths_at_rest(metric: MetricResult, rest: MapAtRest) -> LengthScale | None:
     """Return the scale of a refined map by the measured lengths that took part; None without any."""
-    if metric.tape is None:
+    if not metric.tape.distances:
         return None
     anchor_ids, model = metric.observations.log.anchor_ids, rest.problem.metric
     return scale_by_lengths(locate_distances(metric.tape, model, anchor_ids), metric.trajectory.as_in(model).centers)

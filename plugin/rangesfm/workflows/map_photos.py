@@ -23,7 +23,6 @@ from rangesfm.diagnostics.preflight import (
     notes_on_times,
 )
 from rangesfm.distances.locate_lengths import check_ends
-from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.export import check_formats
 from rangesfm.files.atomic import sole_writer
@@ -80,9 +79,8 @@ def checked_keyframes(run: SurveyRun) -> tuple[tuple[str, ...], ImageTimes | Non
 
 def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
     """Check that the ends of taped distances are among these photos, markers, tags or anchors; raises InputError."""
-    if (tape := run.inputs.tape) is not None:
-        may_be_tags = run.survey.markers.dictionary is not None
-        check_ends(tape, photos, run.inputs.log.anchor_ids, may_be_tags=may_be_tags)
+    may_be_tags = run.survey.markers.dictionary is not None
+    check_ends(run.inputs.tape, photos, run.inputs.log.anchor_ids, may_be_tags=may_be_tags)
 
 
 def tell_of_times(run: SurveyRun, times: ImageTimes | None) -> None:
@@ -201,7 +199,7 @@ def with_tags(run: SurveyRun, names: Sequence[str]) -> SurveyRun:
         journal.warn(message)
     journal.progress.message(f"tags: {len(found.tags)} of {wanted.dictionary} in {found.num_photos} photos")
     sides = () if wanted.side_m is None else found.sides(wanted.side_m, wanted.side_stddev_m)
-    tape, positions = (inputs.tape or Tape()).with_more(sides, found.markers), inputs.positions
+    tape, positions = inputs.tape.with_more(sides, found.markers), inputs.positions
     return replace(run, inputs=replace(inputs, tape=tape, positions=positions.with_more_markers(found.markers)))
 
 

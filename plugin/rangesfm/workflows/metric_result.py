@@ -66,7 +66,7 @@ class MetricResult:
             camera, or where it has not been judged yet.
         models: all models that were to be joined to this one; empty where there was only one.
         diagnosis: result of the tests of mistakes on the final map.
-        tape: the measured lengths, with those left out that cannot be in the map; None without any.
+        tape: the measured lengths, with those left out that cannot be in the map; empty without any.
         positions: the known positions, with those left out that contradict the others.
         positions_at_refined: what they say of the refined map; None without a refinement, or with ranges.
         rivals: other likely time offsets; None without any.
@@ -88,7 +88,7 @@ class MetricResult:
     place: Place | None = None
     models: tuple[ModelVerdict, ...] = ()
     diagnosis: Diagnosis | None = None
-    tape: Tape | None = None
+    tape: Tape = field(default_factory=Tape)
     positions: SurveyedPositions = field(default_factory=SurveyedPositions)
     positions_at_refined: PositionScale | None = None
     rivals: Rivals | None = None

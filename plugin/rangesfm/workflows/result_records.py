@@ -245,7 +245,7 @@ def _rmse(rows: Sequence[entries.PointRow], kind: str) -> entries.PointErrors3d:
 
 def distance_rows(found: MetricResult) -> list[entries.DistanceRow]:
     """Return a row for each measured length, in the order of its file; empty without any."""
-    if found.tape is None:
+    if not found.tape.distances:
         return []
     located = locate_distances(found.tape, found.final, [anchor.anchor_id for anchor in found.anchors])
     lengths_m = located.lengths_m(1.0, np.array([anchor.position_m for anchor in found.anchors]).reshape(-1, 3))
@@ -299,7 +299,7 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
     curve = None if found.time_offset is None else found.time_offset.curve
     if curve is not None:
         yield TimeOffsetCurve(curve.offsets_s, curve.costs_m)
-    markers = {} if found.tape is None else found.tape.found_markers
+    markers = found.tape.found_markers
     if markers:
         names = [name for name, marker in markers.items() for _ in marker.image_names]
         photos = [name for marker in markers.values() for name in marker.image_names]

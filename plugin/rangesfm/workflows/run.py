@@ -158,10 +158,10 @@ def map_in_metres(
         path, verdicts = join_by_survey(run, paths, must_join=must_join)
         images = run.survey.images
         baselines = read_rigs(images.rig_config).baselines(path.sfm, images.baseline_stddev_m)
-        tape = (run.inputs.tape or Tape()).with_more(baselines)
+        tape = run.inputs.tape.with_more(baselines)
         positions = _positions_on_path(run, path)
         run.journal.warn(*positions.notes_on(path.sfm))
-        tape_in_map = locatable(tape, path.sfm) if tape.distances else None
+        tape_in_map = locatable(tape, path.sfm) if tape.distances else Tape()
         run = replace(run, inputs=replace(run.inputs, tape=tape_in_map, positions=positions))
     # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(run, path, refine=refine), models=verdicts)
