@@ -68,17 +68,17 @@ class BatchOptions:
     """Options of a batch.
 
     Attributes:
-        scheduler: address of a Dask scheduler; None: workers on this machine.
-        num_workers: number of surveys at once on this machine; None: as many as its cores and memory allow.
-        num_threads: threads of each survey; None: its worker's share of the cores.
-        memory_limit_bytes: memory of each survey; None: its worker's share of the memory.
+        scheduler: address of a Dask scheduler; empty: workers on this machine.
+        num_workers: number of surveys at once on this machine; 0: as many as its cores and memory allow.
+        num_threads: threads of each survey; 0: its worker's share of the cores.
+        memory_limit_bytes: memory of each survey; 0: its worker's share of the memory.
         restart: repeat what earlier runs have done.
     """
 
-    scheduler: str | None = None
-    num_workers: int | None = None
-    num_threads: int | None = None
-    memory_limit_bytes: int | None = None
+    scheduler: str = ""
+    num_workers: int = 0
+    num_threads: int = 0
+    memory_limit_bytes: int = 0
     restart: bool = False
 
 
@@ -87,13 +87,13 @@ class Share:
     """Resources that one survey may use.
 
     Attributes:
-        num_threads: threads; None: the cores of its machine, divided by the surveys that run there at once.
-        memory_limit_bytes: memory; None: the memory of its machine, divided likewise.
+        num_threads: threads; 0: the cores of its machine, divided by the surveys that run there at once.
+        memory_limit_bytes: memory; 0: the memory of its machine, divided likewise.
         num_at_once: number of surveys at once on each host, as far as it is known beforehand.
     """
 
-    num_threads: int | None = None
-    memory_limit_bytes: int | None = None
+    num_threads: int = 0
+    memory_limit_bytes: int = 0
     num_at_once: Mapping[str, int] = field(default_factory=dict)
 
     def on(self, host: str, num_slots: int, num_cores: int, memory_bytes: int) -> tuple[int, int]:

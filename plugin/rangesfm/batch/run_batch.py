@@ -68,7 +68,7 @@ def run_batch(jobs: Sequence[Job], options: BatchOptions, output_path: Path, lis
 
 @contextmanager
 def _workers(options: BatchOptions, jobs: Sequence[Job], listener: BatchListener) -> Iterator[tuple[Client, Share]]:
-    if options.scheduler is not None:
+    if options.scheduler:
         with workers.workers_of(options.scheduler) as client:
             at_once = workers.num_at_once(client)
             if not at_once:

@@ -207,7 +207,7 @@ def run_on_worker(task: SurveyTask) -> Any:
         memory_limit_bytes=memory_limit_bytes,
         is_stopped=lambda: task.batch in _stopped,
     )
-    if ended.last is None or not ended.last.keys() & {"done", "failed"}:
+    if not ended.last.keys() & {"done", "failed"}:
         return _why_it_did_not_end(ended, memory_limit_bytes)
     if "failed" in ended.last:
         return Failure(**ended.last["failed"])
@@ -215,7 +215,7 @@ def run_on_worker(task: SurveyTask) -> Any:
 
 
 def _why_it_did_not_end(ended: Ended, memory_limit_bytes: int) -> Failure:
-    if ended.needed_bytes is not None:
+    if ended.needed_bytes:
         needed, limit = (f"{num / 1e6:.0f} MB" for num in (ended.needed_bytes, memory_limit_bytes))
         why = f"needs more memory than its share: it took {needed}, and its limit is {limit}"
         return Failure(f"{why}; set a larger --memory_limit or fewer --num_workers", FAILED)

@@ -85,7 +85,9 @@ def _batch(args: argparse.Namespace, progress: Progress) -> Outcome:
 
     output_path = Path(args.output_path)
     jobs = read_jobs(args.surveys, overrides_from_arguments(args), output_path)
-    options = BatchOptions(args.scheduler, args.num_workers, args.num_threads, args.memory_limit, args.restart)
+    options = BatchOptions(
+        args.scheduler or "", args.num_workers or 0, args.num_threads or 0, args.memory_limit or 0, args.restart
+    )
     terminal = BatchTerminal(sys.stderr, quiet=args.quiet)
     batch_state = run_batch(jobs, options, output_path, terminal)
     lines = [

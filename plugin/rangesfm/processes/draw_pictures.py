@@ -33,10 +33,10 @@ def draw_pictures(drawings: Sequence[Drawing]) -> list[bytes]:
         pickle.dumps(drawings),
         lambda _: None,
         environment=os.environ,
-        memory_limit_bytes=None,
+        memory_limit_bytes=0,
         is_stopped=lambda: False,
     )
-    last = ended.last or {}
+    last = ended.last
     if "done" not in last:
         why = last["failed"]["message"] if "failed" in last else ended.how
         hint = " (it reserves 64 GB of address space; `ulimit -v` may allow less)" if ended.signal is not None else ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import math
 import os
 import pickle
 import queue
@@ -123,16 +124,16 @@ class Ended:
     """End of a child process.
 
     Attributes:
-        last: the last message it sent; None if it sent none.
+        last: the last message it sent; empty if it sent none.
         signal: the signal that killed it, if one did.
-        needed_bytes: the memory it took, if it was killed for exceeding its limit, else None.
+        needed_bytes: the memory it took, if it was killed for exceeding its limit, else 0.
         stopped: whether it was interrupted on request.
         errors: the last line it wrote to stderr.
     """
 
-    last: dict[str, Any] | None
+    last: dict[str, Any]
     signal: signal.Signals | None
-    needed_bytes: int | None
+    needed_bytes: int
     stopped: bool
     errors: str
 
@@ -154,7 +155,7 @@ def supervise(
     listen: Callable[[dict[str, Any]], object],
     *,
     environment: Mapping[str, str],
-    memory_limit_bytes: int | None,
+    memory_limit_bytes: int,
     is_stopped: Callable[[], bool],
 ) -> Ended:
     """Run a process that reads ``given`` and writes JSON objects, one a line; return how it ended.
@@ -164,7 +165,7 @@ def supervise(
         given: bytes for its standard input.
         listen: called with each message.
         environment: its environment variables.
-        memory_limit_bytes: the process is killed if it takes more; None: there is no limit.
+        memory_limit_bytes: the process is killed if it takes more; 0: there is no limit.
         is_stopped: called several times a second; once it returns True, the process is interrupted.
     """
     with tempfile.TemporaryFile() as errors:
@@ -183,7 +184,7 @@ def supervise(
             process.kill()  # has no effect if it has ended
             process.wait()
         died_of = signal.Signals(-process.returncode) if process.returncode < 0 else None
-        return Ended(last, died_of, watched.needed_bytes, watched.stopped_at is not None, _last_line(errors))
+        return Ended(last, died_of, watched.needed_bytes, watched.stopped_at < math.inf, _last_line(errors))
 
 
 def run_children(
@@ -219,10 +220,10 @@ def run_children(
             work,
             listen,
             environment=environment,
-            memory_limit_bytes=None,
+            memory_limit_bytes=0,
             is_stopped=stop.is_set,
         )
-        last = ended.last or {}
+        last = ended.last
         if "done" in last:
             num_done[place] = last["done"]
         elif not ended.stopped:
@@ -258,33 +259,33 @@ class _Watched:
     """A process that is interrupted on request, and killed if it takes too much memory or does not stop."""
 
     process: subprocess.Popen[bytes]
-    memory_limit_bytes: int | None
+    memory_limit_bytes: int
     is_stopped: Callable[[], bool]
-    needed_bytes: int | None = None
-    stopped_at: float | None = None
+    needed_bytes: int = 0
+    stopped_at: float = math.inf
 
     def look(self) -> None:
-        if self.memory_limit_bytes is not None and self.needed_bytes is None:
+        if self.memory_limit_bytes and not self.needed_bytes:
             with suppress(psutil.Error):  # the process has ended
                 used = psutil.Process(self.process.pid).memory_info().rss
                 if used > self.memory_limit_bytes:
                     self.needed_bytes = used
                     self.process.kill()
-        if self.stopped_at is None and self.is_stopped():
+        if self.stopped_at == math.inf and self.is_stopped():
             self.stopped_at = time.monotonic()
             self.process.send_signal(signal.SIGINT)
-        if self.stopped_at is not None and time.monotonic() - self.stopped_at > _MAX_STOP_S:
+        if time.monotonic() - self.stopped_at > _MAX_STOP_S:
             self.process.kill()
 
 
-def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], object]) -> dict[str, Any] | None:
+def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
     """Send the input and listen until the process closes its stdout; return its last message."""
     process = watched.process
     assert process.stdin is not None
     assert process.stdout is not None
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
-    last = None
+    last: dict[str, Any] = {}
     try:
         with suppress(BrokenPipeError):  # the process died; its messages so far still count
             process.stdin.write(given)
