@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import rangesfm
 
 PACKAGE = Path(rangesfm.__file__).parent
@@ -43,6 +45,14 @@ LAYER_OF = {folder: number for number, folders in enumerate(LAYERS) for folder i
 DOORS = {"__init__", "__main__", "costs"}
 ROOT = -1
 MAX_NUM_FILES_AT_ROOT = 10
+
+# What only reads a folder of results, and the folders that it must not need.
+READS_RESULTS = (
+    *("result.result_folder", "report", "comparison.before_after", "comparison.many_models"),
+    *("batch.run_batch", "workflows.measure", "workflows.export_result"),
+)
+ESTIMATORS = {"scale", "refine", "estimation", "measurements", "loops", "join", "planning"}
+MAX_NUM_OF_COMPARE = 25
 
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
@@ -113,6 +123,29 @@ def test_only_one_package_touches_the_compiled_part_and_pyceres() -> None:
     ]
     assert touching, "not even the package that is there for it"
     assert all(module.split(".")[0] == "ceres" for module in touching)
+
+
+def reached(module: str) -> set[str]:
+    """Return all modules of the package that importing one of them loads."""
+    found, waiting = set[str](), [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting += own_imports(name)
+    return found
+
+
+@pytest.mark.parametrize("module", [*READS_RESULTS])
+def test_what_only_reads_results_loads_no_estimator(module: str) -> None:
+    assert not {folder_of(name) for name in reached(module)} & ESTIMATORS
+
+
+def test_few_modules_are_loaded_to_compare_paths_and_none_that_reads_logs_to_refine() -> None:
+    assert len(reached("comparison.with_reference")) <= MAX_NUM_OF_COMPARE
+    assert not [
+        name for name in reached("estimation.with_ranges") if name.startswith(("ranging.readers", "files.text"))
+    ]
 
 
 def test_importing_the_package_imports_neither_pycolmap_nor_scipy() -> None:
