@@ -118,14 +118,14 @@ class Figure:
         panels: one or several.
         layout: "single", "views" (two side by side) or "panels" (many).
         table: name of the data on the page that the CSV file is made of, where they are too many to be stored twice;
-            None: the series themselves.
+            empty: the series themselves.
     """
 
     name: str
     caption: str
     panels: tuple[Panel, ...]
     layout: str = "single"
-    table: str | None = None
+    table: str = ""
 
     @property
     def is_wide(self) -> bool:
@@ -153,7 +153,7 @@ def figure_of(
     labels: tuple[str, str],
     series: Iterable[Series],
     *,
-    table: str | None = None,
+    table: str = "",
     **of_panel: Any,
 ) -> Figure:
     """Return a figure with one panel without a title; ``of_panel`` are further attributes of the Panel."""
