@@ -23,6 +23,7 @@ import hypothesis
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tests.simulated.files import write_anchors, write_model
 from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 from tests.simulated.small_demo import make_small_demo
@@ -183,14 +184,11 @@ def make_walked_survey(folder: Path, *, rate_hz: float = 1.0) -> WalkedSurvey:
         seed=1,
     )
     radio = Radio(rate_hz=rate_hz, range_stddev_m=0.05, time_offset_s=TIME_OFFSET_S)
-    (folder / "sparse" / "0").mkdir(parents=True)
-    made.reconstruction.write(folder / "sparse" / "0")
+    write_model(made.reconstruction, folder / "sparse" / "0", made.timestamps_s, folder / "images.csv")
     write_ranges_csv(simulate_ranges(path, _AROUND_WALK_M, TAG_IN_CAM_M, radio, seed=5).log, folder / "uwb.csv")
-    _write_anchors(folder / "anchors.csv", np.array(list(ANCHORS_M.values())))
+    write_anchors(folder / "anchors.csv", ANCHORS_M)
     in_first_camera = (np.array(list(_AROUND_WALK_M.values())) - made.centers_m[0]) @ made.world_from_cam[0]
-    _write_anchors(folder / "anchors_first_camera.csv", in_first_camera)
-    lines = [f"{name},{time!r}\n" for name, time in made.timestamps_s.items()]
-    (folder / "images.csv").write_text("image_name,timestamp_s\n" + "".join(lines))
+    write_anchors(folder / "anchors_first_camera.csv", dict(zip(ANCHORS_M, in_first_camera, strict=True)))
     names, centers_m = tuple(made.timestamps_s), made.centers_m + SITE_M
     write_reference(Reference(centers_m, image_names=names), folder / "reference.csv")
     site_from_sfm = Similarity(1.0, np.eye(3), np.array(SITE_M)) @ made.metric_from_sfm
@@ -251,8 +249,3 @@ def _shared_folder(factory: pytest.TempPathFactory, name: str) -> Iterator[Path]
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the system releases the lock, however the block ends
         yield folder
-
-
-def _write_anchors(path: Path, positions_m: Array) -> None:
-    lines = [f"{name},{x!r},{y!r},{z!r}\n" for name, (x, y, z) in zip(ANCHORS_M, positions_m.tolist(), strict=True)]
-    path.write_text("anchor_id,x_m,y_m,z_m\n" + "".join(lines))

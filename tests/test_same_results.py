@@ -22,7 +22,7 @@ import pytest
 from tests.conftest import ANCHORS_M, SITE_M, TAG_IN_CAM_M, Command, WalkedSurvey
 from tests.join.test_join_models import walk
 from tests.simulated.looped import bent_laps, write_survey
-from tests.studies.simulated_survey import TAG_IN_CAM_M as LAPS_TAG_IN_CAM_M
+from tests.simulated.surveys import TAG_IN_CAM_M as LAPS_TAG_IN_CAM_M
 from tests.workflows.test_surveys_of_rigs import TAG_IN_CAM_M as RIG_TAG_IN_CAM_M
 from tests.workflows.test_surveys_of_rigs import stereo_survey
 

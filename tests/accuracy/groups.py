@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from tests.accuracy.figures import Figure, Values
 from tests.benchmarks import reconstruction
+from tests.simulated.surveys import SITES, simulated, surveyed
 from tests.studies import drifting_maps, growth, known_positions, mistakes, random_surveys, real_logs
-from tests.studies.erring_surveys import SITES, surveyed
-from tests.studies.measured_distances import KINDS, simulated
+from tests.studies.measured_distances import KINDS
 
 from rangesfm.demo.survey import PHOTOS
 from rangesfm.options import CameraOptions
@@ -156,7 +156,7 @@ def desk_tasks(data: Path | None, quick: bool) -> list[Task]:
 
 
 def one_known_survey(known: str, kind: str, seed: int) -> Cases:
-    truth, survey = simulated(replace(KINDS[kind], frame="site"), seed)
+    truth, survey = simulated(replace(KINDS[kind], anchor_frame="site"), seed)
     of_survey = known_positions.Known.of(known.split("+"), truth, survey, KINDS[kind].path(seed), seed)
     line = known_positions.told(of_survey, "none", KINDS[kind].pixel_stddev, seed)
     name = f"{known}, {kind} {seed}"
@@ -189,7 +189,7 @@ def known_tasks(_: Path | None, quick: bool) -> list[Task]:
 def mistakes_of_survey(site_number: int, seed: int, num: int) -> Cases:
     """Run a clean survey, and some kinds of mistakes drawn for this seed."""
     site = SITES[site_number]
-    all_kinds = mistakes.kinds(list(site.anchors_m) if site.frame != "unknown" else [])
+    all_kinds = mistakes.kinds(list(site.anchors_m) if site.anchor_frame != "unknown" else [])
     drawn = np.random.default_rng([seed, site_number]).choice(len(all_kinds), num, replace=False)
     made = mistakes.runs_of_seed(site.name, [(int(k), all_kinds[k]) for k in drawn], partial(surveyed, site), seed, {})
     return {f"{site.name}, {line['kind']} {seed}": of_mistake(line) for line in made}

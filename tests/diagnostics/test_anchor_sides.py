@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.known import known
-from tests.studies.drifting_maps import Made, lap_of_drift, run
-from tests.studies.erring_surveys import SITES
-from tests.studies.erring_surveys import run as run_erring
-from tests.studies.erring_surveys import surveyed as surveyed_by_drone
+from tests.simulated.runs import run, run_stages
+from tests.simulated.surveys import DRONE, MadeSurvey, surveyed
+from tests.studies.drifting_maps import lap_of_drift
 
 from rangesfm.diagnostics.anchor_sides import likelier_sides
 from rangesfm.diagnostics.linearized import ranges_on_map
@@ -23,18 +22,18 @@ FITS_BELOW = 1
 TELLS_NOTHING = 2
 
 
-def surveyed(seed: int) -> Made:
+def lap(seed: int) -> MadeSurvey:
     return lap_of_drift(DRIFT_M, seed, "unknown", num_keyframes=NUM_KEYFRAMES)
 
 
 @pytest.fixture(scope="module")
 def crossed() -> MetricResult:
-    return run(surveyed(FITS_BELOW), 0)
+    return run_stages(lap(FITS_BELOW), 0)
 
 
 def test_an_anchor_that_drift_puts_on_the_wrong_side_is_brought_to_the_right_one(crossed: MetricResult) -> None:
     [anchor] = crossed.anchors
-    truth_m = surveyed(FITS_BELOW).anchors_m["A1"]
+    truth_m = lap(FITS_BELOW).anchors_m["A1"]
     assert np.linalg.norm(anchor.position_m - truth_m) < 3 * np.sqrt(3) * anchor.position_stddev_m
     assert anchor.mirror_position_m is None
     assert crossed.estimate.verdict == "good", crossed.estimate.reasons
@@ -49,8 +48,8 @@ def test_an_anchor_on_the_right_side_stays_there(crossed: MetricResult) -> None:
 
 
 def test_sides_that_the_ranges_do_not_tell_apart_are_both_given() -> None:
-    survey = surveyed(TELLS_NOTHING)
-    found = run(survey, 0)
+    survey = lap(TELLS_NOTHING)
+    found = run_stages(survey, 0)
     [anchor] = found.anchors
     places_m = np.array([anchor.position_m, known(anchor.mirror_position_m)])
     off_m = np.linalg.norm(places_m - survey.anchors_m["A1"], axis=1)
@@ -67,7 +66,7 @@ def test_surveyed_anchors_are_left_alone(crossed: MetricResult) -> None:
 
 
 def test_a_path_that_goes_up_and_down_leaves_nothing_open() -> None:
-    on_map = known(run_erring(surveyed_by_drone(SITES[2], 3), 3).on_map)
+    on_map = known(run(surveyed(DRONE, 3), 3).on_map)
     sides = likelier_sides(on_map)
     assert sides.on_map is on_map
     assert sides.mirrors_m == {"B": None}

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from tests.known import known
 from tests.known_errors import predicted_by_model
-from tests.studies.drifting_maps import Made, lap_of_drift, run, without_points
+from tests.simulated.runs import run_stages
+from tests.simulated.surveys import MadeSurvey
+from tests.studies.drifting_maps import lap_of_drift, without_points
 
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.workflows.metric_result import MetricResult
@@ -15,30 +17,26 @@ NUM_KEYFRAMES = 100
 
 
 @pytest.fixture(scope="module", params=[(0.5, "first_camera"), (5.0, "first_camera"), (5.0, "unknown"), (2.0, "site")])
-def lap(request: pytest.FixtureRequest) -> Made:
+def lap(request: pytest.FixtureRequest) -> MadeSurvey:
     drift_m, frame = request.param
     return lap_of_drift(drift_m, 1, frame, num_keyframes=NUM_KEYFRAMES)
 
 
 @pytest.fixture(scope="module")
-def refined(lap: Made) -> MetricResult:
-    return run(lap, 0)
+def refined(lap: MadeSurvey) -> MetricResult:
+    return run_stages(lap, 0)
 
 
-def error_m(lap: Made, found: MetricResult) -> float:
-    return rmse(found.trajectory.as_in(found.final).centers - lap.truth_m)
-
-
-def true_scale(lap: Made) -> float:
-    return align_points(lap.trajectory.centers, lap.truth_m).scale
+def error_m(lap: MadeSurvey, found: MetricResult) -> float:
+    return rmse(found.trajectory.as_in(found.final).centers - lap.true_centers_m)
 
 
 def test_a_refinement_that_bends_drift_back_is_kept_however_far_it_changes_the_scale(
-    lap: Made, refined: MetricResult
+    lap: MadeSurvey, refined: MetricResult
 ) -> None:
     assert refined.why_broken == ()
     assert refined.kept_refinement is not None
-    scaled_m = rmse(refined.trajectory.as_in(refined.scaled).centers - lap.truth_m)
+    scaled_m = rmse(refined.trajectory.as_in(refined.scaled).centers - lap.true_centers_m)
     assert error_m(lap, refined) < 0.8 * scaled_m
 
 
@@ -48,15 +46,15 @@ def test_no_mistake_is_named_that_nobody_made(refined: MetricResult) -> None:
 
 
 def test_the_scale_that_is_stated_is_the_refined_maps_and_the_truth_is_in_its_interval(
-    lap: Made, refined: MetricResult
+    lap: MadeSurvey, refined: MetricResult
 ) -> None:
     assert refined.estimate.value == refined.refined_scale
     low, high = refined.estimate.interval_95
-    assert low < true_scale(lap) < high
+    assert low < lap.metres_per_unit < high
     assert refined.estimate.uncertainty.half_width_95 < 0.02
 
 
-def test_scale_and_ranges_are_those_of_the_delivered_map(lap: Made, refined: MetricResult) -> None:
+def test_scale_and_ranges_are_those_of_the_delivered_map(lap: MadeSurvey, refined: MetricResult) -> None:
     """After the refinement the map is moved as a whole, and its ranges with it."""
     centers_m = refined.trajectory.as_in(refined.final).centers
     assert align_points(refined.trajectory.centers, centers_m).scale == pytest.approx(refined.estimate.value, rel=1e-9)
@@ -71,9 +69,9 @@ def test_scale_and_ranges_are_those_of_the_delivered_map(lap: Made, refined: Met
     assert refined.predicted_m == pytest.approx(predicted_m, abs=1e-6, nan_ok=True)
 
 
-def test_keyframes_err_as_their_covariances_say(lap: Made, refined: MetricResult) -> None:
+def test_keyframes_err_as_their_covariances_say(lap: MadeSurvey, refined: MetricResult) -> None:
     covariances = np.array([refined.center_covariance_m2[name] for name in refined.trajectory.image_names])
-    off_m = refined.trajectory.as_in(refined.final).centers - lap.truth_m
+    off_m = refined.trajectory.as_in(refined.final).centers - lap.true_centers_m
     stated_m = float(np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2))))
     assert 0.1 * stated_m < rmse(off_m) < 2 * stated_m
 
@@ -81,12 +79,14 @@ def test_keyframes_err_as_their_covariances_say(lap: Made, refined: MetricResult
 def test_a_path_of_poses_is_scaled_to_where_ranges_bend_it_back() -> None:
     """The likeliest similarity is used, and the drift from there is stated as a fact."""
     lap = without_points(lap_of_drift(5.0, 2, "site", num_keyframes=NUM_KEYFRAMES))
-    found = run(lap, 0)
+    found = run_stages(lap, 0)
     assert known(found.diagnosis).causes == ()
     low, high = found.estimate.interval_95
-    assert low < true_scale(lap) < high
+    assert low < lap.metres_per_unit < high
     assert found.estimate.uncertainty.half_width_95 < 0.02
-    best_m = rmse(align_points(lap.trajectory.centers, lap.truth_m).apply(lap.trajectory.centers) - lap.truth_m)
+    best_m = rmse(
+        align_points(lap.trajectory.centers, lap.true_centers_m).apply(lap.trajectory.centers) - lap.true_centers_m
+    )
     assert error_m(lap, found) < 1.1 * best_m + 0.1
     assert any("drifts" in reason for reason in found.estimate.reasons)
     assert known(found.place).worst_keyframe_stddev_m > 0.5 * best_m
@@ -96,17 +96,19 @@ def test_a_path_of_poses_is_scaled_to_where_ranges_bend_it_back() -> None:
 def test_a_path_that_fits_better_turned_over_is_placed_the_right_way_up(drift_m: float, seed: int) -> None:
     """A rigid path fits better with the anchors on its wrong side; a path that drifts does not."""
     lap = without_points(lap_of_drift(drift_m, seed, "site", with_radio=True, num_keyframes=NUM_KEYFRAMES))
-    found = run(lap, 0)
+    found = run_stages(lap, 0)
     assert known(found.diagnosis).causes == ()
-    best_m = rmse(align_points(lap.trajectory.centers, lap.truth_m).apply(lap.trajectory.centers) - lap.truth_m)
+    best_m = rmse(
+        align_points(lap.trajectory.centers, lap.true_centers_m).apply(lap.trajectory.centers) - lap.true_centers_m
+    )
     assert error_m(lap, found) < 1.1 * best_m
 
 
 def test_a_path_that_drifts_by_a_hundred_times_the_usual_has_no_mistake_named() -> None:
     """However far it drifts, drift is no mistake, and all ranges that fit the bent path are used."""
     lap = without_points(lap_of_drift(15.0, 10, "site", with_radio=True, num_keyframes=NUM_KEYFRAMES))
-    found = run(lap, 0)
+    found = run_stages(lap, 0)
     assert known(found.diagnosis).causes == ()
     assert found.estimate.verdict == "good"
     low, high = found.estimate.interval_95
-    assert low < true_scale(lap) < high
+    assert low < lap.metres_per_unit < high

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 from tests.known import known
-from tests.studies.erring_surveys import SITES, Given, run, surveyed
+from tests.simulated.runs import run
+from tests.simulated.surveys import SITES, MadeSurvey, surveyed
 
 from rangesfm.diagnostics.error_bursts import likeliest_burst
 from rangesfm.diagnostics.hypothesis_tests import Factorization
@@ -16,7 +17,7 @@ SEED = 3
 BEGIN_S, END_S = 91.0, 93.0
 
 
-def with_burst(longer_m: float) -> Given:
+def with_burst(longer_m: float) -> MadeSurvey:
     given = surveyed(DRONE, SEED)
     given.range_m = given.range_m + longer_m * ((given.time_s > BEGIN_S) & (given.time_s < END_S))
     return given

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
-from tests.studies.erring_surveys import SITES, run, surveyed
+from tests.simulated.runs import run
+from tests.simulated.surveys import SITES, surveyed
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics import hypothesis_tests

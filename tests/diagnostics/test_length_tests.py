@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.known import known
-from tests.studies.erring_surveys import SITES, run, surveyed
+from tests.simulated.runs import run
+from tests.simulated.surveys import SITES, surveyed
 
 from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.distances.locate_lengths import LocatedDistances

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.known import known
-from tests.studies.erring_surveys import SITES, Given, run, surveyed
+from tests.simulated.runs import run
+from tests.simulated.surveys import SITES, MadeSurvey, surveyed
 from tests.studies.mistakes import kinds
 
 from rangesfm.diagnostics.alternatives import alternatives
@@ -26,7 +27,7 @@ def of_yard() -> Linearized:
     return linearized(known(run(surveyed(YARD, SEED), SEED).on_map))
 
 
-def diagnosis(given: Given) -> Diagnosis:
+def diagnosis(given: MadeSurvey) -> Diagnosis:
     found = run(given, SEED).diagnosis
     assert found is not None
     return found

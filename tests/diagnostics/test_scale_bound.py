@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import special
-from tests.studies.erring_surveys import SITES, run, surveyed
+from tests.simulated.runs import run
+from tests.simulated.surveys import SITES, surveyed
 
 from rangesfm.diagnostics import hypothesis_tests
 from rangesfm.diagnostics.catalogue import anchor_places, wrong_lever_arms

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 from tests.simulated.looped import Closed, LoopedSurvey, ScaledMap, close, two_aisles, two_laps
-from tests.studies.simulated_survey import range_log
+from tests.simulated.surveys import range_log
 
 from rangesfm.estimation import drift, refinement
 from rangesfm.estimation.drift import _solve_with_own_noise

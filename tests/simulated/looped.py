@@ -11,9 +11,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from tests.simulated.files import write_anchors, write_model
 from tests.simulated.model import SyntheticModel, _Frames, _reconstruction, synthetic_model
 from tests.simulated.path import lap_path, look_at
-from tests.studies.simulated_survey import RANGE_MODEL, SITE_ANCHORS_M, TAG_IN_CAM_M, Survey, range_log
+from tests.simulated.surveys import (
+    SITE_ANCHORS_M,
+    TAG_IN_CAM_M,
+    Truth,
+    adjusted,
+    drop_flat_points,
+    range_log,
+)
 
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.colmap.transform import rescale
@@ -49,7 +57,7 @@ class LoopedSurvey:
         max_track_length: photos after one another in which the mapper finds a point; later ones make another point.
     """
 
-    survey: Survey
+    survey: Truth
     max_track_length: int
 
     @property
@@ -58,7 +66,9 @@ class LoopedSurvey:
 
     def chain(self) -> pycolmap.Reconstruction:
         """Return the map that a mapper makes by neighbours in time alone: COLMAP's adjustment of the cut tracks."""
-        return adjusted(self.cut())
+        chain = self.cut()
+        drop_flat_points(chain)
+        return adjusted(chain)
 
     def cut(self) -> pycolmap.Reconstruction:
         """Return the true map with its tracks cut."""
@@ -104,24 +114,6 @@ def _pieces(seen: list[Pair], max_length: int) -> Iterable[list[Pair]]:
                 yield piece
 
 
-def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Adjust a model in place by its features alone, and return it."""
-    pycolmap.ObservationManager(model).filter_points3D_with_small_triangulation_angle(1.5, set(model.point3D_ids()))
-    options = pycolmap.BundleAdjustmentOptions(
-        print_summary=False, refine_focal_length=False, refine_extra_params=False
-    )
-    solver = options.ceres.solver_options
-    solver.num_threads, solver.max_num_iterations, solver.initial_trust_region_radius = 1, 200, 1e8
-    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-10
-    options.ceres.solver_options = solver
-    config = pycolmap.BundleAdjustmentConfig()
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
-    return model
-
-
 def write_matches(
     path: Path, model: pycolmap.Reconstruction, matches: dict[Pair, Matches], *, with_descriptors: bool = False
 ) -> None:
@@ -159,14 +151,10 @@ def write_survey(looped: LoopedSurvey, folder: Path) -> None:
     ``anchors.csv`` and ``reference.csv``, the truth.
     """
     truth = looped.survey.model
-    (folder / "sparse").mkdir()
-    looped.chain().write_binary(folder / "sparse")
-    write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
+    write_model(looped.chain(), folder / "sparse", truth.timestamps_s, folder / "images.csv")
     write_ranges_csv(range_log(looped.survey, 1, num_each=4), folder / "uwb.csv")
-    times = "".join(f"{name},{time}\n" for name, time in truth.timestamps_s.items())
-    (folder / "images.csv").write_text(f"image_name,timestamp_s\n{times}")
-    (anchor,) = looped.survey.anchors_m.values()
-    (folder / "anchors.csv").write_text("anchor_id,x_m,y_m,z_m\nA1,{},{},{}\n".format(*anchor))
+    write_anchors(folder / "anchors.csv", looped.survey.anchors_m)
+    write_matches(folder / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
     reference = Reference(truth.centers_m, image_names=tuple(truth.timestamps_s), world_from_cam=truth.world_from_cam)
     write_reference(reference, folder / "reference.csv")
 
@@ -179,19 +167,17 @@ class ScaledMap:
         scaled: the map, in metres. trajectory, estimate: as the refinement needs them.
     """
 
-    survey: Survey
+    survey: Truth
     scaled: pycolmap.Reconstruction
     trajectory: Trajectory
     estimate: ScaleEstimate
 
     @classmethod
-    def of(cls, survey: Survey, sfm: pycolmap.Reconstruction, log: RangeLog) -> ScaledMap:
+    def of(cls, survey: Truth, sfm: pycolmap.Reconstruction, log: RangeLog) -> ScaledMap:
         trajectory = trajectory_from_reconstruction(sfm, survey.model.timestamps_s)
         observations = associate(log, trajectory, TAG_IN_CAM_M)
         anchors = [Anchor(name, position) for name, position in survey.anchors_m.items()]
-        estimate = initialize_scale(
-            observations, trajectory, anchors, anchor_frame=survey.anchor_frame, range_model=RANGE_MODEL
-        )
+        estimate = initialize_scale(observations, trajectory, anchors, anchor_frame=survey.anchor_frame)
         return cls(survey, rescale(sfm, estimate.metric_from_sfm), trajectory, estimate)
 
     @property
@@ -351,7 +337,7 @@ def two_laps(
         seed=seed,
     )
     anchor = (np.array([0.1 * size_m[0], -0.4 * size_m[1], 4.0]) - centers[0]) @ turns[0]
-    return LoopedSurvey(Survey(model, {"A1": anchor}, "first_camera", 0.1), max_track_length)
+    return LoopedSurvey(Truth(model, {"A1": anchor}, "first_camera"), max_track_length)
 
 
 def bent_laps() -> LoopedSurvey:
@@ -412,7 +398,7 @@ def two_aisles(
     model = _reconstruction(frames, names, camera, points[keep], kept, pixel_stddev, IDENTITY, rng)
     times = dict(zip(names, numbers.astype(np.float64).tolist(), strict=True))
     anchors = {name: np.array(at) for name, at in SITE_ANCHORS_M.items()}
-    survey = Survey(SyntheticModel(model, IDENTITY, times, centers, turns), anchors, "site", 0.1)
+    survey = Truth(SyntheticModel(model, IDENTITY, times, centers, turns), anchors, "site")
     of_point = dict(zip(np.flatnonzero(keep).tolist(), sorted(model.point3D_ids()), strict=True))
     alike: dict[Pair, list[Pair]] = {}
     for k in range(num):

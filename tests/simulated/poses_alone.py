@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
+from tests.simulated.files import write_anchors, write_rows
 from tests.simulated.path import look_at
 
 from rangesfm.geometry.similarity import align_points
@@ -64,16 +65,16 @@ def write_poses_alone(
     turn = Rotation.random(rng=rng).as_matrix()
     centers = found_m @ turn.T / METRES_PER_UNIT
     _write_model(folder / "sparse" / "0", centers, turn @ look_at(true_m, ahead))
-    _write_rows(folder / "images.csv", "image_name,timestamp_s", ((name, s) for s, name in enumerate(_names(times))))
+    write_rows(folder / "images.csv", "image_name,timestamp_s", ((name, s) for s, name in enumerate(_names(times))))
     rows = ((name, *at_m) for name, at_m in zip(_names(times), true_m.tolist(), strict=True))
-    _write_rows(folder / "positions.csv", "image_name,x_m,y_m,z_m", rows)
-    _write_rows(folder / "anchors.csv", "anchor_id,x_m,y_m,z_m", ((name, *at) for name, at in ANCHORS_M.items()))
+    write_rows(folder / "positions.csv", "image_name,x_m,y_m,z_m", rows)
+    write_anchors(folder / "anchors.csv", ANCHORS_M)
     at_s = np.repeat(np.arange(0.0, num_photos - 1, 0.25), len(ANCHORS_M))
     names = np.tile(list(ANCHORS_M), len(at_s) // len(ANCHORS_M))
     from_anchor = _eight(at_s, num_photos, height_amplitude_m) - [ANCHORS_M[name] for name in names]
     range_m = np.linalg.norm(from_anchor, axis=1) + noise_m * rng.standard_normal(len(at_s))
     measured = zip(at_s.tolist(), names.tolist(), garble(range_m, rng).tolist(), strict=True)
-    _write_rows(folder / "uwb.csv", "timestamp_s,anchor_id,range_m", measured)
+    write_rows(folder / "uwb.csv", "timestamp_s,anchor_id,range_m", measured)
     return PosesAlone(folder, align_points(centers, true_m).scale)
 
 
@@ -97,8 +98,3 @@ def _write_model(folder: Path, centers: Array, world_from_cam: Array) -> None:
         numbers = " ".join(repr(float(number)) for number in (w, x, y, z, *(-turn @ center)))
         lines.append(f"{k + 1} {numbers} 1 {k:04d}.jpg\n\n")
     (folder / "images.txt").write_text("".join(lines))
-
-
-def _write_rows(path: Path, header: str, rows: Iterable[tuple[object, ...]]) -> None:
-    lines = [",".join(map(str, row)) for row in rows]
-    path.write_text("\n".join([header, *lines]) + "\n")

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
+from tests.simulated.files import write_rows
 from tests.simulated.path import look_at, loop_path, sequence_path
-from tests.studies.drifting_maps import drawn_errors, of_poses
+from tests.simulated.surveys import TAG_IN_CAM_M, Truth, errors_in, mapped, model_of_poses, truth_of
 from tests.studies.known_positions import POINT_STDDEV_M, Receiver
 from tests.studies.measured_distances import marks_in
-from tests.studies.simulated_survey import TAG_IN_CAM_M, Survey, mapped, truth_of, unit_pixel_errors
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.demo.simulated_radio import CameraPath
@@ -118,9 +118,7 @@ class _Drawing:
         kinds = [kind for kind in ANCHORS if not (has & {"positions", "points"} and kind.endswith("first_camera"))]
         anchors_m, kind = self.anchors(size_m, kinds) if "ranges" in has else ({}, "")
         depth_range_m = (0.5 * size_m, 4 * size_m)
-        truth = truth_of(
-            path, times, anchors_m, "site", num_observations=40 if has_points else 20, depth_range_m=depth_range_m
-        )
+        truth = truth_of(path, times, anchors_m, "site", 40 if has_points else 20, depth_range_m)
         sfm, path_in_sfm = self.map(truth, has_points)
         names, frame_m = path_in_sfm.image_names, truth.model.centers_m
         self.mistake = self.choose(MISTAKES, "mistake") if "ranges" in has and self.rng.random() < 0.2 else "none"
@@ -201,12 +199,12 @@ class _Drawing:
         first = self.choose((1, 101), "ids from")
         return {f"A{first + k}" if first == 1 else str(first + k): (x, y, z) for k, (x, y, z) in enumerate(rows)}, kind
 
-    def map(self, truth: Survey, has_points: bool) -> tuple[pycolmap.Reconstruction, Trajectory]:
+    def map(self, truth: Truth, has_points: bool) -> tuple[pycolmap.Reconstruction, Trajectory]:
         """Map the survey: from noisy features, or as a path that may drift, in a world and a unit of its own."""
         rng, model = self.rng, truth.model
         times = model.timestamps_s
         if has_points:
-            sfm = mapped(truth, float(rng.uniform(0.2, 0.8)) * unit_pixel_errors(truth, self.seed))
+            sfm = mapped(truth, float(rng.uniform(0.2, 0.8)), self.seed)
         else:
             path = trajectory_from_reconstruction(model.reconstruction, times)
             size_m = float(np.linalg.norm(np.std(path.centers, axis=0)))
@@ -216,7 +214,7 @@ class _Drawing:
                 drift * np.cumsum(rng.standard_normal(steps.shape), axis=0) / np.sqrt(len(path))
             )
             seen = path.centers + drift * size_m * steps
-            sfm = of_poses(
+            sfm = model_of_poses(
                 Trajectory(
                     path.frame_ids, path.image_names, path.timestamps_s, seen, turned.as_matrix() @ path.world_from_cam
                 )
@@ -226,7 +224,7 @@ class _Drawing:
         sfm = rescale(sfm, Similarity(unit, turn, 3 * rng.normal(size=3)))
         return sfm, trajectory_from_reconstruction(sfm, times)
 
-    def ranges(self, truth: Survey, path: CameraPath, times: Array, names: tuple[str, ...]) -> None:
+    def ranges(self, truth: Truth, path: CameraPath, times: Array, names: tuple[str, ...]) -> None:
         """Write a log of ranges with a radio's errors, on a clock of its own."""
         rng, ids = self.rng, np.array(list(truth.anchors_m))
         by_photo = self.happens(0.12, "ranges by photo")
@@ -238,7 +236,7 @@ class _Drawing:
         stood_m = np.array(list(truth.anchors_m.values()))[anchor]
         if self.mistake == "anchor moved":
             stood_m = stood_m + ((anchor == 0) & (at_s > at_s.mean()))[:, None] * rng.uniform(0.3, 2.0, 3)
-        range_m = np.linalg.norm(true_m - stood_m, axis=1) + drawn_errors(truth, at_s, ids[anchor], rng)
+        range_m = np.linalg.norm(true_m - stood_m, axis=1) + errors_in(truth, at_s, ids[anchor], TAG_IN_CAM_M, rng)
         range_m = np.maximum(range_m, 0.02) / (FOOT_M if self.mistake == "ranges in feet" else 1.0)
         told_m = tag_m[[2, 0, 1]] if self.mistake == "lever arm turned" else tag_m
         labels = ids[::-1] if self.mistake == "labels swapped" else ids
@@ -291,7 +289,7 @@ class _Drawing:
             self.flags.append(f"--ranges_time_offset={offset_s + ahead_s:.3f}")
         return [{"timestamp_s": f"{time:.6f}", **row} for row, time in zip(rows, seconds.tolist(), strict=True)]
 
-    def write_anchors(self, anchors_m: dict[str, Any], kind: str, truth: Survey, times: Array) -> None:
+    def write_anchors(self, anchors_m: dict[str, Any], kind: str, truth: Truth, times: Array) -> None:
         """Write what is known of the anchors."""
         if kind in ("unknown", "one unknown"):
             self.flags += ["--anchor_frame", "unknown"]
@@ -379,8 +377,7 @@ class _Drawing:
 
     def write(self, name: str, rows: list[Row]) -> None:
         """Write a table."""
-        lines = [",".join(rows[0]), *(",".join(str(cell) for cell in row.values()) for row in rows)]
-        (self.folder / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_rows(self.folder / name, ",".join(rows[0]), (row.values() for row in rows))
 
 
 def _shown_ahead(kind: str, duration_s: float, size_m: float, rise_m: float) -> CameraPath:

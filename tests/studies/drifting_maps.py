@@ -27,100 +27,68 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 from scipy.spatial.transform import Rotation
-from tests.simulated.model import synthetic_model
 from tests.simulated.path import lap_path
-from tests.simulated.surveys import errors_of_radio
-from tests.studies.erring_surveys import METRES_PER_UNIT, OBSTRUCTED_MEAN_M, OBSTRUCTED_SHARE, SITES
-from tests.studies.simulated_survey import TAG_IN_CAM_M, mapped, rmse_bound_m, truth_of, unit_pixel_errors
-from tests.studies.simulated_survey import Survey as Truth
+from tests.simulated.runs import run_stages
+from tests.simulated.surveys import HALL, TAG_IN_CAM_M, Kind, MadeSurvey, expected_drift_m, in_turn, made, truth_of
 
-from rangesfm.colmap.transform import rescale
-from rangesfm.demo.simulated_radio import CameraPath
-from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
-from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, rmse
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.progress import Journal, SilentProgress
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.components import population
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.survey.inputs import RangingInputs
-from rangesfm.survey.settings import Survey
-from rangesfm.survey.survey_run import PathOfModel, SurveyRun
-from rangesfm.workflows.metric_result import MetricResult
-from rangesfm.workflows.run import map_in_metres
+from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]
 
 LEVELS_M = (0.2, 0.5, 1.0, 2.0, 5.0, 15.0)
-HALL_PIXELS = 0.7
 MAST_M = {"A1": (10.0, 5.0, 8.0)}
 # At heights that distinguish the map from its mirror image.
 ROUND_THE_FIELD_M = {"N": (5.0, 52.0, 14.0), "E": (68.0, -4.0, 2.0), "S": (-8.0, -50.0, 18.0), "W": (-66.0, 9.0, 4.0)}
 
 
-@dataclass(frozen=True)
-class Made:
-    """A survey as its user has it, and the true centres of its keyframes in the world of the result."""
-
-    sfm: pycolmap.Reconstruction
-    trajectory: Trajectory
-    anchors_m: dict[str, Array]
-    frame: str
-    log: RangeLog
-    tag_in_cam_m: Array
-    truth_m: Array
-    refine: bool
-
-
-def lap(seed: int, frame: str = "first_camera", *, with_radio: bool = False) -> Made:
+def lap(seed: int, anchor_frame: str = "first_camera", *, with_radio: bool = False) -> MadeSurvey:
     """Simulate one lap; successive seeds go through the levels of drift."""
-    return lap_of_drift(LEVELS_M[seed % len(LEVELS_M)], seed, frame, with_radio=with_radio)
+    return lap_of_drift(LEVELS_M[seed % len(LEVELS_M)], seed, anchor_frame, with_radio=with_radio)
 
 
 def lap_of_drift(
-    level_m: float, seed: int, frame: str = "first_camera", *, with_radio: bool = False, num_keyframes: int = 600
-) -> Made:
+    level_m: float,
+    seed: int,
+    anchor_frame: str = "first_camera",
+    *,
+    with_radio: bool = False,
+    num_keyframes: int = 600,
+) -> MadeSurvey:
     """Simulate one lap with this drift on average."""
     num_observations = 150 if level_m < 3 else 60 if level_m < 10 else 40
-    anchors_m = ROUND_THE_FIELD_M if frame == "site" else MAST_M
+    anchors_m = ROUND_THE_FIELD_M if anchor_frame == "site" else MAST_M
     path, times = lap_path(300.0, share=0.98), np.linspace(0.0, 300.0, num_keyframes)
-    survey = truth_of(path, times, anchors_m, frame, num_observations=num_observations, depth_range_m=(6.0, 40.0))
-    pixels = level_m / rmse_bound_m(survey, 1.0, with_ranges=False)
-    return made(survey, path, np.repeat(times, len(anchors_m)), pixels, seed, 0.1, with_radio=with_radio)
+    truth = truth_of(path, times, anchors_m, anchor_frame, num_observations, (6.0, 40.0))
+    pixels = level_m / expected_drift_m(truth)
+    return made(truth, path, np.repeat(times, len(anchors_m)), pixels, seed, with_radio=with_radio)
 
 
-def hall(seed: int) -> Made:
-    site = SITES[0]
-    path = site.path(seed)
-    times = np.arange(path.start_s, path.end_s, 0.5)
-    survey = truth_of(path, times, site.anchors_m, "site", num_observations=120, depth_range_m=(1.5, 9.0))
-    num = int((path.end_s - path.start_s) * site.rate_hz) * len(site.anchors_m)
-    at_s = path.start_s + (np.arange(num) + 0.5) / (site.rate_hz * len(site.anchors_m))
-    return made(survey, path, at_s[at_s < times[-1]], HALL_PIXELS, seed, site.stddev_m, with_radio=True)
+def hall(seed: int) -> MadeSurvey:
+    kind, path = replace(HALL, num_observations=120, tag_in_cam_m=Kind.tag_in_cam_m), HALL.path(seed)
+    truth = kind.truth(path)
+    return made(truth, path, in_turn(kind, path, truth), kind.pixel_stddev, seed)
 
 
-def poses(seed: int) -> Made:
+def poses(seed: int) -> MadeSurvey:
     return without_points(lap(seed, "site", with_radio=True))
 
 
-def without_points(survey: Made) -> Made:
+def without_points(survey: MadeSurvey) -> MadeSurvey:
     """Return the survey with its path alone, which can only be scaled."""
-    return replace(survey, sfm=pycolmap.Reconstruction(), refine=False)
+    return replace(survey, sfm=None)
 
 
-def desk(folder: Path, seed: int) -> Made:
+def desk(folder: Path, seed: int) -> MadeSurvey:
     """Read real keyframes, matched with the truth by time; those in gaps of the truth are left out."""
     keyframes, truth = (np.loadtxt(folder / name) for name in ("fr2_desk_ORB_kf_mono.txt", "fr2_desk_groundtruth.txt"))
     rng = np.random.default_rng([seed, 11])
@@ -139,94 +107,21 @@ def desk(folder: Path, seed: int) -> Made:
     at = np.repeat(np.arange(len(times)), len(anchors_m))
     ids = np.tile(np.arange(len(anchors_m)), len(times))
     tags_m = centers_m[at] + true_cam[at] @ TAG_IN_CAM_M
-    range_m = np.linalg.norm(tags_m - np.array(list(anchors_m.values()))[ids], axis=1) + 0.08 * rng.normal(size=len(at))
-    log = RangeLog.from_arrays(np.array(list(anchors_m))[ids], range_m, timestamp_s=times[at])
-    return Made(pycolmap.Reconstruction(), path, anchors_m, "site", log, TAG_IN_CAM_M, centers_m, refine=False)
+    survey = MadeSurvey(
+        None, path, anchors_m, "site", TAG_IN_CAM_M, times[at], ids, np.zeros(len(at)), tags_m, true_cam[at], anchors_m,
+        centers_m, align_points(path.centers, centers_m).scale,
+    )  # fmt: skip
+    survey.range_m = survey.distances_m + 0.08 * rng.normal(size=len(at))
+    return survey
 
 
-def made(
-    survey: Truth,
-    path: CameraPath,
-    at_s: Array,
-    pixel_stddev: float,
-    seed: int,
-    range_stddev_m: float,
-    *,
-    with_radio: bool,
-) -> Made:
-    """Map the survey from noisy features in a world of its own, and simulate ranges to its anchors in turn."""
-    rng = np.random.default_rng([seed, 5])
-    sfm = mapped(survey, pixel_stddev * unit_pixel_errors(survey, seed))
-    turned = Rotation.from_quat(rng.normal(size=4)).as_matrix()
-    sfm = rescale(sfm, Similarity(1 / METRES_PER_UNIT, turned, rng.normal(size=3)))
-    model, ids = survey.model, list(survey.anchors_m)
-    origin, turn = path.centers(at_s[:1] * 0 + path.start_s)[0], path.world_from_cam(at_s[:1] * 0 + path.start_s)[0]
-    if survey.anchor_frame == "site":
-        origin, turn = np.zeros(3), np.eye(3)
-    world_from_cam = turn.T @ path.world_from_cam(at_s)
-    tags_m = (path.centers(at_s) - origin) @ turn + world_from_cam @ TAG_IN_CAM_M
-    anchor = np.arange(len(at_s)) % len(ids)
-    range_m = np.linalg.norm(tags_m - np.array(list(survey.anchors_m.values()))[anchor], axis=1)
-    trajectory = trajectory_from_reconstruction(sfm, model.timestamps_s)
-    errors_m = range_stddev_m * rng.standard_normal(len(range_m))
-    if with_radio:
-        errors_m = drawn_errors(survey, at_s, np.array(ids)[anchor], rng)
-    range_m = range_m + errors_m
-    log = RangeLog.from_arrays(np.array(ids)[anchor], np.maximum(range_m, 0.02), timestamp_s=at_s)
-    anchors_m = dict(survey.anchors_m)
-    return Made(sfm, trajectory, anchors_m, survey.anchor_frame, log, TAG_IN_CAM_M, model.centers_m, refine=True)
-
-
-def drawn_errors(survey: Truth, at_s: Array, ids: npt.NDArray[np.str_], rng: np.random.Generator) -> Array:
-    """Draw range errors of a radio from the population, some of whose ranges are obstructed."""
-    model, anchors_m = survey.model, survey.anchors_m
-    log = RangeLog.from_arrays(ids, np.ones(len(ids)), timestamp_s=at_s)
-    true = replace(
-        trajectory_from_reconstruction(model.reconstruction, model.timestamps_s),
-        centers=model.centers_m,
-        world_from_cam=model.world_from_cam,
-    )
-    stddevs = {
-        name: float(median * np.exp(spread * rng.standard_normal())) for name, (median, spread) in population().items()
-    }
-    standing_m = np.array([anchors_m[name] for name in log.anchor_ids])
-    errors_m, _ = errors_of_radio(associate(log, true, TAG_IN_CAM_M), true, standing_m, stddevs, None, rng)
-    is_obstructed = rng.random(len(ids)) < OBSTRUCTED_SHARE
-    return np.asarray(np.nan_to_num(errors_m) + is_obstructed * rng.exponential(OBSTRUCTED_MEAN_M, len(ids)))
-
-
-def run(survey: Made, seed: int) -> MetricResult:
-    """Run all stages from the scale on, with all defaults."""
-    settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
-    anchors = tuple(Anchor(name, None if survey.frame == "unknown" else at) for name, at in survey.anchors_m.items())
-    inputs = RangingInputs(
-        survey.log, survey.tag_in_cam_m[None], anchors, survey.frame, Site(np.zeros(3)), Tape(), None, ()
-    )
-    observations = associate(survey.log, survey.trajectory, survey.tag_in_cam_m)
-    sfm = survey.sfm if survey.sfm.num_reg_images() else of_poses(survey.trajectory)
-    path = PathOfModel("sparse/0", sfm, survey.trajectory, observations)
-    run = SurveyRun(settings, inputs, Journal(SilentProgress()))
-    return map_in_metres(run, [path], refine=survey.refine)[1]
-
-
-def of_poses(path: Trajectory) -> pycolmap.Reconstruction:
-    """Make a model without points."""
-    model = synthetic_model(
-        np.arange(float(len(path))), path.centers, path.world_from_cam, num_observations=0, metric_from_sfm=IDENTITY
-    ).reconstruction
-    for image_id, name in zip(sorted(model.reg_image_ids()), path.image_names, strict=True):
-        model.image(image_id).name = name
-    return model
-
-
-def told(survey: Made, kind: str, seed: int) -> Line:
+def told(survey: MadeSurvey, kind: str, seed: int) -> Line:
     """Run a survey, and return the figures that the report needs."""
     line: Line = {"kind": kind, "seed": seed}
     try:
-        metric = run(survey, seed)
+        metric = run_stages(survey, seed)
     except (GeometryError, SolverError) as error:
         return {**line, "refused": str(error)}
-    true_scale = align_points(survey.trajectory.centers, survey.truth_m).scale
     scaled_m, final_m = (metric.trajectory.as_in(model).centers for model in (metric.scaled, metric.final))
     kept = metric.kept_refinement is not None
     estimate = metric.estimate
@@ -236,19 +131,19 @@ def told(survey: Made, kind: str, seed: int) -> Line:
     variances = metric.center_covariance_m2
     known = np.array([variances[name] for name in metric.trajectory.image_names]) if variances else None
     refined_m = None if metric.refined is None else metric.trajectory.as_in(metric.refined).centers
-    off_m = final_m - survey.truth_m
+    off_m = final_m - survey.true_centers_m
     return {
         **line,
         "refused": "",
-        "scaled_m": rmse(scaled_m - survey.truth_m),
+        "scaled_m": rmse(scaled_m - survey.true_centers_m),
         "final_m": rmse(off_m),
-        "refined_m": None if refined_m is None else rmse(refined_m - survey.truth_m),
+        "refined_m": None if refined_m is None else rmse(refined_m - survey.true_centers_m),
         "kept": kept,
         "why_not": list(metric.why_broken),
-        "log_error": float(np.log((delivered or np.nan) / true_scale)),
+        "log_error": float(np.log((delivered or np.nan) / survey.metres_per_unit)),
         "half_width": estimate.uncertainty.half_width_95,
         "stddev": estimate.uncertainty.empirical,
-        "covered": bool(low <= true_scale <= high),
+        "covered": bool(low <= survey.metres_per_unit <= high),
         "places": None if known is None else float(np.sqrt(np.mean(np.sum(off_m**2, axis=1) / _traces(known)))),
         "places_covered": None if known is None else _covered(off_m, known),
         "verdict": estimate.verdict,
@@ -273,9 +168,9 @@ def _covered(off_m: Array, covariances: Array) -> float:
     return float(np.mean(np.abs(off_m[free]) <= 1.96 * stddevs[free]))
 
 
-def surveys(data: Path | None) -> dict[str, Callable[[int], Made]]:
+def surveys(data: Path | None) -> dict[str, Callable[[int], MadeSurvey]]:
     """Functions that simulate a survey, by kind."""
-    found: dict[str, Callable[[int], Made]] = {
+    found: dict[str, Callable[[int], MadeSurvey]] = {
         "lap": lap,
         "lap_unknown": lambda seed: lap(seed, "unknown"),
         "lap_site": lambda seed: lap(seed, "site"),

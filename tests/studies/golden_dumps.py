@@ -42,10 +42,11 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 from tests.simulated import looped
-from tests.studies.drifting_maps import Made, hall, lap_of_drift, of_poses, poses
+from tests.simulated.files import write_anchors, write_model, write_rows
+from tests.simulated.surveys import TAG_IN_CAM_M, MadeSurvey, simulated
+from tests.studies.drifting_maps import hall, lap_of_drift, poses
 from tests.studies.known_positions import POINT_STDDEV_M, RECEIVERS, points_of, track_of
-from tests.studies.measured_distances import KINDS, simulated
-from tests.studies.simulated_survey import TAG_IN_CAM_M
+from tests.studies.measured_distances import KINDS
 
 import rangesfm
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
@@ -68,8 +69,9 @@ NUM_LENGTHS = 3
 
 def write_hall(folder: Path) -> Tables:
     survey, rng = hall(0), np.random.default_rng(1)
-    obstructed_m = (rng.random(len(survey.log)) < 0.25) * rng.exponential(1.0, len(survey.log))
-    return written(replace(survey, log=replace(survey.log, range_m=survey.log.range_m + obstructed_m)), folder)
+    num = len(survey.range_m)
+    survey.range_m = survey.range_m + (rng.random(num) < 0.25) * rng.exponential(1.0, num)
+    return written(survey, folder)
 
 
 def write_room_unknown(folder: Path) -> Tables:
@@ -78,9 +80,8 @@ def write_room_unknown(folder: Path) -> Tables:
 
 def write_yard_loose(folder: Path) -> Tables:
     survey = simulated(KINDS["yard"], 3)[1]
-    assert survey.log.timestamp_s is not None
-    ahead = replace(survey, log=replace(survey.log, timestamp_s=survey.log.timestamp_s + 7.3))
-    tables = written(ahead, folder)
+    survey.time_s = survey.time_s + 7.3
+    tables = written(survey, folder)
     tables["tag"]["tag_in_cam_m"] = (TAG_IN_CAM_M + np.array([0.06, -0.04, 0.05])).tolist()
     tables["ranges"]["time_offset"] = "auto"
     tables["refine"]["lever_arm_stddev_m"] = 0.1
@@ -97,27 +98,27 @@ def write_poses(folder: Path) -> Tables:
 
 def write_known(kind: str, names: Sequence[str], folder: Path) -> Tables:
     """Write a survey with "ranges", "positions", "points" or "lengths", whose errors are the same whatever else is."""
-    truth, survey = simulated(replace(KINDS[kind], frame="site"), SEED)
+    truth, survey = simulated(replace(KINDS[kind], anchor_frame="site"), SEED)
     rng = np.random.default_rng([SEED, 41])
     points, track = points_of(truth, rng), track_of(survey, KINDS[kind].path(SEED), rng)
     has_ranges = "ranges" in names
-    (written if has_ranges else write_model)(survey, folder)
+    (written if has_ranges else write_map)(survey, folder)
     tables = tables_of_files("site" if has_ranges else None)
     if "positions" in names:
         assert track.log.timestamp_s is not None
         rows = np.column_stack([track.log.timestamp_s, track.log.position_m])
         stated_m = float(np.hypot(RECEIVERS["positions"].noise_m, RECEIVERS["positions"].lasting_m))
-        header = ("timestamp_s", "x_m", "y_m", "z_m", "stddev_m")
+        header = "timestamp_s,x_m,y_m,z_m,stddev_m"
         write_rows(folder / "positions.csv", header, [(*row, stated_m) for row in rows.tolist()])
         tables["positions"] = {"path": "positions.csv", "antenna_in_cam_m": TAG_IN_CAM_M.tolist()}
     if "points" in names:
         given = [(each.name, *each.position_m.tolist(), POINT_STDDEV_M, each.kind) for each in points.points]
-        write_rows(folder / "points.csv", ("marker", "x_m", "y_m", "z_m", "stddev_m", "kind"), given)
+        write_rows(folder / "points.csv", "marker,x_m,y_m,z_m,stddev_m,kind", given)
         tables["points"] = {"path": "points.csv"}
     if "lengths" in names:
         ends = zip(points.points[:NUM_LENGTHS], reversed(points.points), strict=False)
         taped = [(a.name, b.name, float(np.linalg.norm(a.position_m - b.position_m))) for a, b in ends]
-        write_rows(folder / "taped.csv", ("from", "to", "distance_m", "stddev_m"), [(*row, 0.015) for row in taped])
+        write_rows(folder / "taped.csv", "from,to,distance_m,stddev_m", [(*row, 0.015) for row in taped])
         tables["scale"]["distances"] = "taped.csv"
     if {"points", "lengths"} & {*names}:
         seen = [
@@ -125,7 +126,7 @@ def write_known(kind: str, names: Sequence[str], folder: Path) -> Tables:
             for name, marker in points.markers.items()
             for photo, pixel in zip(marker.image_names, marker.pixels.tolist(), strict=True)
         ]
-        write_rows(folder / "markers.csv", ("marker", "image_name", "x_px", "y_px"), seen)
+        write_rows(folder / "markers.csv", "marker,image_name,x_px,y_px", seen)
         tables["scale"]["markers"] = "markers.csv"
     return tables
 
@@ -160,25 +161,21 @@ def write_survey(name: str, folder: Path) -> None:
     (folder / "survey.toml").write_text("\n".join(lines), encoding="utf-8")
 
 
-def written(survey: Made, folder: Path) -> Tables:
+def written(survey: MadeSurvey, folder: Path) -> Tables:
     """Write a survey with ranges, and return the tables of its survey file."""
-    write_model(survey, folder)
+    write_map(survey, folder)
     write_ranges_csv(survey.log, folder / "uwb.csv")
-    rows = [(name, *at.tolist()) for name, at in survey.anchors_m.items()]
-    write_rows(folder / "anchors.csv", ("anchor_id", "x_m", "y_m", "z_m"), rows)
-    tables = tables_of_files(survey.frame)
-    tables["refine"]["enabled"] = survey.refine
+    write_anchors(folder / "anchors.csv", survey.anchors_m)
+    tables = tables_of_files(survey.anchor_frame)
+    tables["refine"]["enabled"] = survey.sfm is not None
     return tables
 
 
-def write_model(survey: Made, folder: Path) -> None:
-    """Write the model and the times of its photos."""
-    sfm = survey.sfm if survey.sfm.num_reg_images() else of_poses(survey.trajectory)
-    (folder / "sparse").mkdir()
-    sfm.write_binary(folder / "sparse")
-    assert survey.trajectory.timestamps_s is not None
-    times = zip(survey.trajectory.image_names, survey.trajectory.timestamps_s.tolist(), strict=True)
-    write_rows(folder / "images.csv", ("image_name", "timestamp_s"), times)
+def write_map(survey: MadeSurvey, folder: Path) -> None:
+    path = survey.trajectory
+    assert path.timestamps_s is not None
+    timestamps_s = dict(zip(path.image_names, path.timestamps_s.tolist(), strict=True))
+    write_model(survey.model, folder / "sparse", timestamps_s, folder / "images.csv")
 
 
 def tables_of_files(frame: str | None) -> Tables:
@@ -198,11 +195,6 @@ def tables_of_files(frame: str | None) -> Tables:
         tables["tag"] = {"tag_in_cam_m": TAG_IN_CAM_M.tolist()}
         tables["anchors"] = {"frame": frame} | ({} if frame == "unknown" else {"path": "anchors.csv"})
     return tables
-
-
-def write_rows(path: Path, header: Sequence[str], rows: Any) -> None:
-    cells = [",".join(map(str, row)) for row in rows]
-    path.write_text("\n".join([",".join(header), *cells]) + "\n", encoding="utf-8")
 
 
 # What the program has in memory. Each of these functions knows where it keeps one kind of thing.

@@ -34,10 +34,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tests.studies.drifting_maps import Made
-from tests.studies.measured_distances import KINDS, marks_in, simulated
-from tests.studies.simulated_survey import TAG_IN_CAM_M, photos_adjuster
-from tests.studies.simulated_survey import Survey as Truth
+from tests.simulated.runs import run_stages
+from tests.simulated.surveys import TAG_IN_CAM_M, MadeSurvey, Truth, photos_adjuster, simulated
+from tests.studies.measured_distances import KINDS, marks_in
 
 from rangesfm.ceres.covariance import PhotosAlone
 from rangesfm.ceres.normal_equations import NormalEquations
@@ -54,18 +53,12 @@ from rangesfm.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.positions.position_formats import AUTONOMOUS_STDDEV_M
 from rangesfm.positions.position_log import PositionLog
 from rangesfm.positions.surveyed_positions import SurveyedPositions
-from rangesfm.progress import Journal, SilentProgress
-from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.scale.scale_by_positions import scale_by_positions
 from rangesfm.survey.inputs import RangingInputs
-from rangesfm.survey.settings import Survey
-from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.result_records import points_entry
-from rangesfm.workflows.run import map_in_metres
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]
@@ -108,7 +101,7 @@ def points_of(truth: Truth, rng: np.random.Generator) -> ControlPoints:
     return ControlPoints(points, markers)
 
 
-def track_of(survey: Made, path: CameraPath, rng: np.random.Generator) -> AntennaTrack:
+def track_of(survey: MadeSurvey, path: CameraPath, rng: np.random.Generator) -> AntennaTrack:
     """Return positions of the antenna once a second; their time offset is not known."""
     assert survey.trajectory.timestamps_s is not None
     first_s, last_s = survey.trajectory.timestamps_s[[0, -1]].tolist()
@@ -119,12 +112,12 @@ def track_of(survey: Made, path: CameraPath, rng: np.random.Generator) -> Antenn
     return AntennaTrack(log, TAG_IN_CAM_M, None, RangesOptions())
 
 
-def exif_of(survey: Made, rng: np.random.Generator) -> AntennaTrack:
+def exif_of(survey: MadeSurvey, rng: np.random.Generator) -> AntennaTrack:
     """Return a position of each photo, with the accuracy that is taken for EXIF positions without a word about it."""
     path = survey.trajectory
     assert path.timestamps_s is not None
     covariances = np.tile(AUTONOMOUS_STDDEV_M**2 * np.eye(3), (len(path), 1, 1))
-    at_m = survey.truth_m + RECEIVERS["exif"].errors_m(path.timestamps_s, rng)
+    at_m = survey.true_centers_m + RECEIVERS["exif"].errors_m(path.timestamps_s, rng)
     log = PositionLog(at_m, covariances, None, path.image_names, np.arange(len(path)))
     return AntennaTrack(log, np.zeros(3), None, RangesOptions())
 
@@ -181,11 +174,11 @@ class Known:
 
     names: tuple[str, ...]
     truth: Truth
-    survey: Made
+    survey: MadeSurvey
     surveyed: SurveyedPositions
 
     @classmethod
-    def of(cls, names: Sequence[str], truth: Truth, survey: Made, path: CameraPath, seed: int) -> Known:
+    def of(cls, names: Sequence[str], truth: Truth, survey: MadeSurvey, path: CameraPath, seed: int) -> Known:
         """Draw errors, which are the same whatever else is known."""
         rng = np.random.default_rng([seed, 31])
         points, track = points_of(truth, rng), track_of(survey, path, rng)
@@ -197,13 +190,12 @@ class Known:
 
     def run(self, surveyed: SurveyedPositions, seed: int) -> MetricResult:
         """Run all stages from the scale on, with all defaults."""
-        settings = Survey().changed({"output.seed": seed, "camera.refine_intrinsics": False, "mapper.num_threads": 1})
-        survey, frame = self.survey, "site" if "anchors" in self.names else "unknown"
-        log, arms = (survey.log, survey.tag_in_cam_m[None]) if "ranges" in self.names else (NO_RANGES, np.zeros((0, 3)))
-        anchors = tuple(Anchor(name, survey.anchors_m[name] if frame == "site" else None) for name in log.anchor_ids)
-        inputs = RangingInputs(log, arms, anchors, frame, Site(np.zeros(3)), Tape(), None, (), positions=surveyed)
-        path = PathOfModel("sparse/0", survey.sfm, survey.trajectory, associate(log, survey.trajectory, arms))
-        return map_in_metres(SurveyRun(settings, inputs, Journal(SilentProgress())), [path], refine=True)[1]
+        survey = replace(self.survey, anchor_frame="site" if "anchors" in self.names else "unknown")
+        given = (survey.log, survey.tag_in_cam_m[None], survey.anchors)
+        log, arms_m, anchors = given if "ranges" in self.names else (NO_RANGES, np.zeros((0, 3)), ())
+        frame, site = survey.anchor_frame, Site(np.zeros(3))
+        inputs = RangingInputs(log, arms_m, anchors, frame, site, Tape(), None, (), positions=surveyed)
+        return run_stages(survey, seed, inputs)
 
     def bound(self, pixel_stddev: float) -> tuple[float, float]:
         """Return the Cramer-Rao bound of the scale (relative) and of a coordinate of the place, without ranges.
@@ -246,7 +238,7 @@ def told(known: Known, mistake: str, pixel_stddev: float, seed: int) -> Line:
         metric = known.run(change(known.surveyed), seed)
     except (GeometryError, SolverError) as error:
         return {"refused": str(error), "found": wanted in str(error)}
-    final_m, truth_m = metric.trajectory.as_in(metric.final).centers, known.survey.truth_m
+    final_m, truth_m = metric.trajectory.as_in(metric.final).centers, known.survey.true_centers_m
     off = float(np.log(align_points(final_m, truth_m).scale))
     low, high = metric.estimate.uncertainty.interval_95
     errors = points_entry(metric)
@@ -315,7 +307,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for known, mistake in itertools.product(asked.known, asked.mistakes):
             if (which := (known, mistake, name, seed)) in done:
                 continue
-            made = made or simulated(replace(kind, frame="site"), seed)
+            made = made or simulated(replace(kind, anchor_frame="site"), seed)
             of_survey = Known.of(known.split("+"), *made, kind.path(seed), seed)
             done[which] = told(of_survey, mistake, kind.pixel_stddev, seed)
             if asked.out is not None:

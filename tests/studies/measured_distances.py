@@ -20,18 +20,17 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import lap_path, loop_path, orbit_path, sequence_path
-from tests.studies.drifting_maps import MAST_M, Made, made, run
-from tests.studies.erring_surveys import SITES
-from tests.studies.simulated_survey import SITE_ANCHORS_M, truth_of
-from tests.studies.simulated_survey import Survey as Truth
+from tests.simulated.runs import run_stages
+from tests.simulated.surveys import HALL, SITE_ANCHORS_M, Kind, Truth, simulated
+from tests.studies.drifting_maps import MAST_M
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.distances.map_points import MapPoints
@@ -56,30 +55,6 @@ ROOM_M = {f"R{k}": (x, y, z) for k, (x, y, z) in enumerate(
 ALONG_M = {"B1": (-5.0, 8.0, 3.0), "B2": (15.0, -9.0, 1.0), "B3": (35.0, 9.0, 4.0), "B4": (55.0, -8.0, 0.5)}
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of survey.
-
-    Attributes:
-        path: of the camera, by seed.
-        interval_s: between two photos.
-        anchors_m: positions in the site.
-        frame: of the anchors.
-        num_observations, depth_range_m: of the photos, as in ``synthetic_model``.
-        pixel_stddev: noise of features.
-        rate_hz: of the ranges to each anchor.
-    """
-
-    path: Callable[[int], CameraPath]
-    interval_s: float
-    anchors_m: dict[str, tuple[float, float, float]]
-    frame: str
-    num_observations: int = 100
-    depth_range_m: tuple[float, float] = (2.0, 20.0)
-    pixel_stddev: float = 0.5
-    rate_hz: float = 4.0
-
-
 def _yard(seed: int) -> CameraPath:
     return loop_path(40.0, height_amplitude_m=0.8, unsteadiness_m=0.1, seed=seed)
 
@@ -91,40 +66,32 @@ def _room(seed: int) -> CameraPath:
     )  # fmt: skip
 
 
+ROOM = Kind("room", _room, ROOM_M, "site", interval_s=1.0, num_observations=120, depth_range_m=(0.8, 4.0))
+_FIRST_IN_YARD_M, _THIRD_IN_YARD_M = ({name: SITE_ANCHORS_M[name]} for name in ("A1", "A3"))
 KINDS = {
-    "yard": Kind(_yard, 0.7, SITE_ANCHORS_M, "site"),
-    "yard, one anchor in the first camera's frame": Kind(_yard, 0.7, {"A1": SITE_ANCHORS_M["A1"]}, "first_camera"),
-    "yard, four unknown anchors": Kind(_yard, 0.7, SITE_ANCHORS_M, "unknown"),
-    "yard, one unknown anchor": Kind(_yard, 0.7, {"A3": SITE_ANCHORS_M["A3"]}, "unknown", rate_hz=10.0),
-    "room": Kind(_room, 1.0, ROOM_M, "site", 120, (0.8, 4.0)),
-    "room, six unknown anchors": Kind(_room, 1.0, ROOM_M, "unknown", 120, (0.8, 4.0)),
-    "hall": Kind(SITES[0].path, 1.5, SITES[0].anchors_m, "site", 100, (1.5, 9.0), 0.7, 1.5),
-    "orbit of a drone": Kind(
-        lambda seed: orbit_path(60.0 + seed % 3, radius_m=15.0, height_amplitude_m=3.0), 1.0, SITE_ANCHORS_M, "site",
-        80, (6.0, 40.0),
-    ),
-    "way that never returns": Kind(lambda seed: sequence_path(60.0, seed=seed), 0.8, ALONG_M, "site", 80, (3.0, 25.0)),
-    "part of a lap, one anchor on a mast": Kind(
-        lambda _: lap_path(40.0, share=0.13), 0.6, MAST_M, "first_camera", 120, (6.0, 40.0), 0.3, 8.0
-    ),
-}  # fmt: skip
-
-
-def simulated(kind: Kind, seed: int) -> tuple[Truth, Made]:
-    """Simulate a survey, and map it."""
-    path = kind.path(seed)
-    times = np.arange(path.start_s, path.end_s - 1e-6, kind.interval_s)
-    truth = truth_of(
-        path,
-        times,
-        kind.anchors_m,
-        kind.frame,
-        num_observations=kind.num_observations,
-        depth_range_m=kind.depth_range_m,
+    kind.name: kind
+    for kind in (
+        Kind("yard", _yard, SITE_ANCHORS_M, "site", interval_s=0.7),
+        Kind("yard, one anchor in the first camera's frame", _yard, _FIRST_IN_YARD_M, "first_camera", interval_s=0.7),
+        Kind("yard, four unknown anchors", _yard, SITE_ANCHORS_M, "unknown", interval_s=0.7),
+        Kind("yard, one unknown anchor", _yard, _THIRD_IN_YARD_M, "unknown", interval_s=0.7, rate_hz=10.0),
+        ROOM,
+        replace(ROOM, name="room, six unknown anchors", anchor_frame="unknown"),
+        replace(HALL, interval_s=1.5, tag_in_cam_m=Kind.tag_in_cam_m),
+        Kind(
+            "orbit of a drone", lambda seed: orbit_path(60.0 + seed % 3, radius_m=15.0, height_amplitude_m=3.0),
+            SITE_ANCHORS_M, "site", interval_s=1.0, num_observations=80, depth_range_m=(6.0, 40.0),
+        ),
+        Kind(
+            "way that never returns", lambda seed: sequence_path(60.0, seed=seed), ALONG_M, "site", interval_s=0.8,
+            num_observations=80, depth_range_m=(3.0, 25.0),
+        ),
+        Kind(
+            "part of a lap, one anchor on a mast", lambda _: lap_path(40.0, share=0.13), MAST_M, "first_camera",
+            interval_s=0.6, rate_hz=8.0, num_observations=120, depth_range_m=(6.0, 40.0), pixel_stddev=0.3,
+        ),
     )
-    step_s = 1 / (kind.rate_hz * len(kind.anchors_m))
-    at_s = np.arange(times[0] + step_s / 2, times[-1], step_s)
-    return truth, made(truth, path, at_s, kind.pixel_stddev, seed, 0.1, with_radio=True)
+}  # fmt: skip
 
 
 def marks_in(truth: Truth, rng: np.random.Generator) -> tuple[dict[str, Marker], dict[str, Array]]:
@@ -170,7 +137,7 @@ def told(name: str, seed: int) -> Line:
     truth, survey = simulated(KINDS[name], own_seed)
     rng = np.random.default_rng([own_seed, 21])
     try:
-        metric = run(survey, own_seed)
+        metric = run_stages(survey, own_seed)
     except (GeometryError, SolverError) as error:
         return {**line, "refused": str(error)}
     if metric.kept_refinement is None or metric.map_errors is None:

@@ -29,14 +29,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tests.studies.erring_photos import run_with_photos, surveyed_with_photos
-from tests.studies.erring_surveys import SITES, X_FORWARD, Z_UP, Array, Given, Run, run, surveyed
+import numpy.typing as npt
+from tests.simulated.runs import Run, run, run_with_photos
+from tests.simulated.surveys import SITES, MadeSurvey, surveyed, surveyed_with_photos
 from tests.studies.real_room import real_room
 
-Mistake = Callable[[Given, float, np.random.Generator], None]
+Array = npt.NDArray[np.float64]
+
+Mistake = Callable[[MadeSurvey, float, np.random.Generator], None]
 Line = dict[str, Any]
 Lines = dict[tuple[str, str, int], Line]
 CLEAN = "clean"
+# A camera's axes (x right, y down, z forward) in terms of a robot's (x forward, y left, z up).
+Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+X_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 # Sizes in terms of the smallest size that is found; mistakes of twice that size must be found.
 FACTORS = (2.0, 1.0, 2.0, 5.0)
 
@@ -139,25 +145,25 @@ def kinds(ids: list[str]) -> list[Kind]:
 
 
 def _place(name: str, axis: int) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         given.anchors_m[name] = given.anchors_m[name] + rng.choice([-1, 1]) * size * np.eye(3)[axis]
 
     return make
 
 
 def _bias(name: str, sign: int = 1) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         given.range_m = given.range_m + sign * size * given.is_of(name)
 
     return make
 
 
-def _common(given: Given, size: float, rng: np.random.Generator) -> None:
+def _common(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.range_m = given.range_m + size
 
 
 def _moved(name: str, share: float) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         direction = rng.normal(size=3) * [1, 1, 0.3]
         at = given.true_anchors_m[name]
         to = at + size * direction / np.linalg.norm(direction)
@@ -169,7 +175,7 @@ def _moved(name: str, share: float) -> Mistake:
 
 
 def _step(name: str | None, share: float) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         is_of = np.ones(len(given.time_s), dtype=bool) if name is None else given.is_of(name)
         given.range_m = given.range_m + size * (is_of & (given.time_s > np.quantile(given.time_s, share)))
 
@@ -177,7 +183,7 @@ def _step(name: str | None, share: float) -> Mistake:
 
 
 def _stretch(name: str | None, share: float) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         is_of = np.ones(len(given.time_s), dtype=bool) if name is None else given.is_of(name)
         low, high = np.quantile(given.time_s, [share, share + 0.15])
         given.range_m = given.range_m + size * (is_of & (given.time_s > low) & (given.time_s < high))
@@ -186,14 +192,14 @@ def _stretch(name: str | None, share: float) -> Mistake:
 
 
 def _stuck(name: str) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         given.range_m = np.where(given.is_of(name), np.median(given.range_m[given.is_of(name)]), given.range_m)
 
     return make
 
 
 def _blocked(name: str) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         is_long = given.is_of(name) & (rng.random(len(given.time_s)) < 0.7)
         given.range_m = given.range_m + is_long * rng.exponential(1.5, len(given.time_s))
 
@@ -201,52 +207,52 @@ def _blocked(name: str) -> Mistake:
 
 
 def _long_share(share: float) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         is_long = rng.random(len(given.time_s)) < share
         given.range_m = given.range_m + is_long * rng.exponential(1.0, len(given.time_s))
 
     return make
 
 
-def _noisy(given: Given, size: float, rng: np.random.Generator) -> None:
+def _noisy(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.range_m = given.range_m + 0.5 * rng.standard_normal(len(given.time_s))
 
 
 def _lever(axis: int) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         given.tag_in_cam_m = given.tag_in_cam_m + rng.choice([-1, 1]) * size * np.eye(3)[axis]
 
     return make
 
 
-def _lever_forgotten(given: Given, size: float, rng: np.random.Generator) -> None:
+def _lever_forgotten(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.tag_in_cam_m = np.zeros(3)
 
 
 def _lever_turned(axes: Array) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         given.tag_in_cam_m = axes @ given.tag_in_cam_m
 
     return make
 
 
 def _clock(sign: int) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         given.time_offset_s = given.time_offset_s + sign * size
 
     return make
 
 
-def _clock_drift(given: Given, size: float, rng: np.random.Generator) -> None:
+def _clock_drift(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     middle = given.time_s.mean()
     given.time_s = middle + (1 + size) * (given.time_s - middle)
 
 
-def _clock_jump(given: Given, size: float, rng: np.random.Generator) -> None:
+def _clock_jump(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.time_s = given.time_s + size * (given.time_s > np.quantile(given.time_s, 0.5))
 
 
-def _tag_slips(given: Given, size: float, rng: np.random.Generator) -> None:
+def _tag_slips(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     """Let the tag slip along the camera's z at half time, so that its measured position is wrong from then on."""
     after = given.time_s > np.quantile(given.time_s, 0.5)
     slipped_m = given.tags_m + after[:, None] * (
@@ -255,13 +261,12 @@ def _tag_slips(given: Given, size: float, rng: np.random.Generator) -> None:
     given.range_m = given.range_m + _grown(given, slipped_m)
 
 
-def _grown(given: Given, tags_m: Array) -> Array:
+def _grown(given: MadeSurvey, tags_m: Array) -> Array:
     """(n,) increase of the distances if the tags were at ``tags_m``."""
-    anchors_m = np.array(list(given.true_anchors_m.values()))[given.anchor]
-    return np.asarray(np.linalg.norm(tags_m - anchors_m, axis=1) - np.linalg.norm(given.tags_m - anchors_m, axis=1))
+    return replace(given, tags_m=tags_m).distances_m - given.distances_m
 
 
-def _map_breaks(given: Given, size: float, rng: np.random.Generator) -> None:
+def _map_breaks(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     """Displace the second half of the map, as a false match would; its true place is then that of the first half."""
     path = given.trajectory
     times = path.timestamps_s
@@ -272,34 +277,34 @@ def _map_breaks(given: Given, size: float, rng: np.random.Generator) -> None:
     given.trajectory = replace(path, centers=path.centers + after * by)
 
 
-def _warming(given: Given, size: float, rng: np.random.Generator) -> None:
+def _warming(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     """Let all ranges grow over time."""
     given.range_m = given.range_m + size * (given.time_s - given.time_s.min()) / np.ptp(given.time_s)
 
 
-def _body(given: Given, size: float, rng: np.random.Generator) -> None:
+def _body(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     """Lengthen the ranges to anchors behind the person who carries the camera."""
-    to_anchor = np.array(list(given.true_anchors_m.values()))[given.anchor] - given.tags_m
-    given.range_m = given.range_m + size * (np.sum(to_anchor * given.world_from_cam[:, :, 2], axis=1) < 0)
+    ahead = given.world_from_cam[:, :, 2]
+    given.range_m = given.range_m + size * (np.sum(given.from_anchor_m * ahead, axis=1) > 0)
 
 
-def _whole_seconds(given: Given, size: float, rng: np.random.Generator) -> None:
+def _whole_seconds(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.time_s = np.floor(given.time_s)
 
 
-def _reversed(given: Given, size: float, rng: np.random.Generator) -> None:
+def _reversed(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.time_s = given.time_s.min() + given.time_s.max() - given.time_s
 
 
 def _ranges_times(factor: float) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         given.range_m = given.range_m * factor
 
     return make
 
 
 def _two_places(ids: Sequence[str]) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         for name, axis in ((ids[1], 0), (ids[2], 1)):
             _place(name, axis)(given, size, rng)
 
@@ -307,7 +312,7 @@ def _two_places(ids: Sequence[str]) -> Mistake:
 
 
 def _coordinate(name: str, axis: int, factor: float) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         at = given.anchors_m[name].copy()
         at[axis] *= factor
         given.anchors_m[name] = at
@@ -315,13 +320,13 @@ def _coordinate(name: str, axis: int, factor: float) -> Mistake:
     return make
 
 
-def _rotated(given: Given, size: float, rng: np.random.Generator) -> None:
+def _rotated(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     at = list(given.anchors_m.values())
     given.anchors_m = dict(zip(given.anchors_m, [*at[1:], at[0]], strict=True))
 
 
 def _taken_for(name: str, other: str) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         rows = np.flatnonzero(given.is_of(name) & (rng.random(len(given.time_s)) < 1 / 3))
         true = given.true_anchors_m
         longer = [np.linalg.norm(given.tags_m[rows] - true[each], axis=1) for each in (other, name)]
@@ -330,27 +335,27 @@ def _taken_for(name: str, other: str) -> Mistake:
     return make
 
 
-def _range_share(given: Given, size: float, rng: np.random.Generator) -> None:
+def _range_share(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.range_m = given.range_m * (1 + size)
 
 
-def _anchor_share(given: Given, size: float, rng: np.random.Generator) -> None:
+def _anchor_share(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.anchors_m = {name: at * (1 - size) for name, at in given.anchors_m.items()}
 
 
-def _feet(given: Given, size: float, rng: np.random.Generator) -> None:
+def _feet(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
     given.anchors_m = {name: at / 0.3048 for name, at in given.anchors_m.items()}
 
 
 def _axes(axes: Array) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         given.anchors_m = {name: axes @ at for name, at in given.anchors_m.items()}
 
     return make
 
 
 def _swap(first: str, second: str) -> Mistake:
-    def make(given: Given, size: float, rng: np.random.Generator) -> None:
+    def make(given: MadeSurvey, size: float, rng: np.random.Generator) -> None:
         anchors = given.anchors_m
         given.anchors_m = {**anchors, first: anchors[second], second: anchors[first]}
 
@@ -375,12 +380,12 @@ def main() -> None:
     if args.report:
         report(list(done.values()))
         return
-    sites = [(site.name, site.frame, list(site.anchors_m), partial(surveyed, site)) for site in SITES]
+    sites = [(site.name, site.anchor_frame, list(site.anchors_m), partial(surveyed, site)) for site in SITES]
     if args.photos:
         sites = [
             (f"{site.name}, photos", "site", list(site.anchors_m), partial(surveyed_with_photos, site))
             for site in SITES
-            if site.frame == "site"
+            if site.anchor_frame == "site"
         ]
     if args.room:
         sites = [
@@ -405,12 +410,12 @@ def main() -> None:
                         out.flush()
 
 
-def outcome(given: Given, seed: int) -> Run:
+def outcome(given: MadeSurvey, seed: int) -> Run:
     return run(given, seed) if given.sfm is None else run_with_photos(given, seed)
 
 
 def runs_of_seed(
-    survey: str, numbered_kinds: Sequence[tuple[int, Kind]], make: Callable[[int], Given], seed: int, done: Lines
+    survey: str, numbered_kinds: Sequence[tuple[int, Kind]], make: Callable[[int], MadeSurvey], seed: int, done: Lines
 ) -> Iterator[Line]:
     """Yield the runs of a seed that are not done yet; a kind's number and the seed decide on the mistake's size."""
     clean = done.get((survey, CLEAN, seed))
@@ -461,7 +466,7 @@ def told(
         "wrong": run_.is_wrong,
         "place": run_.place_in_stddevs,
         "half_width": run_.estimate.uncertainty.half_width_95,
-        "log_error": float(np.log(run_.estimate.value / run_.given.metres_per_unit)),
+        "log_error": float(np.log(run_.estimate.value / run_.survey.metres_per_unit)),
         "hidden": max(effects, default=None),
         "smallest": {f"{t.name} {t.subject}".strip(): t.smallest_detectable for t in tests} if kind == CLEAN else None,
     }

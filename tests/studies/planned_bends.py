@@ -16,28 +16,31 @@ from functools import partial
 
 import numpy as np
 from tests.planning.plans import free_bend_m
-from tests.studies.kept_runs import Row, spread, study
-from tests.studies.simulated_survey import (
-    RANGE_MODEL,
+from tests.simulated.looped import ScaledMap
+from tests.simulated.path import lap_path
+from tests.simulated.surveys import (
+    RANGE_STDDEV_M,
     TAG_IN_CAM_M,
-    Survey,
-    drawn_biases,
-    lap_survey,
+    Array,
+    Truth,
     mapped,
     range_log,
-    run_stages,
-    unit_pixel_errors,
-    yard_survey,
+    truth_of,
+    yard_truth,
 )
+from tests.studies.kept_runs import Row, spread, study
 
+from rangesfm.estimation.with_ranges import refine_with_ranges
 from rangesfm.geometry.similarity import align_points, rmse
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.options import CameraOptions, RangeModelOptions
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import COMPONENTS
 
+RANGE_MODEL = RangeModelOptions()
 # Of the simulated camera.
 _WIDTH_PX, _FOCAL_PX = 960, 750.0
 _FIELD_OF_VIEW_DEG = float(2 * np.rad2deg(np.arctan(_WIDTH_PX / 2 / _FOCAL_PX)))
@@ -54,17 +57,18 @@ def photos(num_points: int, seen_m: tuple[float, float], max_track_length: int |
     )
 
 
-def lap(num_observations: int) -> Survey:
-    """A quarter of a lap, with 150 keyframes."""
-    return lap_survey(num_observations=num_observations, anchor_m=(10.0, 5.0, 4.0), num_keyframes=150)
+def lap(num_observations: int) -> Truth:
+    """A quarter of a rover's lap around a soccer field, with 150 keyframes; the anchor is beside the field's middle."""
+    path, times = lap_path(300.0, share=0.98 / 4), np.linspace(0.0, 300.0, 150)
+    return truth_of(path, times, {"A1": (10.0, 5.0, 4.0)}, "first_camera", num_observations, (6.0, 40.0))
 
 
 IN_YARD, ON_LAP = (2.0, 20.0), (6.0, 40.0)
-SURVEYS: dict[str, tuple[Callable[[], Survey], PlannedPhotos, float]] = {
-    "yard, closed loop": (yard_survey, photos(80, IN_YARD, None, 1.0), 1.0),
-    "yard, open": (partial(yard_survey, max_track_length=8), photos(80, IN_YARD, 8, 1.0), 1.0),
+SURVEYS: dict[str, tuple[Callable[[], Truth], PlannedPhotos, float]] = {
+    "yard, closed loop": (yard_truth, photos(80, IN_YARD, None, 1.0), 1.0),
+    "yard, open": (partial(yard_truth, max_track_length=8), photos(80, IN_YARD, 8, 1.0), 1.0),
     "yard, open, one known anchor": (
-        partial(yard_survey, anchor_frame="first_camera", max_track_length=8),
+        partial(yard_truth, anchor_frame="first_camera", max_track_length=8),
         photos(80, IN_YARD, 8, 1.0),
         1.0,
     ),
@@ -73,7 +77,7 @@ SURVEYS: dict[str, tuple[Callable[[], Survey], PlannedPhotos, float]] = {
 }
 
 
-def planned(survey: Survey, seen: PlannedPhotos) -> PlannedSurvey:
+def planned(survey: Truth, seen: PlannedPhotos) -> PlannedSurvey:
     model = survey.model
     # One range to each anchor at each photo, however far apart the photos are.
     times = np.arange(len(model.timestamps_s)) / 2
@@ -88,7 +92,7 @@ def planned(survey: Survey, seen: PlannedPhotos) -> PlannedSurvey:
         RANGE_MODEL,
         component_stddevs=nothing
         | {
-            "white": survey.range_stddev_m,
+            "white": RANGE_STDDEV_M,
             "bias": RANGE_MODEL.range_bias_stddev_m,
             "common_bias": RANGE_MODEL.common_bias_stddev_m,
         },
@@ -96,14 +100,31 @@ def planned(survey: Survey, seen: PlannedPhotos) -> PlannedSurvey:
     )
 
 
-def one_run(survey: Survey, pixel_stddev: float, seed: int) -> Row:
+def drawn_biases(survey: Truth, seed: int) -> Array:
+    """Draw (num_anchors,) biases from the prior that the stages assume: a part for each anchor, and a common part."""
+    rng = np.random.default_rng([seed, 2])
+    own = RANGE_MODEL.range_bias_stddev_m * rng.standard_normal(len(survey.anchors_m))
+    return np.asarray(own + RANGE_MODEL.common_bias_stddev_m * rng.standard_normal())
+
+
+def one_run(survey: Truth, pixel_stddev: float, seed: int) -> Row:
     """Return the root mean square errors of the keyframes: refined, and before that after the best similarity."""
-    sfm = mapped(survey, pixel_stddev * unit_pixel_errors(survey, seed))
-    log = range_log(survey, seed, biases_m=drawn_biases(survey, seed))
-    truth = survey.model.centers_m
-    free = trajectory_from_reconstruction(sfm, survey.model.timestamps_s).centers
-    done = run_stages(survey, sfm, log)
-    return {"refined": rmse(done.refined.centers - truth), "bend": rmse(align_points(free, truth).apply(free) - truth)}
+    sfm = mapped(survey, pixel_stddev, seed)
+    made = ScaledMap.of(survey, sfm, range_log(survey, seed, biases_m=drawn_biases(survey, seed)))
+    truth, free, estimate = survey.model.centers_m, made.trajectory.centers, made.estimate
+    refined, _ = refine_with_ranges(
+        made.scaled,
+        made.trajectory,
+        estimate.observations,
+        estimate.metric_from_sfm,
+        estimate.anchors,
+        estimate.errors,
+        tag_in_cam_m=TAG_IN_CAM_M,
+        first_pose_is_fixed=survey.is_in_first_camera,
+        camera=CameraOptions(refine_intrinsics=False),
+        num_threads=1,
+    )
+    return {"refined": made.error_m(refined), "bend": rmse(align_points(free, truth).apply(free) - truth)}
 
 
 def rms(stddevs: Expected) -> float:

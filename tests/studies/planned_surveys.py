@@ -20,24 +20,35 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from tests.simulated.path import lap_path, loop_path, sequence_path
-from tests.simulated.surveys import METRES_PER_UNIT, Measured, measured
+from tests.simulated.radio_errors import errors_of_radio
+from tests.simulated.surveys import METRES_PER_UNIT, in_world_of_its_own
 from tests.studies.kept_runs import Row, Study, spread, study
 
 from rangesfm.demo.simulated_radio import CameraPath
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.components import stddevs_in
+from rangesfm.ranging.errors.learned import usual_stddevs
+from rangesfm.ranging.range_log import RangeLog
+from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.range_equation import RangeState
+from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
 from rangesfm.scale.solution import solution_from
 
 Array = npt.NDArray[np.float64]
+
+# How far maps bend.
+BENDING_M = 0.007
 Place = tuple[float, float, float]
 
 RADIOS = {
@@ -122,41 +133,101 @@ SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
 }
 
 
+def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
+    """Stddevs of the components of the range errors: the plan's, or those that radios have on average."""
+    usual = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None)
+    return usual | {"bending": BENDING_M} | dict(planned.component_stddevs)
+
+
+def measured(
+    planned: PlannedSurvey, seed: int
+) -> tuple[RangeObservations, Trajectory, tuple[Anchor, ...], LocatedDistances | None]:
+    """Simulate one such survey: all of its ranges, on a bent map, the anchors as told, and the taped lengths."""
+    rng = np.random.default_rng(seed)
+    stddevs, true = stddevs_of(planned), planned.trajectory
+    times = true.timestamps_s
+    assert times is not None
+    ids = [anchor.anchor_id for anchor in planned.anchors]
+    turn = np.arange(planned.num_ranges)
+    at_s = times[0] + (turn + 0.5) / (planned.rate_hz * len(ids))
+    log = RangeLog.from_arrays([ids[k] for k in turn % len(ids)], np.ones(len(turn)), timestamp_s=at_s)
+    places = associate(log, true, planned.tag_in_cam_m)
+    standing_m = np.array([planned.anchors_m[ids.index(name)] for name in log.anchor_ids])
+    errors_m, distance_m = errors_of_radio(places, true, standing_m, stddevs, planned.curve_stddev_m, rng)
+    ranges_m = np.maximum(np.nan_to_num(distance_m + errors_m, nan=1.0), 0.02)
+    curve = None if planned.curve_stddev_m is None else np.full(len(log), planned.curve_stddev_m)
+    log = replace(log, range_m=ranges_m, shared_stddev_m=curve)
+    bent = replace(true, centers=true.centers + stddevs["bending"] * _bend(times, rng))
+    of_map = in_world_of_its_own(rng)
+    seen = bent.transformed(of_map.scale, of_map.rotation, of_map.translation)
+    return associate(log, seen, planned.tag_in_cam_m), seen, _told(planned, rng), _taped(planned, rng)
+
+
+def _bend(times: Array, rng: np.random.Generator) -> Array:
+    """(n, 3) curve of stddev 1 in each coordinate, smooth within an eighth of the time."""
+    knots = np.linspace(times[0], times[-1], 60)
+    apart = (knots[:, None] - knots) / (np.ptp(times) / 8)
+    lower = np.linalg.cholesky(np.exp(-0.5 * apart**2) + 1e-9 * np.eye(len(knots)))
+    return np.stack([np.interp(times, knots, lower @ rng.standard_normal(len(knots))) for _ in range(3)], axis=1)
+
+
+def _told(planned: PlannedSurvey, rng: np.random.Generator) -> tuple[Anchor, ...]:
+    if planned.anchor_frame == "unknown":
+        return tuple(replace(anchor, position_m=None) for anchor in planned.anchors)
+    path = planned.trajectory
+    first = Similarity(1.0, path.world_from_cam[0], path.centers[0])
+    into = first.inverse() if planned.anchor_frame == "first_camera" else Similarity(1.0, np.eye(3), np.zeros(3))
+    return tuple(
+        replace(anchor, position_m=into.apply(at) + anchor.position_stddev_m * rng.standard_normal(3))
+        for anchor, at in zip(planned.anchors, planned.anchors_m, strict=True)
+    )
+
+
+def _taped(planned: PlannedSurvey, rng: np.random.Generator) -> LocatedDistances | None:
+    if not planned.taped:
+        return None
+    lengths, stddevs = np.array(planned.taped, dtype=np.float64).T
+    found = lengths + stddevs * rng.standard_normal(len(lengths))
+    bent = lengths * (1 + BENDING * rng.standard_normal(len(lengths)))
+    return LocatedDistances.of(found, stddevs, model_length=bent / METRES_PER_UNIT)
+
+
 def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole: bool) -> Row:
     """Return the errors of the scale's logarithm and of one keyframe's place (metres).
 
     A whole run also has its stated stddev.
     """
-    made = measured(planned, seed)
+    observations, trajectory, anchors, distances = measured(planned, seed)
     found: Row = {}
     try:
         if is_whole:
             estimate = initialize_scale(
-                made.observations,
-                made.trajectory,
-                made.anchors,
+                observations,
+                trajectory,
+                anchors,
                 anchor_frame=planned.anchor_frame,
                 options=ScaleOptions(max_relative_stddev=0.5),
                 range_model=planned.range_model,
-                distances=made.distances,
+                distances=distances,
                 seed=seed,
             )
             metric_from_map, found["stated"] = estimate.metric_from_sfm, estimate.uncertainty.empirical
         else:
-            posed = scale_problem(made.observations, made.trajectory, made.anchors, planned.anchor_frame,
-                                  planned.range_model, made.distances)  # fmt: skip
-            fit = solution_from(posed, truth(planned, made, posed)).fit
+            posed = scale_problem(
+                observations, trajectory, anchors, planned.anchor_frame, planned.range_model, distances
+            )
+            fit = solution_from(posed, truth(planned, posed)).fit
             metric_from_map = fit.state.metric_from_model @ posed.first_camera_from_sfm
     except GeometryError as error:
         return found | {"refused": str(error)}
     found["scale"] = float(np.log(metric_from_map.scale / METRES_PER_UNIT))
     if keyframe is not None:
-        at = metric_from_map.apply(made.trajectory.centers[keyframe])
+        at = metric_from_map.apply(trajectory.centers[keyframe])
         found["place"] = (at - planned.trajectory.centers[keyframe]).tolist()
     return found
 
 
-def truth(planned: PlannedSurvey, made: Measured, posed: ScaleProblem) -> RangeState:
+def truth(planned: PlannedSurvey, posed: ScaleProblem) -> RangeState:
     """Return a start at the truth; a whole search takes ten times as long and ends at the same solution."""
     state = planned.state(posed)
     return replace(state, metric_from_model=replace(state.metric_from_model, scale=METRES_PER_UNIT))

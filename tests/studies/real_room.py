@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation, Slerp
-from tests.studies.erring_surveys import Given
+from tests.simulated.surveys import MadeSurvey
 
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.similarity import align_points
@@ -23,7 +23,7 @@ EVERY = 10
 MAX_GAP_S = 0.05
 
 
-def real_room(folder: Path, model: Path, seed: int) -> Given:
+def real_room(folder: Path, model: Path, seed: int) -> MadeSurvey:
     """Read a tenth of the ranges: every tenth, starting at another one for each seed."""
     trajectory, times, centers_m, rotations = path_and_truth(folder, model)
     log = read_ranges(folder / "uwb.csv")
@@ -40,10 +40,11 @@ def real_room(folder: Path, model: Path, seed: int) -> Given:
     anchors_m = {name: anchors_m[name] for name in log.anchor_ids}
     at_photos = interpolated(times, centers_m, np.asarray(trajectory.timestamps_s))
     is_known = np.isfinite(at_photos).all(axis=1)
-    return Given(
+    return MadeSurvey(
+        sfm=None,
         trajectory=trajectory,
         anchors_m=dict(anchors_m),
-        frame="site",
+        anchor_frame="site",
         tag_in_cam_m=tag_in_cam_m,
         time_s=time_s,
         anchor=log.anchor_index[rows],

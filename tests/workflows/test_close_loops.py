@@ -11,7 +11,7 @@ import pytest
 from tests.known import known
 from tests.outputs import names_in
 from tests.simulated.looped import bent_laps, two_laps, write_matches, write_survey
-from tests.studies.simulated_survey import TAG_IN_CAM_M
+from tests.simulated.surveys import TAG_IN_CAM_M
 
 from rangesfm.errors import InputError
 from rangesfm.estimation.refinement import MapAtRest

@@ -13,9 +13,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tests.known import assert_scale, known
+from tests.simulated.files import write_model, write_rows
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import loop_path
-from tests.studies.simulated_survey import mapped, unit_pixel_errors, yard_survey
+from tests.simulated.surveys import mapped, yard_truth
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError, InputError
@@ -349,15 +350,12 @@ def _by_photo(walk: Walk, where: Path, spelt: Callable[[str], str]) -> Survey:
 
 
 def test_positions_of_two_centimetres_bend_a_map_back_that_its_photos_let_drift(tmp_path: Path) -> None:
-    truth = yard_survey(max_track_length=4)
-    (tmp_path / "sparse").mkdir()
-    mapped(truth, 5.0 * unit_pixel_errors(truth, 1)).write(tmp_path / "sparse")
+    truth = yard_truth(max_track_length=4)
     times_s, centers_m = truth.model.timestamps_s, truth.model.centers_m
-    images = (f"{name},{time!r}\n" for name, time in times_s.items())
-    (tmp_path / "images.csv").write_text(f"image_name,timestamp_s\n{''.join(images)}")
+    write_model(mapped(truth, 5.0, 1), tmp_path / "sparse", times_s, tmp_path / "images.csv")
     at_m = centers_m + 0.02 * np.random.default_rng(3).standard_normal(centers_m.shape)
-    rows = (f"{t!r},{x:.4f},{y:.4f},{z:.4f},0.02\n" for t, (x, y, z) in zip(times_s.values(), at_m, strict=True))
-    (tmp_path / "positions.csv").write_text(f"timestamp_s,x_m,y_m,z_m,stddev_m\n{''.join(rows)}")
+    rows = ((time, *place_m, 0.02) for time, place_m in zip(times_s.values(), at_m.round(4).tolist(), strict=True))
+    write_rows(tmp_path / "positions.csv", "timestamp_s,x_m,y_m,z_m,stddev_m", rows)
     walk = Walk(tmp_path, truth.model, loop_path(40.0))
     survey = walk.survey(
         tmp_path,

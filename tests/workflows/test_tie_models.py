@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from tests.simulated.looped import LoopedSurvey, two_aisles, two_laps, write_matches
 from tests.simulated.model import random_similarity
-from tests.studies.simulated_survey import TAG_IN_CAM_M, range_log
+from tests.simulated.surveys import TAG_IN_CAM_M, range_log
 
 from rangesfm.colmap.transform import rescale, without_photos
 from rangesfm.distances.tape import Tape

@@ -1,0 +1,24 @@
+"""The files of a simulated survey."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import pycolmap
+
+
+def write_rows(path: Path, header: str, rows: Iterable[Iterable[object]]) -> None:
+    """Write a table as CSV."""
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n", encoding="utf-8")
+
+
+def write_model(sfm: pycolmap.Reconstruction, sparse: Path, timestamps_s: Mapping[str, float], images: Path) -> None:
+    """Write a model into a folder, and the times of its photos into a file."""
+    sparse.mkdir(parents=True)
+    sfm.write_binary(sparse)
+    write_rows(images, "image_name,timestamp_s", timestamps_s.items())
+
+
+def write_anchors(path: Path, anchors_m: Mapping[str, Iterable[float]]) -> None:
+    write_rows(path, "anchor_id,x_m,y_m,z_m", ((name, *map(float, at)) for name, at in anchors_m.items()))
