@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
@@ -119,13 +119,17 @@ class Measurements(ABC):
             poses: rig_from_world (7,) of each keyframe. blocks: parameter blocks by name.
 
         Returns:
-            Index of each residual among those of the problem.
+            Index of each residual among those of the problem, in the order of the measurements.
         """
 
     @property
     def blocks(self) -> Mapping[Block, Array]:
         """Start values of the blocks that they bring along, which are estimated or held."""
         return {}
+
+    def priors(self) -> Iterator[Measurements]:
+        """Yield what was known of the blocks before."""
+        yield from ()
 
     @property
     def fixed(self) -> frozenset[Block]:

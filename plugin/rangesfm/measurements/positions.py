@@ -98,7 +98,8 @@ class AntennaPositions(Measurements):
     def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
         first, at, roots = adjustment.adjuster.problem.num_residuals(), self.places, self._root_information
         arm_is_free, clock_is_free = self.arm_stddev_m > 0, self.clock_stddev_s > 0
-        for rows in rows_by_key(at.before, at.after):
+        groups = rows_by_key(at.before, at.after)
+        for rows in groups:
             ends = list(dict.fromkeys((int(at.before[rows[0]]), int(at.after[rows[0]]))))
             is_between = len(ends) == 2
             cost = ceres.position_cost(
@@ -114,7 +115,8 @@ class AntennaPositions(Measurements):
             further = [blocks[ARM]] if arm_is_free else []
             further += [blocks[CLOCK]] if is_between and clock_is_free else []
             ceres.add_residual_block(adjustment.adjuster, cost, None, [*(poses[end] for end in ends), *further])
-        return np.arange(first, adjustment.adjuster.problem.num_residuals())
+        coordinates = (3 * np.concatenate(groups)[:, None] + np.arange(3)).ravel()
+        return np.asarray(first + np.argsort(coordinates))
 
     def like(self, other: AntennaPositions) -> AntennaPositions:
         return replace(self, factor=other.factor)

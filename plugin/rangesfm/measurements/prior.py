@@ -52,11 +52,19 @@ class Prior(Measurements):
         return Linearization.without_poses(off.reshape(1, -1), by_block)
 
     def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
-        """Add the prior, if the problem has all of its blocks."""
+        """Add the prior, if the problem has its blocks.
+
+        Raises:
+            ValueError: the problem has some of the blocks only.
+        """
         first, problem = adjustment.adjuster.problem.num_residuals(), adjustment.adjuster.problem
         own = [blocks[name] for name in self.names]
-        if not all(problem.has_parameter_block(block) for block in own):
+        are_there = [problem.has_parameter_block(block) for block in own]
+        if not any(are_there):
             return np.zeros(0, dtype=np.int64)
+        if not all(are_there):
+            missing = [name for name, is_there in zip(self.names, are_there, strict=True) if not is_there]
+            raise ValueError(f"a joint prior of {self.names}, but nothing else depends on {missing}")
         if len(own) == 1:
             stddev = 1 / (self.root_information[0, 0] * adjustment.pixel_stddev)
             ceres.add_normal_prior(adjustment.adjuster, own[0], self.mean[0], stddev)

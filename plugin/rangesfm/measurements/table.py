@@ -129,7 +129,8 @@ class Measured:
         ranges = self.ranges
         if len(ranges.rows):
             ranges = ranges.begun(MapState(poses, ranges.blocks))
-        return tuple(replace(self, ranges=ranges)._kinds(points, trajectory))
+        kinds = tuple(replace(self, ranges=ranges)._kinds(points, trajectory))
+        return (*kinds, *(prior for kind in kinds for prior in kind.priors()))
 
     @property
     def _placed_anchors(self) -> Iterator[AnchorEstimate]:
@@ -141,11 +142,8 @@ class Measured:
         for lengths in (self._taped(points), self._by_radio(points)):
             if len(lengths.ends):
                 yield lengths
-                yield from lengths.priors()
         for used in self.positions:
             yield from _of_positions(used, points, trajectory, self.ranges.options)
-        if len(self.ranges.rows):
-            yield from self.ranges.priors()
         for gravity in self.gravity:
             yield UpwardDirection(gravity)
 
@@ -218,7 +216,6 @@ def _of_positions(
         loss=RobustLoss(options.range_loss_scale, is_bounded=True),
     )
     yield positions
-    yield from positions.priors()
 
 
 def _whitenings(covariances_m2: Array, stddevs_m: Array) -> Array:
