@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
@@ -11,7 +12,7 @@ from markupsafe import Markup
 
 from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
-from rangesfm.report.text import count, decimals_for, fixed, keyed, sentence, signed
+from rangesfm.report.text import count, decimals_for, fixed, keyed, known, sentence, signed
 from rangesfm.result.summary import ResultSummary
 
 
@@ -22,47 +23,47 @@ class QualityCheck:
     Attributes:
         name: heading of the check.
         meaning: one sentence that says what the value is.
-        value: None where the run did not measure it.
+        value: NaN where the run did not measure it.
         unit: of value and limit.
         decimals: of the value as shown.
-        limit: the verdict is doubtful if the value is larger; None: the value alone does not change the verdict.
+        limit: the verdict is doubtful if the value is larger; inf: the value alone does not change the verdict.
         key: of the value in ``result.json``; empty where it is computed from several.
         times: factor of the value over that in ``result.json``.
     """
 
     name: str
     meaning: str
-    value: float | None
+    value: float
     unit: str
     decimals: int
-    limit: float | None = None
+    limit: float = math.inf
     key: str = ""
     times: float = 1.0
 
     @property
-    def light(self) -> str | None:
-        """Return the colour of the light, "green" or "amber", or "off" without a value; None: there is no limit."""
-        if self.limit is None:
-            return None
-        return "off" if self.value is None else "green" if self.value <= self.limit else "amber"
+    def light(self) -> str:
+        """Return the colour of the light, "green" or "amber", or "off" without a value; empty: there is no limit."""
+        if math.isinf(self.limit):
+            return ""
+        return "off" if math.isnan(self.value) else "green" if self.value <= self.limit else "amber"
 
     @property
     def text(self) -> str:
         text = fixed(self.value, self.decimals, self.unit, nothing="not measured")
-        given = None if self.value is None else self.value / self.times
+        given = None if math.isnan(self.value) else self.value / self.times
         return keyed(self.key, given, text, times=self.times) if self.key else text
 
     @property
     def limit_in_words(self) -> str:
-        return "" if self.limit is None else f"Doubtful above {fixed(self.limit, self.decimals, self.unit)}."
+        return "" if math.isinf(self.limit) else f"Doubtful above {fixed(self.limit, self.decimals, self.unit)}."
 
 
 def quality_checks(summary: ResultSummary) -> tuple[QualityCheck, ...]:
     """Return the checks of a result, the most important one first."""
     half_width = summary.scale.half_width_95
     of_scale = "Half of the 95 % interval of the scale: lengths in the map may be off by this share."
-    width_percent = None if half_width is None else 100 * half_width
-    reprojection_px = None if summary.refine is None else summary.refine.reprojection_rms_px
+    width_percent = math.nan if half_width is None else 100 * half_width
+    reprojection_px = known(None if summary.refine is None else summary.refine.reprojection_rms_px)
     of_points = "RMS distance in the photos between the points of the map and the features that show them."
     return (
         QualityCheck("Scale", of_scale, width_percent, "%", 1, limit=100 * DOUBTFUL_ABOVE),
@@ -84,20 +85,20 @@ def _checks_of_ranges(summary: ResultSummary) -> Iterator[QualityCheck]:
             yield QualityCheck(name, meaning, test.statistic, "m", 3, limit=test.threshold, key=f"tests.{i}.statistic")
     of_ranges = Markup("RMS difference between the ranges used and the map; half of the differences are below {}.")
     median = told("ranges.median_abs_m", lambda x: fixed(x, 3, "m"))
-    yield QualityCheck("Ranges and map", of_ranges.format(median), ranges.rms_m, "m", 3, key="ranges.rms_m")
+    yield QualityCheck("Ranges and map", of_ranges.format(median), known(ranges.rms_m), "m", 3, key="ranges.rms_m")
     of_check = Markup("RMS difference between the map and {} ranges that were held out of all estimates.")
-    num, checked_m = told("check_ranges.num"), summary.check_ranges.rms_m
+    num, checked_m = told("check_ranges.num"), known(summary.check_ranges.rms_m)
     if summary.check_ranges.num:
         yield QualityCheck("Check ranges", of_check.format(num), checked_m, "m", 3, key="check_ranges.rms_m")
     of_share = Markup("{} of the {} ranges in the log were used.").format(told("ranges.num_used"), told("ranges.num"))
-    share_percent = 100.0 * ranges.num_used / ranges.num if ranges.num else None
+    share_percent = 100.0 * ranges.num_used / ranges.num if ranges.num else math.nan
     yield QualityCheck("Ranges used", of_share, share_percent, "%", 1)
     decimals = min(decimals_for(offset.stddev_s, default=3), 6)
     of_clocks = Markup("Half of the 95 % interval of the time offset (image time minus range time), which is {}. {}")
     value = told("time_offset.value_s", lambda x: signed(x, decimals, "s"))
     does_not = sentence(offset.note or "any offset near this one gives the same result")
     told_clocks = of_clocks.format(value, does_not if offset.offset_matters is False else "")
-    within_s, key = None if offset.stddev_s is None else NORMAL_95 * offset.stddev_s, "time_offset.stddev_s"
+    within_s, key = NORMAL_95 * known(offset.stddev_s), "time_offset.stddev_s"
     yield QualityCheck("Clocks", told_clocks, within_s, "s", 3, key=key, times=NORMAL_95)
 
 

@@ -16,22 +16,23 @@ from rangesfm.geometry.numerics import NORMAL_95
 NOTHING = "–"
 
 
-def _known(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
+def known(value: float | None) -> float:
+    """Return a number of a result, or NaN where it is unknown or not finite."""
+    return math.nan if value is None or not math.isfinite(value) else float(value)
 
 
 def fixed(value: float | None, decimals: int, unit: str = "", *, nothing: str = NOTHING) -> str:
     """Return a number with a fixed number of decimals and a unit, or ``nothing`` where it is unknown or not finite."""
-    number = _known(value)
-    if number is None:
+    number = known(value)
+    if math.isnan(number):
         return nothing
     return _with_unit(number, f".{decimals}f", unit)
 
 
 def signed(value: float | None, decimals: int, unit: str = "") -> str:
     """Return a number as ``fixed`` does, with a plus sign before positive numbers."""
-    number = _known(value)
-    return NOTHING if number is None else _with_unit(number, f"+.{decimals}f", unit)
+    number = known(value)
+    return NOTHING if math.isnan(number) else _with_unit(number, f"+.{decimals}f", unit)
 
 
 def _with_unit(number: float, spec: str, unit: str) -> str:
@@ -40,14 +41,14 @@ def _with_unit(number: float, spec: str, unit: str) -> str:
 
 def count(value: float | None) -> str:
     """Return a whole number with thin spaces between thousands."""
-    number = _known(value)
-    return NOTHING if number is None else f"{round(number):,}".replace(",", "\u202f")
+    number = known(value)
+    return NOTHING if math.isnan(number) else f"{round(number):,}".replace(",", "\u202f")
 
 
 def rough(value: float | None, unit: str) -> str:
     """Return a number with two digits and its unit, or "open" where nothing determines it."""
-    number = _known(value)
-    return "open" if number is None else f"{number:.2g}\u00a0{unit}"
+    number = known(value)
+    return "open" if math.isnan(number) else f"{number:.2g}\u00a0{unit}"
 
 
 def percent(share: float | None) -> str:
@@ -64,8 +65,8 @@ def decimals_for(stddev: float | None, *, default: int) -> int:
 
 def duration(seconds: float | None) -> str:
     """Return a duration as text ("5 min 03 s") with spaces at which the browser breaks no line."""
-    number = _known(seconds)
-    return NOTHING if number is None else progress.format_duration(number).replace(" ", "\u00a0")
+    number = known(seconds)
+    return NOTHING if math.isnan(number) else progress.format_duration(number).replace(" ", "\u00a0")
 
 
 def sentence(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +34,9 @@ def read_exif_positions(folder: Path) -> PositionLog:
     """
     found = {name: data for name in list_images(folder) if (data := gps_data(folder / name)) is not None}
     found = {name: data for name, data in found.items() if _is_fixed(data)}
-    at = {name: [*data.degrees[::-1], data.altitude_m] for name, data in found.items() if data.altitude_m is not None}
+    at = {
+        name: [*data.degrees[::-1], data.altitude_m] for name, data in found.items() if math.isfinite(data.altitude_m)
+    }
     if not at:
         raise InputError("no photo in it has an EXIF position with an altitude", folder)
     stddevs_m = np.array([_stddevs_m(found[name]) for name in at])

@@ -130,12 +130,12 @@ class GpsData:
     """Position in the data of a photo.
 
     Attributes:
-        degrees: latitude and longitude (WGS 84). altitude_m: None if not given.
+        degrees: latitude and longitude (WGS 84). altitude_m: NaN if not given.
         tags: of the GPS part of EXIF, by number. xmp: further data, as XML.
     """
 
     degrees: tuple[float, float]
-    altitude_m: float | None
+    altitude_m: float
     tags: Mapping[int, Any]
     xmp: bytes
 
@@ -155,12 +155,12 @@ def gps_data(path: Path) -> GpsData | None:
             tags, xmp = image.getexif().get_ifd(_GPS_IFD), image.info.get("xmp", b"")
         latitude = _degrees(tags[_LATITUDE], tags.get(_LATITUDE_REF) == "S")
         longitude = _degrees(tags[_LONGITUDE], tags.get(_LONGITUDE_REF) == "W")
-        altitude = float(tags[_ALTITUDE]) if _ALTITUDE in tags else None
+        altitude = float(tags[_ALTITUDE]) if _ALTITUDE in tags else math.nan
     except (*UNREADABLE, LookupError, TypeError, ZeroDivisionError):
         return None
-    if altitude is not None and tags.get(_ALTITUDE_REF) in (1, b"\x01"):
+    if tags.get(_ALTITUDE_REF) in (1, b"\x01"):
         altitude = -altitude
-    if not all(map(math.isfinite, (latitude, longitude, altitude or 0.0))):
+    if not all(map(math.isfinite, (latitude, longitude))) or (_ALTITUDE in tags and not math.isfinite(altitude)):
         return None
     return GpsData((latitude, longitude), altitude, tags, xmp if isinstance(xmp, bytes) else b"")
 
@@ -171,7 +171,7 @@ def exif_position(path: Path) -> tuple[float, float, float] | None:
     None if the photo has no usable position.
     """
     data = gps_data(path)
-    return None if data is None else (*data.degrees, data.altitude_m or 0.0)
+    return None if data is None else (*data.degrees, 0.0 if math.isnan(data.altitude_m) else data.altitude_m)
 
 
 def _degrees(parts: Any, is_negative: bool) -> float:
