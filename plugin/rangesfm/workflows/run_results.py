@@ -14,7 +14,6 @@ from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import write_reference
-from rangesfm.options import ExportOptions
 from rangesfm.report import write_report_of
 from rangesfm.report.content import Content
 from rangesfm.result.entries import ComparisonRow
@@ -25,6 +24,7 @@ from rangesfm.result.summary import ResultSummary
 from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.survey.input_hashes import input_hashes
 from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.vision.steps import DATABASE_NAME
 from rangesfm.workflows.metric_result import MetricResult
@@ -70,14 +70,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
             comparison = _comparison(inputs, metric, staged)
             # The georeference of the anchors is that of the map, if the map is in their frame.
             georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
-            not_exported = _write_models_and_tables(
-                metric,
-                survey.export,
-                staged,
-                database_path=folder / DATABASE_NAME,
-                images_path=survey.images.path,
-                georeference=georeference,
-            )
+            not_exported = _write_models_and_tables(survey, metric, staged, georeference)
         summary = summary_of(
             metric,
             distances=distances,
@@ -120,23 +113,14 @@ def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tu
 
 
 def _write_models_and_tables(
-    found: MetricResult,
-    export: ExportOptions,
-    folder: Path,
-    *,
-    database_path: Path,
-    images_path: Path | None = None,
-    georeference: Georeference | None = None,
+    survey: Survey, found: MetricResult, folder: Path, georeference: Georeference | None
 ) -> InputError | None:
     """Write the models, the tables and the export formats of a result into a new folder.
 
+    Formats that this result cannot have (points or covariances without any) are left out.
+
     Args:
-        found: the result.
-        export: options that name the formats. Formats that this result cannot have (points or covariances without any)
-            are left out.
         folder: to write into.
-        database_path: final place of the database with the features of the photos.
-        images_path: folder of the photos; None where it is not known.
         georeference: of the result's frame; None without one.
 
     Returns:
@@ -159,17 +143,17 @@ def _write_models_and_tables(
         anchors_m={a.anchor_id: a.position_m for a in found.anchors if np.isfinite(a.position_m).all()},
         metric_from_sfm=found.estimate.metric_from_sfm,
         relative_scale_stddev=found.estimate.uncertainty.empirical,
-        images_path=images_path,
-        database_path=database_path,
+        images_path=survey.images.path,
+        database_path=survey.output.path / DATABASE_NAME,
         is_site=found.estimate.frame == "site",
         georeference=georeference,
         center_covariance_m2=found.center_covariance_m2,
     )
     impossible = [] if found.final.num_points3D() else ["ply"]
     impossible += [] if found.center_covariance_m2 else COVARIANCE_FORMATS
-    formats = tuple(name for name in export.formats if name not in impossible)
+    formats = tuple(name for name in survey.export.formats if name not in impossible)
     try:
-        export_map(map_, folder, export.changed(formats=formats))
+        export_map(map_, folder, survey.export.changed(formats=formats))
     except InputError as error:
         if error.exit_status != BAD_INPUT:  # a full disk, on which the rest of the result cannot be written either
             raise
