@@ -19,6 +19,7 @@ PACKAGE = Path(rangesfm.__file__).parent
 LAYERS = (
     "files processes",
     "geometry",
+    "inference",
     "colmap",
     "ceres",
     "ranging",
@@ -29,7 +30,6 @@ LAYERS = (
     "vision scale export",
     "survey",
     "survey_discovery",
-    "refine",
     "join loops",
     "diagnostics",
     "planning",

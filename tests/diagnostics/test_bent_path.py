@@ -12,10 +12,10 @@ from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.geometry.similarity import align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.inference.bending import WalkBending
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.initialize import initialize_scale

@@ -13,7 +13,9 @@ from tests.simulated.surveys import SITES, surveyed
 from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.distances.tape import Tape, TapedDistance
-from rangesfm.scale.scale_by_lengths import scale_by_lengths
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.bending import WalkBending
+from rangesfm.scale.scale_by_lengths import KnownLengths, LengthScale, scale_by_lengths
 
 
 def test_of_a_tape_between_points_that_are_not_in_the_map_nothing_is_said() -> None:
@@ -28,13 +30,19 @@ def test_of_a_tape_between_points_that_are_not_in_the_map_nothing_is_said() -> N
 def test_what_a_length_could_do_unfound_is_what_the_scale_does_when_it_is_so_much_longer() -> None:
     estimate = known(run(surveyed(SITES[2], 3), 3).estimate)
     lengths_m, stddevs_m = np.array([2.0, 3.0, 4.0]), np.array([0.01, 0.01, 0.02])
+    names, still = tuple(f"{k}.jpg" for k in range(20)), np.tile(np.eye(3), (20, 1, 1))
     centers = np.random.default_rng(0).standard_normal((20, 3))
+    path = Trajectory(np.arange(20), names, np.arange(20.0), centers, still)
+
+    def by(distances: LocatedDistances) -> LengthScale:
+        return known(scale_by_lengths(KnownLengths.of(distances, path, WalkBending(path))))
+
     located = LocatedDistances.of(lengths_m, stddevs_m, model_length=lengths_m / 2)
     tape = Tape(tuple(TapedDistance((f"{k}a", f"{k}b"), float(lengths_m[k]), 0.01, "control", k) for k in range(3)))
-    scale = known(scale_by_lengths(located, centers))
+    scale = by(located)
     found = {test.subject: test for test in diagnose_lengths(replace(estimate, lengths=scale), tape).tests}
     for k, step_m in enumerate(1e-4 * np.eye(3)):
-        longer = known(scale_by_lengths(replace(located, distance_m=lengths_m + step_m), centers))
+        longer = by(replace(located, distance_m=lengths_m + step_m))
         test = found[f"{k}a to {k}b"]
         by_metre = abs(longer.value / scale.value - 1) / 1e-4
         assert test.effect_on_scale == pytest.approx(by_metre * known(test.smallest_detectable), rel=0.02)

@@ -16,7 +16,7 @@ from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.diagnostics.mistakes import find_mistakes
 from rangesfm.diagnostics.scale_bound import RISK, HiddenMistake, scale_bound
-from rangesfm.scale.scale_estimate import ScaleUncertainty
+from rangesfm.inference.posterior import ScaleUncertainty
 
 ONE_PERCENT = ScaleUncertainty(0.0, {"noise": 0.01})
 

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.known import known
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned
 
 from rangesfm.diagnostics.finished_map import by_similarity
+from rangesfm.distances.lengths_on_map import BENDING
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.planning.expected import expect
 from rangesfm.planning.paths import path_through
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_by_lengths import BENDING
 
 
 @pytest.mark.parametrize(
@@ -59,7 +60,7 @@ def test_ranges_that_stand_for_several_say_what_all_would() -> None:
     every = replace(plan, max_num_ranges=100_000)
     assert every.num_alike == 1
     whole = expect(every)
-    assert len(whole.learned.of_range) > 2 * len(thinned.learned.of_range)
+    assert len(known(whole.learned).of_range) > 2 * len(known(thinned.learned).of_range)
     assert thinned.uncertainty.empirical == pytest.approx(whole.uncertainty.empirical, rel=0.05)
     assert thinned.worst_keyframe_m == pytest.approx(whole.worst_keyframe_m, rel=0.05)
 
@@ -108,5 +109,5 @@ def test_what_is_known_of_the_radio_counts() -> None:
 def test_a_taped_length_makes_the_scale_no_better_than_itself_and_the_bending_of_the_map() -> None:
     taped = expect(planned(FIVE_ANCHORS_M, "site", taped=((5.0, 0.005),)))
     # 5 mm in 5 m, and the bending of the map between the ends.
-    assert 0.5 * BENDING < taped.uncertainty.components["given"] < 1.5 * BENDING
+    assert 0.5 * BENDING < taped.uncertainty.components["tape"] < 1.5 * BENDING
     assert 0.5 * BENDING < taped.uncertainty.empirical < 1.5 * BENDING

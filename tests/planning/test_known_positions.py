@@ -13,13 +13,13 @@ from rangesfm.distances.tape import CHECK, CONTROL
 from rangesfm.errors import InputError
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import in_first_camera
+from rangesfm.inference.bending import WalkBending
 from rangesfm.planning.expected import expect
 from rangesfm.planning.plan_file import read_plan
 from rangesfm.planning.planned import PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.survey_plan import plan_survey
 from rangesfm.positions.control_points import ControlPoint
-from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.scale.scale_by_positions import scale_by_positions
 
 STDDEV_M = 0.02

@@ -12,8 +12,8 @@ from tests.simulated.path import loop_path
 
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.inference.bending import MapBending, WalkBending
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.ranging.errors.bending import MapBending, WalkBending
 
 NUM = 16
 

@@ -22,7 +22,7 @@ from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.point_fit import PointProblem
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.bending import by_poses
+from rangesfm.ranging.errors.range_bins import by_poses
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.scale.range_equation import RangeProblem, RangeState, columns_of, predicted_ranges, range_gradient
 from rangesfm.scale.range_equation import range_jacobian as jacobian_of_map

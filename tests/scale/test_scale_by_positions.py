@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +13,12 @@ from tests.simulated.positions_at_origin import known_positions
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.bending import WalkBending
+from rangesfm.positions.grouped_positions import design_of_positions
 from rangesfm.positions.known_positions import KnownPositions
-from rangesfm.ranging.errors.bending import BendingOfBins, ErrorPart
-from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import (
     _determine,
-    _Problem,
+    _Search,
     moved_similarity,
     refuse_open_turn,
     scale_by_positions,
@@ -28,20 +28,6 @@ Array = npt.NDArray[np.float64]
 
 TURN = Rotation.from_rotvec([0.3, -0.5, 1.1]).as_matrix()
 SITE_FROM_MODEL = Similarity(2.0, TURN, np.array([10.0, -4.0, 1.0]))
-
-
-@dataclass(frozen=True)
-class Bending:
-    """A map with the same bending in all coordinates."""
-
-    path: Trajectory
-    formal_m: float = 0.0
-    shift_m: float = 0.0
-
-    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
-        num = len(by_pose)
-        parts = (ErrorPart("bending", np.eye(num), 0.001, spread=1.0),) if self.formal_m else ()
-        return BendingOfBins(parts, self.formal_m**2 * np.eye(num), np.full(num, self.shift_m))
 
 
 def path() -> Trajectory:
@@ -61,14 +47,8 @@ def survey(is_mark: list[bool], noise_m: float = 0.0, stddev_m: float = 0.1, see
     )
 
 
-def problem(
-    positions: KnownPositions,
-    lengths: LengthScale | None = None,
-    refined: Similarity | None = None,
-    bending: Bending | None = None,
-    lasting_s: tuple[float, ...] = (),
-) -> _Problem:
-    return _Problem(positions, path(), bending or Bending(path()), lengths, refined, lasting_s)
+def search(positions: KnownPositions) -> _Search:
+    return _Search(positions, path(), None, (), 1.0)
 
 
 def finite_differences(positions: KnownPositions) -> Array:
@@ -89,17 +69,19 @@ def assert_same(found: Similarity, expected: Similarity, atol: float = 1e-8) -> 
 
 def test_the_design_is_the_finite_difference_and_lever_arms_do_not_scale() -> None:
     positions = survey([True, False, True, False])
-    np.testing.assert_allclose(problem(positions)._design(SITE_FROM_MODEL), finite_differences(positions), atol=1e-7)
+    np.testing.assert_allclose(
+        design_of_positions(positions, SITE_FROM_MODEL, path()), finite_differences(positions), atol=1e-7
+    )
 
 
 def test_without_errors_the_similarity_is_exact_and_all_count() -> None:
     positions = survey([True, True, False, False, True])
     used = np.arange(5) != 4
     wrong = replace(positions, position_m=positions.position_m + np.where(used, 0.0, 100.0)[:, None])
-    similarity, weights, stddev_m = problem(wrong).robust(used, None)
-    assert_same(similarity, SITE_FROM_MODEL)
-    np.testing.assert_allclose(weights, [1.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(stddev_m, 0.1)
+    fit = search(wrong).fit(used)
+    assert_same(fit.similarity, SITE_FROM_MODEL)
+    np.testing.assert_allclose(fit.weights, [1.0, 1.0, 1.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(fit.stddev_m, 0.1)
 
 
 def test_three_positions_off_a_line_determine_a_similarity() -> None:
@@ -117,10 +99,10 @@ def test_three_positions_off_a_line_determine_a_similarity() -> None:
 def test_too_few_positions_are_refused_with_their_number() -> None:
     positions = replace(survey([True] * 4), is_check=np.array([False, True, True, False]))
     with pytest.raises(GeometryError, match=r"^2 known positions are in the map, expected 3 or more that are not on"):
-        problem(positions).require_enough()
-    problem(replace(positions, is_check=np.arange(4) == 1)).require_enough()
+        search(positions).require_enough()
+    search(replace(positions, is_check=np.arange(4) == 1)).require_enough()
     with pytest.raises(GeometryError, match="2 known positions are in the map"):
-        scale_by_positions(positions, path(), Bending(path()))
+        scale_by_positions(positions, path(), WalkBending(path()))
 
 
 @pytest.mark.parametrize("row", [1, 2, 3])

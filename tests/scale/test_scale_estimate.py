@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.scale.scale_estimate import ScaleUncertainty
+from rangesfm.inference.posterior import ScaleUncertainty
 
 
 def test_components_add_in_squares_and_never_say_less_than_the_formal_part() -> None:

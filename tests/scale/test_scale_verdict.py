@@ -11,11 +11,11 @@ from tests.known import known
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
+from rangesfm.inference.posterior import ScaleUncertainty
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_by_lengths import LengthScale
-from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_verdict import judge_lengths, judge_positions, refuse_unknown
 
 if TYPE_CHECKING:
@@ -166,8 +166,9 @@ def test_known_positions_that_leave_the_scale_open_are_too_close_together() -> N
 
 
 def test_short_lengths_are_said_to_be_short() -> None:
+    nothing = np.zeros(2)
     two, one = (
-        LengthScale(1.0, {"tape": 0.01}, rows, rows > 0, *np.ones((5, len(rows))))
+        LengthScale(1.0, ScaleUncertainty(0.01, {}), rows, rows > 0, nothing, nothing, nothing, 1.0, nothing)
         for rows in (np.arange(2), np.arange(1))
     )
     options, narrow, wide = ScaleOptions(), ScaleUncertainty(0.01, {}), ScaleUncertainty(0.03, {})

@@ -10,14 +10,15 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.demo.simulated_radio import Radio
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.inference.bending import Bending, WalkBending
+from rangesfm.inference.posterior import ScaleUncertainty, joined
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.bending import BendingOfBins
 from rangesfm.ranging.errors.components import CLOCKS
+from rangesfm.scale.binned_ranges import binned_ranges
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_estimate import ScaleEstimate, ScaleUncertainty
-from rangesfm.scale.uncertainty import bias_covariance, known_map, linear_map
+from rangesfm.scale.scale_estimate import ScaleEstimate
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -35,8 +36,8 @@ class Rigid:
 
     path: Trajectory
 
-    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
-        return BendingOfBins((), np.zeros((len(by_pose), len(by_pose))), np.zeros(len(by_pose)))
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
+        return Bending((), np.zeros((len(by_pose), len(by_pose))), np.zeros(len(by_pose)))
 
 
 def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -> Array:
@@ -142,18 +143,16 @@ def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(
     assert found.errors.learned is not None
     assert found.problem is not None
     assert found.solution is not None
-    learned = found.errors.learned
-    for share in (1.0, 1e-6):
-        told = replace(learned, covariances_m2=share * learned.covariances_m2)
-        known = known_map(found.problem, found.solution, told)
-        stated, weighted = known.uncertainty.components, found.solution
-        linear = linear_map(found.problem, weighted, told.bins)
-        by_range = weighted.errors.worth * weighted.fit.weights / weighted.errors.stddev_m**2
-        assumed_m2 = np.diag(1 / told.bins.total(by_range)) + bias_covariance(told.bins, found.problem.ranges)
-        by_robust, _ = linear.with_weights(assumed_m2, told.covariance_m2)
+    ranges = binned_ranges(found.problem, found.solution)
+    learnt = joined([ranges], WalkBending(in_first_camera(found.problem.trajectory)), *ranges.priors).learnt()
+    for share in (1.0, 1e-3):
+        told = replace(learnt, sizes={name: share * size for name, size in learnt.sizes.items()})
+        known = told.posterior(is_fitted=True)
+        stated = known.uncertainty.components
+        by_robust, _ = told.linear.with_weights(ranges.working_m2, told.noise.covariance_m2)
         best = np.array([stated[name] for name in stated if name != "reweighting"])
         chance = np.sqrt(by_robust[0, 0] - np.sum(best**2))
-        assert stated["reweighting"] == abs(known.half_way[0]) <= 0.5 * chance * (1 + 1e-9)
+        assert stated["reweighting"] == abs(known.step[0]) <= 0.5 * chance * (1 + 1e-9)
     # With a covariance a millionth as large, the difference exceeds chance, and is limited to it.
     assert stated["reweighting"] == pytest.approx(0.5 * chance)
 

@@ -18,11 +18,11 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import in_first_camera
+from rangesfm.inference.bending import WalkBending
 from rangesfm.options import ScaleOptions
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.range_equation import RangeProblem, RangeState
 from rangesfm.scale.scale_estimate import ScaleEstimate

@@ -50,6 +50,7 @@ from tests.studies.measured_distances import KINDS
 
 import rangesfm
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
+from rangesfm.positions.grouped_positions import POSITIONS
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.workflows import result_records
 from rangesfm.workflows.metric_result import MetricResult
@@ -244,10 +245,10 @@ def position_equations_of(metric: MetricResult) -> Values:
     if found is None:
         return {}
     return {
-        "positions residual": found.equations.linear.residual_m,
-        "positions derivatives": found.equations.linear.design,
-        "positions covariance": found.equations.errors.covariance_m2,
-        "positions weight": found.weights,
+        "positions residual": found.problem.linear.residual_m[found.problem.rows[POSITIONS]],
+        "positions derivatives": found.problem.linear.design[found.problem.rows[POSITIONS]],
+        "positions covariance": found.problem.noise_of(POSITIONS).covariance_m2,
+        "positions weight": found.fit.weights,
     }
 
 
@@ -268,8 +269,8 @@ def noise_of(metric: MetricResult) -> Values:
     """Return the standard deviation of each component of the noise, as learnt for the final map."""
     positions = metric.by_positions
     learnt = {
-        "ranges": metric.learned_at_refined or metric.estimate.errors.learned,
-        "positions": None if positions is None else positions.equations.errors,
+        "ranges": metric.estimate.errors.learned,
+        "positions": None if positions is None else positions.problem.noise_of(POSITIONS),
     }
     return {
         f"{kind} noise {name}": np.array(stddev)

@@ -215,18 +215,18 @@ class Known:
             photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, is_firm, True
         )
         found = scale_by_positions(known, path, bending)
-        parts = {part.name: part.alike for part in found.equations.parts}
-        covariance = found.bending_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))
-        grouping, at = found.equations.grouping, np.flatnonzero(~known.is_mark)
+        parts = {part.name: part.alike for part in found.problem.components}
+        covariance = found.problem.bending.formal_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))
+        grouping, at = found.observed.grouping, np.flatnonzero(~known.is_mark)
         own = np.zeros((len(known), len(known)))
         for name in RECEIVERS.keys() & {*self.names}:
             own[np.ix_(at, at)] = RECEIVERS[name].covariance_m2(known.time_s[at])
         covariance = covariance + grouping @ np.kron(own, np.eye(3)) @ grouping.T
-        rows, design = np.ix_(found.equations.is_used, found.equations.is_used), found.equations.linear.design
+        used, design = found.problem.is_used, found.problem.linear.design
         if known.velocity.any():  # the time offset is unknown, too
             design = np.column_stack([design, grouping @ known.velocity.ravel()])
-        design = design[found.equations.is_used]
-        of_map = np.linalg.inv(design.T @ np.linalg.solve(covariance[rows], design))[:7, :7]
+        design = design[used]
+        of_map = np.linalg.inv(design.T @ np.linalg.solve(covariance[np.ix_(used, used)], design))[:7, :7]
         motions = similarity_motions(path.centers - path.centers[0]).mean(axis=0)
         return float(np.sqrt(of_map[0, 0])), float(np.sqrt(np.trace(motions @ of_map @ motions.T) / 3))
 

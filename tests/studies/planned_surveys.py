@@ -25,6 +25,7 @@ from tests.simulated.surveys import METRES_PER_UNIT, in_world_of_its_own
 from tests.studies.kept_runs import Row, Study, spread, study
 
 from rangesfm.demo.simulated_radio import CameraPath
+from rangesfm.distances.lengths_on_map import BENDING
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
@@ -35,13 +36,11 @@ from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.components import stddevs_in
-from rangesfm.ranging.errors.learned import usual_stddevs
+from rangesfm.ranging.errors.components import COMPONENTS, stddevs_in
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.range_equation import RangeState
-from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
 from rangesfm.scale.solution import solution_from
 
@@ -135,7 +134,8 @@ SURVEYS: dict[str, Callable[[], PlannedSurvey]] = {
 
 def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
     """Stddevs of the components of the range errors: the plan's, or those that radios have on average."""
-    usual = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None)
+    is_calibrated = planned.curve_stddev_m is not None
+    usual = {each.name: float(each.median_if(is_calibrated) * np.exp(each.spread**2)) for each in COMPONENTS}
     return usual | {"bending": BENDING_M} | dict(planned.component_stddevs)
 
 

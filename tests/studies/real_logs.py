@@ -37,11 +37,11 @@ from rangesfm.diagnostics.linearized import ranges_on_map
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.inference.bending import WalkBending
 from rangesfm.options import AssociationOptions, ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.anchor_file import read_anchors
 from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.bending import WalkBending
 from rangesfm.ranging.errors.components import components, population
 from rangesfm.ranging.errors.error_curve import ErrorCurve, correct_ranges
 from rangesfm.ranging.errors.radio_calibration import calibrate_ranges

@@ -26,6 +26,7 @@ from tests.studies.real_room import interpolated, path_and_truth
 from rangesfm.distances.tape import Tape
 from rangesfm.geometry.similarity import align_points
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.posterior import ScaleUncertainty
 from rangesfm.options import RangesOptions
 from rangesfm.positions.antenna_places import locate_antenna
 from rangesfm.positions.antenna_track import AntennaTrack
@@ -36,7 +37,6 @@ from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
 from rangesfm.scale.scale_by_positions import scale_by_positions
-from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun

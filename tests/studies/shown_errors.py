@@ -19,11 +19,11 @@ from tests.studies.real_logs import FACTOR, cases, path_of, placed, read_set
 
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.errors.components import components
-from rangesfm.ranging.errors.learned import learn_errors
+from rangesfm.ranging.errors.learned import learn_errors, radio_components
+from rangesfm.scale.binned_ranges import binned_ranges
 from rangesfm.scale.range_equation import predicted_ranges
 from rangesfm.scale.scale_problem import scale_problem
 from rangesfm.scale.solution import solve_scale
-from rangesfm.scale.uncertainty import errors_to_expect
 
 # Medians that the logs' errors suggest at first sight, metres, and below them how far each log may differ.
 START = {"white": 0.05, "time": 0.04, "drift": 0.01, "place": 0.03, "view": 0.035, "bias": 0.045, "common_bias": 0.2}
@@ -45,9 +45,7 @@ def main() -> None:
     args = parser.parse_args()
     sets = json.loads(Path(__file__).with_name("real_logs.json").read_text(encoding="utf-8"))
     start = components({name: (size, OF_WHITE if name == "white" else SPREAD) for name, size in START.items()})
-    likeliest = patch(
-        "rangesfm.ranging.errors.learned.ComponentLikelihood.mean_stddevs", lambda self, logs: np.exp(logs)
-    )
+    likeliest = patch("rangesfm.inference.noise.ComponentLikelihood.mean_stddevs", lambda self, logs: np.exp(logs))
     with patch("rangesfm.ranging.errors.learned.COMPONENTS", start), likeliest:
         for name, described in sets.items():
             found = shown(args.data, described)
@@ -69,10 +67,13 @@ def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
         bias_m=posed.ranges.bias_mean_m,
     )
     solution = replace(solution, fit=replace(solution.fit, state=true))
-    bins = errors_to_expect(posed, solution, {}).bins
+    ranges = binned_ranges(posed, solution)
+    bins = ranges.bins
     off_m = posed.ranges.range_m - predicted_ranges(posed.ranges, true)
     nothing_open = np.zeros((len(off_m), 1))
-    learned = learn_errors(bins, off_m, nothing_open, np.ones((1, 1)), solution.noise_stddev_m)
+    components = radio_components(bins)
+    given = (bins.mean(off_m), bins.mean(nothing_open), np.ones((1, 1)), solution.noise_stddev_m)
+    learned = learn_errors(components, bins, *given)
     return dict(zip(learned.names, learned.stddevs.tolist(), strict=True))
 
 

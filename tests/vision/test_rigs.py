@@ -18,9 +18,10 @@ from tests.known import known as known_scale
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
+from rangesfm.inference.bending import WalkBending
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.scale.scale_by_lengths import scale_by_lengths
+from rangesfm.scale.scale_by_lengths import KnownLengths, scale_by_lengths
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import read_image_times_csv
 from rangesfm.vision.photo_files import usable_photos
@@ -160,11 +161,12 @@ def test_one_baseline_at_two_visits_is_one_length_and_one_measured_anew_is_anoth
     (tmp_path / "rig_config.json").write_text(json.dumps(rigs))
     taped = read_rigs(tmp_path / "rig_config.json").baselines(model, stddev_m)
     assert len(taped) == num_measured
-    located = locate_distances(Tape(taped), model, [])
-    found = known_scale(scale_by_lengths(located, trajectory_from_reconstruction(model).centers))
+    path = trajectory_from_reconstruction(model)
+    lengths = KnownLengths.of(locate_distances(Tape(taped), model, [], path), path, WalkBending(in_first_camera(path)))
+    found = known_scale(scale_by_lengths(lengths))
     assert found.value == pytest.approx(1.0, rel=1e-3)
     expected = stddev_m / np.linalg.norm(pose.translation) / np.sqrt(num_measured)
-    assert found.relative_stddev == pytest.approx(expected, rel=1e-3)
+    assert found.uncertainty.empirical == pytest.approx(expected, rel=1e-3)
 
 
 def test_photos_of_one_frame_share_the_time_of_the_first_of_them_that_has_one(

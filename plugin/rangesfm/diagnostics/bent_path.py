@@ -22,16 +22,16 @@ from rangesfm.diagnostics.linearized import (
 )
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import rmse
+from rangesfm.inference.bending import BENDS, WalkBending
+from rangesfm.inference.linear_map import regular
+from rangesfm.inference.posterior import Posterior
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.errors.bending import WalkBending, averaged
-from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.range_observations import status_by_weight
-from rangesfm.scale.linear_map import regular
+from rangesfm.scale.binned_ranges import bias_covariance
 from rangesfm.scale.range_equation import RangeState, state_after
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import judge
-from rangesfm.scale.uncertainty import KnownMap, bias_covariance
 
 # Number of Gauss-Newton steps after which the bins are kept: with bins and outliers chosen anew each time, a map may
 # swing to and fro for ever.
@@ -120,7 +120,7 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
         return estimate
     known = _known(problem, posed, estimate.uncertainty.formal)
     uncertainty, covariance = known.uncertainty, known.covariance
-    state = state_after((problem.columns,), on_map.state, known.half_way)
+    state = state_after((problem.columns,), on_map.state, known.step)
     fit = replace(solution.fit, state=state, weights=problem.bins.robust_weight)
     judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, options)
     positions = zip(estimate.anchors, state.anchors_m, strict=True)
@@ -139,11 +139,12 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     )
 
 
-def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> KnownMap:
+def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> Posterior:
     """Return the uncertainty of a path at the estimate with the best weights, compared with simple weights."""
     simple_m2 = problem.errors.only("white", *BENDS).covariance_m2 + bias_covariance(problem.bins, posed.ranges)
     by_others, _ = problem.with_weights(simple_m2, problem.errors.covariance_m2)
-    return KnownMap.between(problem, problem.errors, formal, by_others, problem.solved(simple_m2).step)
+    robust_step = problem.solved(simple_m2).step
+    return Posterior.between(problem, problem.errors, formal, by_others, robust_step, is_at_best=True)
 
 
 def _bent_once(problem: Linearized) -> RangesOnMap:
@@ -152,8 +153,8 @@ def _bent_once(problem: Linearized) -> RangesOnMap:
     is_free = on_map.problem.frame_is_free
     moved, stddevs_m = after_step(problem), problem.errors.stddev_of_component
     pulls = cho_solve(cho_factor(regular(problem.errors.covariance_m2)), moved.residual_m)
-    by_pose = averaged(problem.bins, slopes_by_poses(on_map), len(walk.path))
-    sizes = {part.name: stddevs_m[part.name] / part.median for part in problem.expected.components}
+    by_pose = problem.bins.by_pose(slopes_by_poses(on_map), len(walk.path))
+    sizes = {part.name: stddevs_m[part.name] / part.median for part in problem.components if part.name in BENDS}
     bent = walk.bent_back(pulls @ by_pose, sizes, frame_is_free=is_free)
     return _on_path(moved.on_map, walk, bent)
 

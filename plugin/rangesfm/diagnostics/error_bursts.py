@@ -16,8 +16,9 @@ from rangesfm.arrays import Indices
 from rangesfm.diagnostics.hypothesis import longest_m
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.inference.linear_map import FALSE_ALARM_RATE
+from rangesfm.inference.noise import Component
 from rangesfm.ranging.errors.components import BURSTS, LASTING_S
-from rangesfm.scale.linear_map import FALSE_ALARM_RATE
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,8 @@ def likeliest_burst(solved: Factorization) -> Burst:
 
 def without(problem: Linearized, burst: Burst) -> Linearized:
     """Return the problem with the ranges of a burst left out: they may err by as much as a range can."""
-    known, num = problem.expected.known, len(problem.bins)
-    variances_m2 = np.bincount(burst.bins, np.full(len(burst.bins), longest_m(problem) ** 2), num)
-    known = {**known, BURSTS: known.get(BURSTS, np.zeros((num, num))) + np.diag(variances_m2)}
-    return replace(problem, expected=replace(problem.expected, known=known))
+    variances_m2 = np.bincount(burst.bins, np.full(len(burst.bins), longest_m(problem) ** 2), len(problem.bins))
+    return replace(problem, components=(*problem.components, Component(BURSTS, np.diag(variances_m2))))
 
 
 def _windows(problem: Linearized) -> list[Indices]:

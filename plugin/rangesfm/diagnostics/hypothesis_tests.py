@@ -13,7 +13,7 @@ from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.geometry.numerics import UNDETERMINED
-from rangesfm.scale.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
+from rangesfm.inference.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
 
 # Random surveys from which the thresholds come: 20 of them exceed one.
 _NUM_DRAWS = 1000

@@ -12,7 +12,7 @@ from rangesfm.diagnostics.hypothesis_tests import MistakeTest, finite
 from rangesfm.diagnostics.scale_bound import hidden_lengths
 from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.errors import number_text
-from rangesfm.scale.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.inference.linear_map import FALSE_ALARM_RATE, noncentrality
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
@@ -59,7 +59,7 @@ def _of_each(lengths: LengthScale, taped: list[TapedDistance]) -> Iterator[Mista
             "length",
             between,
             float(lengths.statistic[k]),
-            float(lengths.threshold[k]),
+            lengths.threshold,
             words=f"the length from {between} is given as {one.distance_m:.3f} m, but all else gives "
             f"{one.distance_m - size_m:.3f} m ({number_text(size_m, '+.3f')} m)",
             remedy=_MEASURE_AGAIN,

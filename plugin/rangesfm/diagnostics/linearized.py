@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,13 +12,15 @@ from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.robust_statistics import MIN_STDDEV_M, robust_stddev
 from rangesfm.geometry.similarity import similarity_motions
-from rangesfm.ranging.errors.bending import BendingOfBins, MapBending, bending_in_bins, by_poses
+from rangesfm.inference.bending import MapBending
+from rangesfm.inference.linear_map import LinearMap
+from rangesfm.inference.noise import Component, noise_of_sizes, usual_sizes
 from rangesfm.ranging.errors.components import DRIFT_S, PLACES, WANDERING, OtherError
-from rangesfm.ranging.errors.learned import ExpectedErrors, LearnedErrors
-from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
+from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, radio_components
+from rangesfm.ranging.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
-from rangesfm.scale.linear_map import LinearMap
+from rangesfm.scale.binned_ranges import ruled_out
 from rangesfm.scale.range_equation import (
     RangeProblem,
     RangeState,
@@ -30,7 +33,6 @@ from rangesfm.scale.range_equation import (
 )
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
-from rangesfm.scale.uncertainty import ruled_out
 
 # Fewer bins than for an interval, because the tests learn the errors many times.
 _MAX_NUM_BINS = 160
@@ -137,7 +139,8 @@ class Linearized(LinearMap):
         by_lever_arm: (c, 3) derivative of the residual by the lever arm in the camera's frame.
         by_time: (c,) derivative by the clocks' offset; None without times.
         on_map: the ranges. scatter_m: standard deviation of a range among its neighbours.
-        expected: errors to expect before anything is measured. errors: the errors assumed random.
+        shift_m: (c,) change of the residuals from the map as it is to the map as the photos alone would have it.
+        components: of the errors. errors: the errors assumed random.
     """
 
     place: Array
@@ -148,7 +151,8 @@ class Linearized(LinearMap):
     by_time: Array | None
     on_map: RangesOnMap
     scatter_m: float
-    expected: ExpectedErrors
+    shift_m: Array
+    components: tuple[Component, ...]
     errors: LearnedErrors
 
     @property
@@ -174,20 +178,22 @@ class Linearized(LinearMap):
         priors = self.prior_design[:, :0] if priors is None else priors
         # Residuals are taken where the priors' residuals are smallest, with the map as it is.
         back = np.linalg.lstsq(self.prior_design, self.prior_residual, rcond=1e-12)[0]
-        learnt = self.expected.learnt(
-            off_m=self.design @ back - self.residual_m + self.expected.shift_m,
+        learnt = learn_errors(
+            self.components,
+            self.bins,
+            off_m=self.design @ back - self.residual_m,
             design=np.hstack([self.design, columns]),
             prior_design=np.hstack([self.prior_design, priors]),
             noise_m=self.scatter_m,
             # A radio that errs by significantly more than others was mistaken, which must not pass for noise.
             most_unusual=SIGNIFICANT_STDDEVS,
-            near=None if near is None else near.stddev_of_component,
+            near=near,
         )
         return replace(self, errors=learnt)
 
     def with_usual_errors(self) -> Linearized:
         """Return the problem with the errors usual for radios and maps with this scatter."""
-        return replace(self, errors=self.expected.usual({"white": self.scatter_m}))
+        return replace(self, errors=_usual_errors(self.components, self.bins, self.scatter_m))
 
 
 def linearized(on_map: RangesOnMap, bins_of_ranges: RangeBins | None = None) -> Linearized:
@@ -210,15 +216,25 @@ def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -
     placing_m = on_map.posed.placing_stddev_m(on_map.state.metric_from_model.scale)
     by_places_m2 = bins.shared_by_places(towards, placing_m, on_map.on_path.before)
     others_m2: dict[OtherError, Array] = {WANDERING: _wandering_m2(bins), PLACES: by_places_m2}
-    expected = ExpectedErrors.of(
-        bins, on_map.posed.curve_stddev_m, ruled_out(on_map.problem), others_m2, _bending(on_map, bins)
-    )
-    return _linearized(on_map, expected, scatter_m, expected.usual({"white": scatter_m}))
+    components = radio_components(bins, on_map.posed.curve_stddev_m, ruled_out(on_map.problem), others_m2)
+    bending = on_map.bending
+    if bending is None:
+        shift_m = np.zeros(len(bins))
+    else:
+        by_pose = bins.by_pose(slopes_by_poses(on_map), len(bending.path))
+        bent = bending.of_functions(by_pose, frame_is_free=on_map.problem.frame_is_free)
+        components, shift_m = (*components, *bent.parts), bent.shift_m
+    return _linearized(on_map, components, bins, shift_m, scatter_m, _usual_errors(components, bins, scatter_m))
+
+
+def _usual_errors(components: Sequence[Component], bins: RangeBins, scatter_m: float) -> LearnedErrors:
+    return LearnedErrors.of(noise_of_sizes(components, usual_sizes(components) | {"white": scatter_m}, len(bins)), bins)
 
 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:
     """Linearise the problem at another state or for corrected ranges, with the same bins and errors."""
-    return _linearized(on_map, problem.expected, problem.scatter_m, problem.errors)
+    of = problem
+    return _linearized(on_map, of.components, of.bins, of.shift_m, of.scatter_m, of.errors)
 
 
 def is_nearly_at(now: RangesOnMap, before: RangesOnMap, scatter_m: float) -> bool:
@@ -251,43 +267,44 @@ def after_step(problem: Linearized) -> Linearized:
     return problem
 
 
-def _linearized(on_map: RangesOnMap, expected: ExpectedErrors, scatter_m: float, errors: LearnedErrors) -> Linearized:
+def _linearized(
+    on_map: RangesOnMap,
+    components: tuple[Component, ...],
+    bins: RangeBins,
+    shift_m: Array,
+    scatter_m: float,
+    errors: LearnedErrors,
+) -> Linearized:
     # The anchors' biases are random errors here, not parameters.
     problem = replace(on_map.problem, bias_stddev_m=np.zeros(on_map.problem.num_anchors))
     state, placed = on_map.state, on_map.state.metric_from_model
-    columns, gradient, mean = columns_of([problem])[0], RangeGradient.of(on_map.from_anchor_m), expected.bins.mean
+    columns, gradient, mean = columns_of([problem])[0], RangeGradient.of(on_map.from_anchor_m), bins.mean
     by_time = None
     if on_map.velocity is not None:
         by_time = mean(gradient.by_log_scale(placed.scale * on_map.velocity @ placed.rotation.T))
-    place = np.zeros((len(expected.bins), 3, columns.num))
+    place = np.zeros((len(bins), 3, columns.num))
     place[:, :, columns.scale] = mean(placed.scale * problem.centers @ placed.rotation.T)
     if columns.frame >= 0:
         arms_m = mean(antenna_positions(problem, placed) - placed.translation)
         place[:, :, columns.frame : columns.frame + 6] = similarity_motions(arms_m)[:, :, 1:]
     return Linearized(
-        residual_m=mean(on_map.residual_m) + expected.shift_m,
+        residual_m=mean(on_map.residual_m) + shift_m,
         design=mean(range_jacobian(problem, columns, state, state)),
         prior_residual=prior_residuals(problem, columns, state),
         prior_design=prior_jacobian(problem, columns, state, state),
         columns=columns,
         place=place,
-        bins=expected.bins,
+        bins=bins,
         time_s=mean(on_map.time_s),
         gradient=RangeGradient(mean(gradient.distance_m), mean(gradient.by_tag)),
         by_lever_arm=mean(gradient.by_tag_in_cam(on_map.world_from_cam)),
         by_time=by_time,
         on_map=on_map,
         scatter_m=scatter_m,
-        expected=expected,
+        shift_m=shift_m,
+        components=components,
         errors=errors,
     )
-
-
-def _bending(on_map: RangesOnMap, bins_of_ranges: RangeBins) -> BendingOfBins | None:
-    if on_map.bending is None:
-        return None
-    slopes = slopes_by_poses(on_map)
-    return bending_in_bins(on_map.bending, bins_of_ranges, slopes, frame_is_free=on_map.problem.frame_is_free)
 
 
 def slopes_by_poses(on_map: RangesOnMap) -> csr_array:

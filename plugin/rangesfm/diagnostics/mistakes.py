@@ -18,7 +18,7 @@ from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_other_ma
 from rangesfm.diagnostics.scale_bound import HiddenMistake, hidden_among
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
-from rangesfm.ranging.errors.bending import WalkBending
+from rangesfm.inference.bending import WalkBending
 from rangesfm.scale.range_equation import RangeState, state_after
 
 # Numbers of explanations that are tried, each with the noise that it leaves: in all, of one kind, and when no test

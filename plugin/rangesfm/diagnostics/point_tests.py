@@ -19,9 +19,9 @@ from rangesfm.distances.map_points import MapPoint, MapPoints
 from rangesfm.distances.tape import CHECK, CONTROL
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import similarity_motions
+from rangesfm.inference.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
 from rangesfm.positions.control_points import ControlPoint, ControlPoints, marks_seen
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
 
 _ONE_FRAME = "look whether points and anchors are in one frame, and measured to the same height of the antennas"
 _ALL = "frame of the points"

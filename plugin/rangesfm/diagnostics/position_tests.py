@@ -12,10 +12,10 @@ from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.hypothesis import in_axes
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, row_of_mistake
 from rangesfm.diagnostics.length_tests import against_other
+from rangesfm.inference.linear_map import FALSE_ALARM_RATE
 from rangesfm.options import LEVER_ARM_M
+from rangesfm.positions.grouped_positions import at_point
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.linear_map import FALSE_ALARM_RATE
-from rangesfm.scale.position_equations import at_point
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, PositionScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
@@ -92,7 +92,10 @@ def _of_check_points(positions: PositionScale, left_out: Collection[str]) -> Ite
 
 
 def _of_point(positions: PositionScale, kind: str, row: int, threshold: float) -> MistakeTest:
-    found, name = positions.equations.of_mistake(at_point(positions.known, row)), positions.known.names[row]
+    found, name = (
+        positions.problem.mistake(positions.columns_of(at_point(positions.known, row))),
+        positions.known.names[row],
+    )
     far = f"{np.linalg.norm(found.sizes):.2f} m from its coordinates ({in_axes(-found.sizes)})"
     return row_of_mistake(kind, name, found, threshold, f"the {kind} {name} is {far}", LOOK_AGAIN)
 
@@ -120,7 +123,7 @@ def _of_antenna(positions: PositionScale) -> Iterator[MistakeTest]:
     most = {_ARM: LEVER_ARM_M.most, _CLOCK: float(np.ptp(known.time_s[is_antenna]))}
     for name, of_all in columns.items():
         by = of_all.reshape(3 * len(known), -1)
-        found = positions.equations.with_mistake_learnt(by).of_mistake(by)
+        found = positions.problem.learnt(in_problem := positions.columns_of(by)).mistake(in_problem)
         threshold = float(special.chdtri(max(found.num, 1), FALSE_ALARM_RATE / len(columns)))
         words, remedy, unit = _OF_ANTENNA[name]
         if np.linalg.norm(found.sizes) > most.get(name, np.inf):

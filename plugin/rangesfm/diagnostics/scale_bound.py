@@ -20,9 +20,9 @@ from scipy.optimize import brentq
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Test
 from rangesfm.diagnostics.mistake_words import mistake_in_words
-from rangesfm.scale.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.inference.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.inference.posterior import ScaleUncertainty
 from rangesfm.scale.scale_by_lengths import LengthScale
-from rangesfm.scale.scale_estimate import ScaleUncertainty
 
 RISK = 1e-4
 """Probability with which the scale may be off by more than the bound."""
@@ -84,8 +84,7 @@ def hidden_lengths(lengths: LengthScale, against_stddev: float | None) -> tuple[
     """
     is_checked = np.isfinite(lengths.stddev_m)
     slopes = (np.abs(lengths.by_metre) * lengths.stddev_m)[is_checked]
-    found = zip(slopes.tolist(), lengths.threshold[is_checked].tolist(), strict=True)
-    hidden = [HiddenMistake("length", slope, threshold, 1, np.inf) for slope, threshold in found]
+    hidden = [HiddenMistake("length", slope, lengths.threshold, 1, np.inf) for slope in slopes.tolist()]
     if against_stddev is not None:
         threshold = float(special.chdtri(1, FALSE_ALARM_RATE))
         hidden.append(HiddenMistake("lengths", against_stddev, threshold, 1, np.inf))

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
+from scipy.sparse import csr_array, vstack
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.distances.tape import CONTROL, Marker, Tape, TapedDistance
+from rangesfm.distances.map_points import MapPoints, by_pose
+from rangesfm.distances.markers import images_by_name, mark_covariance, triangulate_markers, variance_along
+from rangesfm.distances.tape import CONTROL, Tape, TapedDistance
 from rangesfm.errors import InputError
+from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 
-# Largest distance of a mark from its reprojected marker, as a fraction of the photo's longer side. A mark farther off
-# belongs to another point.
-_MAX_REPROJECTION = 0.02
-# Smallest angle between the rays to a marker.
-_MIN_TRIANGULATION_ANGLE_DEG = 0.5
 # Standard deviation of the median of normally distributed values over that of their mean: sqrt(pi / 2).
 _MEDIAN_OVER_MEAN = 1.2533
 # Smallest standard deviation of a length between anchors, because lengths are weighted by its inverse.
@@ -47,6 +44,8 @@ class LocatedDistances:
         mark_stddev: (k,) standard deviation of the model's length due to errors of marks in photos, in its unit.
         is_printed: (k,) bool, sides of printed tags, which share one error of their size.
         is_everywhere: (k,) bool, lengths that occur all along the map, so that its bending does not matter.
+        by_pose: (k, 6 n) sparse derivatives of the model's length by the n poses of a path, as of ``KnownPositions``;
+            zero where they do not matter or are not known.
     """
 
     model_length: Array
@@ -58,6 +57,7 @@ class LocatedDistances:
     mark_stddev: Array
     is_printed: Mask
     is_everywhere: Mask
+    by_pose: csr_array
 
     @classmethod
     def of(
@@ -73,7 +73,7 @@ class LocatedDistances:
         length = np.full(k, np.nan) if model_length is None else model_length
         pair = np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair
         no, nowhere = np.zeros(k, dtype=bool), np.full((k, 2, 3), np.nan)
-        return cls(length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no)
+        return cls(length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no, csr_array((k, 0)))
 
     @property
     def is_between_points(self) -> Mask:
@@ -85,14 +85,18 @@ class LocatedDistances:
 
     def subset(self, rows: Mask) -> LocatedDistances:
         """Return the lengths that are true in ``rows`` (k,)."""
-        return LocatedDistances(*(column[rows] for column in self._columns()))
+        return LocatedDistances(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def joined(self, others: LocatedDistances) -> LocatedDistances:
         """Return these lengths followed by others."""
-        return LocatedDistances(*map(np.concatenate, zip(self._columns(), others._columns(), strict=True)))
-
-    def _columns(self) -> tuple[npt.NDArray[Any], ...]:
-        return tuple(getattr(self, field.name) for field in fields(self))
+        columns = dict[str, Any](
+            (field.name, np.concatenate([getattr(self, field.name), getattr(others, field.name)]))
+            for field in fields(self)
+            if field.name != "by_pose"
+        )
+        num = max(self.by_pose.shape[1], others.by_pose.shape[1])
+        parts = [csr_array(of.by_pose, shape=(len(of), num)) for of in (self, others)]
+        return LocatedDistances(**columns, by_pose=vstack(parts, format="csr"))
 
     def lengths_m(self, scale: float, anchors_m: Array) -> Array:
         """Return the lengths in a map (k,), in metres; NaN where an anchor has no position.
@@ -130,10 +134,15 @@ class LocatedDistances:
         return jacobian
 
 
-def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> LocatedDistances:
+def locate_distances(
+    tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str], path: Trajectory | None = None
+) -> LocatedDistances:
     """Find the ends of measured lengths in a model.
 
     An end is the photo of that name (its projection centre), else the marker, else the anchor.
+
+    Args:
+        path: of the model, by whose poses the derivatives are; None: they are not needed.
 
     Raises:
         InputError: an end is none of these, a photo is not in the model, only one of the two ends is an anchor, or the
@@ -141,6 +150,8 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
     """
     images, markers = images_by_name(model), triangulate_markers(tape, model)
     points = {name: image.projection_center() for name, image in images.items()} | markers
+    finder = MapPoints(model, {}, tape.markers, np.nan, tape.markers_path)
+    slopes = np.zeros((len(tape.distances), 0 if path is None else 6 * len(path)))
     ends, mark_stddev = np.full((len(tape.distances), 2, 3), np.nan), np.zeros(len(tape.distances))
     pairs = np.full((len(tape.distances), 2), -1, dtype=np.int64)
     for row, taped in enumerate(tape.distances):
@@ -150,6 +161,11 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
             marked = [(tape.markers[name], points[name]) for name in taped.ends if name in markers]
             of_ends = [mark_covariance(marker, point, images) for marker, point in marked]
             mark_stddev[row] = np.sqrt(variance_along(ends[row, 0], ends[row, 1], sum(of_ends, np.zeros((3, 3)))))
+            if path is not None and not taped.is_everywhere:
+                found = [finder.find_marker(name) if name in markers else finder.find(name) for name in taped.ends]
+                apart = by_pose(found[1], path) - by_pose(found[0], path)
+                away = ends[row, 1] - ends[row, 0]
+                slopes[row] = away / max(float(np.linalg.norm(away)), 1e-12) @ apart
         elif start in anchor_ids and end in anchor_ids:
             pairs[row] = anchor_ids.index(start), anchor_ids.index(end)
         else:
@@ -164,6 +180,7 @@ def locate_distances(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Seq
         mark_stddev,
         np.array([taped.is_printed for taped in tape.distances], dtype=bool),
         np.array([taped.is_everywhere for taped in tape.distances], dtype=bool),
+        csr_array(slopes),
     )
 
 
@@ -189,12 +206,6 @@ def check_ends(tape: Tape, photos: Collection[str], anchor_ids: Collection[str],
                 raise InputError(message, tape.markers_path, marker.lines[0])
 
 
-def variance_along(start: Array, end: Array, covariance: Array) -> float:
-    """Return the variance of the length between two places (3,) by the sum (3, 3) of their covariances."""
-    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-12)
-    return float(along @ covariance @ along)
-
-
 def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:
     """Return the tape with only the lengths whose two ends are both in this model, or are both anchors."""
     images = images_by_name(model)
@@ -211,110 +222,6 @@ def _what_is_wrong(taped: TapedDistance, points: Collection[str], anchor_ids: Co
         if name not in points and name not in anchor_ids:
             return f"an end is {name!r}, expected a photo that is in the model, a marker or an anchor of the log"
     return f"from {taped.ends[0]!r} to {taped.ends[1]!r}: expected two anchors, or two ends that are not anchors"
-
-
-def images_by_name(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
-    """Return the model's photos with a pose, by name."""
-    return {image.name: image for image in model.images.values() if image.has_pose}
-
-
-def triangulate_markers(tape: Tape, model: pycolmap.Reconstruction) -> dict[str, Array]:
-    """Return the position (3,) of each marker that is an end of a length, by name; errors like ``locate_distances``."""
-    images, ends = images_by_name(model), {name for taped in tape.distances for name in taped.ends}
-    wanted = {name: marker for name, marker in tape.markers.items() if name in ends}
-    return {name: triangulate_marker(name, marker, images, tape.markers_path) for name, marker in wanted.items()}
-
-
-def triangulate_marker(
-    name: str, marker: Marker, images: Mapping[str, pycolmap.Image], markers_path: Path | None
-) -> Array:
-    """Return the position of a marker (3,) in the model's world, from the photos that are in the model.
-
-    It is the point that is nearest to the rays of the marks.
-
-    Raises:
-        InputError: the marks are too few, seen from one direction only, or not of one point.
-    """
-
-    def wrong(what: str, k: int = 0) -> InputError:
-        return InputError(f"marker {name!r} {what}", markers_path, marker.lines[k])
-
-    seen = [k for k, image_name in enumerate(marker.image_names) if image_name in images]
-    if len(seen) < 2:
-        raise wrong(f"is marked in {len(seen)} photos of the model, expected two or more")
-    views = [images[marker.image_names[k]] for k in seen]
-    in_cam = [_camera(view).cam_from_img(marker.pixels[k]) for k, view in zip(seen, views, strict=True)]
-    if any(at is None for at in in_cam):
-        raise wrong("has a mark outside its photo")
-    rays = np.array([[*np.ravel(at), 1.0] for at in in_cam if at is not None])
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    # Relative to the first camera, because linear triangulation far from the origin loses half of its digits.
-    origin = views[0].projection_center()
-    relative = pycolmap.triangulate_multi_view_point([_cam_from_world_at(origin, view) for view in views], rays)
-    point = None if relative is None else np.ravel(relative) + origin
-    if point is None or _widest_angle_deg(point, views) < _MIN_TRIANGULATION_ANGLE_DEG:
-        raise wrong("is seen from one direction only, expected photos from different places")
-    for k, view in zip(seen, views, strict=True):
-        camera, seen_at = _camera(view), view.project_point(point)
-        if seen_at is None:
-            raise wrong("is behind this photo's camera by the other photos: is it the same point?", k)
-        off_px = float(np.linalg.norm(seen_at - marker.pixels[k]))
-        if off_px > _MAX_REPROJECTION * max(camera.width, camera.height):
-            raise wrong(
-                f"is {off_px:.0f} px from where the other photos put it: is it the same point, or does the path drift?",
-                k,
-            )
-    return point
-
-
-def mark_covariance(marker: Marker, point: Array, images: Mapping[str, pycolmap.Image]) -> Array:
-    """Return the covariance (3, 3) of a marker's position due to the errors of its marks, in the model's unit."""
-    if marker.stddev_px == 0:
-        return np.zeros((3, 3))
-    information = np.zeros((3, 3))
-    for view in (images[name] for name in marker.image_names if name in images):
-        step = 1e-4 * float(np.linalg.norm(point - view.projection_center()))
-        moved = [view.project_point(point + by) for by in step * np.vstack([np.eye(3), -np.eye(3)])]
-        if all(at is not None for at in moved):
-            plus, minus = np.array(moved, dtype=np.float64).reshape(2, 3, 2)
-            slopes = (plus - minus) / (2 * step)
-            information += slopes @ slopes.T / marker.stddev_px**2
-    return np.asarray(np.linalg.pinv(information, hermitian=True))
-
-
-def locatable(tape: Tape, model: pycolmap.Reconstruction) -> Tape:
-    """Return the tape without tags that have a corner which cannot be triangulated.
-
-    Markers set by hand are kept, so that the user is told what is wrong with them.
-    """
-    images, lost = images_by_name(model), set[str]()
-    for name, marker in tape.found_markers.items():
-        try:
-            triangulate_marker(name, marker, images, tape.markers_path)
-        except InputError:
-            lost.add(name)
-    kept = (taped for taped in tape.distances if not (taped.is_printed and lost.intersection(taped.ends)))
-    return replace(tape, distances=tuple(kept))
-
-
-def _cam_from_world_at(origin: Array, image: pycolmap.Image) -> Array:
-    """Return cam_from_world (3, 4) for a world whose origin is moved to ``origin``."""
-    pose = image.cam_from_world().matrix()
-    pose[:, 3] += pose[:, :3] @ origin
-    return pose
-
-
-def _camera(image: pycolmap.Image) -> pycolmap.Camera:
-    camera = image.camera
-    if camera is None:
-        raise ValueError(f"image {image.name} has no camera")
-    return camera
-
-
-def _widest_angle_deg(point: Array, views: Sequence[pycolmap.Image]) -> float:
-    rays = np.array([view.projection_center() for view in views]) - point
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    return float(np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))
 
 
 def distances_by_radio(

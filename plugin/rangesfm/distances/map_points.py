@@ -10,14 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array
-from rangesfm.distances.locate_lengths import images_by_name, triangulate_marker
+from rangesfm.distances.markers import images_by_name, triangulate_marker
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import InputError
 from rangesfm.geometry.map_errors import MapPointErrors, Part
 from rangesfm.geometry.rotations import cross_matrices
-from rangesfm.geometry.trajectory import pose_of
+from rangesfm.geometry.trajectory import Trajectory, pose_of
 
 POINT_PREFIX = "point:"
 """Text before the number of a 3-D point of the model, as in ``point:1234``."""
@@ -126,6 +127,21 @@ class MapPoints:
         point = self.model.point3D(int(number))
         images = [self.model.image(element.image_id) for element in point.track.elements]
         return MapPoint(name, point.xyz, _errors_of_seen(self.model, images, point.xyz, self.pixel_stddev))
+
+
+def by_pose(point: MapPoint, path: Trajectory) -> csr_array:
+    """Return the (3, 6 n) derivatives of a point by the poses of a path: a turn in their own frame and a shift.
+
+    Other parts of the map are held fixed.
+    """
+    row_of = {frame_id: row for row, frame_id in enumerate(path.frame_ids.tolist())}
+    slopes = np.zeros((3, len(path), 6))
+    for (kind, number), by in point.errors.by_part.items():
+        if kind == "frame" and (row := row_of.get(number)) is not None:
+            # A turn about the camera's own axes is a turn about those of the world, turned by its rotation.
+            slopes[:, row, :3] = by[:, :3] @ path.world_from_cam[row]
+            slopes[:, row, 3:] = by[:, 3:]
+    return csr_array(slopes.reshape(3, -1))
 
 
 class _View:

@@ -25,8 +25,8 @@ from rangesfm.geometry.poses import Poses, relative_poses
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.similarity import rounding_of
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.bending import Bending, bending_part, without_similarity
 from rangesfm.measurements.kind import Block, Linearization, MapState, Measurements
-from rangesfm.ranging.errors.bending import BendingOfBins, bending_part, without_similarity
 
 _INITIAL_DAMPING = 1e-8
 _MAX_DAMPING = 1e6
@@ -110,13 +110,13 @@ class GraphBending:
     vision: VisionInformation
     path: Trajectory
 
-    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free)
         parts = functions.reshape(len(by_pose), -1, 6)
         parts[:, :, 3:] = parts[:, :, 3:] @ self.vision.origin.world_from_rig[0].T
         covariance = functions @ self._factored.solve(np.ascontiguousarray(functions.T))
         found = bending_part("bending", covariance, 1.0, 0.0)
-        return BendingOfBins(() if found is None else (found,), covariance, np.zeros(len(by_pose)))
+        return Bending(() if found is None else (found,), covariance, np.zeros(len(by_pose)))
 
     @cached_property
     def _factored(self) -> NestedFactor:

@@ -18,14 +18,14 @@ from rangesfm.estimation.vision_information import misplaced_points, model_obser
 from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.poses import model_poses
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
-from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.ranging.errors.bending import (
-    BendingOfBins,
+from rangesfm.inference.bending import (
+    Bending,
     MapBending,
     WalkBending,
     bending_part,
     without_similarity,
 )
+from rangesfm.options import CameraOptions, RefineOptions
 
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
 # independent errors of features, as in simulations; 4 in a room of real photos, 8 to 12 in three scenes of others
@@ -58,14 +58,14 @@ class PhotoBending:
     is_firm: Mask
     is_at_optimum: bool
 
-    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         functions = without_similarity(by_pose, self.path, frame_is_free=frame_is_free, is_firm=self.is_firm)
         parts = functions.reshape(len(by_pose), len(self.path), 6)
         by_center = parts[:, :, 3:] @ self.world_from_model.T / self.metres_per_unit
         covariance, shift_m = self.photos.of_functions(self.frame_ids, parts[:, :, :3], by_center)
         found = bending_part("bending", covariance, MEDIAN_FACTOR, _SPREAD)
         shift_m = np.zeros(len(by_pose)) if self.is_at_optimum else shift_m
-        return BendingOfBins(() if found is None else (found,), covariance, shift_m)
+        return Bending(() if found is None else (found,), covariance, shift_m)
 
     def hold_together(self, image_names: Collection[str]) -> bool:
         """Return whether the photos determine the scale of a part of the map relative to the rest.

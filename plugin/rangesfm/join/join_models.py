@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.colmap.transform import joined_model, rescale
-from rangesfm.distances.locate_lengths import distances_within, locatable
+from rangesfm.distances.locate_lengths import distances_within
+from rangesfm.distances.markers import locatable
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import joined_trajectory

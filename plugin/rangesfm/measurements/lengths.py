@@ -12,7 +12,7 @@ import pycolmap
 from rangesfm import ceres
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.bundle_adjustment import BundleAdjustment
-from rangesfm.distances.locate_lengths import images_by_name, variance_along
+from rangesfm.distances.markers import images_by_name, variance_along
 from rangesfm.geometry.robust_statistics import RobustLoss
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.measurements.kind import (

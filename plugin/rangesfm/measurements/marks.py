@@ -11,7 +11,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.ceres.bundle_adjustment import BundleAdjustment
-from rangesfm.distances.locate_lengths import images_by_name, mark_covariance, triangulate_marker
+from rangesfm.distances.markers import images_by_name, mark_covariance, triangulate_marker
 from rangesfm.distances.tape import Marker
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.distances.locate_lengths import images_by_name
+from rangesfm.distances.markers import images_by_name
 from rangesfm.distances.tape import Marker
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.geometry.trajectory import pose_of

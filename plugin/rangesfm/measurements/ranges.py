@@ -17,12 +17,12 @@ from rangesfm.geometry.poses import Poses
 from rangesfm.geometry.robust_statistics import RobustLoss
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.bending import BENDS
 from rangesfm.measurements.kind import Block, ByBlock, LearntErrors, Linearization, MapState, Measurements, Weights
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.prior import Prior
 from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.components import BENDS
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M, bias_whitening
 from rangesfm.ranging.errors.range_errors import RangeErrors

@@ -1,7 +1,6 @@
 """Expected result of a planned survey: the uncertainty that a run will state, from its linear problem at the true map.
 
-Ranges, known positions and the bending that the photos allow are one linear Gaussian problem. The equations, the errors
-and the rule for the interval are those with which a run judges its finished map.
+The equations, the errors and the rule for the interval are those with which a run judges its finished map.
 """
 
 from __future__ import annotations
@@ -11,34 +10,34 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.diagnostics.finished_map import by_similarity
-from rangesfm.diagnostics.linearized import ranges_on_map, slopes_by_poses
+from rangesfm.distances.lengths_on_map import lengths_on_map
 from rangesfm.distances.tape import CHECK
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.free_fit import GraphBending
 from rangesfm.estimation.vision_information import VisionInformation
-from rangesfm.geometry.similarity import IDENTITY, similarity_motions
+from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.geometry.trajectory import in_first_camera
+from rangesfm.inference.bending import BENDS, MapBending, WalkBending
+from rangesfm.inference.linear_map import Columns
+from rangesfm.inference.noise import Component, noise_of_sizes, usual_sizes
+from rangesfm.inference.posterior import JointProblem, Observations, Posterior, ScaleUncertainty, joined
 from rangesfm.options import LENGTH_M, ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.ranging.errors.bending import ErrorPart, MapBending, WalkBending, averaged
-from rangesfm.ranging.errors.components import BENDS
-from rangesfm.ranging.errors.learned import ErrorParts, LearnedErrors, usual_stddevs
+from rangesfm.ranging.errors.learned import LearnedErrors
+from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
-from rangesfm.scale.linear_map import LinearMap, regular
+from rangesfm.scale.binned_ranges import RANGES, BinnedRanges, bias_covariance, binned_ranges
 from rangesfm.scale.placement_prior import PlacementPrior
-from rangesfm.scale.range_equation import Columns, antenna_positions, fit_at
-from rangesfm.scale.scale_by_positions import expected_positions, groups_by_pose, refuse_open_turn
-from rangesfm.scale.scale_estimate import ScaleUncertainty
+from rangesfm.scale.range_equation import antenna_positions, fit_at
+from rangesfm.scale.scale_by_positions import planned_positions, refuse_open_turn
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import Verdict, judge, judge_positions
 from rangesfm.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
-from rangesfm.scale.uncertainty import KnownMap, bias_covariance, chance_differences, errors_to_expect, linear_map
 
 # Numbers of ranges, of bins and of keyframes in the quick computation that compares plans.
 _NUM_COMPARED_RANGES, _NUM_COMPARED_BINS, _NUM_COMPARED_KEYFRAMES = 600, 120, 15
@@ -50,20 +49,22 @@ OPEN = 1e3
 """Standard deviation, in metres or radians, from which on a number counts as not determined."""
 
 
+# Name of the coordinates of keyframes, which are predicted.
+_KEYFRAMES = "keyframes"
+
+
 @dataclass(frozen=True)
 class RangesAtTruth:
     """Planned ranges without errors, on the true map.
 
     Attributes:
         posed: the scale problem. solution: its true state, with the weight of each range.
-        learned: errors to expect of the radio.
-        by_pose: (c, 6 n) derivatives of the bins by the poses.
+        observed: the ranges, of which the robust weights assume what differs from range to range.
     """
 
     posed: ScaleProblem
     solution: Solution
-    learned: LearnedErrors
-    by_pose: Array
+    observed: BinnedRanges
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Expected:
         vision: information of its photos; None: the map bends as maps of poses do.
         ranges: its ranges; None without any.
         known: uncertainty of the map as a whole.
-        errors: of the c bins of ranges and of the coordinates of known positions.
+        learned: errors to expect of the ranges, with those of the map's bending; None without any.
         keyframe_stddevs_m: (n,) roots of the summed variances of each keyframe's position in the result's frame, after
             ranges and known positions have straightened the map; inf if not determined.
         num_positions: number of known positions that hold the map.
@@ -86,8 +87,8 @@ class Expected:
     planned: PlannedSurvey
     vision: VisionInformation | None
     ranges: RangesAtTruth | None
-    known: KnownMap
-    errors: ErrorParts
+    known: Posterior
+    learned: LearnedErrors | None
     keyframe_stddevs_m: Array
     num_positions: int
     notes: tuple[str, ...]
@@ -98,10 +99,9 @@ class Expected:
         """Return that a run will refuse the survey, and know nothing of its map."""
         none, is_placed = np.zeros(0, dtype=np.int64), planned.anchor_frame == "site"
         columns, open_ = Columns(0, 1 if is_placed else -1, none, none, 7), OPEN**4 * np.eye(7)
-        known = KnownMap(ScaleUncertainty(np.inf, {}), open_, columns, np.zeros(7), np.zeros(0))
-        errors = ErrorParts((), np.zeros(0), np.zeros((0, 0, 0)))
+        known = Posterior(ScaleUncertainty(np.inf, {}), columns, open_, np.zeros(7), np.zeros(7), np.zeros(0))
         open_m = np.full(len(planned.trajectory), np.inf)
-        return cls(replace(planned, photos=None), None, None, known, errors, open_m, 0, (), refusal)
+        return cls(replace(planned, photos=None), None, None, known, None, open_m, 0, (), refusal)
 
     @property
     def uncertainty(self) -> ScaleUncertainty:
@@ -127,14 +127,6 @@ class Expected:
             return judge_positions(self.num_positions, self.uncertainty, ScaleOptions(), has_check=has_check)
         return judge(self.ranges.posed, self.ranges.solution, self.uncertainty, {}, (), ScaleOptions())
 
-    @property
-    def learned(self) -> LearnedErrors:
-        """Errors of the ranges, with those of the map's bending."""
-        assert self.ranges is not None, "a plan with ranges"
-        radio, errors, num = self.ranges.learned, self.errors, len(self.ranges.learned.bins)
-        of_bins = errors.covariances_m2[:, :num, :num]
-        return LearnedErrors(errors.names, errors.stddevs, of_bins, radio.bins, radio.of_range)
-
     def mirror_image(self) -> str | None:
         """Return why the run will leave the position open, or None if it will not.
 
@@ -157,10 +149,11 @@ class Expected:
     def turned_out(self, seed: int) -> RangeObservations:
         """Return the ranges with errors drawn from those to expect."""
         assert self.ranges is not None, "a plan with ranges"
+        assert self.learned is not None, "errors of ranges"
         rng, learned, observations = np.random.default_rng(seed), self.learned, self.ranges.posed.observations
         values, vectors = np.linalg.eigh(learned.without("white").covariance_m2)
         of_bins = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-        white_m = self.ranges.learned.stddev_of_component["white"] / np.sqrt(self.planned.num_alike)
+        white_m = learned.stddev_of_component["white"] / np.sqrt(self.planned.num_alike)
         range_m = observations.log.range_m.copy()
         range_m[self.ranges.posed.rows] += of_bins[learned.of_range]
         range_m[self.ranges.posed.rows] += white_m * rng.standard_normal(len(learned.of_range))
@@ -169,7 +162,7 @@ class Expected:
     @property
     def placement(self) -> Array | None:
         """(7, 7) covariance of the map's similarity about the first camera, as of a ScaleEstimate; None: not placed."""
-        return self.known.columns.placement(self.known.covariance)
+        return self.known.placement
 
     @property
     def map_stddevs(self) -> Array | None:
@@ -229,39 +222,37 @@ def expect(
         vision = planned.photos.information(path)
     first = in_first_camera(path)
     the_map = _BendingMap(planned, WalkBending(first) if vision is None else GraphBending(vision, first), num_keyframes)
-    positions, placement, notes = _positions(planned, the_map)
+    positions, placement, notes = _positions(planned, the_map, max_num_bins)
     ranges = _ranges(planned, placement, max_num_bins) if planned.anchors else None
-    observed = [] if ranges is None else [_of_ranges(ranges)]
-    if positions is not None:
-        # Beside known positions, a run gives ranges no more say on the scale than their errors allow.
-        observed = [*(the_map.with_honest_weights(each) for each in observed), positions]
-    known, errors, keyframe_stddevs_m = the_map.solved(observed)
-    num_positions = 0 if positions is None else len(positions.linear.design) // 3
-    return Expected(planned, vision, ranges, known, errors, keyframe_stddevs_m, num_positions, notes)
+    observed: list[Observations] = [] if ranges is None else [ranges.observed]
+    observed += [] if positions is None else [positions]
+    if (taped := planned.taped_lengths) is not None:
+        observed.append(lengths_on_map(taped, 1.0, path, np.ones(len(taped), dtype=bool)))
+    problem, known, keyframe_stddevs_m = the_map.solved(observed, None if ranges is None else ranges.observed.priors)
+    learned = None if ranges is None else LearnedErrors.of(problem.noise_of(RANGES), ranges.observed.bins)
+    num_positions = 0 if positions is None else int(np.count_nonzero(positions.is_used)) // 3
+    return Expected(planned, vision, ranges, known, learned, keyframe_stddevs_m, num_positions, notes)
 
 
 def _positions(
-    planned: PlannedSurvey, the_map: _BendingMap
-) -> tuple[_Observed | None, PlacementPrior | None, tuple[str, ...]]:
+    planned: PlannedSurvey, the_map: _BendingMap, max_num: int
+) -> tuple[Observations | None, PlacementPrior | None, tuple[str, ...]]:
     """Return the known positions, what they say of the map's place without ranges, and why they are not used."""
     known, notes = planned.known_positions()
     if known is None:
         return None, None, notes
     try:
-        equations = expected_positions(known, planned.trajectory, the_map.bending, planned.lasting_s)
-        linear, errors = equations.of(equations.is_used)
-        by_pose = groups_by_pose(known, IDENTITY, planned.trajectory, equations.grouping)[equations.is_used]
-        errors = errors.without(*BENDS)
-        observed = _Observed(linear, errors, errors.only(*_NOISE).covariance_m2, by_pose)
-        alone = the_map.solved([observed])[0]
-        covariance = alone.columns.placement(alone.covariance)
-        assert covariance is not None, "known positions place the map"
-        refuse_open_turn(covariance)
+        found = planned_positions(known, planned.trajectory, planned.lasting_s, max_num)
+        expected = noise_of_sizes(found.components, usual_sizes(found.components), len(found.is_used))
+        observed = replace(found, working_m2=expected.only(*_NOISE).covariance_m2)
+        alone = the_map.solved([observed])[1]
+        assert alone.placement is not None, "known positions place the map"
+        refuse_open_turn(alone.placement)
     except GeometryError as error:
         if not planned.anchors:
             raise GeometryError(f"the scale is not determined: {error}") from None
         return None, None, (*notes, f"the known positions are not used: {error}")
-    return observed, PlacementPrior.of(planned.site_from_first_camera, np.zeros(3), covariance), notes
+    return observed, PlacementPrior.of(planned.site_from_first_camera, np.zeros(3), alone.placement), notes
 
 
 def _ranges(planned: PlannedSurvey, placement: PlacementPrior | None, max_num_bins: int) -> RangesAtTruth:
@@ -272,33 +263,17 @@ def _ranges(planned: PlannedSurvey, placement: PlacementPrior | None, max_num_bi
     problem = weighted(posed.ranges, errors)
     weights = np.full(len(posed.rows), float(planned.num_alike))
     solution = Solution(problem, fit_at(problem, state, weights), errors, errors.noise_m)
-    stddevs = usual_stddevs(is_calibrated=planned.curve_stddev_m is not None) | dict(planned.component_stddevs)
-    learned = errors_to_expect(posed, solution, stddevs, max_num_bins)
-    by_pose = averaged(learned.bins, slopes_by_poses(ranges_on_map(posed, solution, None)), len(planned.trajectory))
-    return RangesAtTruth(posed, solution, learned, by_pose)
+    found = binned_ranges(posed, solution, max_num_bins=max_num_bins, noise_m=START_STDDEV_M)
+    sizes = _given_or_usual(found.components, planned.component_stddevs)
+    alone = noise_of_sizes(found.components, sizes, len(found.is_used)).only(*_NOISE).covariance_m2
+    working = alone + bias_covariance(found.bins, posed.ranges)
+    return RangesAtTruth(posed, solution, replace(found, alone_m2=alone, working_m2=working))
 
 
-@dataclass(frozen=True)
-class _Observed:
-    """Observations of one kind, three for each known position or one for each bin of ranges.
-
-    Attributes:
-        linear: their equations. errors: all but the map's bending. simple_m2: covariance that simple weights assume.
-        by_pose: derivatives by the poses.
-    """
-
-    linear: LinearMap
-    errors: ErrorParts
-    simple_m2: Array
-    by_pose: Array
-
-
-def _of_ranges(ranges: RangesAtTruth) -> _Observed:
-    # Known positions are observations of their own, and not a prior of the ranges' equations.
-    posed = replace(ranges.posed, ranges=replace(ranges.posed.ranges, placement=None))
-    learned = ranges.learned
-    simple_m2 = learned.only(*_NOISE).covariance_m2 + bias_covariance(learned.bins, posed.ranges)
-    return _Observed(linear_map(posed, ranges.solution, learned.bins), learned, simple_m2, ranges.by_pose)
+def _given_or_usual(components: Sequence[Component], given: Mapping[str, float]) -> dict[str, float]:
+    """Return the sizes of components: as given, or usual; those whose size is known have it."""
+    learnt = {each.name for each in components if each.spread > 0 or each.name in BENDS}
+    return usual_sizes(components) | {name: size for name, size in given.items() if name in learnt}
 
 
 @dataclass(frozen=True)
@@ -313,56 +288,29 @@ class _BendingMap:
     bending: MapBending
     num_keyframes: int
 
-    def solved(self, observed: Sequence[_Observed]) -> tuple[KnownMap, ErrorParts, Array]:
-        """Return what observations say of the map: as a whole, their errors, and (n,) stddevs of all keyframes.
+    def solved(
+        self, observed: Sequence[Observations], priors: tuple[Array, Array] | None = None
+    ) -> tuple[JointProblem, Posterior, Array]:
+        """Return what observations say of the map: the joint problem, its posterior, and (n,) stddevs of all keyframes.
 
-        A keyframe's error is that of the map as a whole and its bending, as far as the observations leave it open
-        (universal kriging: Rasmussen and Williams, "Gaussian processes for machine learning", 2006, eq. 2.42).
+        A keyframe's error is that of the map as a whole and its bending, as far as the observations leave it open.
         """
-        columns = observed[0].linear.columns
-        design = np.vstack([_in_columns(each.linear.design, columns) for each in observed])
-        prior_design = np.vstack([_in_columns(each.linear.prior_design, columns) for each in observed])
-        linear = LinearMap(np.zeros(len(design)), design, np.zeros(len(prior_design)), prior_design, columns)
-        bent = self._bent(observed, is_free=columns.frame >= 0)
-        num = len(design)
-        errors = _joined([each.errors for each in observed], {name: by[:num, :num] for name, by in bent.items()})
-        formal = float(np.sqrt(linear.solved(errors.only(*_NOISE).covariance_m2).covariance[0, 0]))
-        bent_m2 = np.sum([np.zeros((num + 3 * len(self._some),) * 2), *bent.values()], axis=0)
-        simple_m2 = block_diag(*(each.simple_m2 for each in observed)) + bent_m2[:num, :num]
-        by_others, _ = linear.with_weights(simple_m2, errors.covariance_m2)
-        # The estimates with different weights will differ by about one standard deviation.
-        best = linear.solved(errors.covariance_m2)
-        half_way = chance_differences(by_others, best.covariance) / 2
-        known = KnownMap.of(best, errors, formal, columns, half_way)
-        whitened = cho_solve(cho_factor(regular(errors.covariance_m2)), np.hstack([bent_m2[:num, num:], design]))
-        of_places, of_design = whitened[:, : bent_m2.shape[0] - num], whitened[:, bent_m2.shape[0] - num :]
-        left = self._motions(columns) - bent_m2[num:, :num] @ of_design
-        variances = np.diag(bent_m2)[num:] - np.sum(bent_m2[num:, :num] * of_places.T, axis=1)
-        variances = variances + np.einsum("ip,pq,iq->i", left, known.covariance, left)
+        problem = joined([*observed, self._keyframes(observed)], self.bending, *(priors or (None, None)))
+        num_first = len(observed[0].residual_m)
+        problem = replace(problem, sizes=self._sizes(problem.components, num_first))
+        known = problem.expected_posterior()
+        variances = np.diag(problem.predicted_m2(_KEYFRAMES, known.covariance))
         stddevs_m = np.sqrt(np.maximum(variances.reshape(-1, 3).sum(axis=1), 0.0))
         of_all = np.interp(np.arange(len(self.planned.trajectory)), self._some, stddevs_m)
-        return known, errors, np.where(of_all < OPEN, of_all, np.inf)
+        return problem, known, np.where(of_all < OPEN, of_all, np.inf)
 
-    def with_honest_weights(self, observed: _Observed) -> _Observed:
-        """Return observations whose simple weights claim no more about the scale than their errors allow."""
-        linear, known = observed.linear, self.solved([observed])[0]
-        claimed = float(linear.solved(observed.simple_m2).covariance[0, 0])
-        excess = max(known.uncertainty.empirical**2 / claimed, 1.0)
-        return replace(observed, simple_m2=excess * observed.simple_m2)
-
-    def _bent(self, observed: Sequence[_Observed], *, is_free: bool) -> dict[str, Array]:
-        """Return by name the covariance of the observations and of the keyframes' coordinates due to the bending."""
-        by_pose = np.vstack([*(each.by_pose for each in observed), self._by_pose])
-        num_first = len(observed[0].by_pose)
-        parts = self.bending.of_functions(by_pose, frame_is_free=is_free).parts
-        return {part.name: self._variance(part, num_first) * part.alike for part in parts}
-
-    def _variance(self, part: ErrorPart, num_first: int) -> float:
-        """Return the variance of a part's size; what is given of it refers to the first observations."""
-        given_m = self.planned.component_stddevs.get(part.name)
-        if given_m is None:
-            return float(part.median_m * np.exp(part.spread**2)) ** 2
-        return given_m**2 * num_first / float(np.trace(part.alike[:num_first, :num_first]))
+    def _sizes(self, components: Sequence[Component], num_first: int) -> dict[str, float]:
+        """Return the sizes of all components; what is given of the bending refers to the first observations."""
+        given = dict(self.planned.component_stddevs)
+        for each in components:
+            if each.name in BENDS and each.name in given:
+                given[each.name] /= float(np.sqrt(np.trace(each.alike[:num_first, :num_first]) / num_first))
+        return _given_or_usual(components, given)
 
     @cached_property
     def _some(self) -> Indices:
@@ -370,44 +318,17 @@ class _BendingMap:
         some: Indices = np.unique(np.linspace(0, len(self.planned.trajectory) - 1, self.num_keyframes).astype(np.int64))
         return some
 
-    @cached_property
-    def _by_pose(self) -> Array:
-        """Derivatives (3 k, 6 n) of these keyframes' coordinates by the poses, with shifts as in the first camera."""
+    def _keyframes(self, observed: Sequence[Observations]) -> Observations:
+        """Return the coordinates of these keyframes, which nobody observes."""
         path, some = self.planned.trajectory, self._some
         by_pose = np.zeros((len(some), 3, len(path), 6))
         by_pose[np.arange(len(some)), :, some, 3:] = path.world_from_cam[0]
-        return by_pose.reshape(3 * len(some), -1)
-
-    def _motions(self, columns: Columns) -> Array:
-        """Return the derivatives (3 k, p) of these keyframes' coordinates by the unknowns."""
-        centers = self.planned.trajectory.centers
-        of_map = columns.of_map
-        motions = np.zeros((3 * len(self._some), columns.num))
-        motions[:, of_map] = similarity_motions(centers[self._some] - centers[0]).reshape(-1, 7)[:, : len(of_map)]
-        return motions
-
-
-def _in_columns(design: Array, columns: Columns) -> Array:
-    """Return the derivatives by all unknowns; known positions have those by the map as a whole."""
-    if design.shape[1] == columns.num:
-        return design
-    widened = np.zeros((len(design), columns.num))
-    widened[:, columns.of_map] = design
-    return widened
-
-
-def _joined(observed: Sequence[ErrorParts], bent: Mapping[str, Array]) -> ErrorParts:
-    """Return the errors of all observations; those of different kinds are independent, but for the bending."""
-    nums = [each.covariances_m2.shape[1] for each in observed]
-    by_name = {
-        name: block_diag(
-            *(
-                each.covariances_m2[each.names.index(name)] if name in each.names else np.zeros((num, num))
-                for each, num in zip(observed, nums, strict=True)
-            )
-        )
-        for name in dict.fromkeys(name for each in observed for name in each.names)
-    } | dict(bent)
-    covariances = np.array(list(by_name.values()))
-    stddevs = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1])
-    return ErrorParts(tuple(by_name), stddevs, covariances)
+        num, nothing = 3 * len(some), np.zeros(0, dtype=np.int64)
+        is_free = max((each.columns for each in observed), key=lambda each: each.num).frame >= 0
+        columns = Columns(0, 1, nothing, nothing, 7) if is_free else Columns(0, -1, nothing, nothing, 1)
+        motions = similarity_motions(path.centers[some] - path.centers[0]).reshape(-1, 7)
+        none = np.zeros((num, num))
+        return Observations(
+            _KEYFRAMES, columns, motions[:, : columns.num], np.zeros(num), by_pose.reshape(num, -1), (), none, none,
+            np.zeros(num, dtype=bool),
+        )  # fmt: skip

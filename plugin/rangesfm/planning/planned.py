@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from rangesfm.arrays import Array
+from rangesfm.distances.lengths_on_map import BENDING
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory
@@ -28,7 +29,6 @@ from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeState
-from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
 
 # Offset of anchors with unknown positions, metres. In practice no anchor is exactly in line with a path or in its
@@ -193,6 +193,14 @@ class PlannedSurvey:
         track = None if self.antenna is None else self.antenna.located(self.trajectory)
         return joined_positions([marks, track]), notes
 
+    @property
+    def taped_lengths(self) -> LocatedDistances | None:
+        """Lengths that will be taped, between places that are not known yet; None without any."""
+        lengths, stddevs = np.array(self.taped, dtype=np.float64).reshape(-1, 2).T
+        # Between its ends the scale of the map varies.
+        stddevs = np.hypot(stddevs, BENDING * lengths)
+        return LocatedDistances.of(lengths, stddevs, model_length=lengths) if self.taped else None
+
     def posed(self, observations: RangeObservations, placement: PlacementPrior | None = None) -> ScaleProblem:
         """Return the scale problem that a run will solve, with the input that it will have.
 
@@ -204,11 +212,7 @@ class PlannedSurvey:
         """
         from_site = self.site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
         told = [replace(a, position_m=from_site.apply(at)) for a, at in zip(self.anchors, self.anchors_m, strict=True)]
-        lengths, stddevs = np.array(self.taped, dtype=np.float64).reshape(-1, 2).T
-        # Between its ends the scale of the map varies.
-        stddevs = np.hypot(stddevs, BENDING * lengths)
-        taped = LocatedDistances.of(lengths, stddevs, model_length=lengths) if self.taped else None
-        given = (observations, self.trajectory, told, self.anchor_frame, self.range_model, taped)
+        given = (observations, self.trajectory, told, self.anchor_frame, self.range_model, self.taped_lengths)
         return scale_problem(*given, placement=placement)
 
     def state(self, posed: ScaleProblem) -> RangeState:

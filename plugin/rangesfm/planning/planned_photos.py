@@ -16,7 +16,7 @@ import pycolmap
 from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.distances.locate_lengths import images_by_name, triangulate_marker
+from rangesfm.distances.markers import images_by_name, triangulate_marker
 from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.vision_information import Observations, VisionInformation, vision_information

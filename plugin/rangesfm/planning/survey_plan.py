@@ -236,11 +236,11 @@ def _mistakes(expected: Expected) -> tuple[MistakeTest, ...]:
 
     Nothing has been measured yet, so that there is nothing to test. The sizes and effects are known all the same.
     """
-    ranges = expected.ranges
-    if ranges is None:
+    ranges, learned = expected.ranges, expected.learned
+    if ranges is None or learned is None:
         return ()
     on_map = ranges_on_map(ranges.posed, ranges.solution, None)
-    problem = replace(linearized(on_map, expected.learned.bins), errors=expected.learned)
+    problem = replace(linearized(on_map, learned.bins), errors=learned)
     hypotheses = [hypothesis for of_kind in STANDING for hypothesis in of_kind(problem)]
     found = []
     for test in Factorization(problem).test(hypotheses, seed=0):

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.distances.locate_lengths import images_by_name
+from rangesfm.distances.markers import images_by_name
 from rangesfm.distances.tape import Marker
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from scipy.sparse import csr_array, vstack
 
-from rangesfm.distances.map_points import MapPoint, MapPoints
+from rangesfm.distances.map_points import MapPoints, by_pose
 from rangesfm.distances.tape import CONTROL
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.positions.control_points import ControlPoints, marks_seen
@@ -42,21 +42,9 @@ def locate_points(points: ControlPoints, model: pycolmap.Reconstruction, path: T
         clock_stddev_s=np.zeros(k),
         velocity=np.zeros((k, 3)),
         world_from_cam=np.zeros((k, 3, 3)),
-        by_pose=vstack([csr_array((0, 6 * len(path))), *(_by_pose(each, path) for each in found)], format="csr"),
+        by_pose=vstack([csr_array((0, 6 * len(path))), *(by_pose(each, path) for each in found)], format="csr"),
         arms_by_pose=csr_array((3 * k, 6 * len(path))),
         on_path=np.full((k, 2), -1, dtype=np.int64),
         fraction=np.zeros(k),
         from_line=np.zeros((k, 3)),
     )
-
-
-def _by_pose(point: MapPoint, path: Trajectory) -> csr_array:
-    """Return the (3, 6 n) derivatives of a mark by the poses of a path; other parts of the map are held fixed."""
-    row_of = {frame_id: row for row, frame_id in enumerate(path.frame_ids.tolist())}
-    slopes = np.zeros((3, len(path), 6))
-    for (kind, number), by in point.errors.by_part.items():
-        if kind == "frame" and (row := row_of.get(number)) is not None:
-            # A turn about the camera's own axes is a turn about those of the world, turned by its rotation.
-            slopes[:, row, :3] = by[:, :3] @ path.world_from_cam[row]
-            slopes[:, row, 3:] = by[:, 3:]
-    return csr_array(slopes.reshape(3, -1))

@@ -26,6 +26,7 @@ from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
 from rangesfm.geometry.rotations import left_jacobian
 from rangesfm.geometry.similarity import Similarity
+from rangesfm.inference.linear_map import Columns
 from rangesfm.ranging.errors.noise import bias_whitening
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.scale.placement_prior import PlacementPrior
@@ -189,30 +190,6 @@ class RangeFit:
             if column >= 0:
                 parts[k] = covariance[column : column + 3, column : column + 3]
         return parts
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Position of each unknown of a model in the parameter vector; -1 for an unknown that is not estimated.
-
-    The order is: for each model in turn, the logarithm of the scale and the frame (6: turn, shift); then the anchors
-    (3 each); then the biases.
-    """
-
-    scale: int
-    frame: int
-    anchor: Indices
-    bias: Indices
-    num: int
-
-    @property
-    def of_map(self) -> list[int]:
-        """Columns of the map as a whole: the logarithm of the scale and, if estimated, the turn and the shift."""
-        return [self.scale, *(range(self.frame, self.frame + 6) if self.frame >= 0 else ())]
-
-    def placement(self, covariance: Array) -> Array | None:
-        """Return the part (7, 7) of the map as a whole of a (p, p) covariance; None if its place is not estimated."""
-        return None if self.frame < 0 else np.asarray(covariance[np.ix_(self.of_map, self.of_map)])
 
 
 def columns_of(parts: Sequence[RangeProblem]) -> tuple[Columns, ...]:

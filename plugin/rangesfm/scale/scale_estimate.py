@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.similarity import Similarity
+from rangesfm.inference.posterior import ScaleByKind, ScaleUncertainty
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.scale_by_lengths import LengthScale, ScaleByKind
+from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
 from rangesfm.scale.two_candidate import TwoCandidate
@@ -22,44 +22,6 @@ from rangesfm.scale.two_candidate import TwoCandidate
 if TYPE_CHECKING:  # both import this module
     from rangesfm.scale.scale_by_positions import PositionScale
     from rangesfm.scale.scale_verdict import Verdict
-
-
-@dataclass(frozen=True)
-class ScaleUncertainty:
-    """Relative standard deviations of the scale, by their causes.
-
-    Attributes:
-        formal: from the Jacobian, as if all ranges erred independently (Cramer-Rao bound).
-        components: standard deviation due to each component of the ranges' errors, by its name.
-    """
-
-    formal: float
-    components: dict[str, float]
-
-    @property
-    def empirical(self) -> float:
-        """Realistic standard deviation: all components together, and never less than the formal one."""
-        return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
-
-    def beside(self, name: str, stddev: float) -> ScaleUncertainty:
-        """Return a copy with more of one component, added in quadrature."""
-        return replace(
-            self, components={**self.components, name: float(np.hypot(self.components.get(name, 0), stddev))}
-        )
-
-    def about(self, value: float) -> ScaleByKind:
-        """Return an estimate with its standard deviation."""
-        return ScaleByKind(value, value * self.empirical)
-
-    @property
-    def interval_95(self) -> tuple[float, float]:
-        """Bounds, with 95 % probability, of the logarithm of the true scale divided by the estimate."""
-        return -self.half_width_95, self.half_width_95
-
-    @property
-    def half_width_95(self) -> float:
-        """Half the width of the 95 % interval, in the logarithm of the scale."""
-        return NORMAL_95 * self.empirical
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,15 @@ from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.geometry.similarity import NEARLY_FLAT, NEARLY_STRAIGHT, path_kind, path_shape
+from rangesfm.inference.bending import BENDS
+from rangesfm.inference.posterior import ScaleUncertainty
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import Anchor, AnchorEstimate
-from rangesfm.ranging.errors.components import BENDS, FRAME
+from rangesfm.ranging.errors.components import FRAME
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.range_equation import RangeFit
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
-from rangesfm.scale.scale_estimate import ScaleUncertainty
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import MANY_OUTLIERS, WHY_SCALE_IS_OPEN, Solution
 

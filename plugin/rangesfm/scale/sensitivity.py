@@ -11,14 +11,14 @@ from rangesfm.scale.range_equation import predicted_ranges, range_gradient
 from rangesfm.scale.scale_estimate import ScaleSensitivity
 from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.solution import Solution
-from rangesfm.scale.uncertainty import KnownMap
 
 
-def scale_sensitivity(solution: Solution, posed: ScaleProblem, known: KnownMap, bins: RangeBins) -> ScaleSensitivity:
+def scale_sensitivity(solution: Solution, posed: ScaleProblem, by_bins: Array, bins: RangeBins) -> ScaleSensitivity:
     """Return the changes of the scale in percent, to first order.
 
     Args:
-        known: uncertainty of the solution. bins: of the problem's ranges.
+        by_bins: (c,) change of the scale's logarithm, with the best weights, per metre that each bin is longer.
+        bins: of the problem's ranges.
     """
     problem, fit, state = solution.problem, solution.fit, solution.fit.state
     # Relative change of the scale with the robust weights per metre by which each range is longer.
@@ -26,7 +26,7 @@ def scale_sensitivity(solution: Solution, posed: ScaleProblem, known: KnownMap, 
 
     def percent(range_error_m: Array) -> float:
         # The scale is half-way between that with the robust weights and that with the best weights.
-        return 50 * float(robust @ range_error_m + known.best_by_bins @ bins.mean(range_error_m))
+        return 50 * float(robust @ range_error_m + by_bins @ bins.mean(range_error_m))
 
     distance, centimetre = predicted_ranges(problem, state), 0.01
     world_from_cam = state.metric_from_model.rotation @ posed.model_from_cam

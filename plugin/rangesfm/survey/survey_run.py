@@ -15,11 +15,11 @@ from rangesfm.errors import InputError
 from rangesfm.files.clock_times import span_text
 from rangesfm.files.photo_names import told_none, told_unknown
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.bending import MapBending
 from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.offset import TimeOffset
 from rangesfm.ranging.clock.time_offset import estimate_time_offset
-from rangesfm.ranging.errors.bending import MapBending
 from rangesfm.ranging.range_log import RangeKind
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.scale.initialize import initialize_scale
@@ -129,7 +129,7 @@ class SurveyRun:
         """
         survey, inputs, distances = self.survey, self.inputs, None
         if inputs.tape.distances:
-            distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
+            distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids, path.trajectory)
         return initialize_scale(
             path.observations,
             path.trajectory,

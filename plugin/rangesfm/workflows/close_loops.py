@@ -19,7 +19,6 @@ from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.resection import Loop
 from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
-from rangesfm.scale.at_map import half_way
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.workflows.loop_matching import LoopMatching
 from rangesfm.workflows.metric_result import MetricResult
@@ -127,8 +126,8 @@ def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: Trie
 
 def _delivered(metric: MetricResult) -> Trajectory:
     """Return the path of a refined map as it would be the result: moved as a whole to where its interval lies."""
-    path, at, learned = metric.trajectory.as_in(metric.final), metric.refined_with_ranges, metric.learned_at_refined
-    if at is None or learned is None:
+    path, at = metric.trajectory.as_in(metric.final), metric.at_refined
+    if at is None or metric.kept_refinement is None:
         return path
-    change = at.change_to(half_way(at, learned, metric.estimate)[1])
+    change = at.change(at.posterior)
     return path.transformed(change.scale, change.rotation, change.translation)

@@ -40,6 +40,7 @@ from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.poses import model_poses
 from rangesfm.geometry.similarity import IDENTITY, align_points
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.inference.bending import MapBending, WalkBending
 from rangesfm.join.join_models import ModelVerdict, join_models
 from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.table import Measured, UsedPositions, anchors_at, antenna_at, ranges_of, ranges_of_map
@@ -48,14 +49,13 @@ from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most
 from rangesfm.ranging.clock.offset import TimeOffset
 from rangesfm.ranging.clock.time_offset import REMEDY
-from rangesfm.ranging.errors.bending import MapBending, WalkBending
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.result.result_folder import is_refined_model
-from rangesfm.scale.at_map import MapWithRanges, estimate_at, estimate_by_positions_at
-from rangesfm.scale.scale_by_lengths import LengthScale, scale_by_lengths
+from rangesfm.scale.at_map import MapWithRanges, MeasuredMap, tested_lengths
+from rangesfm.scale.binned_ranges import RANGES
+from rangesfm.scale.scale_by_lengths import KnownLengths, LengthScale
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.scale.scale_problem import first_camera_from
 from rangesfm.scale.scale_verdict import NOTHING_KNOWN, refuse_unknown
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
@@ -393,18 +393,13 @@ def _problem(
 def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> RefinedMap:
     """Learn the errors at a map at rest, and return it as a result with its covariance."""
     survey, estimate = run.survey, metric.estimate
-    positions, on_map, factor = None, None, 1.0
-    if estimate.positions is not None:
-        # Beside ranges without the measured lengths, which take part beside the ranges and would count twice.
-        lengths = None if estimate.problem is not None else _lengths_at_rest(metric, rest)
-        positions = _positions_at_rest(_surveyed_at_rest(metric.positions, rest), metric.trajectory, rest, lengths)
-        factor = positions.bending_factor
-    if estimate.problem is not None:
-        on_map = _ranges_at_rest(metric, measured, rest, positions)
-        learned = on_map.learned()
-        factor = on_map.bending_factor(learned)
-        kept = learned.without(CLOCKS) if survey.refine.time_offset_stddev_s else learned
-        rest = rest.with_learnt({"range": kept})
+    at, factor = _measured_at_rest(metric, measured, rest), 1.0
+    if at is not None:
+        if at.ranges is not None and survey.refine.time_offset_stddev_s:
+            at = replace(at, problem=at.problem.without(RANGES, CLOCKS))
+        factor = at.problem.bending_factor
+        if at.learned is not None:
+            rest = rest.with_learnt({"range": at.learned})
     covariance = None
     if survey.refine.covariance:
         # Measurements too coarse to see any bending do not make it smaller than the noise of the features does.
@@ -429,8 +424,7 @@ def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: Ma
             refined=refined,
             refinement=summary,
             why_broken=broken,
-            refined_with_ranges=on_map,
-            positions_at_refined=positions,
+            at_refined=at,
         ),
         rest,
     )
@@ -467,24 +461,6 @@ def _surveyed_at_rest(surveyed: SurveyedPositions, rest: MapAtRest) -> SurveyedP
     return replace(surveyed, antenna=replace(track, offset_s=offset_s, antenna_in_cam_m=arm_m))
 
 
-def _positions_at_rest(
-    surveyed: SurveyedPositions, trajectory: Trajectory, rest: MapAtRest, lengths: LengthScale | None
-) -> PositionScale:
-    path = trajectory.as_in(rest.problem.metric)
-    known = surveyed.located(rest.problem.metric, path)
-    assert known is not None, "the positions placed the map"
-    bending = _bending_at_rest(rest, path, 1.0)
-    return scale_by_positions(known, path, bending, lengths=lengths, refined=IDENTITY, lasting_s=surveyed.lasting_s)
-
-
-def _lengths_at_rest(metric: MetricResult, rest: MapAtRest) -> LengthScale | None:
-    """Return the scale of a refined map by the measured lengths that took part; None without any."""
-    if not metric.tape.distances:
-        return None
-    anchor_ids, model = metric.observations.log.anchor_ids, rest.problem.metric
-    return scale_by_lengths(locate_distances(metric.tape, model, anchor_ids), metric.trajectory.as_in(model).centers)
-
-
 def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) -> MapBending:
     """Return the bending of a refined map; ``metres_per_unit``: of the model to which the measurements refer."""
     if rest.equations is not None:
@@ -497,18 +473,45 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) 
     return WalkBending(in_first_camera(path, metres_per_unit))
 
 
-def _ranges_at_rest(
-    metric: MetricResult, measured: Measured, rest: MapAtRest, positions: PositionScale | None
-) -> MapWithRanges:
-    """Return the ranges on a map at rest, as a scale problem in the unit of the unscaled model."""
-    path = metric.trajectory.as_in(rest.problem.metric)
+def _measured_at_rest(metric: MetricResult, measured: Measured, rest: MapAtRest) -> MeasuredMap | None:
+    """Return a map at rest with all that is measured in it; None where nothing is known of the scale's error."""
+    start, model = metric.estimate, rest.problem.metric
+    if start.method == "two-candidate" or (start.problem, start.positions, start.lengths) == (None, None, None):
+        return None
+    path, positions, lengths, on_map = metric.trajectory.as_in(model), None, None, None
     is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
+    bending = _bending_at_rest(rest, path, scale)
+    if start.positions is not None:
+        surveyed = _surveyed_at_rest(metric.positions, rest)
+        known = surveyed.located(model, path)
+        assert known is not None, "the positions placed the map"
+        positions = scale_by_positions(
+            known, path, bending, refined=IDENTITY, lasting_s=surveyed.lasting_s, metres_per_unit=scale
+        )
+    if start.lengths is not None:
+        located = locate_distances(metric.tape, model, metric.observations.log.anchor_ids, path)
+        lengths = KnownLengths.of(located, path, bending, scale, start.lengths.rows)
+    tested = tested_lengths(lengths, positions, start.lengths)
+    if start.problem is not None:
+        on_map = _ranges_at_rest(metric, measured, rest, path, scale, bending, positions, tested)
+    return MeasuredMap.of(path, scale, bending, on_map, positions, lengths, tested)
+
+
+def _ranges_at_rest(
+    metric: MetricResult,
+    measured: Measured,
+    rest: MapAtRest,
+    path: Trajectory,
+    scale: float,
+    bending: MapBending,
+    positions: PositionScale | None,
+    lengths: LengthScale | None,
+) -> MapWithRanges:
+    """Return the ranges on a map at rest, as a scale problem in the unit of the unscaled model."""
     ranges = ranges_of(rest.problem.kinds, measured.ranges)
     tags_m, centers_m = ranges.antennas_m(rest.state)
     anchors = anchors_at(ranges.anchors, rest.state.blocks)
-    # The model's frame is that of the first camera, in the unit of the unscaled model.
-    model_from_map = replace(IDENTITY, scale=1 / scale) @ first_camera_from(path)
     return MapWithRanges.of(
         metric.estimate,
         path,
@@ -519,9 +522,9 @@ def _ranges_at_rest(
         np.array([anchor.range_bias_m for anchor in anchors]),
         ranges.errors,
         ranges.shared_m(rest.state)[ranges.rows],
-        _bending_at_rest(rest, path, scale),
-        placement=None if positions is None else positions.prior(path, model_from_map),
-        lengths=_lengths_at_rest(metric, rest),
+        bending,
+        positions=positions,
+        lengths=lengths,
     )
 
 
@@ -606,20 +609,16 @@ def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array
     )
 
 
-def _moved(metric: MetricResult, before: MapWithRanges, after: MapWithRanges) -> MetricResult:
+def _moved(metric: MetricResult, after: MeasuredMap) -> MetricResult:
     """Return the result with the refined map moved as a whole."""
+    before, refinement = metric.at_refined, metric.kept_refinement
     assert metric.refined is not None
-    assert metric.kept_refinement is not None
-    change, rows = before.change_to(after), after.posed.rows
-    longer_m = after.predicted_m - before.predicted_m
-    known = metric.positions_at_refined
-    return replace(
-        metric,
-        refined=rescale(metric.refined, change),
-        refinement=metric.kept_refinement.moved(change, after.solution.fit.state.anchors_m, rows, longer_m),
-        refined_with_ranges=after,
-        positions_at_refined=known and replace(known, site_from_model=change),
-    )
+    assert before is not None
+    change = before.change(before.posterior)
+    if before.ranges is not None and after.ranges is not None and refinement is not None:
+        longer_m, state = after.ranges.predicted_m - before.ranges.predicted_m, after.ranges.solution.fit.state
+        refinement = refinement.moved(change, state.anchors_m, after.ranges.posed.rows, longer_m)
+    return replace(metric, refined=rescale(metric.refined, change), refinement=refinement, at_refined=after)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
@@ -628,18 +627,15 @@ def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, Rang
     Raises:
         GeometryError: the scale is less certain than asked for.
     """
-    start, at, learned = metric.estimate, metric.refined_with_ranges, metric.learned_at_refined
-    if at is not None and metric.kept_refinement is not None:
-        on_map: RangesOnMap | None = ranges_on_map(at.posed, at.solution, at.bending)
+    start, at = metric.estimate, metric.at_refined
+    if at is not None and at.ranges is not None and metric.kept_refinement is not None:
+        on_map: RangesOnMap | None = ranges_on_map(at.ranges.posed, at.ranges.solution, at.ranges.bending)
     else:
         on_map = metric.on_map or _ranges_on_scaled(start, None)
     try:
-        if at is not None and learned is not None:
-            estimate, moved = estimate_at(at, learned, start, survey.scale)
-            metric = _moved(metric, at, moved)
-        elif (known := metric.positions_at_refined) is not None and metric.kept_refinement is not None:
-            metric = replace(metric, refined=metric.refined and rescale(metric.refined, known.site_from_model))
-            estimate = estimate_by_positions_at(known, metric.refined_scale, start, survey.scale)
+        if at is not None and metric.kept_refinement is not None:
+            estimate, moved = at.judged(start, survey.scale)
+            metric = _moved(metric, moved)
         else:
             if start.method != "two-candidate":  # which has no interval
                 refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)

@@ -26,9 +26,8 @@ from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.clock.offset import TimeOffset
-from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.at_map import MapWithRanges
+from rangesfm.scale.at_map import MapWithRanges, MeasuredMap
 from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.scale.scale_diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.scale_estimate import ScaleEstimate
@@ -68,10 +67,9 @@ class MetricResult:
         diagnosis: result of the tests of mistakes on the final map.
         tape: the measured lengths, with those left out that cannot be in the map; empty without any.
         positions: the known positions, with those left out that contradict the others.
-        positions_at_refined: what they say of the refined map; None without a refinement, or with ranges.
         rivals: other likely time offsets; None without any.
         on_map: the ranges on the scaled map; None where that map is only the start of a refinement, or without ranges.
-        refined_with_ranges: the refined map with the ranges on it; None without one.
+        at_refined: the refined map, and all that is measured in it; None without one.
         loops: the loops that were closed in the refined map; None where none were looked for.
     """
 
@@ -90,10 +88,9 @@ class MetricResult:
     diagnosis: Diagnosis | None = None
     tape: Tape = field(default_factory=Tape)
     positions: SurveyedPositions = field(default_factory=SurveyedPositions)
-    positions_at_refined: PositionScale | None = None
     rivals: Rivals | None = None
     on_map: RangesOnMap | None = None
-    refined_with_ranges: MapWithRanges | None = None
+    at_refined: MeasuredMap | None = None
     loops: LoopClosure | None = None
 
     @property
@@ -107,16 +104,15 @@ class MetricResult:
         return None if self.why_broken else self.refinement
 
     @property
-    def learned_at_refined(self) -> LearnedErrors | None:
-        """Return the learnt errors of the ranges that take part in the kept refined map; None without any."""
-        at, kept = self.refined_with_ranges, self.kept_refinement
-        learned = None if kept is None else kept.errors.learned
-        return None if at is None or learned is None else learned.subset(at.posed.rows)
+    def refined_with_ranges(self) -> MapWithRanges | None:
+        """Return the refined map with the ranges on it; None without any."""
+        return None if self.at_refined is None else self.at_refined.ranges
 
     @property
     def by_positions(self) -> PositionScale | None:
         """Return what the known positions say of the final map; None if they do not determine its place."""
-        return (self.kept_refinement and self.positions_at_refined) or self.estimate.positions
+        kept = None if self.kept_refinement is None or self.at_refined is None else self.at_refined.positions
+        return kept or self.estimate.positions
 
     @property
     def _stage(self) -> ScaleEstimate | RefineSummary:
@@ -177,8 +173,8 @@ class MetricResult:
         """Return metres per SfM unit after the refinement, by least squares over all centres; None without one."""
         if self.refined is None:
             return None
-        if self.refined_with_ranges is not None:
-            return self.refined_with_ranges.metric_from_model.scale
+        if self.at_refined is not None:
+            return self.at_refined.scale
         return align_points(self.trajectory.centers, self.trajectory.as_in(self.refined).centers).scale
 
     def in_site(self, site: Site) -> MetricResult:

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import pycolmap
 
-from rangesfm.distances.locate_lengths import locatable
+from rangesfm.distances.markers import locatable
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.atomic import sole_writer

@@ -10,6 +10,7 @@ import numpy as np
 
 from rangesfm.ceres.installation_checks import recorded_versions
 from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
+from rangesfm.distances.lengths_on_map import BENDING
 from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
 from rangesfm.geometry.georeference import Georeference
@@ -21,7 +22,6 @@ from rangesfm.result.joint_covariance import write_map_errors
 from rangesfm.result.places import recorded_inputs, recorded_settings
 from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_result, read_result_folder
 from rangesfm.result.summary import ResultSummary
-from rangesfm.scale.scale_by_lengths import BENDING
 from rangesfm.survey.input_hashes import input_hashes
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey

@@ -7,13 +7,9 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import multivariate_normal, norm
 
+from rangesfm.inference.noise import ComponentLikelihood, usual_sizes
 from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.ranging.errors.learned import (
-    ComponentLikelihood,
-    ExpectedErrors,
-    LearnedErrors,
-    learn_errors,
-)
+from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, radio_components
 from rangesfm.ranging.errors.range_bins import RangeBins, range_bins
 
 Array = npt.NDArray[np.float64]
@@ -44,8 +40,15 @@ def walked() -> RangeBins:
     )
 
 
+def learnt(
+    of: RangeBins, off_m: Array, design: Array, prior: Array, noise_m: float, curve_stddev_m: Array | None = None
+) -> LearnedErrors:
+    components = radio_components(of, curve_stddev_m)
+    return learn_errors(components, of, of.mean(off_m), of.mean(design), prior, noise_m)
+
+
 def learn(of: RangeBins, off_m: Array) -> LearnedErrors:
-    return learn_errors(of, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.05)
+    return learnt(of, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.05)
 
 
 def stddevs(learned: LearnedErrors) -> dict[str, float]:
@@ -68,9 +71,9 @@ def test_unknowns_that_say_the_same_twice_change_nothing(walked: RangeBins) -> N
     design, prior = rng.standard_normal((len(walked), 6)), np.eye(2, 6)
     off_m = 0.1 * rng.standard_normal(len(walked)) + design @ rng.standard_normal(6)
     mixture = rng.standard_normal((6, 9)) @ np.diag(10.0 ** -np.arange(9))
-    once = learn_errors(walked, off_m, design, prior, 0.05)
+    once = learnt(walked, off_m, design, prior, 0.05)
     for many in (np.hstack([np.eye(6), mixture]), np.hstack([mixture, np.zeros((6, 2)), np.eye(6)])):
-        twice = learn_errors(walked, off_m, design @ many, prior @ many, 0.05)
+        twice = learnt(walked, off_m, design @ many, prior @ many, 0.05)
         np.testing.assert_allclose(twice.stddevs, once.stddevs, rtol=1e-6)
 
 
@@ -98,7 +101,7 @@ def test_anchors_that_are_all_late_towards_where_they_do_not_face_are_seen_to_be
 
 def test_noise_alone_leaves_the_rest_at_what_radios_let_expect_or_less(walked: RangeBins) -> None:
     off_m = 0.05 * np.random.default_rng(2).standard_normal(len(walked))
-    found, usual = stddevs(learn(walked, off_m)), stddevs(ExpectedErrors.of(walked).usual({}))
+    found, usual = stddevs(learn(walked, off_m)), usual_sizes(radio_components(walked))
     assert found.pop("white") == pytest.approx(0.05, rel=0.15)
     for name, stddev in found.items():
         assert stddev < 1.2 * usual[name], name
@@ -108,30 +111,30 @@ def test_what_a_survey_does_not_show_counts_with_the_mean_of_its_variance_over_r
     slope = next(each for each in COMPONENTS if each.name == "slope")
     of_radios = slope.median * np.exp(slope.spread * np.random.default_rng(6).standard_normal(200_000))
     expected = np.sqrt(np.mean(of_radios**2))
-    assert stddevs(ExpectedErrors.of(walked).usual({}))["slope"] == pytest.approx(expected, rel=0.02)
+    assert usual_sizes(radio_components(walked))["slope"] == pytest.approx(expected, rel=0.02)
     distance_m = walked.distance_m[walked.of_range]  # a free scale absorbs all of it
-    scaled_free = learn_errors(walked, np.zeros(len(walked)), distance_m[:, None], NO_MAP, 0.05)
+    scaled_free = learnt(walked, np.zeros(len(walked)), distance_m[:, None], NO_MAP, 0.05)
     assert stddevs(scaled_free)["slope"] == pytest.approx(expected, rel=0.02)
 
 
 def test_errors_are_learnt_alike_from_a_start_nearby(walked: RangeBins) -> None:
     off_m = 0.1 * np.random.default_rng(2).standard_normal(len(walked))
-    expected, design = ExpectedErrors.of(walked), np.zeros((len(walked), 1))
-    learned = expected.learnt(off_m, design, NO_MAP, 0.05)
-    again = expected.learnt(off_m, design, NO_MAP, 0.05, near=learned.stddev_of_component)
+    given = (radio_components(walked), walked, off_m, np.zeros((len(walked), 1)), NO_MAP, 0.05)
+    learned = learn_errors(*given)
+    again = learn_errors(*given, near=learned)
     np.testing.assert_allclose(again.stddevs, learned.stddevs, rtol=1e-3)
 
 
 def test_a_learnt_curve_counts_as_it_is_stated(walked: RangeBins) -> None:
     off_m = 0.02 * np.random.default_rng(3).standard_normal(len(walked))
-    learned = learn_errors(walked, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.02, np.full(len(off_m), 0.03))
+    learned = learnt(walked, off_m, np.zeros((len(off_m), 1)), NO_MAP, 0.02, np.full(len(off_m), 0.03))
     assert learned.names[-1] == "learnt_curve"
     np.testing.assert_allclose(np.diag(learned.covariances_m2[-1]), 0.03**2)
 
 
 def test_a_radio_with_far_more_noise_may_be_off_by_more_in_all_else(walked: RangeBins) -> None:
     off_m = 0.05 * np.random.default_rng(4).standard_normal(len(walked))
-    usual, bad = (learn_errors(walked, k * off_m, np.zeros((len(off_m), 1)), NO_MAP, k * 0.05) for k in (1, 16))
+    usual, bad = (learnt(walked, k * off_m, np.zeros((len(off_m), 1)), NO_MAP, k * 0.05) for k in (1, 16))
     ratio = [np.sqrt(each.covariances_m2[each.names.index("slope")].max()) for each in (usual, bad)]
     assert ratio[1] > 5 * ratio[0]
 

@@ -18,7 +18,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss, robust_stddevs
 from rangesfm.geometry.similarity import path_shape
-from rangesfm.ranging.errors.learned import learn_errors
+from rangesfm.ranging.errors.learned import learn_errors, radio_components
 from rangesfm.ranging.errors.noise import MIN_ORDINARY, START_STDDEV_M, inlier_noise
 from rangesfm.ranging.errors.range_bins import noisiness, range_bins
 from rangesfm.ranging.range_gradient import RangeGradient
@@ -318,22 +318,22 @@ def errors_of_fits(
     slopes = [fit.problem.slopes(fit.x) for fit in fits]
     curve_stddev_m = np.concatenate([fit.problem.shared_stddev_m for fit in fits])
     precision = np.concatenate([fit.own_stddev_m**-2 for fit in fits])
+    bins = range_bins(
+        anchor_index,
+        np.concatenate(tags),
+        np.concatenate(times_s),
+        np.concatenate([fit.problem.positions_m - fit.x[:3] for fit in fits]),
+        np.tile(np.eye(3), (len(anchor_index), 1, 1)),
+        np.concatenate([fit.weights for fit in fits]) * precision / precision.mean(),
+        noisiness(anchor_index, np.concatenate([fit.residuals_m for fit in fits]), len(fits)),
+    )
     learned = learn_errors(
-        range_bins(
-            anchor_index,
-            np.concatenate(tags),
-            np.concatenate(times_s),
-            np.concatenate([fit.problem.positions_m - fit.x[:3] for fit in fits]),
-            np.tile(np.eye(3), (len(anchor_index), 1, 1)),
-            np.concatenate([fit.weights for fit in fits]) * precision / precision.mean(),
-            noisiness(anchor_index, np.concatenate([fit.residuals_m for fit in fits]), len(fits)),
-        ),
-        off_m=np.concatenate([fit.off_m for fit in fits]),
-        design=block_diag(*slopes),
+        radio_components(bins, curve_stddev_m if is_calibrated else None, _NOT_HERE),
+        bins,
+        off_m=bins.mean(np.concatenate([fit.off_m for fit in fits])),
+        design=bins.mean(block_diag(*slopes)),
         prior_design=block_diag(*(fit.problem.prior for fit in fits)),
         noise_m=float(precision.mean() ** -0.5),
-        curve_stddev_m=curve_stddev_m if is_calibrated else None,
-        ruled_out=_NOT_HERE,
     )
     covariance = learned.covariance_m2
     return [FitErrors(learned.of_range[anchor_index == k], covariance) for k in range(len(fits))]

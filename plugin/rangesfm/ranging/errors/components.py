@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.inference.bending import BENDS
 from rangesfm.ranging.errors.noise import SHORT_RANGE_LENGTH_M
 from rangesfm.ranging.errors.range_bins import RangeBins
 
@@ -57,7 +58,7 @@ _LEAST_SPREAD = 0.5
 
 
 @dataclass(frozen=True)
-class Component:
+class RadioComponent:
     """One component of the errors of ranges.
 
     Attributes:
@@ -78,6 +79,10 @@ class Component:
     is_of_anchor: bool
     correlation: Callable[[RangeBins], Array]
     words: str
+
+    def median_if(self, is_calibrated: bool) -> float:
+        """Return the median, also after a learnt error curve was subtracted."""
+        return self.calibrated_median if is_calibrated and self.calibrated_median is not None else self.median
 
 
 def _same(labels: Indices) -> Array:
@@ -129,7 +134,7 @@ def _off_axis(bins: RangeBins) -> Array:
     return _smooth(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, ...]:
+def components(expected: Mapping[str, tuple[float, float]]) -> tuple[RadioComponent, ...]:
     """Return all components, given median and spread over radios by name."""
 
     def of(
@@ -139,8 +144,8 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[Component, 
         *,
         is_of_anchor: bool = False,
         calibrated_median: float | None = None,
-    ) -> Component:
-        return Component(name, *expected[name], calibrated_median, is_of_anchor, correlation, words)
+    ) -> RadioComponent:
+        return RadioComponent(name, *expected[name], calibrated_median, is_of_anchor, correlation, words)
 
     of_anchor = functools.partial(of, is_of_anchor=True)
     return (
@@ -207,13 +212,6 @@ def population(without: str | None = None) -> dict[str, tuple[float, float]]:
 
 COMPONENTS = components(population())
 
-BENDS = {
-    "scale_drift": "drift of the map's scale along the path",
-    "heading_drift": "drift of the map's heading along the path",
-    "bending": "bending of the map",
-}
-"""Components that are errors of the map, not of the ranges, with descriptions; their effect depends on the map."""
-
 OtherError = Literal["learnt_curve", "given", "reweighting", "clocks", "places", "wandering", "bursts"]
 """Names of errors that are no components to be learnt; the checker of types finds one without a description."""
 
@@ -229,12 +227,6 @@ _OTHERS: Mapping[OtherError, str] = {
 
 LEARNT_CURVE: Final = "learnt_curve"
 """Remaining error of an error curve that was subtracted, as learnt with the curve."""
-
-GIVEN: Final = "given"
-"""Uncertainty of what was given on map and anchors; not a component of the ranges' errors."""
-
-REWEIGHTING: Final = "reweighting"
-"""Change of the scale by the best weights for these errors; not a component of the ranges' errors."""
 
 CLOCKS: Final = "clocks"
 """Uncertainty of the camera-radio time offset; not a component of the ranges' errors."""

@@ -14,9 +14,9 @@ from rangesfm.geometry.numerics import NUM_REWEIGHTINGS, ROUNDING
 from rangesfm.geometry.robust_statistics import CAUCHY, robust_stddev
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.components import MIN_DISTANCE_M
+from rangesfm.ranging.errors.components import COMPONENTS, MIN_DISTANCE_M
 from rangesfm.ranging.errors.error_curve import ErrorCurve
-from rangesfm.ranging.errors.learned import ExpectedErrors
+from rangesfm.ranging.errors.learned import learn_errors, radio_components
 from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER
 from rangesfm.ranging.errors.range_bins import RangeBins, noisiness, range_bins
 from rangesfm.ranging.range_log import RangeLog
@@ -133,8 +133,8 @@ def _expected_curve(
 ) -> tuple[Array, Array, Array]:
     """Return the (k,) expected curve at knots, given the errors (c,) of bins, its stddev, and the (m,) biases."""
     # Errors off the anchors' axes are alike at all anchors: the curve has them, and each survey expects its own anew.
-    expected, nothing = ExpectedErrors.of(bins, ruled_out=("off_axis",)), np.zeros((len(bins), 1))
-    learned = expected.learnt(error_m, nothing, np.ones((1, 1)), noise_m)
+    expected, nothing = radio_components(bins, ruled_out=("off_axis",)), np.zeros((len(bins), 1))
+    learned = learn_errors(expected, bins, error_m, nothing, np.ones((1, 1)), noise_m)
     total = learned.covariance_m2
     factor = cho_factor(total + ROUNDING * np.trace(total) * np.eye(len(total)))
     # The components' covariance is also computed at the knots, as if these were further bins.
@@ -144,11 +144,12 @@ def _expected_curve(
     )
     covariance = np.zeros((len(with_knots), len(with_knots)))
     biases = np.zeros(num_anchors)
-    for component, known in zip(expected.components, learned.covariances_m2, strict=False):
-        if component.name in _OF_CURVE:
-            alike = component.correlation(with_knots)
+    correlation_of = {each.name: each.correlation for each in COMPONENTS}
+    for name, known in zip(learned.names, learned.covariances_m2, strict=True):
+        if name in _OF_CURVE:
+            alike = correlation_of[name](with_knots)
             covariance += alike * np.trace(known) / np.trace(alike[num:, num:])
-        if component.name == "bias":
+        if name == "bias":
             heard, first = np.unique(bins.anchor_index, return_index=True)
             biases[heard] = known[first] @ cho_solve(factor, error_m)
     gain = cho_solve(factor, covariance[num:, :num]).T

@@ -6,11 +6,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array, csr_array
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.robust_statistics import robust_stddev
+from rangesfm.geometry.similarity import Similarity
 from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER
+from rangesfm.ranging.range_gradient import RangeGradient
+from rangesfm.ranging.range_observations import OnPath
 
 # The covariance of the bins is a full matrix, and learning it takes some twenty inversions.
 MAX_NUM_BINS = 450
@@ -61,6 +64,11 @@ class RangeBins:
         """Return the (c, ...) weighted means of (n, ...) values of the ranges."""
         means = self.averages @ values.reshape(len(values), -1)
         return np.asarray(means.reshape(len(self), *values.shape[1:]))
+
+    def by_pose(self, by_range: csr_array, num_poses: int) -> Array:
+        """Return the (c, 6 k) means of (n, 6 k') derivatives by poses; the last of the k poses may have no ranges."""
+        means = self.averages @ by_range
+        return np.pad(means.toarray(), ((0, 0), (0, 6 * num_poses - means.shape[1])))
 
     def shared_by_places(self, towards: Array, placing_m: Array, gap: Indices) -> Array:
         """Return the covariance (c, c), square metres, of the bins due to uncertain positions of the antenna.
@@ -128,6 +136,32 @@ def range_bins(
         from_anchor=_unit(begun.mean(towards)),
         in_cam=_unit(begun.mean(np.einsum("nij,nj->ni", cam_from_world, towards))),
     )
+
+
+def by_poses(
+    gradient: RangeGradient,
+    metric_from_model: Similarity,
+    model_from_cam: Array,
+    tag_from_center: Array,
+    on_path: OnPath,
+) -> csr_array:
+    """Return (n, 6 k) derivatives of the distances by k poses: turns in their own frames, shifts in the model's world.
+
+    Args:
+        model_from_cam: (n, 3, 3) rotations. tag_from_center: (n, 3) lever arms, metres, in the axes of the model.
+    """
+    num_poses = int(max(on_path.before.max(), on_path.after.max())) + 1
+    by_shift = metric_from_model.scale * gradient.by_tag @ metric_from_model.rotation
+    in_cam = np.einsum("nji,nj->ni", model_from_cam, gradient.by_tag @ metric_from_model.rotation)
+    by_turn = np.cross(np.einsum("nji,nj->ni", model_from_cam, tag_from_center), in_cam)
+    values = np.hstack([by_turn, by_shift])
+    rows = np.repeat(np.arange(len(values)), 6)
+    parts = [
+        ((share[:, None] * values).ravel(), rows, (6 * pose[:, None] + np.arange(6)).ravel())
+        for pose, share in ((on_path.before, 1 - on_path.fraction), (on_path.after, on_path.fraction))
+    ]
+    value, row, column = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return coo_array((value, (row, column)), shape=(len(values), 6 * num_poses)).tocsr()
 
 
 def noisiness(anchor_index: Indices, residuals_m: Array, num_anchors: int) -> Array:

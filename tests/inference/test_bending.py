@@ -11,11 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.errors.bending import (
-    WalkBending,
-    by_poses,
-    without_similarity,
-)
+from rangesfm.inference.bending import WalkBending, without_similarity
+from rangesfm.ranging.errors.range_bins import by_poses
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 

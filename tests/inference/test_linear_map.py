@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.scale.linear_map import Solved
+from rangesfm.inference.linear_map import Solved
 
 Array = npt.NDArray[np.float64]
 

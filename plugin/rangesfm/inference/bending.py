@@ -1,4 +1,4 @@
-"""Bending of a map, as it affects the ranges: the errors of the map itself in every model of range errors."""
+"""Bending of a map, as it affects what is measured in it (section 3 of ``model.md``)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from itertools import accumulate
 from typing import Protocol
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.geometry.similarity import Similarity, align_points, similarity_motions
+from rangesfm.geometry.similarity import align_points, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.errors.components import BENDS, Component
-from rangesfm.ranging.errors.range_bins import RangeBins
-from rangesfm.ranging.range_gradient import RangeGradient
-from rangesfm.ranging.range_observations import OnPath
+from rangesfm.inference.noise import Component
+
+BENDS = {
+    "scale_drift": "drift of the map's scale along the path",
+    "heading_drift": "drift of the map's heading along the path",
+    "bending": "bending of the map",
+}
+"""Components that are errors of the map itself, with descriptions; their effect depends on the map."""
 
 # Weight of turns against shifts in the fit of a similarity. Turns only matter for a turn about a straight path, which
 # nothing else shows; elsewhere this weight is too small to have an effect.
@@ -39,71 +42,19 @@ _OF_STEP = np.array(["scale_drift", "heading_drift", "heading_drift", "heading_d
 LearnedSizes = Mapping[str, float]
 
 
-def by_poses(
-    gradient: RangeGradient,
-    metric_from_model: Similarity,
-    model_from_cam: Array,
-    tag_from_center: Array,
-    on_path: OnPath,
-) -> csr_array:
-    """Return (n, 6 k) derivatives of the distances by k poses: turns in their own frames, shifts in the model's world.
-
-    Args:
-        model_from_cam: (n, 3, 3) rotations. tag_from_center: (n, 3) lever arms, metres, in the axes of the model.
-    """
-    num_poses = int(max(on_path.before.max(), on_path.after.max())) + 1
-    by_shift = metric_from_model.scale * gradient.by_tag @ metric_from_model.rotation
-    in_cam = np.einsum("nji,nj->ni", model_from_cam, gradient.by_tag @ metric_from_model.rotation)
-    by_turn = np.cross(np.einsum("nji,nj->ni", model_from_cam, tag_from_center), in_cam)
-    values = np.hstack([by_turn, by_shift])
-    rows = np.repeat(np.arange(len(values)), 6)
-    parts = [
-        ((share[:, None] * values).ravel(), rows, (6 * pose[:, None] + np.arange(6)).ravel())
-        for pose, share in ((on_path.before, 1 - on_path.fraction), (on_path.after, on_path.fraction))
-    ]
-    value, row, column = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return coo_array((value, (row, column)), shape=(len(values), 6 * num_poses)).tocsr()
-
-
 @dataclass(frozen=True)
-class ErrorPart:
-    """One component of errors, such as of a map's bending.
+class Bending:
+    """Effect of a map's bending on c functions of its path, such as observations.
 
     Attributes:
-        name: in BENDS, for a part of the bending. alike: (c, c) covariance for a size of 1.
-        median_m: of its size, before anything is measured. spread: standard deviation of the logarithm of that; 0: the
-            size is known.
-    """
-
-    name: str
-    alike: Array
-    median_m: float = 1.0
-    spread: float = 0.0
-
-    @property
-    def component(self) -> Component:
-        """Return it as a component of the errors of ranges."""
-        return Component(self.name, self.median_m, self.spread, None, False, lambda _: self.alike, BENDS[self.name])
-
-
-@dataclass(frozen=True)
-class BendingOfBins:
-    """Effect of a map's bending on c bins of ranges, or on c other functions of the path.
-
-    Attributes:
-        parts: of the bending, in metres.
+        parts: components of these errors, in metres.
         formal_m2: (c, c) covariance expected from the photos' residuals; zero if photos were not used.
-        shift_m: (c,) change of the predicted ranges if the map moves to the minimum of the photos alone.
+        shift_m: (c,) change of the functions if the map moves to the minimum of the photos alone.
     """
 
-    parts: tuple[ErrorPart, ...]
+    parts: tuple[Component, ...]
     formal_m2: Array
     shift_m: Array
-
-    @property
-    def components(self) -> tuple[Component, ...]:
-        """Return the parts as components of the errors of ranges."""
-        return tuple(part.component for part in self.parts)
 
 
 class MapBending(Protocol):
@@ -114,7 +65,7 @@ class MapBending(Protocol):
         """Return the path of k poses that is bent, in the model's world."""
         ...
 
-    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         """Return the bending of c functions of the path, such as coordinates.
 
         Args:
@@ -124,17 +75,7 @@ class MapBending(Protocol):
         ...
 
 
-def bending_in_bins(bending: MapBending, bins: RangeBins, by_pose: csr_array, *, frame_is_free: bool) -> BendingOfBins:
-    """Return the bending in bins of ranges.
-
-    Args:
-        by_pose: (n, 6 k) derivatives of each range by the path's poses, from ``by_poses``.
-        frame_is_free: as for ``MapBending.of_functions``.
-    """
-    return bending.of_functions(averaged(bins, by_pose, len(bending.path)), frame_is_free=frame_is_free)
-
-
-def bending_part(name: str, covariance: Array, factor: float, spread: float) -> ErrorPart | None:
+def bending_part(name: str, covariance: Array, factor: float, spread: float) -> Component | None:
     """Return a part in metres with ``factor`` as the median of its size; None if the bins are not affected.
 
     Args:
@@ -143,13 +84,7 @@ def bending_part(name: str, covariance: Array, factor: float, spread: float) -> 
     size_m = float(np.sqrt(np.trace(covariance) / max(len(covariance), 1)))
     if not size_m > 0:
         return None
-    return ErrorPart(name, covariance / size_m**2, factor * size_m, spread)
-
-
-def averaged(bins: RangeBins, by_range: csr_array, num_poses: int) -> Array:
-    """Average (n, 6 k') derivatives over bins and return (c, 6 k); the last of the k poses may have no ranges."""
-    sums = bins.averages @ by_range
-    return np.pad(sums.toarray(), ((0, 0), (0, 6 * num_poses - sums.shape[1])))
+    return Component(name, covariance / size_m**2, factor * size_m, spread)
 
 
 def without_similarity(by_pose: Array, path: Trajectory, *, frame_is_free: bool, is_firm: Mask | None = None) -> Array:
@@ -206,7 +141,7 @@ class WalkBending:
     steps: Array | None = None
     frame_is_free: bool = False
 
-    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> BendingOfBins:
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
         num = len(by_pose)
         factors = self.factors(by_pose, frame_is_free=frame_is_free)
         shift_m = np.zeros(num) if self.steps is None else -np.einsum("csi,si->c", factors, self.steps)
@@ -214,7 +149,7 @@ class WalkBending:
         for name, median in _OF_PATH.items():
             own = factors[:, :, name == _OF_STEP].reshape(num, -1)
             found.append(bending_part(name, own @ own.T, median, _SPREAD))
-        return BendingOfBins(tuple(each for each in found if each is not None), np.zeros((num, num)), shift_m)
+        return Bending(tuple(each for each in found if each is not None), np.zeros((num, num)), shift_m)
 
     def factors(self, by_pose: Array, *, frame_is_free: bool) -> Array:
         """Return the (c, s, 7) derivatives of c functions of the path by each step; arguments as in of_functions."""

@@ -15,9 +15,8 @@ import numpy as np
 from scipy import special
 from scipy.linalg import solve_triangular
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.numerics import ROUNDING, UNDETERMINED
-from rangesfm.scale.range_equation import Columns
 
 FALSE_ALARM_RATE = 0.02
 """Share of surveys without any mistake in which one is named, or a correct length or point is set aside."""
@@ -25,6 +24,30 @@ NUM_SUSPECTS = 3
 """Number of measurements for which it is tried what the others say without them, the most deviating first."""
 # Baarda's significance level of a single test, and the probability that it misses a mistake of the smallest size.
 _ALPHA, _BETA = 0.001, 0.2
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Position of each unknown of a model in the parameter vector; -1 for an unknown that is not estimated.
+
+    The order is: for each model in turn, the logarithm of the scale and the frame (6: turn, shift); then the anchors
+    (3 each); then the biases.
+    """
+
+    scale: int
+    frame: int
+    anchor: Indices
+    bias: Indices
+    num: int
+
+    @property
+    def of_map(self) -> list[int]:
+        """Columns of the map as a whole: the logarithm of the scale and, if estimated, the turn and the shift."""
+        return [self.scale, *(range(self.frame, self.frame + 6) if self.frame >= 0 else ())]
+
+    def placement(self, covariance: Array) -> Array | None:
+        """Return the part (7, 7) of the map as a whole of a (p, p) covariance; None if its place is not estimated."""
+        return None if self.frame < 0 else np.asarray(covariance[np.ix_(self.of_map, self.of_map)])
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,394 @@
+"""The posterior of a map by measurements of all kinds together (sections 6 and 7 of ``model.md``).
+
+All are linear equations of the motions of the map as a whole, and of anchors: e = A x + noise. The noise of a kind is
+its own; the bending of the map is that of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag, cho_factor, cho_solve
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
+from rangesfm.inference.bending import BENDS, Bending, MapBending
+from rangesfm.inference.linear_map import Columns, EstimatedMistake, LinearMap, Solved, regular
+from rangesfm.inference.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
+
+GIVEN = "given"
+"""Effect of priors; not a component of the noise."""
+REWEIGHTING = "reweighting"
+"""Effect of the choice between the best and the robust weights; not a component of the noise."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """c observations of one kind, single ones or means of groups, linearised at a state of a map.
+
+    Attributes:
+        kind: its name.
+        columns: unknowns on which they depend. design: (c, p) derivatives by these.
+        residual_m: (c,) predicted minus measured.
+        by_pose: (c, 6 n) derivatives by the poses of the path: turns in their own frames, and shifts in the frame and
+            in the unit in which ``MapBending`` has the path.
+        components: of their errors, without the bending of the map.
+        alone_m2: (c, c) covariance as if each single one erred independently. working_m2: that which the robust
+            weights assume.
+        is_used: (c,) whether they take part in the estimate; the others are only tested or predicted.
+    """
+
+    kind: str
+    columns: Columns
+    design: Array
+    residual_m: Array
+    by_pose: Array
+    components: tuple[Component, ...]
+    alone_m2: Array
+    working_m2: Array
+    is_used: Mask
+
+
+@dataclass(frozen=True)
+class ScaleByKind:
+    """The scale by one kind of measurement alone, in metres per SfM unit.
+
+    Attributes:
+        value: middle of its interval. stddev: with all error components; inf where the scale is not determined.
+    """
+
+    value: float
+    stddev: float
+
+
+@dataclass(frozen=True)
+class ScaleUncertainty:
+    """Relative standard deviations of the scale, by their causes.
+
+    Attributes:
+        formal: from the Jacobian, as if all measurements erred independently (Cramer-Rao bound).
+        components: standard deviation due to each component of the errors, by its name.
+    """
+
+    formal: float
+    components: dict[str, float]
+
+    @property
+    def empirical(self) -> float:
+        """Realistic standard deviation: all components together, and never less than the formal one."""
+        return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
+
+    def beside(self, name: str, stddev: float) -> ScaleUncertainty:
+        """Return a copy with more of one component, added in quadrature."""
+        return replace(
+            self, components={**self.components, name: float(np.hypot(self.components.get(name, 0), stddev))}
+        )
+
+    def about(self, value: float) -> ScaleByKind:
+        """Return an estimate with its standard deviation."""
+        return ScaleByKind(value, value * self.empirical)
+
+    @property
+    def interval_95(self) -> tuple[float, float]:
+        """Bounds, with 95 % probability, of the logarithm of the true scale divided by the estimate."""
+        return -self.half_width_95, self.half_width_95
+
+    @property
+    def half_width_95(self) -> float:
+        """Half the width of the 95 % interval, in the logarithm of the scale."""
+        return NORMAL_95 * self.empirical
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What is known of a map as a whole and of its anchors.
+
+    Attributes:
+        uncertainty: of the scale.
+        columns: the p unknowns. covariance: (p, p) of these.
+        step: (p,) from the state at which the map is to the estimate, to which everything else refers.
+        best_step: (p,) to the estimate with the best weights.
+        gains: (c,) change of the scale's logarithm, with the best weights, per metre of each observation that is used.
+    """
+
+    uncertainty: ScaleUncertainty
+    columns: Columns
+    covariance: Array
+    step: Array
+    best_step: Array
+    gains: Array
+
+    @property
+    def placement(self) -> Array | None:
+        """(7, 7) covariance of the scale's logarithm, a turn and a shift; None if the map's place is not estimated."""
+        return self.columns.placement(self.covariance)
+
+    @classmethod
+    def of(cls, best: Solved, noise: Noise, formal: float, columns: Columns, step: Array, half: Array) -> Posterior:
+        """Return the posterior at the middle between two estimates, each of which is ``half`` (p,) away.
+
+        Args:
+            step: (p,) to that middle.
+        """
+        of_observations, of_priors = best.gains
+        components = noise.effects(of_observations[0])
+        if (given := float(np.linalg.norm(of_priors[0]))) > 0:
+            components[GIVEN] = given
+        components[REWEIGHTING] = abs(float(half[0]))
+        covariance = best.covariance + np.outer(half, half)
+        uncertainty = ScaleUncertainty(formal, components)
+        return cls(uncertainty, columns, covariance, step, best.step, of_observations[0])
+
+    @classmethod
+    def between(
+        cls,
+        linear: LinearMap,
+        noise: Noise,
+        formal: float,
+        by_robust: Array,
+        robust_step: Array | None = None,
+        *,
+        is_at_best: bool = False,
+    ) -> Posterior:
+        """Combine the estimate with the best weights for the errors and the robust estimate.
+
+        Best weights (Gauss-Markov) are only as good as the model of the errors, which real radios do not always follow.
+        Robust weights depend less on the model. The truth is taken to be equally likely at either estimate: the map is
+        best placed half-way between them, and its interval is wider by as much. The variance of the difference is the
+        difference of the variances (Hausman, "Specification tests in econometrics", 1978). A difference of the scale of
+        more than one standard deviation is evidence against the model, so only one standard deviation of it is used.
+
+        Args:
+            formal: relative standard deviation of the scale, as if all observations erred independently.
+            by_robust: (p, p) covariance of the unknowns with the robust weights.
+            robust_step: (p,) to the robust estimate; None: the map is there.
+            is_at_best: whether the map is at the estimate with the best weights. A part of the way to the robust one is
+                then gone from there, and else from the robust one.
+        """
+        best = linear.solved(noise.covariance_m2)
+        robust = np.zeros(len(best.step)) if robust_step is None else robust_step
+        change = -robust if is_at_best else best.step - robust
+        chance = chance_differences(by_robust, best.covariance)[0]
+        # The whole step is shortened, because a shorter one of the scale alone would not fit the anchors' places.
+        half = min(1.0, chance / max(abs(float(change[0])), 1e-300)) * change / 2
+        return cls.of(best, noise, formal, linear.columns, -half if is_at_best else robust + half, half)
+
+
+def chance_differences(by_others: Array, by_best: Array) -> Array:
+    """Return the (p,) standard deviations of the difference of two estimates with these covariances (p, p)."""
+    return np.sqrt(np.maximum(np.diag(by_others - by_best), 0.0))
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """The linear equations of all kinds of observations, one below the other, and of the priors.
+
+    Attributes:
+        linear: the equations; residuals are those of the map as the photos alone would have it.
+        rows: of each kind, by its name.
+        components: of the errors. sizes: of these, by name.
+        bending: of the map, in all observations.
+        alone_m2, working_m2, is_used: as of ``Observations``.
+    """
+
+    linear: LinearMap
+    rows: Mapping[str, slice]
+    components: tuple[Component, ...]
+    sizes: Mapping[str, float]
+    bending: Bending
+    alone_m2: Array
+    working_m2: Array
+    is_used: Mask
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Errors of all observations."""
+        return noise_of_sizes(self.components, self.sizes, len(self.is_used))
+
+    def without(self, kind: str, name: str) -> JointProblem:
+        """Return the problem without one component of the errors of a kind."""
+        rows = self.rows[kind]
+        kept = (each for each in self.components if each.name != name or not each.alike[rows].any())
+        return replace(self, components=tuple(kept))
+
+    def of_kind(self, kind: str, of_used: Array) -> Array:
+        """Return the (c,) numbers of one kind from those of all observations that are used; 0 for the others."""
+        of_all = np.zeros(len(self.is_used))
+        of_all[self.is_used] = of_used
+        return of_all[self.rows[kind]]
+
+    def size_of(self, kind: str) -> Array:
+        """Return the column (c, 1) of a mistake by which all observations of a kind have the map too small."""
+        column = np.zeros((len(self.is_used), 1))
+        column[self.rows[kind], 0] = self.linear.design[self.rows[kind], self.linear.columns.scale]
+        return column
+
+    def noise_of(self, kind: str) -> Noise:
+        """Return the errors of the observations of one kind, with those of the map."""
+        found = self.noise.of_rows(self.rows[kind])
+        return found.only(*(name for name, of in zip(found.names, found.covariances_m2, strict=True) if of.any()))
+
+    @property
+    def bending_factor(self) -> float:
+        """Return the learnt bending over the bending expected from the photos' residuals; 1 if that is unknown."""
+        expected_m = float(np.sqrt(np.trace(self.bending.formal_m2) / len(self.is_used)))
+        return self.noise.stddev_of_component["bending"] / expected_m if expected_m > 0 else 1.0
+
+    def learnt(self, mistake: Array | None = None, most_unusual: float = np.inf) -> JointProblem:
+        """Return the problem with the sizes of the errors that the observations show.
+
+        Args:
+            mistake: (c, m) columns of a mistake. It explains what it can, as the errors that it causes would otherwise
+                be taken for noise, in which it then hides.
+            most_unusual: largest size of a component above its median, in spreads over surveys.
+        """
+        used, linear = self.is_used, self.linear
+        columns = np.zeros((len(used), 0)) if mistake is None else mistake
+        # Kinds that contradict each other by more than maps bend are mistaken, which must not pass for bending.
+        most_bent = np.inf if len(self.rows) == 1 else SIGNIFICANT_STDDEVS
+        components = self.components
+        if not used.all():
+            at = np.ix_(used, used)
+            components = tuple(
+                replace(each, alike=each.alike[at], tied={name: of[at] for name, of in each.tied.items()})
+                for each in components
+            )
+        sizes = learnt_sizes(
+            components,
+            -linear.residual_m[used],
+            np.hstack([linear.design[used], columns[used]]),
+            np.pad(linear.prior_design, ((0, 0), (0, columns.shape[1]))),
+            {name: min(most_unusual, most_bent) if name in BENDS else most_unusual for name in self.sizes},
+        )
+        return replace(self, sizes=sizes)
+
+    def among(self, rows: Mask) -> tuple[LinearMap, Noise]:
+        """Return the equations and the errors of some of the observations."""
+        linear = replace(self.linear, residual_m=self.linear.residual_m[rows], design=self.linear.design[rows])
+        return linear, self.noise.of_rows(rows)
+
+    def mistake(self, columns: Array) -> EstimatedMistake:
+        """Estimate a mistake that changes what is measured by (c, m) ``columns`` times its m numbers.
+
+        Observations that it changes are taken into the equations, whether they take part or not.
+        """
+        rows = self.is_used | np.any(columns != 0, axis=1)
+        linear, noise = self.among(rows)
+        return linear.solved(noise.covariance_m2).mistake(-columns[rows])
+
+    def posterior(self, *, is_fitted: bool, is_refined: bool = False, formal: float | None = None) -> Posterior:
+        """Return what all observations say of the map.
+
+        Args:
+            is_fitted: whether the map is where the robust weights of all observations have it.
+            is_refined: whether the photos let it bend in that fit.
+            formal: as of ``Posterior.between``; None: it is computed.
+        """
+        used = self.is_used
+        at = np.ix_(used, used)
+        linear, noise = self.among(used)
+        bent_m2 = self.bending.formal_m2[at] if is_refined else np.zeros((used.sum(),) * 2)
+        if formal is None:
+            formal = float(np.sqrt(linear.solved(self.alone_m2[at] + bent_m2).covariance[0, 0]))
+        working_m2 = bent_m2 + (self.working_m2 if is_fitted else self.balanced_m2)[at]
+        by_robust, _ = linear.with_weights(working_m2, noise.covariance_m2)
+        robust_step = None if is_fitted else linear.solved(working_m2).step
+        return Posterior.between(linear, noise, formal, by_robust, robust_step)
+
+    def expected_posterior(self) -> Posterior:
+        """Return what the observations are expected to say, before anything is measured."""
+        used = self.is_used
+        at, (linear, noise) = np.ix_(used, used), self.among(used)
+        formal = float(np.sqrt(linear.solved(self.alone_m2[at]).covariance[0, 0]))
+        by_robust, _ = linear.with_weights(self.balanced_m2[at] + noise.only(*BENDS).covariance_m2, noise.covariance_m2)
+        best = linear.solved(noise.covariance_m2)
+        # The estimates with different weights will differ by about one standard deviation.
+        half = chance_differences(by_robust, best.covariance) / 2
+        return Posterior.of(best, noise, formal, linear.columns, np.zeros(len(half)), half)
+
+    @property
+    def balanced_m2(self) -> Array:
+        """(c, c) covariance that robust weights assume where no kind says more of the scale than its errors allow.
+
+        The weights of single observations do not know how much of their errors they share, which is more in one kind
+        than in another.
+        """
+        kinds = [of_kind for of_kind in self.rows.values() if self.is_used[of_kind].any()]
+        balanced = self.working_m2.copy()
+        for of_kind in kinds if len(kinds) > 1 else ():
+            rows = np.zeros(len(self.is_used), dtype=bool)
+            rows[of_kind] = self.is_used[of_kind]
+            at, (linear, noise) = np.ix_(rows, rows), self.among(rows)
+            claimed = float(linear.solved(self.working_m2[at]).covariance[0, 0])
+            by_errors, _ = linear.with_weights(self.working_m2[at], noise.covariance_m2)
+            balanced[of_kind, of_kind] *= max(float(by_errors[0, 0]) / claimed, 1.0)
+        return balanced
+
+    def predicted_m2(self, kind: str, covariance: Array) -> Array:
+        """Return the (c, c) covariance of the errors of unused functions of the map, after all that is observed.
+
+        Universal kriging: Rasmussen and Williams, "Gaussian processes for machine learning", 2006, eq. 2.42.
+
+        Args:
+            covariance: (p, p) of the unknowns.
+        """
+        used, rows, linear, noise_m2 = self.is_used, self.rows[kind], self.linear, self.noise.covariance_m2
+        across = noise_m2[rows][:, used]
+        factor = cho_factor(regular(noise_m2[np.ix_(used, used)]))
+        left = linear.design[rows] - across @ cho_solve(factor, linear.design[used])
+        return np.asarray(noise_m2[rows, rows] - across @ cho_solve(factor, across.T) + left @ covariance @ left.T)
+
+
+def joined(
+    observations: Sequence[Observations],
+    bending: MapBending,
+    prior_residual: Array | None = None,
+    prior_design: Array | None = None,
+) -> JointProblem:
+    """Join observations of all kinds on one map, with the usual sizes of their errors.
+
+    Args:
+        bending: of the map.
+        prior_residual, prior_design: (r,), (r, p) of the priors, by the unknowns of the kind that has the most.
+    """
+    columns = max((each.columns for each in observations), key=lambda each: each.num)
+    ends = np.cumsum([len(each.residual_m) for each in observations])
+    num = int(ends[-1])
+    rows = {
+        each.kind: slice(int(end) - len(each.residual_m), int(end))
+        for each, end in zip(observations, ends, strict=True)
+    }
+    bent = bending.of_functions(np.vstack([each.by_pose for each in observations]), frame_is_free=columns.frame >= 0)
+    own = (part.among(rows[each.kind], num) for each in observations for part in each.components)
+    components = (*own, *bent.parts)
+    linear = LinearMap(
+        np.concatenate([each.residual_m for each in observations]) + bent.shift_m,
+        np.vstack([_in_columns(each, columns) for each in observations]),
+        np.zeros(0) if prior_residual is None else prior_residual,
+        np.zeros((0, columns.num)) if prior_design is None else prior_design,
+        columns,
+    )
+    return JointProblem(
+        linear,
+        rows,
+        components,
+        usual_sizes(components),
+        bent,
+        np.asarray(block_diag(*(each.alone_m2 for each in observations))),
+        np.asarray(block_diag(*(each.working_m2 for each in observations))),
+        np.concatenate([each.is_used for each in observations]),
+    )
+
+
+def _in_columns(observations: Observations, columns: Columns) -> Array:
+    """Return the derivatives by all unknowns; kinds without anchors have those by the map as a whole."""
+    own = observations.design
+    if observations.columns.num == columns.num:
+        return own
+    widened = np.zeros((len(own), columns.num))
+    of_map = columns.of_map[: len(observations.columns.of_map)]
+    widened[:, of_map] = own[:, : len(of_map)]
+    return widened

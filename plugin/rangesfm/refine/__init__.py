@@ -1,1 +1,0 @@
-"""The refinement: bundle adjustment with ranges."""
