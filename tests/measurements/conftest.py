@@ -131,8 +131,8 @@ def _ranges(path: Trajectory, rng: np.random.Generator) -> Ranges:
 
 
 def _positions(path: Trajectory, rng: np.random.Generator) -> AntennaPositions:
-    before = np.array([0, 0, 3, 5, 8, 9])
-    after = before + np.array([1, 1, 1, 0, 1, 1])
+    before = np.array([3, 0, 8, 0, 5, 9])
+    after = before + np.array([1, 1, 1, 1, 0, 1])
     fraction = np.where(after > before, rng.uniform(0.1, 0.9, 6), 0.0)
     assert path.timestamps_s is not None
     places = AntennaPlaces(
@@ -141,8 +141,8 @@ def _positions(path: Trajectory, rng: np.random.Generator) -> AntennaPositions:
     )  # fmt: skip
     roots = np.linalg.inv(np.linalg.cholesky([0.1**2 * np.eye(3) + np.outer(v, v) for v in rng.normal(0, 0.1, (6, 3))]))
     return AntennaPositions(
-        places, path.centers[before] + rng.normal(0, 0.3, (6, 3)), roots, np.zeros(6), 0.7, ARM_M, 0.1, 0.1,
-        LEAST_SQUARES,
+        tuple("abcdef"), places, path.centers[before] + rng.normal(0, 0.3, (6, 3)), roots, np.zeros(6), np.arange(6),
+        ARM_M, 0.1, 0.1, LEAST_SQUARES, inflation=1.2,
     )  # fmt: skip
 
 

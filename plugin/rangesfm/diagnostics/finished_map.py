@@ -112,14 +112,12 @@ def place_of_map(
     if estimate.placement is None:
         return None
     found, centers_m = None if summary is None else summary.covariance, path.centers
-    of_map, of_keyframes = of_one_piece = by_similarity(estimate.placement, centers_m)
+    of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
     if found is not None:
-        of_map, of_keyframes = found.similarity, found.centers[np.searchsorted(found.frame_ids, path.frame_ids)]
+        of_keyframes = found.centers[np.searchsorted(found.frame_ids, path.frame_ids)]
+        # With known positions the map was moved as a whole to where the best weights for errors that last have it.
+        of_map = found.similarity if estimate.positions is None else of_map
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
-    if estimate.positions is not None:
-        # The refined problem has no errors of known positions that last, which shift or turn the map as a whole.
-        of_map = of_one_piece[0]
-        keyframes_m2 = np.maximum(keyframes_m2, np.trace(of_one_piece[1], axis1=1, axis2=2))
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))
     bent_m2 = np.square(bent_by_m) if found is None and len(bent_by_m) else 0.0

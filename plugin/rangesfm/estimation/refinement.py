@@ -242,19 +242,18 @@ def joint_errors(rest: MapAtRest, bending_factor: float) -> JointCovariance | No
         return None
 
 
-def _errors_of_residuals(rest: MapAtRest, bending_factor: float) -> ResidualErrors | None:
-    """Return the learnt errors of the measurements' residuals, in units of those of the photos; None without any."""
+def _errors_of_residuals(rest: MapAtRest, bending_factor: float) -> ResidualErrors:
+    """Return the errors of the measurements' residuals, in units of those of the photos."""
     kinds, residuals = rest.problem.kinds, rest.problem.residuals(rest.state)
     found = [(rows, kind.learnt_errors(of)) for rows, kind, of in zip(rest.added.rows, kinds, residuals, strict=True)]
     learnt = [(rows, errors) for rows, errors in found if errors is not None]
-    if not learnt:
-        return None
     priors = frozenset[Block]().union(*(errors.priors for _, errors in learnt))
     exact = [rows for rows, kind in zip(rest.added.rows, kinds, strict=True) if kind.is_prior_of(priors)]
+    nothing = np.zeros(0, dtype=np.int64)
     return ResidualErrors(
-        np.concatenate([rows for rows, _ in learnt]),
-        csr_array(sparse.block_diag([errors.by_error for _, errors in learnt])),
-        block_diag(*(errors.covariance for _, errors in learnt)) / bending_factor**2,
-        np.concatenate([np.zeros(0, dtype=np.int64), *exact]),
+        np.concatenate([nothing, *(rows for rows, _ in learnt)]),
+        csr_array(sparse.block_diag([csr_array((0, 0)), *(errors.by_error for _, errors in learnt)])),
+        block_diag(np.zeros((0, 0)), *(errors.covariance for _, errors in learnt)) / bending_factor**2,
+        np.concatenate([nothing, *exact]),
         bending_factor**-2,
     )

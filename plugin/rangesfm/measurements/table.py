@@ -30,6 +30,7 @@ from rangesfm.options import RefineOptions
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
+from rangesfm.ranging.errors.noise import STRETCH_S, stretch_labels
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
 
@@ -76,15 +77,16 @@ class UsedPositions:
     """Known positions that took part in an estimate of the scale, with the errors that it learnt.
 
     Attributes:
-        known: in the unscaled model. is_used: (k,) those that took part.
-        stddev_m: (k,) standard deviations of a coordinate. inflation: of the antenna's, for errors that last.
+        known: in the unscaled model.
+        takes_part: (k,) all but check points and what contradicts the others. Outliers of an antenna are left to the
+            loss, because on a map that is one piece drift looks like them.
+        stddev_m: (k,) standard deviations of a coordinate.
         site_from_model: the estimate. markers: of all points, by name. track: of the antenna, by tuple of at most one.
     """
 
     known: KnownPositions
-    is_used: Mask
+    takes_part: Mask
     stddev_m: Array
-    inflation: float
     site_from_model: Similarity
     markers: Mapping[str, Marker]
     track: tuple[AntennaTrack, ...]
@@ -182,18 +184,18 @@ class Measured:
 
 
 def _names_of_marks(used: UsedPositions) -> list[str]:
-    return [used.known.names[row] for row in np.flatnonzero(used.is_used & used.known.is_mark).tolist()]
+    return [used.known.names[row] for row in np.flatnonzero(used.takes_part & used.known.is_mark).tolist()]
 
 
 def _of_positions(
     used: UsedPositions, points: NamedPoints, trajectory: Trajectory, options: RefineOptions
 ) -> Iterator[Measurements]:
     known = used.known
-    if len(rows := np.flatnonzero(used.is_used & known.is_mark)):
+    if len(rows := np.flatnonzero(used.takes_part & known.is_mark)):
         yield ControlPoints(
             tuple(known.names[row] for row in rows.tolist()), points, known.position_m[rows], used.stddev_m[rows], {}
         )
-    rows = np.flatnonzero(used.is_used & ~known.is_mark)
+    rows = np.flatnonzero(used.takes_part & ~known.is_mark)
     if not len(rows):
         return
     [track] = used.track
@@ -205,11 +207,12 @@ def _of_positions(
     times = np.zeros(len(trajectory)) if trajectory.timestamps_s is None else trajectory.timestamps_s
     stated_m = np.sqrt(np.trace(known.covariance_m2[rows], axis1=1, axis2=2) / 3)
     positions = AntennaPositions(
+        tuple(known.names[row] for row in rows.tolist()),
         AntennaPlaces(before, after, fraction, times[after] - times[before], beyond @ used.site_from_model.rotation.T),
         known.position_m[rows],
         _whitenings(known.covariance_m2[rows], used.stddev_m[rows]),
         stated_share=np.where(known.is_stated[rows], np.nan_to_num(stated_m) / used.stddev_m[rows], 0.0),
-        share=1 / used.inflation**2,
+        group=stretch_labels(known.time_s[rows], STRETCH_S),
         arm_m=arm_m,
         arm_stddev_m=options.lever_arm_stddev_m,
         clock_stddev_s=track.offset_stddev_s,

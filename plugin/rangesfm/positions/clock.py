@@ -204,5 +204,9 @@ def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
         return track
     if track.offset_s is None:
         return replace(track, offset_s=found.value_s, offset_stddev_s=found.stddev_s, search=found)
-    off_m = [residual_stddev_at(positions, samples, each_s) for each_s in (track.offset_s, found.value_s)]
+    # Of the same positions: a map that drifts fits a part of them better than all.
+    offsets_s = (track.offset_s, found.value_s)
+    on_both = np.logical_and(*(samples.knows(positions.times_s + each_s) for each_s in offsets_s))
+    compared = positions.take(on_both) if on_both.any() else positions
+    off_m = [residual_stddev_at(compared, samples, each_s) for each_s in offsets_s]
     return replace(track, other_offset_s=found.value_s) if off_m[0] > _MUCH_WORSE * off_m[1] else track

@@ -51,6 +51,11 @@ class SurveyedPositions:
             yield f"positions: {len(log)}{name} ({log.format})"
 
     @property
+    def are_known(self) -> bool:
+        """True if there are any."""
+        return self.points is not None or self.antenna is not None
+
+    @property
     def needs_times(self) -> bool:
         """True if the photos' times are needed."""
         return self.antenna is not None and self.antenna.log.timestamp_s is not None

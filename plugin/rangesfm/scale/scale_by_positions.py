@@ -37,8 +37,9 @@ from rangesfm.positions.grouped_positions import (
     grouped_positions,
     stddev_of,
 )
-from rangesfm.positions.known_positions import LASTING_S, KnownPositions
+from rangesfm.positions.known_positions import LASTING_S, KnownPositions, LearntPositions
 from rangesfm.processes.threads import with_one_blas_thread
+from rangesfm.ranging.errors.components import FRAME
 from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import is_line
@@ -145,6 +146,19 @@ class PositionScale:
         base = np.where(np.isfinite(given), given, self.fit.stddev_m)
         return base * np.where(self.known.is_mark, learnt.get("points", 1.0), learnt.get("positions", 1.0))
 
+    def errors_of_antenna(self, problem: JointProblem) -> LearntPositions:
+        """Return the errors of the antenna's positions themselves: neither the map's bending nor that of a clock.
+
+        Args:
+            problem: of all measurements, with learnt errors.
+        """
+        groups, rows = self.observed.grouping[::3, ::3].nonzero()
+        pairs = zip(groups.tolist(), rows.tolist(), strict=True)
+        group_of = {self.known.names[row]: group for group, row in pairs if not self.known.is_mark[row]}
+        noise = problem.noise_of(POSITIONS)
+        own = (name for name in noise.names if name in ("places", FRAME) or name.startswith(POSITIONS))
+        return LearntPositions(group_of, noise.only(*own).covariance_m2)
+
     @property
     def names_left_out(self) -> list[str]:
         """Names of the control points that contradict the others."""
@@ -159,9 +173,14 @@ class PositionScale:
         return PlacementPrior.of(best @ first_camera_from_model.inverse(), np.zeros(3), self.covariance)
 
     @property
+    def takes_part(self) -> Mask:
+        """(k,) control positions that do not contradict the others, outliers of an antenna among them."""
+        return np.asarray(~self.known.is_check & ~self.is_left_out)
+
+    @property
     def is_used(self) -> Mask:
-        """(k,) positions that take part."""
-        return np.asarray(~self.known.is_check & ~self.is_left_out & (self.fit.weights >= OUTLIER_BELOW))
+        """(k,) positions that take part and are no outliers."""
+        return np.asarray(self.takes_part & (self.known.is_mark | (self.fit.weights >= OUTLIER_BELOW)))
 
     @property
     def num_used(self) -> int:

@@ -139,7 +139,9 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     survey, inputs, offset = run.survey, run.inputs, path.time_offset
     if offset is not None and offset.offset_matters:
         path = replace(path, observations=replace(path.observations, time_offset_stddev_s=offset.stddev_s))
-    bending = None if is_a_start else bending_by_survey(survey, path)
+    # Which control points and lengths contradict the others depends on how far the photos let the map drift.
+    is_judged = not is_a_start or inputs.positions.are_known or len(inputs.tape.control().distances) > 0
+    bending = bending_by_survey(survey, path) if is_judged else None
     limit = max(survey.scale.max_relative_stddev, NOTHING_KNOWN)  # a refinement can start from less certain scales
     try:
         estimate = run.changed({"scale.max_relative_stddev": limit}).estimate_scale(path, bending)
@@ -365,9 +367,8 @@ def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
 def _used_positions(found: PositionScale, surveyed: SurveyedPositions) -> UsedPositions:
     return UsedPositions(
         found.known,
-        found.is_used,
+        found.takes_part,
         found.stddev_m,
-        found.inflation,
         found.site_from_model,
         surveyed.markers,
         () if surveyed.antenna is None else (surveyed.antenna,),
@@ -400,6 +401,8 @@ def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: Ma
         factor = at.problem.bending_factor
         if at.learned is not None:
             rest = rest.with_learnt({"range": at.learned})
+        if at.positions is not None:
+            rest = rest.with_learnt({"position": at.positions.errors_of_antenna(at.problem)})
     covariance = None
     if survey.refine.covariance:
         # Measurements too coarse to see any bending do not make it smaller than the noise of the features does.
