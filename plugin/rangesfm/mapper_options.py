@@ -55,8 +55,9 @@ class MapperOptions(Options, table="mapper"):
     HierarchicalPipelineOptions."""
     close_loops: bool = True
     """Match photos of distant times that the refined map predicts to see the same, and refine again with these matches.
-    Photos of different models that look alike are matched too. Only where neighbours in time alone were matched, and
-    with refine where database_path gives the matches."""
+    Photos of different models that look alike are matched too. Without anything in metres (reconstruct), the unscaled
+    model proposes, and photos that look alike are matched. Only where neighbours in time alone were matched, and with
+    refine where database_path gives the matches."""
     num_threads: Annotated[
         Literal[-1] | Annotated[int, Field(ge=1, le=4096)],
         KeyMeta(expected="1 or more up to 4096, or -1 for all cores"),

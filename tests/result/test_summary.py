@@ -168,7 +168,7 @@ def test_loops_and_unnoticed_mistakes_are_told_in_sentences() -> None:
     lines = list(ResultSummary.model_validate(result_document(loops=loops, reliability=bound)).lines(Path("out"), None))
     assert (
         "loops: the map suggests that 309 pairs of photos show the same place; 60 of them match; 15 were used to close "
-        "loops, which moved the map by 0.021 m (rms); 2 contradict the ranges and were not used"
+        "loops, which moved the map by 0.021 m (rms); 2 contradict the measurements and were not used"
     ) in lines
     assert (
         "reliability: if one mistake was made and not noticed, the scale is off by 7.7 % at most (risk of more: "

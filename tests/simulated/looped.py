@@ -385,20 +385,13 @@ def two_aisles(
     points = np.concatenate([shelf, shelf - [0.0, apart_m, 0.0], clutter])
     frames = _Frames(centers, turns, 500.0, (960, 640))
     numbers = np.arange(len(x))
-    depth = np.einsum("fi,pfi->pf", turns[:, :, 2], points[:, None] - centers)
-    sees = frames.sees(points, numbers, 0.5) & (depth < 3.5)
+    sees = _sees(frames, points)
     in_first, in_second = numbers < num_keyframes, numbers >= len(x) - num_keyframes
     sees[:num] &= ~in_second
     sees[num : 2 * num] &= ~in_first
-    seen_by = [np.flatnonzero(row) for row in sees]
-    keep = np.array([len(by) > 1 for by in seen_by])
-    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=960, height=640, params=[500, 500, 480, 320])
-    names = [f"frame_{k:05d}.jpg" for k in numbers]
-    kept = [by for by, is_kept in zip(seen_by, keep, strict=True) if is_kept]
-    model = _reconstruction(frames, names, camera, points[keep], kept, pixel_stddev, IDENTITY, rng)
-    times = dict(zip(names, numbers.astype(np.float64).tolist(), strict=True))
-    anchors = {name: np.array(at) for name, at in SITE_ANCHORS_M.items()}
-    survey = Truth(SyntheticModel(model, IDENTITY, times, centers, turns), anchors, "site")
+    keep = sees.sum(axis=1) > 1
+    looped = _walk(frames, points[keep], sees[keep], pixel_stddev, rng)
+    model = looped.truth
     of_point = dict(zip(np.flatnonzero(keep).tolist(), sorted(model.point3D_ids()), strict=True))
     alike: dict[Pair, list[Pair]] = {}
     for k in range(num):
@@ -410,4 +403,50 @@ def two_aisles(
                         pair = first.image_id, second.image_id
                         alike.setdefault(pair, []).append((first.point2D_idx, second.point2D_idx))
     enough = {pair: np.array(of) for pair, of in alike.items() if len(of) >= MIN_NUM_SHARED}
-    return RepeatingSurvey(LoopedSurvey(survey, 8), enough)
+    return RepeatingSurvey(looped, enough)
+
+
+def around_a_room(num_keyframes: int = 60, *, pixel_stddev: float = 1.0, seed: int = 0) -> LoopedSurvey:
+    """Simulate a walk, once around a round room and some way further, looking at its wall.
+
+    Neighbours hold the whole map together, so that a mapper makes one model of them.
+
+    Args:
+        pixel_stddev: of a coordinate of a feature.
+        seed: of points and noise.
+    """
+    rng = np.random.default_rng(seed)
+    angle, around = np.linspace(0.0, 2.6 * np.pi, num_keyframes), rng.uniform(0.0, 2.0 * np.pi, 1500)
+    outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(num_keyframes)])
+    centers = 4.0 * outward + np.array([0.0, 0.0, 1.6])
+    centers[:, 2] += 0.1 * np.sin(np.arange(num_keyframes))
+    to_wall = rng.uniform(6.0, 7.0, len(around))
+    points = np.column_stack([to_wall * np.cos(around), to_wall * np.sin(around), rng.uniform(0.0, 3.0, len(around))])
+    frames = _Frames(centers, look_at(centers, centers + outward), 500.0, (960, 640))
+    sees = _sees(frames, points)
+    keep = sees.sum(axis=1) > 1
+    return _walk(frames, points[keep], sees[keep], pixel_stddev, rng)
+
+
+def _sees(frames: _Frames, points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Return whether each photo of a walk sees each of the points (p, photos), which are not far away."""
+    depth = np.einsum("fi,pfi->pf", frames.world_from_cam[:, :, 2], points[:, None] - frames.centers)
+    return np.asarray(frames.sees(points, np.arange(len(frames.centers)), 0.5) & (depth < 3.5))
+
+
+def _walk(
+    frames: _Frames,
+    points: npt.NDArray[np.float64],
+    sees: npt.NDArray[np.bool_],
+    pixel_stddev: float,
+    rng: np.random.Generator,
+) -> LoopedSurvey:
+    """Return the survey of a walk with four anchors, by which photos see each point (p, photos)."""
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=960, height=640, params=[500, 500, 480, 320])
+    names = [f"frame_{k:05d}.jpg" for k in range(len(frames.centers))]
+    seen_by = [np.flatnonzero(row) for row in sees]
+    model = _reconstruction(frames, names, camera, points, seen_by, pixel_stddev, IDENTITY, rng)
+    times = dict(zip(names, np.arange(len(names), dtype=np.float64).tolist(), strict=True))
+    anchors = {name: np.array(at) for name, at in SITE_ANCHORS_M.items()}
+    made = SyntheticModel(model, IDENTITY, times, frames.centers, frames.world_from_cam)
+    return LoopedSurvey(Truth(made, anchors, "site"), 8)

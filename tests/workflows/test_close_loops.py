@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import pycolmap
 import pytest
 from tests.known import known
 from tests.outputs import names_in
-from tests.simulated.looped import bent_laps, two_laps, write_matches, write_survey
+from tests.simulated.looped import around_a_room, bent_laps, two_laps, write_matches, write_survey
 from tests.simulated.surveys import TAG_IN_CAM_M
 
 from rangesfm.errors import InputError
@@ -136,6 +137,27 @@ def test_a_model_with_its_database_has_its_loops_closed(closed: ClosedLaps, laps
     assert num_pairs(out / "database.db") == num_pairs(laps.database) + loops.num_closed
     assert set(names_in(out / ".rangesfm")) == {"manifest.json"}
     assert 'id="loops"' in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_loops_are_closed_where_the_metres_come_from_two_lengths(tmp_path: Path) -> None:
+    looped = around_a_room()
+    write_survey(looped, tmp_path)
+    names, at_m = list(looped.survey.model.timestamps_s), looped.survey.model.centers_m
+    rows = [f"{names[a]},{names[b]},{np.linalg.norm(at_m[a] - at_m[b]):.3f},0.005" for a, b in ((0, 12), (30, 42))]
+    (tmp_path / "lengths.csv").write_text("\n".join(["from,to,distance_m,stddev_m", *rows]) + "\n")
+    given = {
+        "images.model": tmp_path / "sparse",
+        "camera.refine_intrinsics": False,
+        "mapper.database_path": tmp_path / "database.db",
+        "scale.distances": tmp_path / "lengths.csv",
+        "report.reference": tmp_path / "reference.csv",
+        "output.path": tmp_path / "out",
+    }
+    made = refine_model(Survey().changed(given), progress=SilentProgress())
+    assert made.summary.scale.verdict == "good"
+    error_m = {row.name: row.rmse_sim3_m for row in made.summary.comparison}
+    assert known(error_m["refined"]) < 0.5 * known(error_m["refined, loops open"])
+    assert len(known(LoopPairs.read(tmp_path / "out")).pairs("closed")) == known(made.summary.loops).num_closed > 10
 
 
 def test_the_map_before_is_the_one_that_open_loops_would_give(closed: ClosedLaps, laps: Laps, tmp_path: Path) -> None:

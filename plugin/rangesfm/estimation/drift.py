@@ -65,11 +65,13 @@ def straighten(problem: MapProblem, rays: Observations) -> Straightened:
     The noise is estimated again with every solution. While the drift is large, the residuals and their standard
     deviations are large too. So the robust loss, which is relative to the standard deviations, tightens as the map
     straightens, and does not take drift for outliers. Then a bounded loss, as in the scale stage and in the full
-    problem, removes the outliers.
+    problem, removes the outliers. Without measurements nothing tells drift from the path.
 
     Args:
         rays: all observations of the photos.
     """
+    if not problem.kinds:
+        return Straightened(problem, {}, (), 0.0, 0)
     graph = _graph(problem, rays, problem.start.blocks)
     fit, problem = _solve_with_own_noise(graph, problem)
     return _moved(problem, rays, graph, fit)
@@ -89,12 +91,12 @@ def straighten_again(problem: MapProblem, rays: Observations, blocks: Mapping[Bl
 
 
 def close_in_graph(
-    problem: MapProblem, known: MapProblem, rays: Observations, loops: LoopPoses, most_bend_m: float
+    problem: MapProblem, known: MapProblem, rays: Observations, loops: LoopPoses
 ) -> tuple[Straightened, bool]:
     """Close loops of a model that was refined, in place, and return the result and whether the model stays near.
 
     A map that bends far leaves its ranges on the way, and would lose them as outliers. So known noise is kept only
-    where closing bends the map by no more than ``most_bend_m``. Elsewhere it is estimated as in ``straighten``.
+    where closing bends the map by no more than photos just see. Elsewhere it is estimated as in ``straighten``.
 
     Args:
         problem, known: with the noise to begin with, and with which the model was refined.
@@ -102,8 +104,9 @@ def close_in_graph(
     """
     graph = _graph(known, rays, known.start.blocks, loops)
     fit = _solve_precisely(graph, known, graph.start)
-    if _bend(graph.vision.origin.centers, fit.state.poses.centers) <= most_bend_m:
-        return _moved(known, rays, graph, fit), True
+    is_near = _bend(graph.vision.origin.centers, fit.state.poses.centers) <= problem.visible_m
+    if is_near or not problem.kinds:
+        return _moved(known, rays, graph, fit), is_near
     fit, problem = _solve_with_own_noise(replace(graph, kinds=problem.kinds), problem)
     return _moved(problem, rays, graph, fit), False
 

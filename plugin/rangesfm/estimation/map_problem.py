@@ -35,6 +35,8 @@ class MapProblem:
         is_refined: whether the model was refined with its measurements before, which pull it from the photos' optimum.
         marker_ids: 3-D points of the model that are marks, by name.
         left_out_ids: 3-D points that do not take part.
+        visible_m: movement of a camera that moves a feature by its standard deviation. It says what matters in a map
+            without measurements, in the unit of the map.
     """
 
     metric: pycolmap.Reconstruction
@@ -48,6 +50,7 @@ class MapProblem:
     is_refined: bool = False
     marker_ids: Mapping[str, int] = field(default_factory=dict)
     left_out_ids: frozenset[int] = frozenset()
+    visible_m: float = 0.0
 
     @property
     def frame_ids(self) -> Indices:
@@ -90,18 +93,20 @@ class MapProblem:
 
     @property
     def smallest_stddev(self) -> float:
-        """Smallest standard deviation of a measurement, metres."""
+        """Smallest standard deviation of a measurement, metres; that of a camera's place without measurements."""
         return min(float(of.min()) for of in self._stddevs_m)
 
     @property
     def usual_stddev(self) -> float:
-        """Smallest, among the kinds, of their median standard deviations, metres."""
+        """Smallest, among the kinds, of their median standard deviations, metres; without measurements as above."""
         return min(float(np.median(of)) for of in self._stddevs_m)
 
     @property
     def _stddevs_m(self) -> list[Array]:
         """Standard deviations of the measurements, the root of the mean variance of their coordinates, by kind."""
         roots = [kind.weights.root_information for kind in self.kinds if kind.counts_in_metres]
+        if not roots:
+            return [np.array([self.visible_m])]
         return [np.linalg.norm(np.linalg.inv(of), axis=(1, 2)) / np.sqrt(of.shape[1]) for of in roots]
 
     def of_photos(self, max_num_iterations: int) -> BundleAdjustment:

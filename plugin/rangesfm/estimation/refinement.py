@@ -132,7 +132,8 @@ def _without_misplaced(
     adjustment = problem.of_photos(problem.options.max_num_iterations)
     beyond_m2 = errors_beyond_features(adjustment, markers, problem.marker_ids)
     problem = problem.replaced(lambda _, kind: kind.with_errors_of_marks(beyond_m2))
-    return problem, adjustment, rays.with_pixel_stddev(adjustment.pixel_stddev)
+    rays = rays.with_pixel_stddev(adjustment.pixel_stddev)
+    return replace(problem, visible_m=_just_visible_m(rays, model_poses(problem.metric, frame_ids))), adjustment, rays
 
 
 def refine_with_loops(
@@ -156,9 +157,8 @@ def refine_with_loops(
         for ids in (loops.reference, loops.frame)
     )
     seen, _, rays = _without_misplaced(problem, {})
-    visible_m = _just_visible_m(rays, model_poses(problem.metric, problem.frame_ids))
     at_indices = replace(loops, reference=reference, frame=frame)
-    closed, is_near = close_in_graph(seen, seen.like(known), rays, at_indices, visible_m)
+    closed, is_near = close_in_graph(seen, seen.like(known), rays, at_indices)
     merge_tracks(problem.metric)
     if is_near:
         return refine(problem, markers, closed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -117,6 +117,26 @@ def propose_pairs(
         pixel_stddev: standard deviation of a coordinate of a feature.
     """
     pairs: set[tuple[int, int]] = set()
+    for first, others, overlap in predicted_overlaps(views, errors, known):
+        unknown_px = _unknown_px(views, errors, first, others)
+        worth = np.where(unknown_px > pixel_stddev, overlap * unknown_px, 0.0)
+        for second in _best_apart(others, worth, views.image_ids, known, max_num):
+            ids = sorted((int(views.image_ids[first]), int(views.image_ids[second])))
+            pairs.add((ids[0], ids[1]))
+    return sorted(pairs)
+
+
+def predicted_overlaps(
+    views: Views, errors: RelativeErrors, known: Mapping[int, Set[int]]
+) -> Iterator[tuple[int, Indices, Array]]:
+    """Yield for each photo the others that the map predicts to see enough of its points, with their shares.
+
+    Args:
+        errors, known: as for ``propose_pairs``.
+
+    Yields:
+        The row of a photo in ``views``, the rows (k,) of the others, and the (k,) shares of its points in these.
+    """
     tree, stddev_m = KDTree(views.targets), errors.stddev_m[views.frame]
     reach_m = np.median(np.linalg.norm(views.points - views.centers[:, None], axis=2), axis=1) + 2 * stddev_m
     for first, near in enumerate(tree.query_ball_point(views.targets, reach_m, return_sorted=True)):
@@ -125,13 +145,7 @@ def propose_pairs(
         if not len(others):
             continue
         overlap = views.overlaps(first, others, np.hypot(stddev_m[first], stddev_m[others]))
-        others, overlap = others[overlap >= MIN_OVERLAP], overlap[overlap >= MIN_OVERLAP]
-        unknown_px = _unknown_px(views, errors, first, others)
-        worth = np.where(unknown_px > pixel_stddev, overlap * unknown_px, 0.0)
-        for second in _best_apart(others, worth, views.image_ids, known, max_num):
-            ids = sorted((int(views.image_ids[first]), int(views.image_ids[second])))
-            pairs.add((ids[0], ids[1]))
-    return sorted(pairs)
+        yield first, others[overlap >= MIN_OVERLAP], overlap[overlap >= MIN_OVERLAP]
 
 
 def _unknown_px(views: Views, errors: RelativeErrors, first: int, others: Indices) -> Array:

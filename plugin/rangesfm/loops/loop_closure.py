@@ -1,4 +1,4 @@
-"""The loops of a map: what was proposed, found, contradicted by the ranges, and by how much the map moved."""
+"""The loops of a map: what was proposed, found, contradicted by the measurements, and by how much the map moved."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LoopClosure:
         num_proposed: pairs of photos that the map predicted to see the same.
         num_verified: pairs of these that match.
         closed: pairs of these that were used.
-        contradicted: pairs of these that the ranges contradict.
+        contradicted: pairs of these that the measurements contradict.
         before: keyframes of the map that would be the result with its loops open, metres; None if none was closed.
     """
 
@@ -38,13 +38,13 @@ class LoopClosure:
 
     @property
     def warning(self) -> str | None:
-        """Return a line that names the pairs that the ranges contradict; None if there are none."""
+        """Return a line that names the pairs that the measurements contradict; None if there are none."""
         if not self.contradicted:
             return None
         first = " and ".join(self.contradicted[0])
         return (
-            f"{len(self.contradicted)} pairs of photos match but contradict the ranges, and are not used; the first"
-            f" is {first}, and loops.csv has all"
+            f"{len(self.contradicted)} pairs of photos match but contradict the measurements, and are not used; the"
+            f" first is {first}, and loops.csv has all"
         )
 
     def moved(self, offset_m: Array) -> LoopClosure:

@@ -1,4 +1,4 @@
-"""Proposal of pairs by a refined map, and the test of those that match against the ranges in that map."""
+"""Proposal of pairs by a refined map, and the test of those that match against that map."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rangesfm.colmap.point_observations import overlaps_in
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.loops.candidates import Views, propose_pairs
+from rangesfm.loops.candidates import Views, predicted_overlaps, propose_pairs
 from rangesfm.loops.relative_errors import RelativeErrors
 from rangesfm.loops.resection import MAX_CHANCE, Loop, Resection, loop_poses
 from rangesfm.vision.loop_database import Pair
@@ -63,15 +63,28 @@ class LoopFinder:
             matched: ids of the photos that each photo was matched with, by its id.
             max_num: largest number of pairs that one photo proposes.
         """
-        known = {id_: set(others) for id_, others in matched.items()}
-        shared, ids = overlaps_in(self.model).tocoo(), self.model.reg_image_ids()
-        enough = (shared.data >= MIN_NUM_SHARED) & (shared.row != shared.col)
-        for first, second in zip(shared.row[enough].tolist(), shared.col[enough].tolist(), strict=True):
-            known.setdefault(ids[first], set()).add(ids[second])
+        known = self._known(matched)
         return propose_pairs(self.views, self.errors, known, max_num=max_num, pixel_stddev=self.pixel_stddev)
 
+    def predicted(self, matched: Mapping[int, Set[int]]) -> dict[int, set[int]]:
+        """Return for each photo those that it was matched with, or that the map predicts to see the same, by ids."""
+        known, ids = self._known(matched), self.views.image_ids
+        for first, others, _ in predicted_overlaps(self.views, self.errors, known):
+            known[int(ids[first])].update(ids[others].tolist())
+        return known
+
+    def _known(self, matched: Mapping[int, Set[int]]) -> dict[int, set[int]]:
+        """Return for each photo of the map those that it was matched with or shares enough points with, by ids."""
+        ids = self.model.reg_image_ids()
+        known = {id_: set(matched.get(id_, ())) for id_ in ids}
+        shared = overlaps_in(self.model).tocoo()
+        enough = (shared.data >= MIN_NUM_SHARED) & (shared.row != shared.col)
+        for first, second in zip(shared.row[enough].tolist(), shared.col[enough].tolist(), strict=True):
+            known[ids[first]].add(ids[second])
+        return known
+
     def tested(self, verified: Mapping[Pair, Indices]) -> tuple[list[Loop], list[Pair]]:
-        """Return the loops that fit the ranges, and the pairs that the ranges contradict.
+        """Return the loops that fit the map, and the pairs that it contradicts.
 
         Pairs whose matches have too few points say nothing and are in neither.
 

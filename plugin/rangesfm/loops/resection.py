@@ -1,4 +1,4 @@
-"""Pose of a photo by the points of another one that it was matched with, and its test against the refined map."""
+"""Pose of a photo by the points of another one that it was matched with, and its test against the map."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Loop:
     noise: Array
 
     def chance(self, errors: RelativeErrors) -> float:
-        """Return the probability that the photos differ this much from the map with its ranges, by chance."""
+        """Return the probability that the photos differ this much from the map, by chance."""
         frames = np.append(self.frames, self.moved)
         covariance = self.noise + errors.covariance(frames, np.concatenate([self.by_frame, -np.eye(6)[None]]))
         difference = np.concatenate([self.turn, self.shift])

@@ -23,7 +23,7 @@ class TriedPairs:
 
     Attributes:
         proposed: by the maps. verified: those of them that match.
-        closed: those of these that were used. contradicted: those that the ranges contradict in the last map.
+        closed: those of these that were used. contradicted: those that the last map with its measurements contradicts.
     """
 
     proposed: frozenset[Pair] = frozenset()
@@ -73,21 +73,26 @@ def find_in(
     match: Callable[[list[Pair]], Mapping[Pair, Indices]],
     known: Mapping[int, Set[int]],
     tried: TriedPairs,
+    alike: Callable[[Mapping[int, Set[int]]], list[Pair]] = lambda _: [],
 ) -> tuple[list[Loop], TriedPairs]:
-    """Return the loops that match and fit the ranges, and all pairs that have been tried with those of this round.
+    """Return the loops that match and fit the map, and all pairs that have been tried with those of this round.
 
     Args:
         finder: of loops in the map.
         match: returns the matches (m, 2) of those of some pairs that are verified.
         known: ids of the photos that each photo was matched with by the mapping, by its id.
-        tried: pairs of the rounds before. Those that the ranges contradicted are tried again.
+        tried: pairs of the rounds before. Those that the map contradicted are tried again.
+        alike: returns pairs of photos that look alike, given for each photo, by its id, those that it is not to be
+            paired with: they were matched with it, or the map predicts that they see the same. It is asked once.
     """
     matched = {id_: set(others) for id_, others in known.items()}
     for first, second in tried.proposed:
         matched.setdefault(first, set()).add(second)
         matched.setdefault(second, set()).add(first)
-    proposed = finder.propose(matched, max_num=MAX_NUM_PAIRS)
-    verified = match(sorted({*proposed, *tried.contradicted}))
+    proposed = set(finder.propose(matched, max_num=MAX_NUM_PAIRS))
+    if not tried.proposed:
+        proposed.update(alike(finder.predicted(matched)))
+    verified = match(sorted(proposed | tried.contradicted))
     loops, contradicted = finder.tested(verified)
     return loops, TriedPairs(
         tried.proposed.union(proposed),

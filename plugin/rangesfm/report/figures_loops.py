@@ -28,7 +28,7 @@ def loops_figure(content: Content) -> Figure | None:
     series = (
         Series("neighbours in time", "before", np.column_stack([along, along]), "line", is_data=False),
         Series("closed a loop", "after", dots("closed")),
-        Series("contradict the ranges", "reference", dots("contradicted")),
+        Series("contradict the measurements", "reference", dots("contradicted")),
     )
     panel = Panel(
         "",

@@ -261,8 +261,8 @@ class LoopsEntry(Record):
     Attributes:
         num_proposed: pairs of photos that the refined map predicted to see the same.
         num_verified: pairs of these that match.
-        num_closed: pairs of these that fit the ranges and were used.
-        num_contradicted: pairs of these that the ranges contradict.
+        num_closed: pairs of these that fit the measurements and were used.
+        num_contradicted: pairs of these that the measurements contradict.
         moved_m: root mean square movement of the keyframes.
     """
 

@@ -168,7 +168,7 @@ def _reliable(reliability: entries.ReliabilityEntry) -> str:
 def _closed(loops: entries.LoopsEntry) -> str:
     """Return the line that says which loops were closed."""
     moved = f", which moved the map by {loops.moved_m:.2g} m (rms)" if loops.num_closed else ""
-    contradicted = f"; {loops.num_contradicted} contradict the ranges and were not used"
+    contradicted = f"; {loops.num_contradicted} contradict the measurements and were not used"
     return (
         f"loops: the map suggests that {loops.num_proposed} pairs of photos show the same place; {loops.num_verified} "
         f"of them match; {loops.num_closed} were used to close loops{moved}"

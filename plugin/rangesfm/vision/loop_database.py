@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import shutil
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pycolmap
@@ -26,19 +27,25 @@ from rangesfm.vision.steps import DATABASE_NAME, LOG_NAME, RECORD_NAME, Steps
 Pair = tuple[int, int]
 """Ids of two photos, the smaller one first."""
 _FOLDER_NAME, _SOURCE_NAME, _NOTE = "loops", "source.txt", "loops"
-_LOOPS, _TIES = "pairs", "ties"  # pairs that were tried as loops, and pairs that tie models
+# Pairs that were tried as loops, pairs that tie models, and pairs whose loops are closed in the models themselves.
+_LOOPS, _TIES, _CLOSED = "pairs", "ties", "closed"
 
 
 def forget_loops(steps: Steps, path: Path | None = None) -> None:
-    """Remove the matches of all loops that a reconstruction's record notes from its database, and the note.
+    """Remove the matches of all loops that a reconstruction's record notes from its database, and the notes.
 
     Args:
         path: of the database; None: it has just been made without loops.
     """
-    if pairs := {*_noted(steps, _LOOPS), *_noted(steps, _TIES)}:
+    if noted := steps.notes.get(_NOTE, {}):
         if path is not None:
-            _forget(path, pairs)
+            _forget(path, set[Pair]().union(*(_noted(steps, kind) for kind in noted)))
         steps.note(_NOTE, {})
+
+
+def has_closed_loops(steps: Steps) -> bool:
+    """Return whether the loops of a reconstruction's models were closed, as far as there are any."""
+    return _CLOSED in steps.notes.get(_NOTE, {})
 
 
 def _noted(steps: Steps, kind: str) -> set[Pair]:
@@ -122,7 +129,7 @@ class LoopDatabase:
 
     def match(self, pairs: list[Pair], options: MatchingOptions, progress: Progress) -> dict[Pair, Indices]:
         """Match pairs, and return the matches (m, 2) of those that are verified by a two-view geometry."""
-        self._note({*self._tried(), *pairs} - self._ties(), self._ties())
+        self._note(_LOOPS, {*self._tried(), *pairs} - self._noted(_TIES))
         with colmap_log(self.log):
             match_pairs(self.path, pairs, options, self.log, progress)
         verified: dict[Pair, Indices] = {}
@@ -137,17 +144,37 @@ class LoopDatabase:
         """Forget the matches of all pairs that were tried as loops, except those that are accepted or do not match."""
         right = {*accepted, *(set(proposed) - set(verified))}
         _forget(self.path, self._tried() - right)
-        self._note(right, self._ties())
+        self._note(_LOOPS, right)
 
     def keep_ties(self, proposed: Collection[Pair], accepted: Collection[Pair]) -> None:
         """Forget the matches of all pairs that were proposed as ties, now or before, except those that are accepted."""
-        _forget(self.path, self._ties().union(proposed).difference(accepted))
-        self._note(self._tried().difference(proposed), accepted)
+        _forget(self.path, self._noted(_TIES).union(proposed).difference(accepted))
+        self._note(_LOOPS, self._tried().difference(proposed))
+        self._note(_TIES, accepted)
+
+    def keep_closed(self) -> None:
+        """Let the pairs that were kept as loops belong to the models, which now have them."""
+        self._note(_CLOSED, self._tried())
+        self._note(_LOOPS, ())
 
     def publish(self, output: OutputFolder) -> None:
         """Let the database, and the record that notes its loops, take their places with the next whole result."""
+        output.defer(self._places(output))
+
+    def publish_with(
+        self, output: OutputFolder, more: Mapping[Path, Path] = MappingProxyType({}), superseded: Sequence[Path] = ()
+    ) -> None:
+        """Let the database, its record and more files take their places at once; arguments as ``OutputFolder.publish``.
+
+        Raises:
+            InputError: something in one of the places is not this tool's own.
+        """
+        output.publish({**self._places(output), **more}, superseded)
+        self.discard()
+
+    def _places(self, output: OutputFolder) -> dict[Path, Path]:
         names = (DATABASE_NAME, RECORD_NAME) if self.has_record else (DATABASE_NAME,)
-        output.defer({output.path / name: self.folder / name for name in names})
+        return {output.path / name: self.folder / name for name in names}
 
     def discard(self) -> None:
         """Remove the copy."""
@@ -157,10 +184,11 @@ class LoopDatabase:
         return Steps(self.folder / RECORD_NAME, SILENT)
 
     def _tried(self) -> set[Pair]:
-        return _noted(self._record(), _LOOPS)
+        return self._noted(_LOOPS)
 
-    def _ties(self) -> set[Pair]:
-        return _noted(self._record(), _TIES)
+    def _noted(self, kind: str) -> set[Pair]:
+        return _noted(self._record(), kind)
 
-    def _note(self, tried: Collection[Pair], ties: Collection[Pair]) -> None:
-        self._record().note(_NOTE, {_LOOPS: sorted(tried), _TIES: sorted(ties)})
+    def _note(self, kind: str, pairs: Collection[Pair]) -> None:
+        record = self._record()
+        record.note(_NOTE, {**record.notes.get(_NOTE, {}), kind: sorted(pairs)})

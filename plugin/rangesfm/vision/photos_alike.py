@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,30 +24,31 @@ _NUM_OF_PHOTO = 1000
 
 
 def pairs_alike(
-    database_path: Path, groups: Sequence[Collection[int]], log: Path, *, max_num: int, seed: int
+    database_path: Path, known: Mapping[int, Set[int]], log: Path, *, max_num: int, seed: int
 ) -> list[Pair]:
-    """Return pairs of photos of different groups that look alike, as ids, smaller first.
+    """Return pairs of photos that look alike, as ids, smaller first.
 
     Args:
         database_path: with the photos' descriptors.
-        groups: ids of the photos of each group.
+        known: ids of the photos, with those of the photos that each one is not to be paired with.
         log: the messages of COLMAP and of its parts are appended to this file.
         max_num: largest number of pairs that one photo proposes.
         seed: of the vocabulary.
     """
-    group_of = {image_id: k for k, image_ids in enumerate(groups) for image_id in image_ids}
     with scratch_folder(database_path.with_name("vocabulary")) as folder, colmap_log(log):
         path = folder / "words.bin"
         with pycolmap.Database.open(database_path) as database:
-            _write_vocabulary(database, sorted(group_of), path, log, seed)
+            _write_vocabulary(database, sorted(known), path, log, seed)
             options = pycolmap.VocabTreePairingOptions(
-                vocab_tree_path=path, num_images=len(group_of), max_num_features=_NUM_OF_PHOTO
+                vocab_tree_path=path, num_images=len(known), max_num_features=_NUM_OF_PHOTO, num_threads=1
             )
             ranked = pycolmap.VocabTreePairGenerator(options, database).all_pairs()
     num_of: Counter[int] = Counter()
     chosen: set[Pair] = set()
     for photo, other in ranked:  # for each photo, the most similar one first
-        if num_of[photo] < max_num and {photo, other} <= group_of.keys() and group_of[photo] != group_of[other]:
+        if photo == other or not {photo, other} <= known.keys():
+            continue
+        if num_of[photo] < max_num and other not in known[photo]:
             num_of[photo] += 1
             chosen.add((min(photo, other), max(photo, other)))
     return sorted(chosen)

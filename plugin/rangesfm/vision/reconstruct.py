@@ -17,7 +17,7 @@ from rangesfm.progress import SILENT, Progress
 from rangesfm.vision.camera import cameras_of_photos, check_camera
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.given_database import opened
-from rangesfm.vision.loop_database import forget_loops
+from rangesfm.vision.loop_database import forget_loops, has_closed_loops
 from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_mapped_models
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
@@ -150,6 +150,8 @@ def _map(
                     space, photos, rigs, mapping_options(camera, mapper, NO_RIGS, seed, space.database)
                 ),
             )
+        if has_closed_loops(space.steps) and not mapper.close_loops:
+            space.steps.repeat("mapping")
         space.steps.run(
             "mapping",
             inputs,

@@ -126,6 +126,12 @@ class Steps:
         source = self._path if self._earlier is None else self._earlier._path
         self._record, self.notes = _read(source, "steps"), _read(source, "notes")
 
+    def repeat(self, first: str) -> None:
+        """Do this step and those after it again, even if they were done with the same inputs."""
+        if self._earlier is not None:
+            self.begin()
+        self.forget(first)
+
     def forget(self, first: str) -> None:
         """Remove this step and those after it from the record."""
         names = list(self._record)

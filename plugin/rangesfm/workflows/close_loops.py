@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import pycolmap
 
-from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import InputError
 from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.files.output_folder import sole_writer
+from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.loops.loop_closure import LoopClosure
-from rangesfm.loops.loop_finder import LoopFinder
-from rangesfm.loops.merge import merge_tracks
-from rangesfm.loops.resection import Loop
-from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
+from rangesfm.loops.rounds import TriedPairs, close_in_rounds
 from rangesfm.survey.survey_run import SurveyRun
 from rangesfm.workflows.loop_matching import LoopMatching
+from rangesfm.workflows.matched_map import MatchedMap, MergeTracks
 from rangesfm.workflows.metric_result import MetricResult
 
 
@@ -32,7 +29,6 @@ class RefinedMap:
     at_rest: MapAtRest
 
 
-MergeTracks = Callable[[pycolmap.Reconstruction], None]
 Refine = Callable[[SurveyRun, RefinedMap, LoopPoses, MergeTracks], RefinedMap]
 """Closes loops of a map and refines it again."""
 
@@ -50,7 +46,7 @@ def close_loops_of_survey(run: SurveyRun, refined: RefinedMap, refine: Refine) -
     if not run.survey.mapper.close_loops or metric.kept_refinement is None:
         return metric
     with sole_writer(run.survey.output.path) as output:
-        if (matching := LoopMatching.for_survey(run, output)) is None:
+        if (matching := LoopMatching.for_survey(run.survey, run.journal.progress, output)) is None:
             return metric
         if metric.map_errors is None:
             run.journal.warn("loops are not closed, because the covariance of the poses is not known")
@@ -60,53 +56,43 @@ def close_loops_of_survey(run: SurveyRun, refined: RefinedMap, refine: Refine) -
             if run.survey.images.model is not None:
                 raise InputError(why_not, run.survey.mapper.database_path)
             return metric
-        last, tried = close_in_rounds(_RefinedMap(run, refined, matching, refine))
+        metric_map, seed = _MetricMap(run, refined, refine), run.survey.output.seed
+        last, tried = close_in_rounds(MatchedMap(metric_map, matching, run.journal, seed, asks_vocabulary=False))
         last.keep(tried)
         matching.database.publish(output)
-        return _told(run, metric, last.refined.metric, tried)
+        return _told(run, metric, last.map.refined.metric, tried)
 
 
 @dataclass(frozen=True)
-class _RefinedMap:
-    """A refined map with the matching of its photos."""
+class _MetricMap:
+    """A refined map of a survey, as one whose loops can be closed."""
 
     run: SurveyRun
     refined: RefinedMap
-    matching: LoopMatching
     refine: Refine
 
-    def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
-        if (finder := self._finder) is None:
-            return [], tried
-        with self.run.journal.stage("loops"):
-            return find_in(finder, self.matching.match, self.matching.database.known(), tried)
+    @property
+    def model(self) -> pycolmap.Reconstruction:
+        return self.refined.metric.final
 
-    def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> _RefinedMap | None:
-        self.keep(tried)
-        finder, database = self._finder, self.matching.database
-        assert finder is not None, "it has found the loops"
+    @property
+    def trajectory(self) -> Trajectory:
+        return self.refined.metric.trajectory
 
-        def merge(model: pycolmap.Reconstruction) -> None:
-            with colmap_log(database.log):
-                merge_tracks(model, database.path, seed=finder.seed)
+    @property
+    def errors(self) -> MapErrors | None:
+        return self.refined.metric.map_errors
 
-        with self.run.journal.stage("refinement"):
-            refined = self.refine(self.run, self.refined, finder.relative_poses(loops), merge)
-        if why := refined.metric.why_broken:
-            self.run.journal.warn(f"loops are left open, because the map broke: {'; '.join(why)}")
-            return None
-        return replace(self, refined=refined)
+    @property
+    def pixel_stddev(self) -> float:
+        return self.refined.at_rest.pixel_stddev
 
-    def keep(self, tried: TriedPairs) -> None:
-        self.matching.database.keep(tried.proposed, tried.verified, tried.closed)
+    @property
+    def why_broken(self) -> tuple[str, ...]:
+        return self.refined.metric.why_broken
 
-    @cached_property
-    def _finder(self) -> LoopFinder | None:
-        metric = self.refined.metric
-        if metric.map_errors is None or metric.kept_refinement is None:
-            return None
-        pixel_stddev, seed = metric.kept_refinement.pixel_stddev, self.run.survey.output.seed
-        return LoopFinder.of(metric.final, metric.trajectory, metric.map_errors, pixel_stddev, seed)
+    def with_loops(self, loops: LoopPoses, merge: MergeTracks) -> _MetricMap:
+        return replace(self, refined=self.refine(self.run, self.refined, loops, merge))
 
 
 def _told(run: SurveyRun, before: MetricResult, after: MetricResult, tried: TriedPairs) -> MetricResult:

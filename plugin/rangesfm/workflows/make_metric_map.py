@@ -104,14 +104,19 @@ def metric_map(run: SurveyRun, path: PathOfModel, *, refine: bool) -> MetricResu
         GeometryError: the scale is not determined, or is less certain than asked for.
         SolverError: the refinement broke the map, and the scaled map does not fit the photos either.
     """
-    of_pieces = doubts_of_pieces(_pieces_not_held(run, path), path.sfm.num_reg_images())
-    run.journal.warn(*(doubt.reason for doubt in of_pieces))
+    pieces = _pieces_not_held(run, path)
     with run.journal.stage("scale"):
         metric = scale_by_survey(run, path, is_a_start=refine)
     if refine:
         with run.journal.stage("refinement"):
             refined = _with_anchors_on_likelier_sides(run, metric, refine_map(run, metric))
         metric = close_loops_of_survey(run, refined, refine_closed_map)
+        if pieces and metric.loops is not None and metric.loops.closed:  # loops hold pieces that neighbours do not
+            pieces = _pieces_not_held(
+                run, replace(path, sfm=metric.final, trajectory=path.trajectory.as_in(metric.final))
+            )
+    of_pieces = doubts_of_pieces(pieces, path.sfm.num_reg_images())
+    run.journal.warn(*(doubt.reason for doubt in of_pieces))
     with run.journal.stage("judgement"):
         return judge_map(run, metric, of_pieces)
 

@@ -26,6 +26,7 @@ from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.rigs import read_rigs
 from rangesfm.workflows.adoption import with_likeliest_cause
+from rangesfm.workflows.close_unscaled import close_loops_of_models
 from rangesfm.workflows.make_metric_map import join_by_survey, metric_map
 from rangesfm.workflows.map_photos import (
     begin_run,
@@ -90,7 +91,8 @@ def reconstruct_survey(survey: Survey, *, progress: Progress = SILENT, restart: 
     with sole_writer(survey.output.path), at_most(survey.mapper.num_threads):
         survey = with_photos_in_folder(survey, journal, restart=restart)
         keyframes, _ = find_keyframes(survey, journal)
-        sfm = map_keyframes(survey, keyframes, journal, restart, deferred=False)[0]
+        models = map_keyframes(survey, keyframes, journal, restart, deferred=False)
+        sfm = close_loops_of_models(survey, models, journal)
     path = survey.output.path / "sparse" / "0"
     return [f"unscaled model: {sfm.num_reg_images()} photos, {sfm.num_points3D()} points, in {path}"]
 

@@ -48,12 +48,13 @@ def tie_by_photos(run: SurveyRun, paths: Sequence[PathOfModel], times: ImageTime
     if len(paths) == 1:
         return list(paths)
     with sole_writer(run.survey.output.path) as output:
-        if (matching := LoopMatching.for_survey(run, output)) is None:
+        if (matching := LoopMatching.for_survey(run.survey, run.journal.progress, output)) is None:
             return list(paths)
         with run.journal.stage("loops"):
-            groups = [sorted(path.sfm.reg_image_ids()) for path in paths]
+            groups = [set(path.sfm.reg_image_ids()) for path in paths]
+            own = {image_id: group for group in groups for image_id in group}
             seed, database = run.survey.output.seed, matching.database
-            proposed = pairs_alike(database.path, groups, database.log, max_num=MAX_NUM_PAIRS, seed=seed)
+            proposed = pairs_alike(database.path, own, database.log, max_num=MAX_NUM_PAIRS, seed=seed)
             tied, pairs = _tied(run, paths, matching.match(proposed))
             database.keep_ties(proposed, pairs)
             with colmap_log(database.log):
