@@ -11,6 +11,7 @@ import pycolmap
 
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.colmap.reprojection import point_errors
+from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.map_problem import MapProblem
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
@@ -43,20 +44,36 @@ def close_loops_of_models(
             return models[0]
         if (matching := LoopMatching.for_survey(survey, journal.progress, output)) is None:
             return models[0]
-        with journal.stage("refinement"):
-            start = _UnscaledMap.at_rest_by_photos(survey, models[0])
-        if start.errors is None:
-            journal.warn("loops are not closed, because the covariance of the poses is not known")
+        try:
+            closed = _closed(survey, models[0], matching, journal)
+        except (GeometryError, SolverError) as error:
+            journal.warn(f"loops are not closed: {error}")
             matching.database.discard()
             return models[0]
-        first = MatchedMap(start, matching, journal, survey.output.seed, asks_vocabulary=True)
-        last, tried = close_in_rounds(first)
-        last.keep(tried)
-        matching.database.keep_closed()
-        journal.progress.message(_told(tried))
-        closed = last.map.model if tried.closed else None
         _publish(output, matching, closed)
         return closed or models[0]
+
+
+def _closed(
+    survey: Survey, model: pycolmap.Reconstruction, matching: LoopMatching, journal: Journal
+) -> pycolmap.Reconstruction | None:
+    """Return a copy of a model with its loops closed; None if no loops are found.
+
+    Raises:
+        GeometryError: the photos do not determine the poses, or have other features in the database.
+        SolverError: the model cannot be adjusted.
+    """
+    if why_not := matching.database.why_unfit(model):
+        raise GeometryError(why_not)
+    with journal.stage("refinement"):
+        start = _UnscaledMap.at_rest_by_photos(survey, model)
+    if start.errors is None:
+        raise GeometryError("the covariance of the poses is not known")
+    last, tried = close_in_rounds(MatchedMap(start, matching, journal, survey.output.seed, asks_vocabulary=True))
+    last.keep(tried)
+    matching.database.keep_closed()
+    journal.progress.message(_told(tried))
+    return last.map.model if tried.closed else None
 
 
 @dataclass(frozen=True)
