@@ -100,6 +100,18 @@ def test_a_model_without_any_measurement_has_its_loops_closed_though_it_was_inte
     assert not again.stages
 
 
+def test_one_that_was_stopped_before_its_model_took_its_place_closes_them_again(tmp_path: Path) -> None:
+    made = Reconstructed.of(around_a_room(), tmp_path / "out")
+    open_m = made.error_m(made.model)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LoopDatabase, "publish_with", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            made.close()
+    assert made.error_m(made.model) == open_m
+    made.close()
+    assert made.error_m(made.model) < 0.4 * open_m
+
+
 def test_photos_that_look_alike_close_loops_that_a_map_does_not_predict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -153,7 +153,8 @@ class LoopDatabase:
         self._note(_TIES, accepted)
 
     def keep_closed(self) -> None:
-        """Let the pairs that were kept as loops belong to the models, which now have them."""
+        """Let the pairs that were kept as loops belong to the models, which are to be published with the database."""
+        (self.folder / _SOURCE_NAME).unlink()  # a run that is stopped before that must not go on with this copy
         self._note(_CLOSED, self._tried())
         self._note(_LOOPS, ())
 
