@@ -1,0 +1,63 @@
+"""ImuLog: what an inertial sensor measured, as checked arrays, and the noise of its two sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesfm.arrays import Array
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Noise of an inertial sensor in continuous time, as kalibr states it (its wiki, "IMU Noise Model").
+
+    Attributes:
+        gyro_noise_density_rad_s_rthz: white noise of the angular rates, rad/s/sqrt(Hz).
+        accel_noise_density_m_s2_rthz: white noise of the specific force, m/s^2/sqrt(Hz).
+        gyro_bias_walk: random walk of the gyroscope's bias, rad/s^2/sqrt(Hz).
+        accel_bias_walk: random walk of the accelerometer's bias, m/s^3/sqrt(Hz).
+    """
+
+    gyro_noise_density_rad_s_rthz: float
+    accel_noise_density_m_s2_rthz: float
+    gyro_bias_walk: float
+    accel_bias_walk: float
+
+    def __post_init__(self) -> None:
+        if not all(np.isfinite(value) and value >= 0 for value in vars(self).values()):
+            raise ValueError("noise is finite and not negative")
+
+
+@dataclass(frozen=True)
+class ImuLog:
+    """k samples of an inertial sensor, in its own frame.
+
+    Attributes:
+        timestamp_s: (k,) seconds on the sensor's clock, rising.
+        gyro_rad_s: (k, 3) angular rates of the sensor.
+        accel_m_s2: (k, 3) specific force: acceleration minus gravity, which points upward in a sensor at rest.
+        path: the file, for messages; empty if made in memory.
+        noise: as a file states it; None if none does.
+        notes: assumptions made in reading the file, as lines for the user.
+    """
+
+    timestamp_s: Array
+    gyro_rad_s: Array
+    accel_m_s2: Array
+    path: str = ""
+    noise: ImuNoise | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        num = len(self.timestamp_s)
+        if self.timestamp_s.shape != (num,) or not self.gyro_rad_s.shape == self.accel_m_s2.shape == (num, 3):
+            raise ValueError("a log has k times, (k, 3) angular rates and (k, 3) accelerations")
+        if not all(np.isfinite(values).all() for values in (self.timestamp_s, self.gyro_rad_s, self.accel_m_s2)):
+            raise ValueError("times, angular rates and accelerations are finite")
+        if np.any(np.diff(self.timestamp_s) <= 0):
+            raise ValueError("times rise")
+
+    def __len__(self) -> int:
+        return len(self.timestamp_s)
