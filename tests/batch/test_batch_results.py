@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rangesfm.batch.batch_state import BatchState, Status
+from rangesfm.batch.batch_state import BatchState
 from rangesfm.batch.jobs import Job
 from rangesfm.batch.run_batch import write_batch_results
 from rangesfm.errors import Failure
@@ -21,13 +21,15 @@ BAD_NAME = '</td><script>alert(1)</script>&".toml'
 
 @pytest.fixture
 def batch_state(tmp_path: Path) -> BatchState:
-    jobs = [Job(f"surveys/{i}.toml", Survey(output=OutputOptions(path=tmp_path / f"out #{i}"))) for i in range(3)]
-    batch_state = BatchState([*jobs, Job(BAD_NAME, None, Failure(f"{BAD_NAME}: no such file", 2))])
+    jobs: list[Job] = [
+        (f"surveys/{i}.toml", Survey(output=OutputOptions(path=tmp_path / f"out #{i}"))) for i in range(3)
+    ]
+    batch_state = BatchState([*jobs, (BAD_NAME, Failure(f"{BAD_NAME}: no such file", 2))])
     for i, verdict in enumerate(["good", "doubtful"]):
         batch_state.tell(i, {"began_on": "here"})
         found = (verdict, 0.5, 0.002, "site", 14, 725, 481, 0.0795, 0.51, 0.0821, 2)
         figures = dict(zip(list(batch_state.rows[i].cells())[-len(found) :], found))
-        batch_state.end(i, Status.DONE, "" if verdict == "good" else "short path", 0, **figures)
+        batch_state.end(i, "done", "" if verdict == "good" else "short path", 0, **figures)
     (tmp_path / "out #0").mkdir()
     (tmp_path / "out #0" / "report.html").touch()
     return batch_state
@@ -80,6 +82,6 @@ def test_the_page_escapes_names_and_links_to_reports_that_are_there(batch_state:
 def test_the_page_loads_itself_anew_until_the_batch_is_over(batch_state: BatchState, tmp_path: Path) -> None:
     write_batch_results(batch_state, tmp_path)
     assert Page((tmp_path / "batch.html").read_text()).has_refresh
-    batch_state.end_all(Status.INTERRUPTED, "interrupted")
+    batch_state.end_all("interrupted", "interrupted")
     write_batch_results(batch_state, tmp_path)
     assert not Page((tmp_path / "batch.html").read_text()).has_refresh

@@ -6,8 +6,7 @@ import pytest
 from tests.cli.screen import Clock
 from tests.result_document import result_document
 
-from rangesfm.batch.batch_state import BatchState, Status, SurveyRow, exit_status_of, figures_of, format_rows
-from rangesfm.batch.jobs import Job
+from rangesfm.batch.batch_state import BatchState, SurveyRow, exit_status_of, figures_of, format_rows
 from rangesfm.errors import Failure
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
@@ -20,36 +19,31 @@ def clock() -> Clock:
 
 @pytest.fixture
 def batch_state(clock: Clock) -> BatchState:
-    return BatchState([Job(name, Survey()) for name in "abcd"], clock=clock)
+    return BatchState([(name, Survey()) for name in "abcd"], clock=clock)
 
 
 def test_an_attempt_begins_anew_where_a_worker_was_killed(batch_state: BatchState, clock: Clock) -> None:
     batch_state.tell(0, {"began_on": "one"})
     batch_state.tell(0, {"stage": "mapping"})
     batch_state.tell(0, {"num_done": 3, "num_total": 9})
-    assert (batch_state.states[0].stage, batch_state.states[0].num_done, batch_state.states[0].num_total) == (
-        "mapping",
-        3,
-        9,
-    )
+    row = batch_state.rows[0]
+    assert (row.stage, row.num_done, row.num_total) == ("mapping", 3, 9)
     clock.now_s += 50
     batch_state.tell(0, {"began_on": "two"})
-    assert (batch_state.states[0].stage, batch_state.states[0].num_done) == ("", None)
+    assert (row.stage, row.num_done) == ("", None)
     clock.now_s += 8
-    batch_state.end(0, Status.DONE, "", 0, verdict="good")
-    row = batch_state.rows[0]
-    assert (row.status, row.num_attempts, row.host, row.seconds) == (Status.DONE, 2, "two", 8)
+    batch_state.end(0, "done", "", 0, verdict="good")
+    assert (row.status, row.num_attempts, row.host, row.seconds) == ("done", 2, "two", 8)
     batch_state.tell(0, {"began_on": "late"})  # from a worker that was thought to be lost
-    assert batch_state.rows[0] == row
+    assert (row.status, row.num_attempts, row.host) == ("done", 2, "two")
 
 
 def test_time_left_is_that_of_those_that_are_done(batch_state: BatchState, clock: Clock) -> None:
-    batch_state.num_at_once = 2
     for index in (0, 1):
         batch_state.tell(index, {"began_on": "here"})
     clock.now_s += 30
     assert batch_state.seconds_left() is None
-    batch_state.end(0, Status.DONE, "", 0)
+    batch_state.end(0, "done", "", 0)
     batch_state.tell(2, {"began_on": "here"})
     # d waits, b should have ended by now, c has just begun
     assert batch_state.seconds_left() == pytest.approx((30 + 0 + 30) / 2)
@@ -59,14 +53,14 @@ def test_time_left_is_that_of_those_that_are_done(batch_state: BatchState, clock
 
 def test_whatever_is_not_over_when_it_is_interrupted_says_so(batch_state: BatchState) -> None:
     batch_state.tell(0, {"began_on": "here"})
-    batch_state.end(1, Status.DONE, "", 0)
-    batch_state.end_all(Status.INTERRUPTED, "interrupted")
+    batch_state.end(1, "done", "", 0)
+    batch_state.end_all("interrupted", "interrupted")
     assert batch_state.is_over
-    assert [row.status.value for row in batch_state.rows] == ["interrupted", "done", "interrupted", "interrupted"]
+    assert [row.status for row in batch_state.rows] == ["interrupted", "done", "interrupted", "interrupted"]
 
 
 def test_a_file_that_could_not_be_read_is_over_from_the_start() -> None:
-    batch_state = BatchState([Job("x.toml", None, Failure("x.toml: no such file", 2))])
+    batch_state = BatchState([("x.toml", Failure("x.toml: no such file", 2))])
     assert batch_state.is_over
     assert exit_status_of(batch_state.rows) == 2
 
@@ -79,8 +73,8 @@ def test_the_batch_ends_with_the_largest_of_the_statuses(statuses: tuple[int, ..
 
 
 def test_the_table_of_the_terminal_says_why_below() -> None:
-    done = SurveyRow("a.toml", Status.DONE, "short", 0, verdict="doubtful", scale=0.5, num_photos=3)
-    failed = SurveyRow("b.toml", Status.FAILED, "no such file", 2)
+    done = SurveyRow("a.toml", "done", "short", 0, verdict="doubtful", scale=0.5, num_photos=3)
+    failed = SurveyRow("b.toml", "failed", "no such file", 2)
     lines = format_rows([done, failed]).split("\n")
     assert lines[1].split() == ["a.toml", "doubtful", "0.5", "3", "-", "-", "-", "-"]
     assert lines[2].split()[:2] == ["b.toml", "failed"]

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from rangesfm.batch.jobs import BatchOptions, Share, read_jobs, share_this_machine
-from rangesfm.errors import InputError
+from rangesfm.batch.jobs import BatchOptions, read_jobs, share_this_machine
+from rangesfm.errors import Failure, InputError
+from rangesfm.survey.settings import Survey
 
 GB = 10**9
 
@@ -21,7 +22,7 @@ def write_survey(path: Path, output: str | None) -> Path:
 def test_each_survey_has_its_own_folder_and_the_overrides_of_all(tmp_path: Path) -> None:
     paths = [write_survey(tmp_path / name / "survey.toml", None) for name in ("a", "b")]
     jobs = read_jobs(paths, {"output.seed": 7}, tmp_path / "batch")
-    surveys = [job.survey for job in jobs if job.survey is not None]
+    surveys = [survey for _, survey in jobs if isinstance(survey, Survey)]
     assert [survey.output.path for survey in surveys] == [tmp_path / "a" / "out", tmp_path / "b" / "out"]
     assert [survey.output.seed for survey in surveys] == [7, 7]
 
@@ -54,16 +55,15 @@ def test_a_file_that_cannot_be_used_is_a_job_that_has_failed(tmp_path: Path) -> 
     wrong.write_text("[images]\nfolder = 3\n")
     good = write_survey(tmp_path / "good.toml", None)
     jobs = read_jobs([wrong, tmp_path / "none.toml", good], {}, tmp_path / "batch")
-    assert [job.survey is None for job in jobs] == [True, True, False]
-    failures = [job.failure for job in jobs[:2] if job.failure is not None]
+    failures = [failure for _, failure in jobs[:2] if isinstance(failure, Failure)]
     assert [failure.exit_status for failure in failures] == [2, 2]
     assert failures[0].message.startswith(f"{wrong}:2: unknown key 'folder'")
     assert failures[1].message == f"{tmp_path / 'none.toml'}: no such file"
 
 
 def test_names_of_files_may_hold_what_no_table_could(tmp_path: Path) -> None:
-    (job,) = read_jobs([tmp_path / "a\n\udcff.toml"], {}, tmp_path / "batch")
-    assert job.name == str(tmp_path / "a ?.toml")
+    ((name, _),) = read_jobs([tmp_path / "a\n\udcff.toml"], {}, tmp_path / "batch")
+    assert name == str(tmp_path / "a ?.toml")
 
 
 @pytest.mark.parametrize(
@@ -82,12 +82,9 @@ def test_names_of_files_may_hold_what_no_table_could(tmp_path: Path) -> None:
 def test_workers_times_threads_is_at_most_the_cores(
     options: BatchOptions, num_surveys: int, num_cores: int, memory_gb: int, expected: tuple[int, int, int]
 ) -> None:
-    num_workers, share, note = share_this_machine(options, num_surveys, num_cores, memory_gb * GB)
-    assert share.num_threads is not None
-    assert share.memory_limit_bytes is not None
-    assert (num_workers, share.num_threads, share.memory_limit_bytes // GB) == expected
-    assert num_workers * share.num_threads <= num_cores
-    assert note is None
+    num_workers, num_threads, memory, note = share_this_machine(options, num_surveys, num_cores, memory_gb * GB)
+    assert (num_workers, num_threads, memory // GB, note) == (*expected, "")
+    assert num_workers * num_threads <= num_cores
 
 
 def test_more_threads_than_cores_are_refused() -> None:
@@ -97,15 +94,6 @@ def test_more_threads_than_cores_are_refused() -> None:
 
 
 def test_more_workers_than_cores_are_told_of() -> None:
-    num_workers, share, note = share_this_machine(BatchOptions(num_workers=2), 16, 1, 64 * GB)
-    assert (num_workers, share.num_threads) == (2, 1)
+    num_workers, num_threads, _, note = share_this_machine(BatchOptions(num_workers=2), 16, 1, 64 * GB)
+    assert (num_workers, num_threads) == (2, 1)
     assert note == "2 workers with 1 threads each, and this machine has 1 cores: each survey takes longer"
-
-
-def test_workers_of_a_cluster_share_their_machines() -> None:
-    share = Share(num_at_once={"big": 4})
-    assert share.on("big", 1, 32, 64 * GB) == (8, 16 * GB)
-    assert share.on("new", 2, 32, 64 * GB) == (16, 32 * GB)
-    assert share.on("small", 1, 4, 8 * GB) == (4, 8 * GB)
-    assert share.on("full", 8, 4, 8 * GB) == (1, GB)
-    assert Share(3, 2 * GB).on("big", 1, 32, 64 * GB) == (3, 2 * GB)

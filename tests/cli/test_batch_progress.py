@@ -7,8 +7,7 @@ import io
 import pytest
 from tests.cli.screen import Clock, Terminal
 
-from rangesfm.batch.batch_state import BatchState, Status
-from rangesfm.batch.jobs import Job
+from rangesfm.batch.batch_state import BatchState
 from rangesfm.cli.batch import BatchTerminal
 from rangesfm.survey.settings import Survey
 
@@ -20,7 +19,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def batch_state(clock: Clock) -> BatchState:
-    return BatchState([Job(name, Survey()) for name in ("a.toml", "b.toml")], clock=clock)
+    return BatchState([(name, Survey()) for name in ("a.toml", "b.toml")], clock=clock)
 
 
 def go_on(batch_state: BatchState, shown: BatchTerminal, clock: Clock) -> None:
@@ -35,10 +34,10 @@ def go_on(batch_state: BatchState, shown: BatchTerminal, clock: Clock) -> None:
     shown.show(batch_state)
     batch_state.tell(1, {"began_on": "there"})
     shown.show(batch_state)
-    batch_state.end(0, Status.DONE, "", 0, verdict="good")
+    batch_state.end(0, "done", "", 0, verdict="good")
     clock.now_s += 4.0
     shown.show(batch_state)
-    batch_state.end(1, Status.FAILED, "the scale is not known", 3)
+    batch_state.end(1, "failed", "the scale is not known", 3)
     shown.show(batch_state)
 
 

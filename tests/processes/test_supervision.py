@@ -27,14 +27,8 @@ def run(
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Ended:
     code = "import json, os, signal, sys, time\nsay = lambda **m: print(json.dumps(m), flush=True)\n" + code
-    return supervise(
-        [sys.executable, "-S", "-c", code],
-        given,
-        listen,
-        environment=os.environ,
-        memory_limit_bytes=memory_limit_bytes,
-        is_stopped=is_stopped,
-    )
+    command = [sys.executable, "-S", "-c", code]
+    return supervise(command, given, listen, memory_limit_bytes=memory_limit_bytes, is_stopped=is_stopped)
 
 
 def test_messages_come_one_by_one_and_the_last_is_the_ending() -> None:
@@ -101,14 +95,7 @@ def test_a_child_imports_nothing_from_the_working_folder(
 ) -> None:
     sprung = set_traps(tmp_path)
     monkeypatch.chdir(tmp_path)
-    ended = supervise(
-        child_command(module),
-        pickle.dumps("no work"),
-        lambda _: None,
-        environment=os.environ,
-        memory_limit_bytes=0,
-        is_stopped=lambda: False,
-    )
+    ended = supervise(child_command(module), pickle.dumps("no work"))
     assert "failed" in ended.last, ended.how  # it got far enough to say what is wrong
     assert not sprung()
 

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from rangesfm.batch.batch_state import BatchState, Status, SurveyRow
+from rangesfm.batch.batch_state import BatchState, SurveyRow
 from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.report import report_page
 from rangesfm.report.report_tables import ReportTable
@@ -56,10 +56,10 @@ def render_batch(batch_state: BatchState, folder: Path) -> str:
 
 def _tiles(batch_state: BatchState) -> list[tuple[str, str, str]]:
     seconds = sum(row.seconds or 0.0 for row in batch_state.rows)
-    num_left = len(batch_state.rows) - batch_state.num(Status.DONE) - batch_state.num(Status.FAILED)
+    num_left = len(batch_state.rows) - batch_state.num("done") - batch_state.num("failed")
     return [
-        ("Done", count(batch_state.num(Status.DONE)), f"of {count(len(batch_state.rows))}"),
-        ("Failed", count(batch_state.num(Status.FAILED)), "reasons below"),
+        ("Done", count(batch_state.num("done")), f"of {count(len(batch_state.rows))}"),
+        ("Failed", count(batch_state.num("failed")), "reasons below"),
         ("Not done", count(num_left), "waiting, running or interrupted"),
         ("Time taken", duration(batch_state.seconds), f"sum of all surveys {duration(seconds)}"),
     ]
@@ -71,7 +71,7 @@ def _row(row: SurveyRow, folder: Path) -> list[str]:
     scale = fixed(row.scale, decimals)
     return [
         _name(row, folder),
-        Markup("{} {}").format(report_page.light(_light(row)), row.verdict or row.status.value),
+        Markup("{} {}").format(report_page.light(_light(row)), row.verdict or row.status),
         scale if within is None else f"{scale} ± {fixed(within, decimals)}",
         count(row.num_photos),
         f"{count(row.num_ranges_used)} of {count(row.num_ranges)}" if row.num_ranges is not None else plain(None),
@@ -87,13 +87,13 @@ def _row(row: SurveyRow, folder: Path) -> list[str]:
 def _name(row: SurveyRow, folder: Path) -> str:
     """Return the survey's name, with a link to its report if there is one."""
     report = Path(row.output_path) / REPORT_NAME
-    if row.status is not Status.DONE or not report.is_file():
+    if row.status != "done" or not report.is_file():
         return row.survey
     address = quote(Path(os.path.relpath(report, folder)).as_posix())
     return Markup('<a href="{}">{}</a>').format(address, row.survey)
 
 
 def _light(row: SurveyRow) -> str:
-    if row.status is Status.DONE:
+    if row.status == "done":
         return "green" if row.verdict == "good" else "amber"
-    return "red" if row.status is Status.FAILED else "off"
+    return "red" if row.status == "failed" else "off"

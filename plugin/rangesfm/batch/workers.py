@@ -1,86 +1,136 @@
-"""Dask workers, on this machine or of an existing scheduler, and the run of one survey on a worker."""
+"""Those who run the surveys of a batch: threads of this process, or the Dask workers of a scheduler.
+
+Each survey is run in a process of its own. A crash of the survey then does not affect who runs it, its memory is known,
+and it can be interrupted.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
 import pickle
+import queue
 import signal
 import socket
-import tempfile
+import threading
+import uuid
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import dask
 from dask.system import CPU_COUNT
-from distributed import Client, Scheduler, Security, SpecCluster, Worker, get_worker
+from distributed import Client, Security, get_worker, wait
 from distributed.comm import get_address_host_port
 from distributed.system import MEMORY_LIMIT
 
-from rangesfm.batch.jobs import Share
+from rangesfm.batch.jobs import BatchOptions, share_this_machine
 from rangesfm.errors import FAILED, INTERRUPTED, Failure, InputError
-from rangesfm.processes.supervision import Ended, child_command, supervise
+from rangesfm.processes.supervision import child_command, supervise
 from rangesfm.survey.settings import Survey
 
+MAX_STOP_S = 30.0  # longer than it takes to interrupt a survey
 _CONNECT_S = 10
-_IN_PROCESS = "inproc://"
-# Dask's web pages and profiling are switched off.
-_CONFIG = {
-    "distributed.scheduler.http.routes": [],
-    "distributed.worker.http.routes": [],
-    "distributed.admin.system-monitor.interval": "5s",
-    "distributed.worker.profile.enabled": False,
-    "distributed.comm.timeouts.connect": f"{_CONNECT_S}s",
-}
-_SILENT = logging.CRITICAL + 1
+_NUM_RETRIES = 2  # of a survey whose process was killed; Dask itself counts attempts whose worker was killed
 # Signals by which the system, when memory is short, or a user kills a process. Such a survey is tried again.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
-# Batches whose surveys this worker must not run any more.
+# Batches whose surveys this Dask worker must not run any more.
 _stopped: set[str] = set()
 
 
-class _NoServer:
-    """Mixin for a scheduler or worker without Dask's web server, which would open a port even if it has no pages."""
+@dataclass(frozen=True)
+class Crew:
+    """Those who run the surveys of a batch.
 
-    def start_http_server(self, *arguments: Any, **options: Any) -> None:
-        """Start nothing."""
+    Attributes:
+        submit: has the survey with this index run, and returns a future with what ``run_apart`` returns or raises.
+        stop: interrupts all surveys, and waits for their end, so that nothing is left half-written.
+        is_lost: whether no more surveys can end, because nobody answers.
+    """
 
-
-class _Scheduler(_NoServer, Scheduler):  # type: ignore[misc] # Dask has no type hints
-    pass
-
-
-class _Worker(_NoServer, Worker):  # type: ignore[misc] # Dask has no type hints
-    pass
+    submit: Callable[[int, Survey], Any]
+    stop: Callable[[], None]
+    is_lost: Callable[[], bool]
 
 
 @contextmanager
-def local_workers(num: int) -> Iterator[Client]:
-    """Start workers in this process, each for one survey at a time.
+def crew_of(
+    options: BatchOptions, num_surveys: int, inbox: queue.SimpleQueue[Any], say: Callable[[str], None]
+) -> Iterator[Crew]:
+    """Yield who runs the surveys, by the options.
 
-    They need no processes of their own, because every survey has one. They open no port, because Dask runs any code
-    that is sent to its port, so that another user of the machine could run code as this user.
+    Args:
+        inbox: is put the messages of surveys, each with the survey's index before it.
+        say: is told remarks for the user.
+
+    Raises:
+        InputError: more threads are asked for than there are cores, or there is no such scheduler.
     """
-    with (
-        dask.config.set(_CONFIG),
-        _silence(),
-        tempfile.TemporaryDirectory(prefix="rangesfm_batch_", ignore_cleanup_errors=True) as scratch,
-        SpecCluster(
-            scheduler={"cls": _Scheduler, "options": {"protocol": _IN_PROCESS, "dashboard": False}},
-            workers={key: {"cls": _Worker, "options": _worker_options(scratch)} for key in range(num)},
-            silence_logs=_SILENT,
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-        yield client
+    with _on_scheduler(options, inbox, say) if options.scheduler else _here(options, num_surveys, inbox, say) as crew:
+        yield crew
 
 
-def _worker_options(scratch: str) -> dict[str, Any]:
-    # Dask does not watch the memory, because each survey's process is watched.
-    return {"protocol": _IN_PROCESS, "nthreads": 1, "memory_limit": 0, "local_directory": scratch}
+@contextmanager
+def _here(
+    options: BatchOptions, num_surveys: int, inbox: queue.SimpleQueue[Any], say: Callable[[str], None]
+) -> Iterator[Crew]:
+    num_at_once, num_threads, memory_bytes, note = share_this_machine(options, num_surveys, CPU_COUNT, MEMORY_LIMIT)
+    if note:
+        say(note)
+    stop = threading.Event()
+
+    def run(index: int, survey: Survey) -> Any:
+        def tell(message: dict[str, Any]) -> None:
+            inbox.put((index, message))
+
+        for num_retries_left in reversed(range(_NUM_RETRIES + 1)):
+            try:
+                return run_apart(survey, options.restart, num_threads, memory_bytes, tell, stop.is_set)
+            except KilledError:
+                if not num_retries_left:
+                    raise
+        return None
+
+    with ThreadPoolExecutor(num_at_once, thread_name_prefix="survey") as pool:
+
+        def stop_all() -> None:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+
+        try:
+            yield Crew(lambda index, survey: pool.submit(run, index, survey), stop_all, lambda: False)
+        finally:
+            stop.set()
+
+
+@contextmanager
+def _on_scheduler(options: BatchOptions, inbox: queue.SimpleQueue[Any], say: Callable[[str], None]) -> Iterator[Crew]:
+    with workers_of(options.scheduler) as client:
+        at_once = num_at_once(client)
+        if not at_once:
+            say(f"{options.scheduler} has no workers yet: the surveys wait for them")
+        batch, futures = f"rangesfm-batch-{uuid.uuid4().hex}", list[Any]()
+        client.subscribe_topic(batch, lambda event: inbox.put((*event[1],)))  # event[0] is its time
+
+        def submit(index: int, survey: Survey) -> Any:
+            task = batch, index, survey, options, at_once
+            key = f"{batch}-{index}"
+            futures.append(client.submit(_run_on_worker, *task, key=key, pure=False, retries=_NUM_RETRIES))
+            return futures[-1]
+
+        def stop() -> None:
+            try:
+                client.run(_stop_on_worker, batch, on_error="ignore")
+                with client.as_current():
+                    wait(futures, timeout=MAX_STOP_S)
+                client.cancel(futures)
+            except (OSError, RuntimeError):  # the workers are gone, or do not answer (TimeoutError)
+                pass
+
+        yield Crew(submit, stop, lambda: client.status != "running")
 
 
 @contextmanager
@@ -92,18 +142,23 @@ def workers_of(scheduler: str) -> Iterator[Client]:
     Raises:
         InputError: the scheduler does not answer, or certificates are missing.
     """
-    with dask.config.set(_CONFIG), _silence():
-        try:
-            get_address_host_port(scheduler)
-            _require_certificates(scheduler)
-            client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, ImportError, RuntimeError) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(
-                f"no Dask scheduler answers at '{scheduler}' (expected an address like tcp://head:8786): {reason}"
-            ) from None
-        with client:
-            yield client
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)  # Dask logs a traceback for each worker that is lost
+    try:
+        with dask.config.set({"distributed.comm.timeouts.connect": f"{_CONNECT_S}s"}):
+            try:
+                get_address_host_port(scheduler)
+                _require_certificates(scheduler)
+                client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+            except (OSError, ValueError, ImportError, RuntimeError) as error:
+                reason = " ".join(str(error).split())
+                raise InputError(
+                    f"no Dask scheduler answers at '{scheduler}' (expected an address like tcp://head:8786): {reason}"
+                ) from None
+            with client:
+                yield client
+    finally:
+        logging.disable(before)
 
 
 def _require_certificates(scheduler: str) -> None:
@@ -115,17 +170,6 @@ def _require_certificates(scheduler: str) -> None:
             raise ValueError(f"tls:// needs certificates, expected {expected} in Dask's configuration")
     elif security.require_encryption:
         raise ValueError("Dask's configuration says require-encryption, expected an address like tls://head:8786")
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Switch off logging inside the block, because Dask logs a traceback for each worker that is lost."""
-    before = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logging.disable(before)
 
 
 def num_at_once(client: Client) -> Mapping[str, int]:
@@ -149,35 +193,44 @@ def _slots(dask_worker: Any) -> tuple[str, int]:
     return socket.gethostname(), dask_worker.state.nthreads
 
 
-@dataclass(frozen=True)
-class SurveyTask:
-    """A survey for a worker.
+def _run_on_worker(batch: str, index: int, survey: Survey, options: BatchOptions, at_once: Mapping[str, int]) -> Any:
+    """Run a survey on a Dask worker.
 
-    Attributes:
+    Args:
         batch: name of the batch, which is the topic of the worker's messages.
-        index: of the survey in the batch.
-        survey: its settings.
-        share: the resources that it may use.
-        restart: repeat what earlier runs have done.
+        at_once: number of surveys at once on each host, as far as it was known when the batch began.
     """
+    worker = get_worker()
+    # A machine's cores and memory are divided by the surveys that run there at once. A worker may have a memory limit.
+    num = max(worker.state.nthreads, at_once.get(socket.gethostname(), 0))
+    memory_bytes = getattr(worker.memory_manager, "memory_limit", None) or MEMORY_LIMIT
+    return run_apart(
+        survey,
+        options.restart,
+        options.num_threads or max(1, CPU_COUNT // num),
+        options.memory_limit_bytes or memory_bytes // num,
+        lambda message: worker.log_event(batch, (index, message)),
+        lambda: batch in _stopped,
+    )
 
-    batch: str
-    index: int
-    survey: Survey
-    share: Share
-    restart: bool
+
+def _stop_on_worker(batch: str) -> None:
+    """Interrupt the surveys of a batch on this worker, and begin no more of them."""
+    _stopped.add(batch)
 
 
 class KilledError(Exception):
     """The survey's process was killed from outside; the text is one line for the user."""
 
 
-def stop_batch(batch: str) -> None:
-    """Interrupt the surveys of a batch on this worker, and begin no more of them."""
-    _stopped.add(batch)
-
-
-def run_on_worker(task: SurveyTask) -> Any:
+def run_apart(
+    survey: Survey,
+    restart: bool,
+    num_threads: int,
+    memory_limit_bytes: int,
+    tell: Callable[[dict[str, Any]], object],
+    is_stopped: Callable[[], bool],
+) -> Any:
     """Run a survey in a process of its own.
 
     Returns:
@@ -186,35 +239,23 @@ def run_on_worker(task: SurveyTask) -> Any:
     Raises:
         KilledError: the process was killed from outside, so that another attempt may succeed.
     """
-    worker, host = get_worker(), socket.gethostname()
-
-    def tell(message: dict[str, Any]) -> None:
-        worker.log_event(task.batch, {"index": task.index, **message})
-
-    if task.batch in _stopped:
+    if is_stopped():
         return Failure("interrupted", INTERRUPTED)
-    tell({"began_on": host})
-    # A worker of a cluster may have a memory limit for all its tasks.
-    memory_bytes = getattr(worker.memory_manager, "memory_limit", None) or MEMORY_LIMIT
-    num_threads, memory_limit_bytes = task.share.on(host, worker.state.nthreads, CPU_COUNT, memory_bytes)
-    own = task.survey.mapper.num_threads  # the survey file may ask for fewer threads, but not for more
-    survey = task.survey.changed({"mapper.num_threads": num_threads if own < 1 else min(own, num_threads)})
+    tell({"began_on": socket.gethostname()})
+    own = survey.mapper.num_threads  # the survey file may ask for fewer threads, but not for more
+    survey = survey.changed({"mapper.num_threads": num_threads if own < 1 else min(own, num_threads)})
     ended = supervise(
         child_command("rangesfm.batch.survey_process"),
-        pickle.dumps((survey, task.restart)),
+        pickle.dumps((survey, restart)),
         tell,
         environment={**os.environ, "OMP_NUM_THREADS": str(num_threads), "OPENBLAS_NUM_THREADS": "1"},
         memory_limit_bytes=memory_limit_bytes,
-        is_stopped=lambda: task.batch in _stopped,
+        is_stopped=is_stopped,
     )
-    if not ended.last.keys() & {"done", "failed"}:
-        return _why_it_did_not_end(ended, memory_limit_bytes)
+    if "done" in ended.last:
+        return ended.last["done"]
     if "failed" in ended.last:
         return Failure(**ended.last["failed"])
-    return ended.last["done"]
-
-
-def _why_it_did_not_end(ended: Ended, memory_limit_bytes: int) -> Failure:
     if ended.needed_bytes:
         needed, limit = (f"{num / 1e6:.0f} MB" for num in (ended.needed_bytes, memory_limit_bytes))
         why = f"needs more memory than its share: it took {needed}, and its limit is {limit}"

@@ -18,7 +18,7 @@ from rangesfm.installed_versions import missing_extra
 from rangesfm.progress import Progress, format_duration
 
 if TYPE_CHECKING:
-    from rangesfm.batch.batch_state import BatchState, SurveyState
+    from rangesfm.batch.batch_state import BatchState, SurveyRow
 
 
 # Keys without a flag here: each survey has its own photos and output, and the workers share the threads.
@@ -89,7 +89,7 @@ def _batch(args: argparse.Namespace, progress: Progress) -> Outcome:
         args.scheduler or "", args.num_workers or 0, args.num_threads or 0, args.memory_limit or 0, args.restart
     )
     terminal = BatchTerminal(sys.stderr, quiet=args.quiet)
-    batch_state = run_batch(jobs, options, output_path, terminal)
+    batch_state = run_batch(jobs, options, output_path, terminal.show, terminal.message)
     lines = [
         *format_rows(batch_state.rows).splitlines(),
         "",
@@ -114,7 +114,7 @@ def _bytes(text: str) -> int:
 
 
 class BatchTerminal:
-    """Listener that writes the progress of a batch to ``stream``."""
+    """Writer of the progress of a batch to ``stream``."""
 
     def __init__(self, stream: TextIO, *, quiet: bool = False, clock: Callable[[], float] = time.monotonic):
         self._screen = Screen(stream, quiet=quiet)
@@ -139,12 +139,12 @@ class BatchTerminal:
     def _news(self, batch_state: BatchState) -> list[str]:
         """Return new lines about surveys: each survey that has ended, and off a terminal also each stage."""
         lines = []
-        for index, state in enumerate(batch_state.states):
-            line = _ended(state) if state.row.status.is_final else "" if self._screen.is_terminal else _stage(state)
+        for index, row in enumerate(batch_state.rows):
+            line = _ended(row) if row.is_over else "" if self._screen.is_terminal else _stage(row)
             if line and self._told.get(index) != line:
                 self._told[index] = line
                 lines.append(line)
-        num_over = sum(row.status.is_final for row in batch_state.rows)
+        num_over = sum(row.is_over for row in batch_state.rows)
         if num_over > self._num_over and not self._screen.is_terminal:
             lines.append(_summary(batch_state))
         self._num_over = num_over
@@ -152,35 +152,30 @@ class BatchTerminal:
 
 
 def _going_on(batch_state: BatchState) -> list[str]:
-    running = [state for state in batch_state.states if state.began_s is not None]
-    lines = [
-        f"  {_stage(state)}{_counted(state)}, {format_duration(batch_state.seconds_running(state))}"
-        for state in running
-    ]
+    lines = []
+    for row in batch_state.rows:
+        if row.began_s is not None:
+            counted = "" if row.num_done is None else f" {counts(row.num_done, row.num_total)}"
+            lines.append(f"  {_stage(row)}{counted}, {format_duration(batch_state.seconds_running(row))}")
     return [*lines[:_MAX_NUM_LINES], _summary(batch_state)]
 
 
-def _stage(state: SurveyState) -> str:
-    if state.began_s is None:
+def _stage(row: SurveyRow) -> str:
+    if row.began_s is None:
         return ""
-    again = f" again, attempt {state.row.num_attempts}" if state.row.num_attempts > 1 else ""
-    return f"{state.row.survey}: {state.stage or 'begins' + again}"
+    again = f" again, attempt {row.num_attempts}" if row.num_attempts > 1 else ""
+    return f"{row.survey}: {row.stage or 'begins' + again}"
 
 
-def _counted(state: SurveyState) -> str:
-    return "" if state.num_done is None else f" {counts(state.num_done, state.num_total)}"
-
-
-def _ended(state: SurveyState) -> str:
-    row = state.row
+def _ended(row: SurveyRow) -> str:
     seconds = "" if row.seconds is None else f" after {format_duration(row.seconds)}"
-    what = (row.exit_status == 0 and row.verdict) or row.status.value
+    what = (row.exit_status == 0 and row.verdict) or row.status
     reason = f": {row.reason}" if row.reason and row.reason != what else ""
     return f"{row.survey}: {what}{seconds}{reason}"
 
 
 def _summary(batch_state: BatchState) -> str:
-    num_over = sum(row.status.is_final for row in batch_state.rows)
+    num_over = sum(row.is_over for row in batch_state.rows)
     num_failed = sum(bool(row.exit_status) for row in batch_state.rows)
     failed = f", {num_failed} of them failed" if num_failed else ""
     left = batch_state.seconds_left()

@@ -7,15 +7,14 @@ noticed. ``rangesfm.processes.supervision`` runs this file as a module.
 from __future__ import annotations
 
 import base64
-import os
 import pickle
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 from rangesfm.errors import SolverError
-from rangesfm.processes.supervision import MessagesToParent, child_command, supervise, work_for_parent
+from rangesfm.processes.supervision import child_command, supervise, work_for_parent
+from rangesfm.progress import Progress
 
-_MODULE = "rangesfm.processes.draw_pictures"
 # Pixels of a PNG per pixel of the page, with which text has the size that is usual in papers.
 _PNG_SCALE = 2.5
 # Vega-Lite specification of a picture, and its format: "png" or "svg".
@@ -28,23 +27,14 @@ def draw_pictures(drawings: Sequence[Drawing]) -> list[bytes]:
     Raises:
         SolverError: the engine fails, for example because it may not reserve the address space that it wants.
     """
-    ended = supervise(
-        child_command(_MODULE),
-        pickle.dumps(drawings),
-        lambda _: None,
-        environment=os.environ,
-        memory_limit_bytes=0,
-        is_stopped=lambda: False,
-    )
-    last = ended.last
-    if "done" not in last:
-        why = last["failed"]["message"] if "failed" in last else ended.how
+    ended = supervise(child_command("rangesfm.processes.draw_pictures"), pickle.dumps(drawings))
+    if "done" not in ended.last:
         hint = " (it reserves 64 GB of address space; `ulimit -v` may allow less)" if ended.signal is not None else ""
-        raise SolverError(f"the engine that draws pictures failed: {why}{hint}")
-    return [base64.b64decode(content) for content in last["done"]]
+        raise SolverError(f"the engine that draws pictures failed: {ended.how}{hint}")
+    return [base64.b64decode(content) for content in ended.last["done"]]
 
 
-def _draw(drawings: Sequence[Drawing], _: MessagesToParent) -> list[str]:
+def _draw(drawings: Sequence[Drawing], _: Progress) -> list[str]:
     """Draw the pictures and return their contents as text for a message."""
     import vl_convert  # it loads 90 MB with a script engine, so it is imported only where a picture is drawn
 

@@ -30,6 +30,7 @@ from typing import IO, Any, TextIO
 import psutil
 
 from rangesfm.errors import ReconstructionError, failure_of
+from rangesfm.progress import Progress
 
 _PR_SET_PDEATHSIG = 1
 _UPDATE_INTERVAL_S = 0.5
@@ -71,7 +72,7 @@ class MessagesToParent:
         self._stream.flush()
 
 
-def work_for_parent(work: Callable[[Any, MessagesToParent], Any]) -> None:
+def work_for_parent(work: Callable[[Any, Progress], Any]) -> None:
     """Do the work of a child process: call ``work`` with the object that the parent sends.
 
     The last message is the result of ``work`` (plain values), or the error that it raised.
@@ -80,20 +81,15 @@ def work_for_parent(work: Callable[[Any, MessagesToParent], Any]) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if sys.platform != "win32":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-    parent = MessagesToParent(_own_stdout())
+    # The stream to the parent is the process's own; whatever else is printed goes to stderr.
+    parent = MessagesToParent(os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8"))
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     try:
         given = pickle.load(sys.stdin.buffer)
         _end_with(int(sys.argv[1]))
         parent.send({"done": work(given, parent)})
     except (Exception, KeyboardInterrupt) as error:
         parent.send({"failed": asdict(failure_of(error))})
-
-
-def _own_stdout() -> TextIO:
-    """Return the stream to the parent, and send everything else that is printed to stderr."""
-    stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return stream
 
 
 def _end_with(parent: int) -> None:
@@ -139,7 +135,9 @@ class Ended:
 
     @property
     def how(self) -> str:
-        """A message about the end of a process that did not send one itself."""
+        """Why there is no result: the error that ended the work, or else how the process ended."""
+        if "failed" in self.last:
+            return str(self.last["failed"]["message"])
         how = "its process ended too soon" if self.signal is None else f"its process was ended ({self.signal.name})"
         return f"{how}: {self.errors}" if self.errors else how
 
@@ -152,11 +150,11 @@ def child_command(module: str) -> list[str]:
 def supervise(
     command: Sequence[str],
     given: bytes,
-    listen: Callable[[dict[str, Any]], object],
+    listen: Callable[[dict[str, Any]], object] = lambda _: None,
     *,
-    environment: Mapping[str, str],
-    memory_limit_bytes: int,
-    is_stopped: Callable[[], bool],
+    environment: Mapping[str, str] = os.environ,
+    memory_limit_bytes: int = 0,
+    is_stopped: Callable[[], bool] = lambda: False,
 ) -> Ended:
     """Run a process that reads ``given`` and writes JSON objects, one a line; return how it ended.
 
@@ -168,6 +166,9 @@ def supervise(
         memory_limit_bytes: the process is killed if it takes more; 0: there is no limit.
         is_stopped: called several times a second; once it returns True, the process is interrupted.
     """
+    lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    last: dict[str, Any] = {}
+    needed_bytes, stopped_at = 0, math.inf
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
             command,
@@ -177,14 +178,49 @@ def supervise(
             env=environment,
             start_new_session=True,  # so that a Ctrl-C in the terminal does not reach it
         )
+        assert process.stdin is not None
+        assert process.stdout is not None
         try:
-            watched = _Watched(process, memory_limit_bytes, is_stopped)
-            last = _talk(watched, given, listen)
+            threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
+            with suppress(BrokenPipeError):  # the process died; its messages so far still count
+                process.stdin.write(given)
+                process.stdin.flush()
+            while True:
+                if memory_limit_bytes and not needed_bytes:
+                    with suppress(psutil.Error):  # the process has ended
+                        used = psutil.Process(process.pid).memory_info().rss
+                        if used > memory_limit_bytes:
+                            needed_bytes = used
+                            process.kill()
+                if stopped_at == math.inf and is_stopped():
+                    stopped_at = time.monotonic()
+                    process.send_signal(signal.SIGINT)
+                if time.monotonic() - stopped_at > _MAX_STOP_S:
+                    process.kill()
+                with suppress(queue.Empty):
+                    if (line := lines.get(timeout=_POLL_INTERVAL_S)) is None:
+                        break
+                    last = json.loads(line)
+                    listen(last)
+            process.wait()
         finally:
+            with suppress(BrokenPipeError):
+                process.stdin.close()  # only now, because an open stdin tells the process that its parent is alive
             process.kill()  # has no effect if it has ended
             process.wait()
         died_of = signal.Signals(-process.returncode) if process.returncode < 0 else None
-        return Ended(last, died_of, watched.needed_bytes, watched.stopped_at < math.inf, _last_line(errors))
+        errors.seek(0)
+        said = [line.strip().lstrip("# ") for line in errors.read().decode(errors="replace").split("\n")]
+        why = next((line[:_MAX_LINE] for line in reversed(said) if line and not _STACK_TRACE.match(line)), "")
+        return Ended(last, died_of, needed_bytes, stopped_at < math.inf, why)
+
+
+def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
+    with stream:
+        for line in stream:
+            if line.endswith(b"\n"):  # a line without it is incomplete, because the process was killed
+                lines.put(line)
+    lines.put(None)
 
 
 def run_children(
@@ -215,19 +251,11 @@ def run_children(
         if stop.is_set():
             return
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        ended = supervise(
-            child_command(module),
-            work,
-            listen,
-            environment=environment,
-            memory_limit_bytes=0,
-            is_stopped=stop.is_set,
-        )
-        last = ended.last
-        if "done" in last:
-            num_done[place] = last["done"]
+        ended = supervise(child_command(module), work, listen, environment=environment, is_stopped=stop.is_set)
+        if "done" in ended.last:
+            num_done[place] = ended.last["done"]
         elif not ended.stopped:
-            raise ReconstructionError(last["failed"]["message"] if "failed" in last else ended.how)
+            raise ReconstructionError(ended.how)
 
     def wait_for_first() -> None:
         while not wait([pending[0]], timeout=_POLL_INTERVAL_S).done:
@@ -252,67 +280,3 @@ def run_children(
         except BaseException:
             stop.set()
             raise
-
-
-@dataclass
-class _Watched:
-    """A process that is interrupted on request, and killed if it takes too much memory or does not stop."""
-
-    process: subprocess.Popen[bytes]
-    memory_limit_bytes: int
-    is_stopped: Callable[[], bool]
-    needed_bytes: int = 0
-    stopped_at: float = math.inf
-
-    def look(self) -> None:
-        if self.memory_limit_bytes and not self.needed_bytes:
-            with suppress(psutil.Error):  # the process has ended
-                used = psutil.Process(self.process.pid).memory_info().rss
-                if used > self.memory_limit_bytes:
-                    self.needed_bytes = used
-                    self.process.kill()
-        if self.stopped_at == math.inf and self.is_stopped():
-            self.stopped_at = time.monotonic()
-            self.process.send_signal(signal.SIGINT)
-        if time.monotonic() - self.stopped_at > _MAX_STOP_S:
-            self.process.kill()
-
-
-def _talk(watched: _Watched, given: bytes, listen: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
-    """Send the input and listen until the process closes its stdout; return its last message."""
-    process = watched.process
-    assert process.stdin is not None
-    assert process.stdout is not None
-    lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-    threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
-    last: dict[str, Any] = {}
-    try:
-        with suppress(BrokenPipeError):  # the process died; its messages so far still count
-            process.stdin.write(given)
-            process.stdin.flush()
-        while True:
-            watched.look()
-            with suppress(queue.Empty):
-                if (line := lines.get(timeout=_POLL_INTERVAL_S)) is None:
-                    break
-                last = json.loads(line)
-                listen(last)
-    finally:
-        with suppress(BrokenPipeError):
-            process.stdin.close()  # only now, because an open stdin tells the process that its parent is alive
-    process.wait()
-    return last
-
-
-def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
-    with stream:
-        for line in stream:
-            if line.endswith(b"\n"):  # a line without it is incomplete, because the process was killed
-                lines.put(line)
-    lines.put(None)
-
-
-def _last_line(errors: IO[bytes]) -> str:
-    errors.seek(0)
-    lines = [line.strip().lstrip("# ") for line in errors.read().decode(errors="replace").split("\n")]
-    return next((line[:_MAX_LINE] for line in reversed(lines) if line and not _STACK_TRACE.match(line)), "")

@@ -17,7 +17,7 @@ from pathlib import Path
 import pycolmap
 
 from rangesfm.colmap.colmap_log import colmap_log
-from rangesfm.processes.supervision import MessagesToParent, end_group_with_parent, work_for_parent
+from rangesfm.processes.supervision import end_group_with_parent, work_for_parent
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import copy_matches, copy_photos
@@ -166,7 +166,7 @@ class ExternalMapping:
         return done.returncode
 
 
-def _run(work: FeatureExtraction | MatchingShare | WholeMapping | ExternalMapping, parent: MessagesToParent) -> int:
+def _run(work: FeatureExtraction | MatchingShare | WholeMapping | ExternalMapping, parent: Progress) -> int:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C may end the process at once: files written so far are intact
     return work.run(parent)
 
