@@ -158,14 +158,13 @@ def test_a_taped_distance_is_found_in_each_model_and_placed_by_the_ranges(
     first, last = (compared(*models[:2]).models[0].path.image_names[i] for i in (0, -1))
     taped = tmp_path / "taped.csv"
     taped.write_text(f"from,to,distance_m\n{first},{last},5.0\n")
-    (row,) = compare_many(read_named_models([result, *models[:2]]), tape=read_tape(taped)).taped
-    metric, whole, half = row.lengths
-    assert whole is not None
+    (lengths,) = compare_many(read_named_models([result, *models[:2]]), tape=read_tape(taped)).taped.values()
+    measured_m, metric, whole, half, *placed_m = lengths
     assert half == pytest.approx(whole / 2)
-    assert row.lengths_m == pytest.approx((metric, metric, metric), rel=1e-6)
-    assert row.measured_m == 5.0
-    (unplaced,) = compare_many(read_named_models(models[:2]), tape=read_tape(taped)).taped
-    assert unplaced.lengths_m == ()
+    assert placed_m == pytest.approx((metric, metric, metric), rel=1e-6)
+    assert measured_m == 5.0
+    (unplaced,) = compare_many(read_named_models(models[:2]), tape=read_tape(taped)).taped.values()
+    assert len(unplaced) == 3
     taped.write_text(f"from,to,distance_m\n{first},nowhere,5.0\n")
     with pytest.raises(InputError, match=r"taped.csv:2: an end is 'nowhere'.*model"):
         compare_many(read_named_models(models[:2]), tape=read_tape(taped))

@@ -184,7 +184,7 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
         raise InputError(f"one model is given, {paths[0]}; comparing models with ranges or distances needs two")
     from rangesfm.comparison.before_after import compare_folder
 
-    return Outcome([str(compare_folder(paths[0], args.reference))])
+    return Outcome([compare_folder(paths[0], args.reference)])
 
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:

@@ -16,9 +16,8 @@ from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import read_reference
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.model_path import path_in_result
-from rangesfm.result.result_folder import ResultFolder, read_result_folder
+from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 
 _Pair = tuple[float, ...]
@@ -88,28 +87,12 @@ def compare_models(
     )
 
 
-@dataclass(frozen=True)
-class FolderComparison:
-    """Comparisons of a finished run.
-
-    Attributes:
-        rows: comparison with the reference, as in the 2018 paper; empty without a reference.
-        models: comparison of the scaled with the refined model; None where the run did not refine.
-        frame: of the models.
-    """
-
-    rows: tuple[ComparisonRow, ...]
-    models: ModelComparison | None
-    frame: str
-
-    def __str__(self) -> str:
-        return "\n\n".join(
-            filter(None, (format_table(self.rows, self.frame) if self.rows else "", str(self.models or "")))
-        )
-
-
-def compare_folder(output_path: Path, reference_path: Path | None = None) -> FolderComparison:
+def compare_folder(output_path: Path, reference_path: Path | None = None) -> str:
     """Compare the models in the output folder of a run with each other and, if there is one, with a reference file.
+
+    Returns:
+        Tables in plain text: that of the 2018 paper, if there is a reference; and the scaled against the refined model,
+        if the run refined.
 
     Raises:
         InputError: the folder is not a result or has nothing to compare, or the reference cannot be read or has none of
@@ -121,17 +104,16 @@ def compare_folder(output_path: Path, reference_path: Path | None = None) -> Fol
         raise InputError("there is no scaled model (sparse_scaled/0) to compare", output_path)
     if refined is None and reference_path is None:
         raise InputError("the run did not refine (no sparse_metric/0): a reference is needed to compare", output_path)
-    rows: tuple[ComparisonRow, ...] = ()
+    tables = []
     if reference_path is not None:
         path = path_in_result(scaled, result)
         path_of_refined = None if refined is None else path.as_in(refined)
         rows = papers_table(path, path_of_refined, read_reference(reference_path), frame=result.summary.frame)
-    changed = None if refined is None else compare_models(scaled, refined, range_residuals_m=_used_residuals(result))
-    return FolderComparison(rows, changed, result.summary.frame)
-
-
-def _used_residuals(result: ResultFolder) -> tuple[Array, Array] | None:
-    ranges = result.read(RangesAsUsed)
-    both = [] if ranges is None else [of_all[ranges.is_used] for of_all in ranges.residuals_by_model_m.values()]
-    known = np.isfinite(both).all(axis=0)
-    return (both[0][known], both[1][known]) if len(both) == 2 and known.any() else None
+        tables.append(format_table(rows, result.summary.frame))
+    if refined is not None:
+        ranges = result.read(RangesAsUsed)
+        both = [] if ranges is None else [of_all[ranges.is_used] for of_all in ranges.residuals_by_model_m.values()]
+        known = np.isfinite(both).all(axis=0)
+        residuals_m = (both[0][known], both[1][known]) if len(both) == 2 and known.any() else None
+        tables.append(str(compare_models(scaled, refined, range_residuals_m=residuals_m)))
+    return "\n\n".join(tables)

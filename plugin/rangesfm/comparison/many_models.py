@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -103,23 +103,6 @@ class ModelRow:
 
 
 @dataclass(frozen=True)
-class TapedRow:
-    """One taped distance, and its length in each model.
-
-    Attributes:
-        ends: names of both ends.
-        measured_m: taped length.
-        lengths: length in each model, in the unit of that model; NaN for a model that is only a path.
-        lengths_m: the same with the scale that brings the model onto ``ModelRanges.metric_path``; empty without ranges.
-    """
-
-    ends: tuple[str, str]
-    measured_m: float
-    lengths: tuple[float, ...]
-    lengths_m: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class ModelsComparison:
     """Comparison of models of the same photos with the first of them.
 
@@ -127,15 +110,17 @@ class ModelsComparison:
         models: as given; all are compared with the first.
         rows: one for each model.
         distances: between a few pairs of photos that all models have.
-        taped: taped distances; empty if none are given.
+        taped: for the ends of each taped distance, its length by tape; its length in each model, in the unit of that
+            model; and with ranges, the latter with the scale that brings the model onto ``ModelRanges.metric_path``.
+            NaN for a model that is only a path.
         truth: rows of the table against a reference; empty without one.
     """
 
     models: tuple[NamedModel, ...]
     rows: tuple[ModelRow, ...]
     distances: tuple[Length, ...]
-    taped: tuple[TapedRow, ...] = ()
-    truth: tuple[Sequence[str], ...] = ()
+    taped: Mapping[tuple[str, str], Sequence[float]]
+    truth: Sequence[Sequence[str]]
 
     @property
     def tables(self) -> tuple[ReportTable, ...]:
@@ -143,7 +128,11 @@ class ModelsComparison:
         cells = [_cells(row, self.models[0]) for row in self.rows]
         names = [model.heading(model.name) for model in self.models]
         of_row = [f"{model.name} after Sim(3) m" for model in self.models]
-        of_row = of_row if self.taped and self.taped[0].lengths_m else []
+        of_row = of_row if any(len(lengths) > 1 + len(names) for lengths in self.taped.values()) else []
+        taped = [
+            [f"{a} to {b}", *(text_or_dash(length, ".4f") for length in lengths)]
+            for (a, b), lengths in self.taped.items()
+        ]
         distances = [[f"{a} to {b}", *(f"{length:.4f}" for length in lengths)] for a, b, lengths in self.distances]
         return (
             ReportTable(
@@ -156,7 +145,7 @@ class ModelsComparison:
             ReportTable(
                 "Taped distances",
                 ["taped distance", "tape m", *names, *of_row],
-                [_taped_cells(row) for row in self.taped],
+                taped,
                 _TAPED_NOTE,
             ),
             ReportTable("Each model against the reference", _TRUTH_HEADER, self.truth, _TRUTH_NOTE),
@@ -182,7 +171,10 @@ def read_named_models(paths: Sequence[Path], survey: Survey = Survey()) -> tuple
         raise InputError("only files of positions are given, expected a model or a result folder too", paths[0])
     models = {path: _read_model(path) for path in folders}
     times_s = _photo_times(models, survey)
-    timed = {path: replace(model, path=_timed(model.path, times_s)) for path, model in models.items()}
+    timed = {}
+    for path, model in models.items():
+        has_no_times = model.path.timestamps_s is None and all(name in times_s for name in model.path.image_names)
+        timed[path] = replace(model, path=model.path.timed(times_s)) if has_no_times else model
     return tuple(timed[path] if path in timed else _read_positions(path, timed[folders[0]].path) for path in paths)
 
 
@@ -197,12 +189,6 @@ def _photo_times(models: Mapping[Path, NamedModel], survey: Survey) -> dict[str,
     for result in filter(None, map(_result_around, models)):
         times_s.update(result.timestamps_s or {})
     return times_s
-
-
-def _timed(path: Trajectory, times_s: Mapping[str, float]) -> Trajectory:
-    """Return a path with the times of its photos, if it has none and all are known."""
-    has_times = path.timestamps_s is not None or not all(name in times_s for name in path.image_names)
-    return path if has_times else path.timed(times_s)
 
 
 def _result_around(path: Path) -> ResultFolder | None:
@@ -233,10 +219,13 @@ def compare_many(
     if ranges is None:
         own = [None if one.result is None else ranges_of_result(one.result, one.path) for one in models]
         ranges = next(filter(None, own), None)
-    onto_ranges = [None if ranges is None else _onto(ranges.metric_path, model.path) for model in models]
+    onto_ranges: list[Similarity | None] = [None] * len(models)
+    if ranges is not None:
+        common = (common_photos(ranges.metric_path, model.path) for model in models)
+        onto_ranges = [similarity_onto(source, target) for _, target, source in common]
     rows = tuple(_row(models[0], *each, ranges) for each in zip(models, own, onto_ranges, strict=True))
-    taped = () if tape is None else tuple(_taped(models, ranges, onto_ranges, tape))
-    truth = () if reference is None else tuple(_truth_cells(model, reference) for model in models)
+    taped = {} if tape is None else _taped(models, ranges, onto_ranges, tape)
+    truth = [] if reference is None else [_truth_cells(model, reference) for model in models]
     return ModelsComparison(tuple(models), rows, lengths_along([model.path for model in models]), taped, truth)
 
 
@@ -278,72 +267,49 @@ def _row(
     if not names:
         raise InputError(f"it has no photo in common with {base.name}", other.name)
     similarity = similarity_onto(theirs, ours)
+    aligned = np.full(ours.shape, np.nan) if similarity is None else similarity.apply(theirs)
+    range_rms_m = _NO_RANGES
+    if ranges is not None and onto_ranges is not None and other.has_orientations:
+        as_it_is = rms((own or ranges).residuals_m(other.path))
+        carried = rms(ranges.residuals_m(carried_by(onto_ranges, other.path)))
+        range_rms_m = _NO_RANGES if np.isnan(as_it_is) else (as_it_is, carried)
     return ModelRow(
         name=other.name,
         is_metric=other.frame is not None,
         num_photos=len(other.path),
         base_from_model=similarity,
         common_names=names,
-        moved=_apart(theirs, ours),
-        moved_aligned=np.full(len(ours), np.nan) if similarity is None else _apart(similarity.apply(theirs), ours),
+        moved=np.linalg.norm(theirs - ours, axis=1),
+        moved_aligned=np.linalg.norm(aligned - ours, axis=1),
         reprojection_rms_px=math.nan if other.model is None else reprojection_rms_px(other.model),
-        range_rms_m=_range_rms(own or ranges, ranges, other, onto_ranges) if ranges and onto_ranges else _NO_RANGES,
+        range_rms_m=range_rms_m,
     )
 
 
-def _apart(first: Array, second: Array) -> Array:
-    """Return the distances (n,) between points (n, 3)."""
-    return np.asarray(np.linalg.norm(first - second, axis=1))
-
-
-def _onto(goal: Trajectory, path: Trajectory) -> Similarity | None:
-    """Estimate the similarity that brings a path onto another one of the same photos."""
-    _, target, source = common_photos(goal, path)
-    return similarity_onto(source, target)
-
-
-def _range_rms(
-    own: ModelRanges, ranges: ModelRanges, model: NamedModel, onto_ranges: Similarity
-) -> tuple[float, float]:
-    """Return ``ModelRow.range_rms_m``, given the model's own ranges and those that all models share."""
-    if not model.has_orientations:
-        return _NO_RANGES
-    as_it_is, carried = rms(own.residuals_m(model.path)), rms(ranges.residuals_m(carried_by(onto_ranges, model.path)))
-    return _NO_RANGES if np.isnan(as_it_is) else (as_it_is, carried)
-
-
 def _taped(
-    models: Sequence[NamedModel],
-    ranges: ModelRanges | None,
-    onto_ranges: Sequence[Similarity | None],
-    tape: Tape,
-) -> Iterator[TapedRow]:
-    anchors_m = {} if ranges is None else ranges.anchors_m
-    of_models = [_taped_lengths(model, tape, onto, anchors_m) for model, onto in zip(models, onto_ranges)]
-    for taped, of_row in zip(tape.distances, zip(*of_models)):
-        lengths, lengths_m = zip(*of_row)
-        yield TapedRow(taped.ends, taped.distance_m, lengths, () if ranges is None else lengths_m)
-
-
-def _taped_lengths(
-    model: NamedModel, tape: Tape, onto_ranges: Similarity | None, anchors_m: Mapping[str, Array]
-) -> list[tuple[float, float]]:
-    """Return each taped distance in a model, in the unit of the model and in metres by ``onto_ranges``.
+    models: Sequence[NamedModel], ranges: ModelRanges | None, onto_ranges: Sequence[Similarity | None], tape: Tape
+) -> dict[tuple[str, str], list[float]]:
+    """Return ``ModelsComparison.taped``.
 
     Raises:
-        InputError: an end of a distance is not in the model.
+        InputError: an end of a distance is not in a model.
     """
-    unknown = [math.nan] * len(tape.distances)
-    if model.model is None:
-        return list(zip(unknown, unknown))
-    try:
-        markers = markers_of_photos(tape.markers, [image.name for image in model.model.images.values()])
-        located = locate_distances(replace(tape, markers=markers), model.model, list(anchors_m))
-    except InputError as error:
-        raise InputError(f"{error} (model {model.name})") from None
+    anchors_m = {} if ranges is None else ranges.anchors_m
     places = np.array(list(anchors_m.values())).reshape(-1, 3)
-    carried = unknown if onto_ranges is None else located.lengths_m(onto_ranges.scale, places).tolist()
-    return list(zip(located.lengths_m(1.0, places).tolist(), carried))
+    lengths, lengths_m = (np.full((len(models), len(tape.distances)), np.nan) for _ in range(2))
+    for k, (model, onto) in enumerate(zip(models, onto_ranges, strict=True)):
+        if model.model is None:
+            continue
+        try:
+            markers = markers_of_photos(tape.markers, [image.name for image in model.model.images.values()])
+            located = locate_distances(replace(tape, markers=markers), model.model, list(anchors_m))
+        except InputError as error:
+            raise InputError(f"{error} (model {model.name})") from None
+        lengths[k] = located.lengths_m(1.0, places)
+        if onto is not None:
+            lengths_m[k] = located.lengths_m(onto.scale, places)
+    both = lengths if ranges is None else np.vstack([lengths, lengths_m])
+    return {taped.ends: [taped.distance_m, *both[:, k].tolist()] for k, taped in enumerate(tape.distances)}
 
 
 _TRUTH_HEADER = ("model", "keyframes", "RMSE m", "aligned by", "after SE(3) m", "after Sim(3) m", "scale / truth")
@@ -395,8 +361,3 @@ def _cells(row: ModelRow, first: NamedModel) -> list[tuple[str, str]]:
         ("range RMS m", text_or_dash(row.range_rms_m[0] if row.is_metric else None, ".4f")),
         ("after Sim(3) m", text_or_dash(row.range_rms_m[1], ".4f")),
     ]
-
-
-def _taped_cells(row: TapedRow) -> list[str]:
-    lengths = (row.measured_m, *row.lengths, *row.lengths_m)
-    return ["{} to {}".format(*row.ends), *(text_or_dash(length, ".4f") for length in lengths)]
