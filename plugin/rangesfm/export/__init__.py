@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 
 import pycolmap
@@ -48,61 +49,47 @@ __all__ = [
     "write_points",
 ]
 
+# Writes a map to the path with the first of the names of its format, and returns the paths of what it wrote.
 Exporter = Callable[[MetricMap, Path], Path | tuple[Path, ...]]
 
-EXPORTERS: dict[str, Exporter] = {
-    "colmap": lambda map_, folder: write_project(map_, folder / "colmap"),
-    "colmap_text": lambda map_, folder: write_project(map_, folder / "colmap_text", as_text=True),
-    "undistorted": lambda map_, folder: write_undistorted(map_, folder / "undistorted"),
-    "tum": lambda map_, folder: write_trajectory(map_.trajectory, folder / "trajectory.tum"),
-    "kitti": lambda map_, folder: write_kitti(map_.trajectory, folder / "trajectory.kitti"),
-    "tum_covariance": lambda map_, folder: (
-        write_covariances(map_, folder / "trajectory_covariance.csv"),
-        write_trajectory(map_.trajectory, folder / "trajectory.tum"),
+_TUM, _KITTI, _COVARIANCE = "trajectory.tum", "trajectory.kitti", "trajectory_covariance.csv"
+EXPORTERS: dict[str, tuple[tuple[str, ...], Exporter]] = {
+    "colmap": (("colmap",), write_project),
+    "colmap_text": (("colmap_text",), partial(write_project, as_text=True)),
+    "undistorted": (("undistorted",), write_undistorted),
+    "tum": ((_TUM,), lambda map_, path: write_trajectory(map_.trajectory, path)),
+    "kitti": ((_KITTI,), lambda map_, path: write_kitti(map_.trajectory, path)),
+    "tum_covariance": (
+        (_COVARIANCE, _TUM),
+        lambda map_, path: (write_covariances(map_, path), write_trajectory(map_.trajectory, path.with_name(_TUM))),
     ),
-    "kitti_covariance": lambda map_, folder: (
-        write_covariances(map_, folder / "trajectory_covariance.csv"),
-        write_kitti(map_.trajectory, folder / "trajectory.kitti"),
+    "kitti_covariance": (
+        (_COVARIANCE, _KITTI),
+        lambda map_, path: (write_covariances(map_, path), write_kitti(map_.trajectory, path.with_name(_KITTI))),
     ),
-    "ply": lambda map_, folder: write_points(map_.reconstruction, folder / "points.ply"),
-    "ply_cameras": lambda map_, folder: write_cameras(map_.trajectory, folder / "cameras.ply"),
-    "ply_anchors": lambda map_, folder: write_anchor_vertices(map_.anchors_m, folder / "anchors.ply"),
-    "laz": lambda map_, folder: write_laz(map_, folder / "points.laz"),
-    "gpkg": lambda map_, folder: write_features(map_, folder / "survey.gpkg", "GPKG"),
-    "geojson": lambda map_, folder: write_features(map_, folder / "survey.geojson", "GeoJSON"),
-    "kml": lambda map_, folder: write_features(map_, folder / "survey.kml", "KML"),
-    "transform": lambda map_, folder: write_transform(map_.metric_from_sfm, folder),
-    "model_aligner": lambda map_, folder: write_camera_positions(map_.reconstruction, folder / "positions.txt"),
-    "pose_priors": lambda map_, folder: write_pose_priors(map_, folder / "pose_priors.db"),
-    "nerfstudio": lambda map_, folder: write_nerfstudio(map_, folder),
-    "opensfm": lambda map_, folder: write_opensfm(map_, folder / "reconstruction.json"),
-    "opf": lambda map_, folder: write_opf(map_, folder / "opf"),
+    "ply": (("points.ply",), lambda map_, path: write_points(map_.reconstruction, path)),
+    "ply_cameras": (("cameras.ply",), lambda map_, path: write_cameras(map_.trajectory, path)),
+    "ply_anchors": (("anchors.ply",), lambda map_, path: write_anchor_vertices(map_.anchors_m, path)),
+    "laz": (("points.laz",), write_laz),
+    "gpkg": (("survey.gpkg",), partial(write_features, driver="GPKG")),
+    "geojson": (("survey.geojson",), partial(write_features, driver="GeoJSON")),
+    "kml": (("survey.kml",), partial(write_features, driver="KML")),
+    "transform": (
+        ("transform_colmap_4.txt", "transform_colmap_3.8.txt"),
+        lambda map_, path: write_transform(map_.metric_from_sfm, path.parent),
+    ),
+    "model_aligner": (("positions.txt",), lambda map_, path: write_camera_positions(map_.reconstruction, path)),
+    "pose_priors": (("pose_priors.db",), write_pose_priors),
+    "nerfstudio": (
+        ("transforms.json", "transforms_points.ply", NERFSTUDIO_IMAGES),
+        lambda map_, path: write_nerfstudio(map_, path.parent),
+    ),
+    "opensfm": (("reconstruction.json",), write_opensfm),
+    "opf": (("opf",), write_opf),
 }
-"""Functions by name of the format. Each writes a map into a folder and returns the paths of what it wrote."""
+"""By name of the format: the names of the files and folders that it writes into a folder, and who writes them."""
 
-EXPORTED_NAMES: dict[str, tuple[str, ...]] = {
-    "colmap": ("colmap",),
-    "colmap_text": ("colmap_text",),
-    "undistorted": ("undistorted",),
-    "tum": ("trajectory.tum",),
-    "kitti": ("trajectory.kitti",),
-    "tum_covariance": ("trajectory_covariance.csv", "trajectory.tum"),
-    "kitti_covariance": ("trajectory_covariance.csv", "trajectory.kitti"),
-    "ply": ("points.ply",),
-    "ply_cameras": ("cameras.ply",),
-    "ply_anchors": ("anchors.ply",),
-    "laz": ("points.laz",),
-    "gpkg": ("survey.gpkg",),
-    "geojson": ("survey.geojson",),
-    "kml": ("survey.kml",),
-    "transform": ("transform_colmap_4.txt", "transform_colmap_3.8.txt"),
-    "model_aligner": ("positions.txt",),
-    "pose_priors": ("pose_priors.db",),
-    "nerfstudio": ("transforms.json", "transforms_points.ply", NERFSTUDIO_IMAGES),
-    "opensfm": ("reconstruction.json",),
-    "opf": ("opf",),
-}
-"""Names of the files and folders that each format writes into the folder."""
+EXPORTED_NAMES = {name: names for name, (names, _) in EXPORTERS.items()}
 
 TRAINERS_FORMATS = ("nerfstudio", "undistorted")
 """Formats for programs that compute with 32 bits, as trainers do. Their origin is near the cameras."""
@@ -151,32 +138,28 @@ def export_map(map_: MetricMap, output_path: Path, options: ExportOptions) -> tu
     written: dict[str, list[Path]] = {}
     failures: dict[str, Exception] = {}
     for name in chosen:
+        names, write = EXPORTERS[name]
         try:
-            paths = EXPORTERS[name](for_trainers if name in TRAINERS_FORMATS else map_, output_path)
+            paths = write(for_trainers if name in TRAINERS_FORMATS else map_, output_path / names[0])
             written[name] = [paths] if isinstance(paths, Path) else [*paths]
         except (RangesfmError, OSError) as error:
             failures[name] = error
     moved = [name for name in written if name in TRAINERS_FORMATS or options.frame == "level"]
     if moved:
-        names = dict.fromkeys(file for name in moved for file in EXPORTED_NAMES[name] if file != NERFSTUDIO_IMAGES)
-        write_offset(for_trainers.offset_m, names, output_path)
-    if failures:
-        raise _not_all(failures, written, num_chosen=len(chosen))
+        files = dict.fromkeys(file for name in moved for file in EXPORTED_NAMES[name] if file != NERFSTUDIO_IMAGES)
+        write_offset(for_trainers.offset_m, files, output_path)
+    if len(failures) == 1 == len(chosen):
+        raise failures[chosen[0]]
+    if failures:  # one error for all: a line for each, and a line with the formats that were written
+        told = {name: failure_of(error) for name, error in failures.items()}
+        lines = [f"{name}: {failure.message}" for name, failure in told.items()]
+        all_failed = InputError(
+            f"{len(failures)} of {len(chosen)} formats could not be written: {lines[0]}",
+            advice=[*lines[1:], *(["these were written: " + ", ".join(written)] if written else [])],
+        )
+        all_failed.exit_status = max(failure.exit_status for failure in told.values())
+        raise all_failed
     return tuple(dict.fromkeys(path for paths in written.values() for path in paths))
-
-
-def _not_all(failures: Mapping[str, Exception], written: Collection[str], num_chosen: int) -> Exception:
-    """Return one error for all formats that failed: a line for each, and a line with the formats that were written."""
-    if num_chosen == 1:
-        return next(iter(failures.values()))
-    told = [failure_of(error) for error in failures.values()]
-    lines = [f"{name}: {failure.message}" for name, failure in zip(failures, told)]
-    error = InputError(
-        f"{len(failures)} of {num_chosen} formats could not be written: {lines[0]}",
-        advice=[*lines[1:], *(["these were written: " + ", ".join(written)] if written else [])],
-    )
-    error.exit_status = max(failure.exit_status for failure in told)
-    return error
 
 
 def check_formats(formats: Iterable[str]) -> None:

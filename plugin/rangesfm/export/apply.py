@@ -109,7 +109,7 @@ def _sfm_from_file(path: Path, sfm: pycolmap.Reconstruction, metric: Sequence[py
         of_unscaled, of_metric = of_sfm.centers, [_cameras_of(each).centers for each in metric]
     else:
         places, what = kind.vertices(path), "vertices"
-        of_unscaled, of_metric = _points(sfm), [_points(each) for each in metric]
+        of_unscaled, of_metric = colored_points(sfm)[0], [colored_points(each)[0] for each in metric]
     places = places[np.isfinite(places).all(axis=1)]
     if not len(places) or not len(of_unscaled):
         return IDENTITY
@@ -198,16 +198,12 @@ def _lies_on(places: Array, of_map: Array) -> bool:
         distances = tree.query(middle + similarity.apply(from_middle), distance_upper_bound=reach)[0]
         return float(np.mean(np.maximum(1 - distances / reach, 0.0)))
 
+    small = [Similarity((1 + _SMALL) ** sign, np.eye(3), np.zeros(3)) for sign in (-1, 1)]
+    for axis in _SMALL * np.vstack([np.eye(3), -np.eye(3)]):
+        small.append(Similarity(1.0, Rotation.from_rotvec(axis).as_matrix(), np.zeros(3)))
+        small.append(Similarity(1.0, np.eye(3), size * axis))
     as_it_is = near(IDENTITY)
-    return as_it_is > 0 and as_it_is >= max(map(near, _small_similarities(size)))
-
-
-def _small_similarities(size: float) -> Iterator[Similarity]:
-    for sign in (-1, 1):
-        yield Similarity((1 + _SMALL) ** sign, np.eye(3), np.zeros(3))
-        for axis in sign * _SMALL * np.eye(3):
-            yield Similarity(1.0, Rotation.from_rotvec(axis).as_matrix(), np.zeros(3))
-            yield Similarity(1.0, np.eye(3), size * axis)
+    return as_it_is > 0 and as_it_is >= max(map(near, small))
 
 
 def _some(places: Array, num: int) -> Array:
@@ -258,10 +254,6 @@ def _cameras_of(model: pycolmap.Reconstruction) -> _Cameras:
     )
 
 
-def _points(model: pycolmap.Reconstruction) -> Array:
-    return colored_points(model)[0]
-
-
 @dataclass(frozen=True)
 class _Kind:
     """A kind of file: how to transform it, and its cameras or else its vertices (n, 3)."""
@@ -285,42 +277,40 @@ def _kind_of(path: Path) -> _Kind:
 _IN_METRES = "# metres"
 
 
+def _lines_of_obj(path: Path, new_from_old: Similarity) -> Iterator[tuple[str, Array | None]]:
+    """Yield each line of an OBJ file, with the transformed vertex or normal (3,) if it is one."""
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.split()
+        if words[:1] not in (["v"], ["vn"]):
+            yield line, None
+            continue
+        try:
+            at: Array = np.array([float(word) for word in words[1:4]]).reshape(3)
+            with overflow_raised():
+                at = new_from_old.apply(at) if words[0] == "v" else new_from_old.rotation @ at
+            if not np.isfinite(at).all():
+                raise ValueError
+        except (ValueError, FloatingPointError):
+            raise InputError(f"'{line[:60]}' is not a vertex, expected three numbers", path, number) from None
+        yield line, at
+
+
 def _transform_obj(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
     """Transform vertices and normals of an OBJ file; faces, colours and all else are copied unchanged."""
     lines = [_IN_METRES]
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        words = line.split()
-        if words[:1] in (["v"], ["vn"]):
-            at = _vector_of_obj(words, path, number, line)
-            try:
-                with overflow_raised():
-                    moved = metric_from_sfm.apply(at) if words[0] == "v" else metric_from_sfm.rotation @ at
-            except FloatingPointError:
-                raise _no_vertex(path, number, line) from None
-            line = " ".join([words[0], *(f"{value:.10g}" for value in moved), *words[4:]])
-        lines.append(line)
+    for line, moved in _lines_of_obj(path, metric_from_sfm):
+        if moved is None:
+            lines.append(line)
+        else:
+            name, _, _, _, *others = line.split()
+            lines.append(" ".join([name, *(f"{value:.10g}" for value in moved), *others]))
     write_text("\n".join(lines) + "\n", target)
     return target
 
 
-def _vector_of_obj(words: Sequence[str], path: Path, number: int, line: str) -> Array:
-    try:
-        at = np.array([float(word) for word in words[1:4]]).reshape(3)
-    except ValueError:
-        raise _no_vertex(path, number, line) from None
-    if not np.isfinite(at).all():
-        raise _no_vertex(path, number, line)
-    return at
-
-
-def _no_vertex(path: Path, number: int, line: str) -> InputError:
-    return InputError(f"'{line[:60]}' is not a vertex, expected three numbers", path, number)
-
-
 def _vertices_of_obj(path: Path) -> Array:
-    lines = [(number, line, line.split()) for number, line in enumerate(read_text(path).splitlines(), 1)]
-    found = [_vector_of_obj(words, path, number, line) for number, line, words in lines if words[:1] == ["v"]]
-    return np.array(found).reshape(-1, 3)
+    rows = [at for line, at in _lines_of_obj(path, IDENTITY) if at is not None and line.split()[0] == "v"]
+    return np.array(rows).reshape(-1, 3)
 
 
 def _transform_json(path: Path, metric_from_sfm: Similarity, target: Path) -> Path:
@@ -349,7 +339,11 @@ def _moved_json(path: Path, metric_from_sfm: Similarity) -> Json:
             if isinstance(content, dict) and "frames" in content:
                 _move_nerfstudio(content, metric_from_sfm)
             elif isinstance(content, list) and content and "position" in content[0]:
-                _move_splatting(content, metric_from_sfm)
+                for camera in content:
+                    position: Array = np.array(camera["position"], dtype=np.float64).reshape(3)
+                    rotation: Array = np.array(camera["rotation"], dtype=np.float64).reshape(3, 3)
+                    camera["position"] = metric_from_sfm.apply(position).tolist()
+                    camera["rotation"] = (metric_from_sfm.rotation @ rotation).tolist()
             else:
                 expected = "expected nerfstudio's transforms.json or a splatting cameras.json"
                 raise InputError(f"has no cameras, {expected}", path)
@@ -378,14 +372,6 @@ def _move_nerfstudio(content: Json, metric_from_sfm: Similarity) -> None:
         content["applied_transform"] = np.eye(4)[:3].tolist()
     # nerfstudio wrote this scale for the old poses; it would be wrong for the new ones.
     content.pop("applied_scale", None)
-
-
-def _move_splatting(content: Json, metric_from_sfm: Similarity) -> None:
-    for camera in content:
-        position: Array = np.array(camera["position"], dtype=np.float64).reshape(3)
-        rotation: Array = np.array(camera["rotation"], dtype=np.float64).reshape(3, 3)
-        camera["position"] = metric_from_sfm.apply(position).tolist()
-        camera["rotation"] = (metric_from_sfm.rotation @ rotation).tolist()
 
 
 _KINDS = {

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.arrays import Array
 from rangesfm.export.metric_map import MetricMap, colored_points
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.georeference import GEOGRAPHIC, is_geographic
@@ -34,9 +33,12 @@ def write_laz(map_: MetricMap, path: Path) -> Path:
     if not laspy.LazBackend.detect_available():
         raise missing_extra("the format 'laz' needs lazrs besides laspy", "geo")
     places, colors = colored_points(map_.reconstruction)
-    xyz, steps = _coordinates(map_, places)
+    xyz, steps = places, [_STEP_M] * 3
+    if map_.georeference is not None:
+        xyz = map_.georeference.projected(places)
+        steps = [_STEP_DEG] * 2 + [_STEP_M] if is_geographic(map_.georeference.crs) else steps
     header = laspy.LasHeader(version="1.4", point_format=_POINT_FORMAT_WITH_COLOR)
-    header.scales = steps
+    header.scales = np.array(steps)
     header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
     if map_.georeference is not None:
         import pyproj
@@ -48,14 +50,6 @@ def write_laz(map_: MetricMap, path: Path) -> Path:
     with new_file(path) as temporary:
         las.write(str(temporary))
     return path
-
-
-def _coordinates(map_: MetricMap, xyz: Array) -> tuple[Array, Array]:
-    """Return the coordinates to write, (n, 3), and the step of each axis to which they are rounded, (3,)."""
-    if map_.georeference is None:
-        return xyz, np.full(3, _STEP_M)
-    step = _STEP_DEG if is_geographic(map_.georeference.crs) else _STEP_M
-    return map_.georeference.projected(xyz), np.array([step, step, _STEP_M])
 
 
 def write_features(map_: MetricMap, path: Path, driver: str) -> Path:

@@ -74,33 +74,27 @@ def write_nerfstudio(map_: MetricMap, folder: Path) -> Path:
         raise InputError("nerfstudio has one camera model for all photos, but only some of these are fisheye photos")
     common = next(iter(cameras.values())) if len(cameras) == 1 else {}
     if map_.images_path is not None and real_path(map_.images_path) != real_path(folder / NERFSTUDIO_IMAGES):
-        _copy_photos(photo_files(map_, map_.images_path), folder / NERFSTUDIO_IMAGES)
+        files = photo_files(map_, map_.images_path)
+        with new_folder(folder / NERFSTUDIO_IMAGES) as copies:
+            require_space(copies, files.values())
+            for name, file in files.items():  # they are no links, so that editing a copy cannot change a photo
+                (copies / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, copies / name)
+    frames = []
+    for image in images:
+        world_from_cam = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
+        matrix = (world_from_cam @ _FLIP_Y_AND_Z).tolist()
+        own = {} if common else cameras[image.camera_id]
+        frames.append({"file_path": f"{NERFSTUDIO_IMAGES}/{image.name}", "transform_matrix": matrix, **own})
     content = {
         **({"camera_model": kinds.pop()} if kinds else {}),
         **common,
         "applied_transform": np.eye(4)[:3].tolist(),
         "ply_file_path": write_points(model, folder / _POINTS_NAME).name,
-        "frames": [{**_frame(image), **({} if common else cameras[image.camera_id])} for image in images],
+        "frames": frames,
     }
     write_json(content, folder / "transforms.json")
     return folder / "transforms.json"
-
-
-def _copy_photos(files: Mapping[str, Path], path: Path) -> None:
-    """Copy photos into the folder ``path``. They are no links, so that editing a copy cannot change a photo."""
-    with new_folder(path) as folder:
-        require_space(folder, files.values())
-        for name, file in files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, folder / name)
-
-
-def _frame(image: pycolmap.Image) -> dict[str, Any]:
-    world_from_cam = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
-    return {
-        "file_path": f"{NERFSTUDIO_IMAGES}/{image.name}",
-        "transform_matrix": (world_from_cam @ _FLIP_Y_AND_Z).tolist(),
-    }
 
 
 def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:

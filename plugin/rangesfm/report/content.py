@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -151,11 +151,6 @@ def _cameras(
         focal = camera.mean_focal_length()
         half_angles = (camera.width / (2 * focal), camera.height / (2 * focal))
         yield CameraIntrinsics(title, tuple(zip(names, *values)), half_angles)
-
-
-def in_natural_order(ids: Iterable[str]) -> list[str]:
-    """Return the distinct ids in order, numbers by their value: "2" before "10"."""
-    return sorted(set(ids), key=lambda id_: (not id_.isdecimal(), int(id_) if id_.isdecimal() else 0, id_))
 
 
 def _range_times(ranges: RangesAsUsed, image_times_s: dict[str, float]) -> Array:

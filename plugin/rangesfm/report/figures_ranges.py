@@ -8,10 +8,11 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.files.clock_times import time_text
+from rangesfm.files.folders import natural_order
 from rangesfm.ranging.errors.error_curve import ErrorCurve
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.report.content import Content, in_natural_order
+from rangesfm.report.content import Content
 from rangesfm.report.plot import (
     WIDE_SIZE,
     Figure,
@@ -45,7 +46,9 @@ def residuals_over_time(content: Content) -> Figure | None:
     ranges = content.ranges
     if ranges is None or not _of_used(ranges):
         return None
-    panels = tuple(_residual_panel(content, ranges, anchor_id) for anchor_id in in_natural_order(ranges.anchor_id))
+    panels = tuple(
+        _residual_panel(content, ranges, anchor_id) for anchor_id in sorted({*ranges.anchor_id}, key=natural_order)
+    )
     caption = (
         "Range residuals (predicted minus measured) over time: dots of the final map, and running medians of the "
         "ranges used. A steady offset is a bias; a slow wave is drift of the map or an error of the time offset. "

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rangesfm.report.content import Content, in_natural_order
+from rangesfm.files.folders import natural_order
+from rangesfm.report.content import Content
 from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, every_nth, figure_of, from_zero, time_axis
 from rangesfm.report.text import signed
 from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus, TimeOffsetCurve
@@ -17,7 +18,7 @@ CANDIDATE_AXIS = (-1.0, 4.0)
 def scale_per_anchor_figure(content: Content) -> Figure | None:
     """Return the figure of the scale from each anchor alone, beside that of all anchors and its 95 % interval."""
     scale, joint = content.summary.scale, content.summary.metric_from_sfm.scale
-    values = {anchor_id: scale.per_anchor[anchor_id] for anchor_id in in_natural_order(scale.per_anchor)}
+    values = {anchor_id: scale.per_anchor[anchor_id] for anchor_id in sorted({*scale.per_anchor}, key=natural_order)}
     alone = {anchor_id: value for anchor_id, value in values.items() if value is not None}
     if len(alone) < 2:
         return None

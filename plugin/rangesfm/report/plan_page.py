@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.arrays import Array, Mask
+from rangesfm.arrays import Array
 from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.files.atomic import make_output_folder, write_text
 from rangesfm.geometry.numerics import NORMAL_95
@@ -126,10 +126,12 @@ def _view(plan: SurveyPlan, view: View, centers: Array, edges: Array) -> Panel:
     of_keyframe = np.digitize(NORMAL_95 * np.array(plan.keyframe_stddevs_m), edges)
     names = _names(edges)
     shown = names if len(edges) in of_keyframe else names[:-1]
-    series = [
-        Series(name, _color(band, len(names)), _stretches(line, of_keyframe == band), "line")
-        for band, name in enumerate(shown)
-    ]
+    series = []
+    for band, name in enumerate(shown):
+        inside = of_keyframe == band
+        inside |= np.append(False, inside[:-1])  # the step that leads out of a band has its colour, too
+        points = np.where(inside[:, None], line, np.nan)
+        series.append(Series(name, _color(band, len(names)), points, "line"))
     if walls and view.axes == (0, 1):
         gaps = [np.vstack([view.seen(wall), [[np.nan, np.nan]]]) for wall in walls]
         series.append(Series(plan.expected.planned.walls_are, _WALL_COLOR, np.vstack(gaps), "line"))
@@ -181,12 +183,6 @@ def _names(edges: Array) -> list[str]:
 
 def _color(band: int, num: int) -> str:
     return _OPEN_COLOR if band == num - 1 else _COLORS[round(band * (len(_COLORS) - 1) / max(num - 2, 1))]
-
-
-def _stretches(line: Array, inside: Mask) -> Array:
-    """Return the path (n, 2) with NaN outside the mask; the step that leads out of the mask is kept."""
-    kept = inside | np.append(False, inside[:-1])
-    return np.where(kept[:, None], line, np.nan)
 
 
 def _advice(caption: str, ranked: Sequence[Advice]) -> ReportTable:

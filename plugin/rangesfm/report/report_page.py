@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -49,7 +49,7 @@ _Maker = Callable[[Content], Figure | report_tables.ReportTable | None]
 # Sections of the report: id and title, and the functions that make its figures and tables.
 _FOUND = ("found", "Mistakes that the ranges show")
 _SECTIONS: dict[tuple[str, str], tuple[_Maker, ...]] = {
-    _FOUND: (report_tables.mistakes_found,),
+    _FOUND: (partial(report_tables.mistakes, are_found=True),),
     ("path", "Path"): (
         *(figures_path.trajectory_views, figures_path.map_views, loops_figure, figures_path.local_scale),
         report_tables.comparison,
@@ -67,7 +67,11 @@ _SECTIONS: dict[tuple[str, str], tuple[_Maker, ...]] = {
 }
 _APPENDIX: dict[tuple[str, str], tuple[_Maker, ...]] = {
     ("mistakes", "Mistakes that were tested for and not found"): (
-        *(figures_mistakes.mistakes_figure, report_tables.mistakes_not_found, report_tables.reliability),
+        *(
+            figures_mistakes.mistakes_figure,
+            partial(report_tables.mistakes, are_found=False),
+            report_tables.reliability,
+        ),
     ),
     ("candidates", "The method of the 2018 paper, for comparison"): (
         *(figures_scale.candidates, report_tables.two_candidates),
@@ -121,9 +125,14 @@ def render_page(template: str, *, sections: Sequence[Section] = (), **values: An
         values: of the template's variables; text that is not Markup is escaped.
     """
     charts = page_charts([figure for section in sections for figure in section.figures])
-    script = _script() if charts else None
-    policy = CONTENT_POLICY.format(script="'none'" if script is None else _policy_source(script))
-    styles = [_asset(name) for name in STYLES]
+    script, source = None, "'none'"
+    if charts:  # three.js and Vega, then this package's own files in one scope
+        libraries = "".join(_asset(f"vendor/{name}.min.js") for name in ("three", "vega"))
+        files = "".join(_asset(f"view/{name}.js") for name in _SCRIPTS)
+        script = f'{libraries}\n(() => {{\n"use strict";\n{files}}})();\n'
+        digest = hashlib.sha256(script.encode("utf-8")).digest()
+        source = f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+    policy, styles = CONTENT_POLICY.format(script=source), [_asset(name) for name in STYLES]
     page = _environment().get_template(template)
     return page.render(policy=policy, styles=styles, script=script, charts=charts, sections=sections, **values)
 
@@ -136,19 +145,6 @@ def write_page(page: str, path: Path) -> None:
 
 def _asset(name: str) -> str:
     return (ASSETS / name).read_text(encoding="utf-8")
-
-
-def _script() -> str:
-    """Return the script of a page: three.js and Vega, then this package's own files in one scope."""
-    libraries = [_asset(f"vendor/{name}.min.js") for name in ("three", "vega")]
-    files = [_asset(f"view/{name}.js") for name in _SCRIPTS]
-    return f'{"".join(libraries)}\n(() => {{\n"use strict";\n{"".join(files)}}})();\n'
-
-
-def _policy_source(script: str) -> str:
-    """Return the name by which a Content-Security-Policy allows an inline script: its SHA-256 hash."""
-    digest = hashlib.sha256(script.encode("utf-8")).digest()
-    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
 def light(color: str) -> Markup:

@@ -17,9 +17,9 @@ from rangesfm.diagnostics.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.files.folders import natural_order
 from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.ranging.errors.components import component_words
-from rangesfm.report.content import Content, in_natural_order
+from rangesfm.report.content import Content
 from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, sentence, signed
-from rangesfm.result.entries import AnchorEntry, MistakeEntry, rmse_heading
+from rangesfm.result.entries import AnchorEntry, rmse_heading
 from rangesfm.survey.settings import KEYS
 
 _Columns = Mapping[str, Callable[[Any], str]]
@@ -93,7 +93,7 @@ def range_statuses(content: Content) -> ReportTable:
 def ranges_per_anchor(content: Content) -> ReportTable:
     """Return the table of each anchor's ranges: how many, and their residuals before and after the refinement."""
     ranges, rows = content.ranges, []
-    for anchor_id in [] if ranges is None else in_natural_order(ranges.anchor_id):
+    for anchor_id in [] if ranges is None else sorted({*ranges.anchor_id}, key=natural_order):
         assert ranges is not None
         mine = np.array(ranges.anchor_id, dtype=str) == anchor_id
         used = mine & ranges.is_used
@@ -107,22 +107,26 @@ def ranges_per_anchor(content: Content) -> ReportTable:
     return ReportTable("Ranges of each anchor", header, rows)
 
 
-def mistakes_found(content: Content) -> ReportTable:
-    """Return the table of the mistakes that the ranges show."""
-    return _mistakes(content, "Mistakes that the ranges show", are_found=True)
+def mistakes(content: Content, *, are_found: bool) -> ReportTable:
+    """Return the table of the mistakes that the ranges show, or of those that were tested for and not found.
 
-
-def mistakes_not_found(content: Content) -> ReportTable:
-    """Return the table of the mistakes that were tested for and not found.
-
-    Where there are several of one kind, such as one for each anchor, it has only the one with the most evidence.
+    A bar that is half full is at the threshold of the test. Where several of one kind were not found, such as one for
+    each anchor, there is only the one with the most evidence.
     """
-    return _mistakes(content, "Mistakes that were tested for and not found", are_found=False)
-
-
-def _mistakes(content: Content, caption: str, *, are_found: bool) -> ReportTable:
-    """Return a table of tests of mistakes. A bar that is half full is at the threshold of the test."""
-    tests, rows = content.summary.tests, []
+    tests, rows = content.summary.tests, list[Sequence[str]]()
+    note = "A bar more than half full is more than chance explains"
+    if not are_found:
+        least = min((test.threshold for test in tests if test.stddev and test.threshold), default=None)
+        if least is not None:
+            note += (
+                f" (a mistake that is one number is found from {math.sqrt(least):.1f} of its standard deviations on: "
+                "among so many tests, one reaches three by chance)"
+            )
+        note += (
+            ". A mistake that is not found may still be there, if it is smaller than the smallest one found. The last "
+            "two columns say how much it may then change the scale (as a fraction of it) and places in the map. All "
+            "tests are in result.json"
+        )
     numbers = {
         "stddev": "± (95 %)",
         "smallest_detectable": "smallest found",
@@ -144,7 +148,7 @@ def _mistakes(content: Content, caption: str, *, are_found: bool) -> ReportTable
         verdict = "found" if test.rejected else unfound
         rows.append([mistake_in_words(test.name, test.subject), f"{test.words}{others}", bar, verdict, unit, *cells])
     return ReportTable(
-        caption,
+        "Mistakes that the ranges show" if are_found else "Mistakes that were tested for and not found",
         [
             "mistake",
             "what the ranges say" if are_found else "if it was made",
@@ -154,16 +158,8 @@ def _mistakes(content: Content, caption: str, *, are_found: bool) -> ReportTable
             *numbers.values(),
         ],
         rows,
-        "A bar more than half full is more than chance explains." if are_found else _note_on_not_found(tests),
+        f"{note}.",
         kind="mistakes",
-    )
-
-
-def _note_on_not_found(tests: Sequence[MistakeEntry]) -> str:
-    return (
-        f"A bar more than half full is more than chance explains{_from_stddevs(tests)}. A mistake that is not found "
-        "may still be there, if it is smaller than the smallest one found. The last two columns say how much it may "
-        "then change the scale (as a fraction of it) and places in the map. All tests are in result.json."
     )
 
 
@@ -194,17 +190,6 @@ def reliability(content: Content) -> ReportTable:
         )
     header = ["given value", "checked", "smallest error found", "its effect on the scale"]
     return ReportTable("How well given values are checked", header, rows, note)
-
-
-def _from_stddevs(tests: Sequence[MistakeEntry]) -> str:
-    """Return a remark that says from how many stddevs on a mistake with a single number counts as found."""
-    least = min((test.threshold for test in tests if test.stddev and test.threshold), default=None)
-    if least is None:
-        return ""
-    return (
-        f" (a mistake that is one number is found from {math.sqrt(least):.1f} of its standard deviations on: among so "
-        "many tests, one reaches three by chance)"
-    )
 
 
 def comparison(content: Content) -> ReportTable:
@@ -240,7 +225,7 @@ def two_candidates(content: Content) -> ReportTable:
 def anchors(content: Content) -> ReportTable:
     """Return the table of the anchors: positions, their standard deviations, and range biases."""
     given = content.summary.anchors
-    rows = [_anchor(anchor_id, given[anchor_id]) for anchor_id in in_natural_order(given)]
+    rows = [_anchor(anchor_id, given[anchor_id]) for anchor_id in sorted({*given}, key=natural_order)]
     header = ["anchor", "x m", "y m", "z m", "± m (95 %)", "Δx m", "Δy m", "Δz m", "range bias m", "mirror image at m"]
     note = "Δ: estimated minus surveyed position, for surveyed anchors. ± 0: the position was held fixed."
     return ReportTable("Anchors in the map's frame", header, rows, note)
@@ -409,10 +394,9 @@ def _cells(key: str, entry: object, columns: _Columns) -> list[str]:
 
     Of a standard deviation, the cell has half of the 95 % interval.
     """
-    return [_cell(f"{key}.{name}", getattr(entry, name), show) for name, show in columns.items()]
-
-
-def _cell(key: str, value: Any, show: Callable[[Any], str]) -> str:
-    if value is None or "stddev" not in key.rpartition(".")[2]:
-        return keyed(key, value, show(value))
-    return keyed(key, value, show(NORMAL_95 * value), times=NORMAL_95)
+    cells = []
+    for name, show in columns.items():
+        value = getattr(entry, name)
+        times = NORMAL_95 if value is not None and "stddev" in name else 1.0
+        cells.append(keyed(f"{key}.{name}", value, show(value if times == 1.0 else times * value), times=times))
+    return cells

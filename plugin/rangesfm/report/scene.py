@@ -127,8 +127,19 @@ def view_of(scene: Scene) -> dict[str, Any]:
 
     They are what the script draws, the layers (id, name, colour and shape of the swatch), and a note for the reader.
     """
-    origin_m = _origin_m(scene)
-    box, content, photos = _box(scene, origin_m), scene.content, scene.result.image_names
+    seen = [_around(scene)]
+    if len(scene.points_m):
+        seen.append(np.quantile(scene.points_m, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0))
+    corners = np.concatenate(seen)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    # A graphics card computes with 32 bits, which resolve only half a metre in a national grid 5400000 m from its
+    # origin. The origin is at round numbers, so that the lines of the grid are at round coordinates.
+    step = 10.0 ** math.floor(math.log10(radius))
+    origin_m = step * np.round((low + high) / 2 / step)
+    low, high = low - origin_m, high - origin_m
+    ground = float(low[2]) if scene.frame == "site" else float(high[1])
+    content, photos = scene.content, scene.result.image_names
     cameras, scale = (None, None) if content is None else (content.cameras, content.summary.scale)
     pictures = {} if content is None else thumbnails(content.images_path, photos)
     points, ranges = _points(scene, origin_m), None if content is None else _ranges(content, scene.result)
@@ -136,6 +147,10 @@ def view_of(scene: Scene) -> dict[str, Any]:
     layers = [("points", "Map points", "map", "dots")] if points else []
     layers += [(path.id, path.name, path.color, "line" if path.has_orientations else "dashed") for path in scene.paths]
     layers += [("anchors", "Anchors", "anchor", "triangle")] if anchors else []
+    errors = None
+    if content is not None:
+        anchor_ids = [anchor["id"] for anchor in anchors]
+        errors = errors_of_scene(content.result.read_map_errors(), content.summary, scene.result, anchor_ids)
     num_left_out = len(scene.points_m) - (points["num"] if points else 0)
     stride = 1 if content is None or content.ranges is None else every_nth(len(content.ranges.status), MAX_NUM_RANGES)
     note = (
@@ -151,24 +166,20 @@ def view_of(scene: Scene) -> dict[str, Any]:
         "unit": scene.unit,
         "up": [0, 0, 1] if scene.frame == "site" else [0, -1, 0],
         "origin": origin_m.tolist(),
-        "box": box,
+        "box": {"low": low.tolist(), "high": high.tolist(), "radius": radius, "ground": ground},
         "paths": [_path(path, origin_m) for path in scene.paths],
         "points": points,
         "anchors": anchors,
         "ranges": ranges,
-        "frustum_size": _frustum_size(scene.result, box["radius"]),
+        "frustum_size": _frustum_size(scene.result, radius),
         "frustum_shape": cameras[0].half_angles if cameras else _FRUSTUM_SHAPE,
         "thumbnails": pictures,
-        "errors": None if content is None else _errors(content, scene, [anchor["id"] for anchor in anchors]),
+        "errors": errors,
         "scale_interval": [end / scale.value for end in scale.interval_95] if scale and scale.interval_95 else None,
         "layers": [*layers, ("grid", "Grid", "muted", "box")],
         "num_photos": len(photos) if scene.paths[-1].has_orientations else 0,
         "note": " ".join(filter(None, note)),
     }
-
-
-def _errors(content: Content, scene: Scene, anchor_ids: Sequence[str]) -> dict[str, Any] | None:
-    return errors_of_scene(content.result.read_map_errors(), content.summary, scene.result, anchor_ids)
 
 
 def _path(path: ScenePath, origin_m: Array) -> dict[str, Any]:
@@ -221,36 +232,6 @@ def _around(scene: Scene) -> Array:
     """Return the positions of cameras and anchors, (n, 3)."""
     anchors = [[anchor.position_m] for anchor in scene.anchors.values() if anchor.position_m is not None]
     return np.concatenate([*(path.trajectory.centers for path in scene.paths), *anchors])
-
-
-def _seen_m(scene: Scene) -> tuple[Array, Array, float]:
-    """Return both corners (3,) and the radius in metres of the box that the view shows at first."""
-    seen = [_around(scene)]
-    if len(scene.points_m):
-        seen.append(np.quantile(scene.points_m, [_SEEN_QUANTILE, 1 - _SEEN_QUANTILE], axis=0))
-    corners = np.concatenate(seen)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    return low, high, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
-
-
-def _origin_m(scene: Scene) -> Array:
-    """Return the origin (3,) of the positions in the view, near the middle of what the view shows at first.
-
-    A graphics card computes with 32 bits, which resolve only half a metre in a national grid 5400000 m from its origin.
-    The coordinates of the origin are round numbers, so that the lines of the grid are at round coordinates.
-    """
-    low, high, radius = _seen_m(scene)
-    step = 10.0 ** math.floor(math.log10(radius))
-    origin: Array = step * np.round((low + high) / 2 / step)
-    return origin
-
-
-def _box(scene: Scene, origin_m: Array) -> dict[str, Any]:
-    """Return corners and radius of the box that the view shows at first, and the height of the ground."""
-    low, high, radius = _seen_m(scene)
-    low, high = low - origin_m, high - origin_m
-    ground = float(low[2]) if scene.frame == "site" else float(high[1])
-    return {"low": low.tolist(), "high": high.tolist(), "radius": radius, "ground": ground}
 
 
 def _frustum_size(path: Trajectory, radius: float) -> float:

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.arrays import Array
-from rangesfm.geometry.map_errors import MapErrors, PartErrors
+from rangesfm.geometry.map_errors import Kind, MapErrors
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.packing import pack
 from rangesfm.result.summary import ResultSummary
@@ -27,10 +26,20 @@ def errors_of_scene(
     """
     if errors is None or not len(path) or summary.scale.interval_95 is None:
         return None
+    found = []
+    points: tuple[tuple[Kind, Sequence[int | str], slice], ...] = (
+        ("frame", path.frame_ids.tolist(), _SHIFT),
+        ("anchor", anchor_ids, slice(0, 3)),
+    )
     try:
-        modes, rests, by_scale = _of_points(errors, path, anchor_ids)
+        for kind, ids, shift in points:
+            if len(ids):
+                parts = errors.parts[kind]
+                rows = [parts.row_of[id_] for id_ in ids]
+                found.append((parts.modes[rows, shift], parts.rests[rows, shift, shift], parts.by_scale[rows, shift]))
     except KeyError:  # the model is of another run
         return None
+    modes, rests, by_scale = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     left, sizes, _ = np.linalg.svd(modes.reshape(3 * len(modes), -1), full_matrices=False)
     shifts = left * sizes
     steps = np.maximum(np.abs(shifts).max(axis=0), 1e-12) / _NUM_STEPS
@@ -45,18 +54,3 @@ def errors_of_scene(
         "up": None if up is None else up[0].tolist(),
         "tilt_stddev": None if up is None else up[1],
     }
-
-
-def _of_points(errors: MapErrors, path: Trajectory, anchor_ids: Sequence[str]) -> tuple[Array, Array, Array]:
-    """Return the modes (n, 3, r), rests (n, 3, 3) and changes by scale (n, 3) of the shifts of cameras and anchors."""
-    frames, anchors = errors.parts["frame"], errors.parts.get("anchor")
-    found = [_shifts(frames, path.frame_ids.tolist(), _SHIFT)]
-    if anchor_ids:
-        found.append(_shifts(errors.parts["anchor"] if anchors is None else anchors, anchor_ids, slice(0, 3)))
-    modes, rests, by_scale = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    return modes, rests, by_scale
-
-
-def _shifts(parts: PartErrors, ids: Sequence[int | str], shift: slice) -> tuple[Array, Array, Array]:
-    rows = [parts.row_of[id_] for id_ in ids]
-    return parts.modes[rows, shift], parts.rests[rows, shift, shift], parts.by_scale[rows, shift]
