@@ -27,7 +27,7 @@ from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.mapping import mapping_options, pipeline_options
 from rangesfm.vision.matching import matching_options
-from rangesfm.vision.own_process import MatchingShare
+from rangesfm.vision.own_process import match_share
 from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import NO_RIGS
 
@@ -180,10 +180,10 @@ def test_shares_of_pairs_are_matched_as_colmap_matches_pairs(monkeypatch: pytest
     handed: list[Any] = []
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda _, *options, **__: handed.extend(options))
     matcher, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    MatchingShare(tmp_path, [(1, 2)], matcher, verification).run(SilentProgress())
+    match_share(tmp_path / "1.db", [(1, 2)], matcher, verification, tmp_path, SilentProgress())
     assert (handed[0], handed[2]) == (matcher, verification)
     # The block size depends on the photos' features; in a database without any, it is one photo.
-    assert changes(handed[1]) == {"match_list_path": tmp_path / "pairs.txt", "block_size": 1}
+    assert changes(handed[1]) == {"match_list_path": tmp_path / "1.txt", "block_size": 1}
 
 
 def test_a_model_is_adjusted_as_colmap_adjusts_it() -> None:

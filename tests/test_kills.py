@@ -36,7 +36,7 @@ def function_or_death(*arguments, **options):
 setattr(module, name, function_or_death)
 sys.exit(main(argv))
 """
-IN_MATCHING = ("rangesfm.vision.matching", "append_log", 0)
+IN_MATCHING = ("rangesfm.vision.matching", "copy_matches", 0)
 IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
 BEFORE_THE_RESULT = ("rangesfm.workflows.run_results", "input_hashes", 0)
 BEFORE_THE_REPORT = ("rangesfm.workflows.run_results", "write_report_of", 0)

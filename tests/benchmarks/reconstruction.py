@@ -140,8 +140,8 @@ def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes
     clear_matches(database)
     options = matching_options(MapperOptions(matching="sequential", num_threads=num_processes), len(names), seed)
     usable, log = usable_photos(photos, names), database.with_name("mapper.log")
-    with colmap_log(log):
-        return effort_of(lambda: match_features(database, usable, options, log, SilentProgress()))
+    with colmap_log(log) as log_folder:
+        return effort_of(lambda: match_features(database, usable, options, log_folder, SilentProgress()))
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,10 @@ import psutil
 import pytest
 from tests.traps import set_traps
 
-from rangesfm.processes.supervision import Ended, child_command, supervise
+from rangesfm.batch.survey_process import run_in_batch
+from rangesfm.processes.draw_pictures import _draw
+from rangesfm.processes.supervision import Ended, call_by_name, supervise
+from rangesfm.vision.own_process import find_features
 
 
 def run(
@@ -28,7 +31,7 @@ def run(
 ) -> Ended:
     code = "import json, os, signal, sys, time\nsay = lambda **m: print(json.dumps(m), flush=True)\n" + code
     command = [sys.executable, "-S", "-c", code]
-    return supervise(command, given, listen, memory_limit_bytes=memory_limit_bytes, is_stopped=is_stopped)
+    return supervise(given, listen, memory_limit_bytes=memory_limit_bytes, is_stopped=is_stopped, command=command)
 
 
 def test_messages_come_one_by_one_and_the_last_is_the_ending() -> None:
@@ -86,22 +89,16 @@ def test_nothing_is_left_running_where_the_listener_fails() -> None:
     assert not psutil.pid_exists(heard[0]["pid"])
 
 
-@pytest.mark.parametrize(
-    "module",
-    ["rangesfm.vision.own_process", "rangesfm.batch.survey_process", "rangesfm.processes.draw_pictures"],
-)
-def test_a_child_imports_nothing_from_the_working_folder(
-    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_child_imports_nothing_from_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sprung = set_traps(tmp_path)
     monkeypatch.chdir(tmp_path)
-    ended = supervise(child_command(module), pickle.dumps("no work"))
-    assert "failed" in ended.last, ended.how  # it got far enough to say what is wrong
+    works: list[Any] = [find_features, run_in_batch, partial(_draw, [])]
+    ended = [supervise(pickle.dumps(work)) for work in works]
+    assert ["failed" in of.last for of in ended] == [True, True, False]  # they got far enough to say what is wrong
     assert not sprung()
 
 
 def test_a_child_imports_what_is_on_the_path_of_the_user(tmp_path: Path) -> None:
-    (tmp_path / "of_the_user.py").write_text("import sys\nprint(__name__, len(sys.argv), int(sys.argv[1]) > 0)\n")
-    paths = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(child_command("of_the_user"), env=paths, capture_output=True, text=True, check=True)
-    assert done.stdout == "__main__ 2 True\n"
+    (tmp_path / "of_the_user.py").write_text("def work(progress):\n    return 5\n")
+    work = pickle.dumps(partial(call_by_name, "of_the_user:work"))
+    assert supervise(work, environment={**os.environ, "PYTHONPATH": str(tmp_path)}).last == {"done": 5}

@@ -111,7 +111,7 @@ def map_database(folder: Path, method: str, leaf_size: int) -> None:
     mapper = MapperOptions(pipeline=pipelines[method], num_threads=1).changed(method=method)
     options = mapping_options(camera, mapper, NO_RIGS, 0, database)
     photos = Photos(folder, names, ((known.width, known.height),) * len(names), {})
-    map_photos(Workspace(folder, SilentProgress()), photos, options)
+    map_photos(Workspace(folder, SilentProgress()), photos, options, folder)
 
 
 def cost_of(*arguments: object) -> tuple[float, float]:

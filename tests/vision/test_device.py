@@ -14,7 +14,7 @@ from rangesfm.progress import SilentProgress
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matching import matching_options
-from rangesfm.vision.own_process import FeatureExtraction, MatchingShare
+from rangesfm.vision.own_process import find_features, match_share
 
 NUM_CORES = 3
 SILENT = SilentProgress()
@@ -81,6 +81,6 @@ def test_colmap_is_told_the_device_beside_the_options_which_it_would_not_heed_al
         monkeypatch.setattr(pycolmap, name, lambda *_, device, **__: told.append(device))
     for_features = pycolmap.FeatureExtractionOptions(use_gpu=on_gpu)
     matcher = pycolmap.FeatureMatchingOptions(use_gpu=on_gpu)
-    FeatureExtraction(tmp_path / "database.db", tmp_path, ["1.jpg"], None, for_features, tmp_path / "1.log").run(SILENT)
-    MatchingShare(tmp_path, [(1, 2)], matcher, pycolmap.TwoViewGeometryOptions()).run(SILENT)
+    find_features(tmp_path / "1.db", tmp_path, ["1.jpg"], None, for_features, tmp_path, SILENT)
+    match_share(tmp_path / "1.db", [(1, 2)], matcher, pycolmap.TwoViewGeometryOptions(), tmp_path, SILENT)
     assert told == [pycolmap.Device.cuda if on_gpu else pycolmap.Device.cpu] * 2

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from tests.vision.matches import content_of
 
+from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import ReconstructionError
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SilentProgress
@@ -19,7 +20,6 @@ from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.database import create_database
 from rangesfm.vision.features import extract_features, feature_options
 from rangesfm.vision.matching import match_features, matching_options
-from rangesfm.vision.own_process import MatchingShare
 from rangesfm.vision.photo_files import Photos, usable_photos
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def photos(render_room: Callable[..., Room], tmp_path_factory: pytest.TempPathFa
     cameras = cameras_of_photos(room.camera, photos)
     create_database(room.folder / "database.db", room.names, cameras.cameras, cameras.of_photo)
     options = feature_options(MapperOptions(features={"sift": {"first_octave": 0, "max_num_features": 250}}))
-    extract_features(room.folder / "database.db", photos, options, room.folder / "features.log", SilentProgress())
+    extract_features(room.folder / "database.db", photos, options, room.folder, SilentProgress())
     return photos
 
 
@@ -55,7 +55,8 @@ def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def match(photos: Photos, database: Path, listener: Listener, num_processes: int) -> None:
     options = matching_options(MapperOptions(num_threads=num_processes), NUM_PHOTOS, seed=0)
-    match_features(database, photos, options, database.with_name("mapper.log"), listener)
+    with colmap_log(database.with_name("mapper.log")) as log_folder:
+        match_features(database, photos, options, log_folder, listener)
 
 
 @pytest.mark.usefixtures("small_shares")
@@ -93,13 +94,13 @@ def test_what_was_matched_before_an_interruption_is_kept_and_not_matched_again(
     num_kept = len(content_of(database)) - NUM_PHOTOS
     assert NUM_PAIRS // 3 <= num_kept < NUM_PAIRS
     asked: list[int] = []
-    prepare = MatchingShare.prepare
+    share_out = matching._shared_out
 
-    def counted(share: MatchingShare, source: Path) -> None:
-        asked.append(len(share.pairs))
-        prepare(share, source)
+    def counted(pairs: list[tuple[int, int]], num_processes: int) -> Iterator[list[tuple[int, int]]]:
+        asked.append(len(pairs))
+        return share_out(pairs, num_processes)
 
-    monkeypatch.setattr(MatchingShare, "prepare", counted)
+    monkeypatch.setattr(matching, "_shared_out", counted)
     listener.stage("again")
     match(photos, database, listener, 2)
     assert sum(asked) == NUM_PAIRS - num_kept
@@ -110,7 +111,7 @@ def test_a_process_that_fails_is_told_of_and_ends_the_others(
     photos: Photos, database: Path, listener: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     listener.stage("matching")
-    monkeypatch.setattr(MatchingShare, "prepare", lambda *_: None)  # so that the list of pairs is missing
-    with pytest.raises(ReconstructionError, match=r"Could not open .*pairs\.txt"):
+    monkeypatch.setattr(matching, "match_share", int)
+    with pytest.raises(ReconstructionError, match="int\\(\\) takes at most 2 arguments"):
         match(photos, database, listener, 2)
     assert sorted(os.listdir(database.parent)) == ["database.db", "mapper.log"]

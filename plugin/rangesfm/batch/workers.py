@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import dask
@@ -29,7 +30,7 @@ from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch.jobs import BatchOptions, share_this_machine
 from rangesfm.errors import FAILED, INTERRUPTED, Failure, InputError
-from rangesfm.processes.supervision import child_command, supervise
+from rangesfm.processes.supervision import call_by_name, supervise
 from rangesfm.survey.settings import Survey
 
 MAX_STOP_S = 30.0  # longer than it takes to interrupt a survey
@@ -244,9 +245,10 @@ def run_apart(
     tell({"began_on": socket.gethostname()})
     own = survey.mapper.num_threads  # the survey file may ask for fewer threads, but not for more
     survey = survey.changed({"mapper.num_threads": num_threads if own < 1 else min(own, num_threads)})
+    # By its name, because what runs a batch loads no estimator.
+    work = partial(call_by_name, "rangesfm.batch.survey_process:run_in_batch", survey, restart)
     ended = supervise(
-        child_command("rangesfm.batch.survey_process"),
-        pickle.dumps((survey, restart)),
+        pickle.dumps(work),
         tell,
         environment={**os.environ, "OMP_NUM_THREADS": str(num_threads), "OPENBLAS_NUM_THREADS": "1"},
         memory_limit_bytes=memory_limit_bytes,

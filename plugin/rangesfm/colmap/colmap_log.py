@@ -1,31 +1,55 @@
-"""Redirection of COLMAP's log from the terminal into a file."""
+"""Redirection of what COLMAP logs from the terminal into files; its logger, glog, has one destination per process."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
-from rangesfm.colmap.glog import logging_into
+import pycolmap
+
 from rangesfm.files.atomic import scratch_folder
+
+_FLAGS_INTO_FILE = {"alsologtostderr": False, "logtostderr": False, "stderrthreshold": 3, "minloglevel": 0}
 
 
 @contextmanager
-def colmap_log(path: Path) -> Iterator[None]:
+def colmap_log(path: Path) -> Iterator[Path]:
     """Append what COLMAP logs inside the block to ``path``; blocks as for ``logging_into``.
 
-    glog adds a time and a number to the name of its file, so that it gets a temporary folder.
+    Yields the temporary folder of the messages, into which other processes may log too: glog adds a time and the number
+    of the process to the names of its files.
     """
     with scratch_folder(path) as folder:
         try:
             with logging_into(folder):
-                yield
+                yield folder
         finally:
-            for part in sorted(folder.iterdir()):
-                append_log(part, path)
+            with path.open("ab") as log:
+                for part in sorted(folder.iterdir()):
+                    log.write(part.read_bytes())
 
 
-def append_log(part: Path, path: Path) -> None:
-    """Append the log of another process to ``path``, if that log exists."""
-    with suppress(FileNotFoundError), path.open("ab") as log:
-        log.write(part.read_bytes())
+@contextmanager
+def logging_into(folder: Path) -> Iterator[None]:
+    """Write what COLMAP logs inside the block to new files in a folder, and not to the terminal.
+
+    Blocks must not nest, nor run at the same time in two threads. Afterwards the flags are restored. glog's default
+    files in the system's temporary folder stay off.
+    """
+    logging = pycolmap.logging
+    flags = {name: getattr(logging, name) for name in _FLAGS_INTO_FILE}
+    for level in logging.Level.__members__.values():
+        logging.set_log_destination(level, "")
+    logging.set_log_destination(logging.INFO, folder / "colmap.")
+    _set_flags(_FLAGS_INTO_FILE)
+    try:
+        yield
+    finally:
+        _set_flags(flags)
+        logging.set_log_destination(logging.INFO, "")
+
+
+def _set_flags(flags: dict[str, bool | int]) -> None:
+    for name, value in flags.items():
+        setattr(pycolmap.logging, name, value)

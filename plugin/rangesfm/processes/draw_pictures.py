@@ -1,7 +1,7 @@
 """Drawing of pictures by the engine of Vega-Lite, in a process of its own.
 
 The engine is written in C++ and ends the whole process where it fails. Here that is a child process, whose end is
-noticed. ``rangesfm.processes.supervision`` runs this file as a module.
+noticed.
 """
 
 from __future__ import annotations
@@ -9,10 +9,11 @@ from __future__ import annotations
 import base64
 import pickle
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, TypeAlias
 
 from rangesfm.errors import SolverError
-from rangesfm.processes.supervision import child_command, supervise, work_for_parent
+from rangesfm.processes.supervision import supervise
 from rangesfm.progress import Progress
 
 # Pixels of a PNG per pixel of the page, with which text has the size that is usual in papers.
@@ -27,7 +28,7 @@ def draw_pictures(drawings: Sequence[Drawing]) -> list[bytes]:
     Raises:
         SolverError: the engine fails, for example because it may not reserve the address space that it wants.
     """
-    ended = supervise(child_command("rangesfm.processes.draw_pictures"), pickle.dumps(drawings))
+    ended = supervise(pickle.dumps(partial(_draw, drawings)))
     if "done" not in ended.last:
         hint = " (it reserves 64 GB of address space; `ulimit -v` may allow less)" if ended.signal is not None else ""
         raise SolverError(f"the engine that draws pictures failed: {ended.how}{hint}")
@@ -45,7 +46,3 @@ def _draw(drawings: Sequence[Drawing], _: Progress) -> list[str]:
         for spec, format in drawings
     ]
     return [base64.b64encode(content).decode("ascii") for content in contents]
-
-
-if __name__ == "__main__":
-    work_for_parent(_draw)

@@ -1,8 +1,7 @@
 """Supervision of a child process from its start to its end: its messages, its memory, and why it ended.
 
-The process runs a module like ``python -m MODULE PARENT``, but imports nothing from the working folder. It reads one
-pickled object, and writes JSON objects, one a line: ``{"stage": name}``, ``{"num_done": n, "num_total": m}``, and last
-either ``{"done": ...}`` or ``{"failed": ...}``.
+The process reads one pickled function, calls it, and writes JSON objects, one a line: ``{"stage": name}``,
+``{"num_done": n, "num_total": m}``, and last either ``{"done": ...}`` or ``{"failed": ...}``.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import json
 import math
 import os
 import pickle
+import pkgutil
 import queue
 import re
 import signal
@@ -23,11 +23,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import IO, Any, TextIO
-
-import psutil
 
 from rangesfm.errors import ReconstructionError, failure_of
 from rangesfm.progress import Progress
@@ -39,9 +38,9 @@ _MAX_STOP_S = 20.0  # an interrupted process that has not ended by then is kille
 _MAX_LINE = 200
 # Python puts the working folder first on the path, as "". A survey from somebody else may hold a numpy.py, which would
 # be imported and so run. `python -P` would leave the folder out, but exists only since Python 3.11.
-_RUN_MODULE = (
+_CHILD = (
     "import sys; sys.path[:1] == [''] and sys.path.pop(0); "
-    "import runpy; runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
+    "from rangesfm.processes.supervision import work_for_parent; work_for_parent()"
 )
 # A line of a stack trace by glog or V8, after leading marks.
 _STACK_TRACE = re.compile(r"\*\*\*|@|PC:|=+ |.*\[0x[0-9a-f]+\]$")
@@ -72,10 +71,10 @@ class MessagesToParent:
         self._stream.flush()
 
 
-def work_for_parent(work: Callable[[Any, Progress], Any]) -> None:
-    """Do the work of a child process: call ``work`` with the object that the parent sends.
+def work_for_parent() -> None:
+    """Do the work of a child process: call the function that the parent sends with a listener to its progress.
 
-    The last message is the result of ``work`` (plain values), or the error that it raised.
+    The last message is the result of the function (plain values), or the error that it raised.
     """
     # The parent may ignore Ctrl-C or block SIGTERM, and a child process inherits both.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -85,9 +84,9 @@ def work_for_parent(work: Callable[[Any, Progress], Any]) -> None:
     parent = MessagesToParent(os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8"))
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     try:
-        given = pickle.load(sys.stdin.buffer)
+        work = pickle.load(sys.stdin.buffer)
         _end_with(int(sys.argv[1]))
-        parent.send({"done": work(given, parent)})
+        parent.send({"done": work(parent)})
     except (Exception, KeyboardInterrupt) as error:
         parent.send({"failed": asdict(failure_of(error))})
 
@@ -142,36 +141,36 @@ class Ended:
         return f"{how}: {self.errors}" if self.errors else how
 
 
-def child_command(module: str) -> list[str]:
-    """Return the command that runs a module which calls ``work_for_parent``."""
-    return [sys.executable, "-c", _RUN_MODULE, module, str(os.getpid())]
+def call_by_name(name: str, *arguments: Any) -> Any:
+    """Call the function named ``module:function``; only the process that calls it loads the module."""
+    return pkgutil.resolve_name(name)(*arguments)
 
 
 def supervise(
-    command: Sequence[str],
     given: bytes,
     listen: Callable[[dict[str, Any]], object] = lambda _: None,
     *,
     environment: Mapping[str, str] = os.environ,
     memory_limit_bytes: int = 0,
     is_stopped: Callable[[], bool] = lambda: False,
+    command: Sequence[str] | None = None,
 ) -> Ended:
-    """Run a process that reads ``given`` and writes JSON objects, one a line; return how it ended.
+    """Have a process call a function, and return how it ended.
 
     Args:
-        command: the process's command line.
-        given: bytes for its standard input.
+        given: bytes for its standard input: the pickled function, which takes a ``Progress``.
         listen: called with each message.
         environment: its environment variables.
         memory_limit_bytes: the process is killed if it takes more; 0: there is no limit.
         is_stopped: called several times a second; once it returns True, the process is interrupted.
+        command: another command line than that of a Python that calls the function.
     """
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     last: dict[str, Any] = {}
     needed_bytes, stopped_at = 0, math.inf
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
-            command,
+            command or [sys.executable, "-c", _CHILD, str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
@@ -186,12 +185,9 @@ def supervise(
                 process.stdin.write(given)
                 process.stdin.flush()
             while True:
-                if memory_limit_bytes and not needed_bytes:
-                    with suppress(psutil.Error):  # the process has ended
-                        used = psutil.Process(process.pid).memory_info().rss
-                        if used > memory_limit_bytes:
-                            needed_bytes = used
-                            process.kill()
+                if memory_limit_bytes and not needed_bytes and (used := _used_bytes(process)) > memory_limit_bytes:
+                    needed_bytes = used
+                    process.kill()
                 if stopped_at == math.inf and is_stopped():
                     stopped_at = time.monotonic()
                     process.send_signal(signal.SIGINT)
@@ -215,6 +211,15 @@ def supervise(
         return Ended(last, died_of, needed_bytes, stopped_at < math.inf, why)
 
 
+def _used_bytes(process: subprocess.Popen[bytes]) -> int:
+    import psutil  # here, because the child processes import this module and should start fast
+
+    try:
+        return int(psutil.Process(process.pid).memory_info().rss)
+    except psutil.Error:  # the process has ended
+        return 0
+
+
 def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> None:
     with stream:
         for line in stream:
@@ -223,18 +228,29 @@ def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> No
     lines.put(None)
 
 
+def run_child(work: Callable[[Progress], int], update: Callable[[int], object] = lambda _: None) -> int:
+    """Do one piece of work as ``run_children`` does, and return its result."""
+    num_done = [0]
+
+    def listen(num: int) -> None:
+        num_done[0] = num
+        update(num)
+
+    with closing(run_children([work], 1, listen)) as ended:
+        list(ended)
+    return num_done[0]
+
+
 def run_children(
-    module: str, given: Iterable[object], num_at_once: int, update: Callable[[int], object]
+    works: Iterable[Callable[[Progress], int]], num_at_once: int, update: Callable[[int], object]
 ) -> Generator[None, None, None]:
     """Have each piece of work done by a process; yield once for each finished piece, in their order.
 
     Leaving the iteration (``contextlib.closing``) interrupts the processes, and waits for their end.
 
     Args:
-        module: the module that a process runs; it calls ``work_for_parent``, with the number of finished items as the
-            result.
-        given: the object that each process is given. Objects are taken one at a time, when they are needed; at most one
-            waits for a process.
+        works: functions of a module that return the number of finished items; Ctrl-C may end them at any moment. They
+            are taken one at a time, when they are needed; at most one waits for a process.
         num_at_once: number of processes at the same time.
         update: called several times a second with the number of items that all processes have finished.
 
@@ -251,7 +267,7 @@ def run_children(
         if stop.is_set():
             return
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        ended = supervise(child_command(module), work, listen, environment=environment, is_stopped=stop.is_set)
+        ended = supervise(work, listen, environment=environment, is_stopped=stop.is_set)
         if "done" in ended.last:
             num_done[place] = ended.last["done"]
         elif not ended.stopped:
@@ -268,9 +284,9 @@ def run_children(
 
     with ThreadPoolExecutor(num_at_once, thread_name_prefix="child") as executor:
         try:
-            for place, work in enumerate(given):
+            for place, work in enumerate(works):
                 num_done.append(0)
-                pending.append(executor.submit(run, place, pickle.dumps(work)))
+                pending.append(executor.submit(run, place, pickle.dumps(partial(_end_at_once, work))))
                 if len(pending) > num_at_once:
                     wait_for_first()
                     yield
@@ -280,3 +296,8 @@ def run_children(
         except BaseException:
             stop.set()
             raise
+
+
+def _end_at_once(work: Callable[[Progress], int], progress: Progress) -> int:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # files that COLMAP has written are intact at any moment
+    return work(progress)

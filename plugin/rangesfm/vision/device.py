@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pycolmap
-
 from rangesfm.errors import OptionError
 from rangesfm.installed_versions import OTHER_BUILDS, num_gpus
 from rangesfm.options import MapperOptions
@@ -23,11 +21,6 @@ def uses_gpu(mapper: MapperOptions) -> bool:
         why = "pycolmap finds no GPU" if num == 0 else f"this pycolmap is built without CUDA; install {others}"
         raise OptionError(f"[mapper] device is 'cuda', expected 'auto' or 'cpu': {why}", "mapper", "device")
     return bool(num)
-
-
-def device_of(options: pycolmap.FeatureExtractionOptions | pycolmap.FeatureMatchingOptions) -> pycolmap.Device:
-    """Return the device that the options ask for; by default COLMAP uses a GPU if there is one, whatever they say."""
-    return pycolmap.Device.cuda if options.use_gpu else pycolmap.Device.cpu
 
 
 def refuse_missing_gpu(use_gpu: bool, table: str) -> None:

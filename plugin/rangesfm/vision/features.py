@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.colmap_log import append_log
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import OptionError, ReconstructionError
-from rangesfm.files.atomic import scratch_folder
 from rangesfm.options import MapperOptions
-from rangesfm.processes.supervision import run_children
+from rangesfm.processes.supervision import run_child
 from rangesfm.progress import Progress
 from rangesfm.vision.database import num_photos_with_features
 from rangesfm.vision.device import refuse_missing_gpu, uses_gpu
-from rangesfm.vision.own_process import MODULE, FeatureExtraction
+from rangesfm.vision.own_process import find_features
 from rangesfm.vision.photo_files import MIN_NUM_PHOTOS, Photos
 
 # A photo with fewer features is reported as poor. COLMAP starts from pairs with 100 matches and adds photos that see
@@ -58,14 +56,14 @@ def extract_features(
     database_path: Path,
     photos: Photos,
     options: pycolmap.FeatureExtractionOptions,
-    log: Path,
+    log_folder: Path,
     progress: Progress,
     mask_path: Path | None = None,
 ) -> None:
     """Find features in the photos of the database that have none yet, except where their masks are black.
 
     Args:
-        log: COLMAP's messages are appended to this file.
+        log_folder: folder for COLMAP's messages.
         mask_path: folder of the masks.
 
     Raises:
@@ -77,13 +75,9 @@ def extract_features(
             progress.update(num_photos_with_features(database), len(photos.names))
 
         missing = [name for id_, name in enumerate(photos.names, 1) if not database.exists_keypoints(id_)]
-        with scratch_folder(database_path.with_name("features")) as folder:
-            work = FeatureExtraction(database_path, photos.folder, missing, mask_path, options, folder / "mapper.log")
-            try:
-                with closing(run_children(MODULE, [work] if missing else [], 1, say_how_many)) as ended:
-                    list(ended)
-            finally:
-                append_log(work.log, log)
+        if missing:
+            work = partial(find_features, database_path, photos.folder, missing, mask_path, options, log_folder)
+            run_child(work, say_how_many)
         say_how_many(0)
         ids = enumerate(photos.names, 1)
         poor = [name for id_, name in ids if database.num_keypoints_for_image(id_) < _MIN_NUM_FEATURES]

@@ -130,8 +130,8 @@ class LoopDatabase:
     def match(self, pairs: list[Pair], options: MatchingOptions, progress: Progress) -> dict[Pair, Indices]:
         """Match pairs, and return the matches (m, 2) of those that are verified by a two-view geometry."""
         self._note(_LOOPS, {*self._tried(), *pairs} - self._noted(_TIES))
-        with colmap_log(self.log):
-            match_pairs(self.path, pairs, options, self.log, progress)
+        with colmap_log(self.log) as log_folder:
+            match_pairs(self.path, pairs, options, log_folder, progress)
         verified: dict[Pair, Indices] = {}
         with pycolmap.Database.open(self.path) as database:
             for pair in pairs:

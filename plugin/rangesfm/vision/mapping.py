@@ -7,26 +7,25 @@ import os
 import shlex
 import shutil
 import signal
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pycolmap
 
 from rangesfm.colmap.calibrated_cameras import cameras_as_given
-from rangesfm.colmap.colmap_log import append_log
 from rangesfm.colmap.model_files import read_model, write_binary_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError, ReconstructionError, shown
 from rangesfm.files.atomic import new_folder, scratch_folder
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.processes.supervision import run_children
+from rangesfm.processes.supervision import run_child
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs
 from rangesfm.vision.device import uses_gpu
 from rangesfm.vision.incremental_mapping import UnfinishedMapping, adjust_whole, incremental_mapping
-from rangesfm.vision.own_process import MODULE, ExternalMapping, WholeMapping, WholePipelineOptions
+from rangesfm.vision.own_process import WholePipelineOptions, map_at_once, run_program
 from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import Rigs
 from rangesfm.vision.snapshots import Snapshots, newest_snapshot
@@ -160,7 +159,7 @@ def _held_cameras(
     return held["kept"], held["refined last"]
 
 
-def map_photos(space: Workspace, photos: Photos, options: MappingOptions) -> None:
+def map_photos(space: Workspace, photos: Photos, options: MappingOptions, log_folder: Path) -> None:
     """Map the photos of the database and write all models, the one with the most photos first.
 
     The incremental mapper continues from the newest snapshot, if there is one, and writes snapshots until it is done.
@@ -171,10 +170,8 @@ def map_photos(space: Workspace, photos: Photos, options: MappingOptions) -> Non
     growing, whole = options.growing, options.whole
     if isinstance(growing, pycolmap.IncrementalPipelineOptions):
         models = _map_incrementally(space, photos, growing)
-    elif isinstance(growing, ExternalMapper):
-        models = _map_by_program(space, photos.folder, growing)
     else:
-        models = _map_at_once(space, photos.folder, growing)
+        models = _map_in_child(space, photos.folder, growing, log_folder)
     if whole is not None:
         for model in models:
             adjust_whole(space.database, model, options=whole)
@@ -228,35 +225,46 @@ def _num_registered(mapping: UnfinishedMapping) -> int:
     return sum(model.num_reg_images() for model in mapping.models)
 
 
-def _map_at_once(space: Workspace, image_path: Path, options: WholePipelineOptions) -> list[pycolmap.Reconstruction]:
-    """Return all models of a mapper that takes all photos at once, and append COLMAP's messages to the log."""
-    with _folder_with_database(space) as folder:
-        _run_in_child(space, WholeMapping(folder / DATABASE_NAME, image_path, options))
+def _map_in_child(
+    space: Workspace, image_path: Path, mapper: WholePipelineOptions | ExternalMapper, log_folder: Path
+) -> list[pycolmap.Reconstruction]:
+    """Return all models of a mapper that takes all photos at once, in a process of its own.
+
+    It works in a folder with a copy of the database, into which it may write what it finds about pairs.
+    """
+    space.progress.message("mapping: this mapper shows no progress, and starts anew after an interruption")
+    with scratch_folder(space.output / "mapping") as folder:
+        database_path = Path(shutil.copyfile(space.database, folder / DATABASE_NAME))
+        if isinstance(mapper, ExternalMapper):
+            return _map_by_program(space, folder, image_path, mapper, log_folder / "external_mapper")
+        # It does not notice a cancellation, so that Ctrl-C ends its process.
+        run_child(partial(map_at_once, database_path, image_path, mapper, log_folder))
         return [read_model(path) for path in sorted(folder.iterdir()) if path.is_dir()]
 
 
-def _map_by_program(space: Workspace, image_path: Path, mapper: ExternalMapper) -> list[pycolmap.Reconstruction]:
-    """Return the models that an external mapper writes, and append what it prints to the log.
+def _map_by_program(
+    space: Workspace, folder: Path, image_path: Path, mapper: ExternalMapper, log: Path
+) -> list[pycolmap.Reconstruction]:
+    """Return the models that an external mapper writes into a folder with a copy of the database.
 
     Raises:
         ReconstructionError: it failed, wrote no model, or a model of other photos.
     """
     words = [word.replace("{images}", str(image_path.resolve())) for word in mapper.words]
     name = f"the external mapper {Path(mapper.words[0]).name}"
-    with _folder_with_database(space) as folder:
-        status = _run_in_child(space, work := ExternalMapping(folder, words, dict(os.environ)))
-        if status:
-            how = f"status {status}" if status > 0 else signal.Signals(-status).name
-            printed = work.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            raise ReconstructionError(f"{name} ended with {how}" + (f": {printed[-1][:_MAX_LINE]}" if printed else ""))
-        if not (folder / MODELS_NAME / "0").is_dir():
-            raise ReconstructionError(f"{name} ended without an error, but wrote no model to sparse/0")
-        try:
-            models = list(read_mapped_models(folder / MODELS_NAME))
-        except InputError as error:
-            raise ReconstructionError(f"{name} wrote a model that cannot be used: {error}") from error
-        with pycolmap.Database.open(space.database) as database:
-            name_of = {image.image_id: image.name for image in database.read_all_images()}
+    status = run_child(partial(run_program, words, folder, dict(os.environ), log))
+    if status:
+        how = f"status {status}" if status > 0 else signal.Signals(-status).name
+        printed = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        raise ReconstructionError(f"{name} ended with {how}" + (f": {printed[-1][:_MAX_LINE]}" if printed else ""))
+    if not (folder / MODELS_NAME / "0").is_dir():
+        raise ReconstructionError(f"{name} ended without an error, but wrote no model to sparse/0")
+    try:
+        models = list(read_mapped_models(folder / MODELS_NAME))
+    except InputError as error:
+        raise ReconstructionError(f"{name} wrote a model that cannot be used: {error}") from error
+    with pycolmap.Database.open(space.database) as database:
+        name_of = {image.image_id: image.name for image in database.read_all_images()}
     for model in models:
         for image_id, image in model.images.items():
             if name_of.get(image_id) != image.name:
@@ -266,26 +274,6 @@ def _map_by_program(space: Workspace, image_path: Path, mapper: ExternalMapper) 
                     f"database.db, where that is {expected}"
                 )
     return models
-
-
-@contextmanager
-def _folder_with_database(space: Workspace) -> Iterator[Path]:
-    """Yield a folder with a copy of the database, into which a mapper may write what it finds about pairs."""
-    space.progress.message("mapping: this mapper shows no progress, and starts anew after an interruption")
-    with scratch_folder(space.output / "mapping") as folder:
-        shutil.copyfile(space.database, folder / DATABASE_NAME)
-        yield folder
-
-
-def _run_in_child(space: Workspace, work: WholeMapping | ExternalMapping) -> int:
-    """Do a piece of work in a process of its own, append its log to that of the workspace, and return its result."""
-    num_done: list[int] = [0]
-    try:
-        with closing(run_children(MODULE, [work], 1, num_done.append)) as ended:
-            list(ended)
-    finally:
-        append_log(work.log, space.log)
-    return num_done[-1]
 
 
 def read_mapped_models(models_path: Path) -> tuple[pycolmap.Reconstruction, ...]:

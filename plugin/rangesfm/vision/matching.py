@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-from rangesfm.colmap.colmap_log import append_log
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.files.atomic import scratch_folder
@@ -21,10 +20,10 @@ from rangesfm.options import MapperOptions
 from rangesfm.processes.supervision import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
-from rangesfm.vision.database import num_matching_pairs
+from rangesfm.vision.database import copy_matches, copy_photos, num_matching_pairs, remove_database
 from rangesfm.vision.device import refuse_missing_gpu, uses_gpu
 from rangesfm.vision.features import refuse_learned
-from rangesfm.vision.own_process import MODULE, MatchingShare
+from rangesfm.vision.own_process import match_share
 from rangesfm.vision.pairs import NamedPairs, PairingOptions, pairing_options, pairs_to_match
 from rangesfm.vision.photo_files import Photos
 
@@ -105,36 +104,58 @@ def matching_options(mapper: MapperOptions, num_photos: int, seed: int) -> Match
 
 
 def match_features(
-    database_path: Path, photos: Photos, options: MatchingOptions, log: Path, progress: Progress
+    database_path: Path, photos: Photos, options: MatchingOptions, log_folder: Path, progress: Progress
 ) -> None:
     """Match the pairs of photos that have not been matched yet; the number of processes does not change the result.
 
     Args:
-        log: COLMAP's messages are appended to this file.
+        log_folder: folder for COLMAP's messages.
 
     Raises:
         ReconstructionError: no two photos match.
     """
-    match_pairs(database_path, pairs_to_match(database_path, photos, options.pairing), options, log, progress)
+    match_pairs(database_path, pairs_to_match(database_path, photos, options.pairing), options, log_folder, progress)
     _require_matches(database_path, photos)
 
 
 def match_pairs(
-    database_path: Path, pairs: Sequence[tuple[int, int]], options: MatchingOptions, log: Path, progress: Progress
+    database_path: Path,
+    pairs: Sequence[tuple[int, int]],
+    options: MatchingOptions,
+    log_folder: Path,
+    progress: Progress,
 ) -> None:
     """Match those of the pairs (ids of photos, smaller first) that have not been matched yet."""
     with pycolmap.Database.open(database_path) as database:
         missing = [pair for pair in pairs if not database.exists_two_view_geometry(*pair)]
-    num_there, num_all = len(pairs) - len(missing), len(pairs)
-    progress.update(num_there, num_all)
+    num_there = len(pairs) - len(missing)
+    progress.update(num_there, len(pairs))
+    begun: deque[tuple[Path, list[tuple[int, int]]]] = deque()
+
+    def prepared(folder: Path) -> Iterator[Callable[[Progress], int]]:
+        for number, share in enumerate(_shared_out(missing, options.num_processes)):
+            path = folder / f"{number}.db"
+            copy_photos(database_path, path, sorted({image_id for pair in share for image_id in pair}))
+            begun.append((path, share))
+            yield partial(match_share, path, share, options.matcher, options.verification, log_folder)
+
+    def take_first() -> None:
+        path, share = begun.popleft()
+        copy_matches(path, database_path, ((pair, pair) for pair in share))
+        remove_database(path)
+
     with scratch_folder(database_path.with_name("matching")) as folder:
-        shares = [
-            MatchingShare(folder / str(k), share, options.matcher, options.verification)
-            for k, share in enumerate(_shared_out(missing, options.num_processes))
-        ]
-        _match_shares(
-            shares, database_path, options.num_processes, log, lambda num: progress.update(num_there + num, num_all)
-        )
+        works = prepared(folder)
+        try:
+            with closing(
+                run_children(works, options.num_processes, lambda num: progress.update(num_there + num, len(pairs)))
+            ) as ended:
+                for _ in ended:
+                    take_first()
+        finally:  # after an interruption, keep the matches found so far for the next run
+            while begun:
+                with suppress(RuntimeError):  # the database of a share was not complete yet
+                    take_first()
 
 
 def verify_matches(database_path: Path, photos: Photos, options: MatchingOptions, progress: Progress) -> None:
@@ -168,34 +189,6 @@ def _require_matches(database_path: Path, photos: Photos) -> None:
             f"no two of {len(photos.names)} photos match: neighbouring photos should overlap by at least half;"
             " more photos or more keyframes may help"
         )
-
-
-def _match_shares(
-    shares: Sequence[MatchingShare], database_path: Path, num_at_once: int, log: Path, update: Callable[[int], object]
-) -> None:
-    begun: deque[MatchingShare] = deque()
-
-    def prepared() -> Iterator[MatchingShare]:
-        for share in shares:
-            share.folder.mkdir()
-            share.prepare(database_path)
-            begun.append(share)
-            yield share
-
-    def take_first() -> None:
-        share = begun.popleft()
-        append_log(share.log, log)
-        share.hand_over(database_path)
-        shutil.rmtree(share.folder)
-
-    try:
-        with closing(run_children(MODULE, prepared(), num_at_once, update)) as ended:
-            for _ in ended:
-                take_first()
-    finally:  # after an interruption, keep the matches found so far for the next run
-        while begun:
-            with suppress(RuntimeError):  # the database of a share was not complete yet
-                take_first()
 
 
 def _shared_out(pairs: Sequence[tuple[int, int]], num_processes: int) -> Iterator[list[tuple[int, int]]]:

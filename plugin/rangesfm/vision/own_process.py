@@ -1,175 +1,116 @@
 """Work in a process of its own: features, a share of the matching, mappers that take all photos, and external ones.
 
 When the disk is full, a library that writes from its own thread ends the whole process. Here that is a child process,
-whose end is noticed.
-
-``rangesfm.processes.supervision`` runs this file as a module to do one piece of work.
+whose end is noticed. ``rangesfm.processes.supervision`` calls these functions there, with a listener to their progress
+as the last argument. This module imports little, so that a process starts fast.
 """
 
 from __future__ import annotations
 
-import signal
 import subprocess
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import pycolmap
 
-from rangesfm.colmap.colmap_log import colmap_log
-from rangesfm.processes.supervision import end_group_with_parent, work_for_parent
+from rangesfm.colmap.colmap_log import logging_into
+from rangesfm.processes.supervision import end_group_with_parent
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background
-from rangesfm.vision.database import copy_matches, copy_photos
-from rangesfm.vision.device import device_of
 
-MODULE = "rangesfm.vision.own_process"
 WholePipelineOptions = pycolmap.GlobalPipelineOptions | pycolmap.HierarchicalPipelineOptions
 # Largest number of features that COLMAP keeps in memory, each with its index some 700 bytes. Features that it drops are
 # read and indexed again when needed.
 _MAX_NUM_FEATURES = 400_000
 
 
-@dataclass(frozen=True)
-class FeatureExtraction:
-    """Feature extraction for photos of a database, except where their masks, if there are any, are black."""
+def find_features(
+    database_path: Path,
+    image_path: Path,
+    image_names: Sequence[str],
+    mask_path: Path | None,
+    options: pycolmap.FeatureExtractionOptions,
+    log_folder: Path,
+    _: Progress,
+) -> int:
+    """Find features in photos of a database, except where their masks, if there are any, are black.
 
-    database: Path
-    image_path: Path
-    image_names: Sequence[str]
-    mask_path: Path | None
-    options: pycolmap.FeatureExtractionOptions
-    log: Path
-
-    def run(self, _: Progress) -> int:
-        """Extract the features and return the number of photos; progress is read from the database instead."""
-        reader = pycolmap.ImageReaderOptions()
-        if self.mask_path is not None:
-            reader.mask_path = self.mask_path
-        with colmap_log(self.log):
-            pycolmap.extract_features(
-                self.database,
-                self.image_path,
-                image_names=list(self.image_names),
-                reader_options=reader,
-                extraction_options=self.options,
-                device=device_of(self.options),
-            )
-        return len(self.image_names)
-
-
-@dataclass(frozen=True)
-class MatchingShare:
-    """A share of the matching: pairs of photo ids, smaller first, matched in a folder of their own."""
-
-    folder: Path
-    pairs: Sequence[tuple[int, int]]
-    matcher: pycolmap.FeatureMatchingOptions
-    verification: pycolmap.TwoViewGeometryOptions
-
-    @property
-    def database(self) -> Path:
-        return self.folder / "database.db"
-
-    @property
-    def log(self) -> Path:
-        """File with COLMAP's messages."""
-        return self.folder / "mapper.log"
-
-    def prepare(self, source: Path) -> None:
-        """Copy the features of its photos into a database of its own, where each photo is named by its id."""
-        copy_photos(source, self.database, sorted({id_ for pair in self.pairs for id_ in pair}))
-        (self.folder / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in self.pairs))
-
-    def run(self, progress: Progress) -> int:
-        """Match the pairs and return their number."""
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = self.folder / "pairs.txt"
-        with colmap_log(self.log), pycolmap.Database.open(self.database) as database:
-            # Number of pairs after which COLMAP writes its matches; it also keeps this many photos in memory.
-            pairing.block_size = max(1, _MAX_NUM_FEATURES * database.num_images() // (1 + database.num_descriptors()))
-            run_in_background(
-                lambda token: pycolmap.match_image_pairs(
-                    self.database,
-                    self.matcher,
-                    pairing,
-                    self.verification,
-                    device=device_of(self.matcher),
-                    cancellation_token=token,
-                ),
-                progress,
-                database.num_verified_image_pairs,
-                len(self.pairs),
-            )
-        return len(self.pairs)
-
-    def hand_over(self, target: Path) -> None:
-        """Copy the results into the target database, also of pairs that do not match."""
-        copy_matches(self.database, target, ((pair, pair) for pair in self.pairs))
-
-
-@dataclass(frozen=True)
-class WholeMapping:
-    """A mapping that takes all photos at once; it reports no progress and writes the models beside the database.
-
-    It does not notice a cancellation, so that Ctrl-C ends its process.
+    Returns the number of photos. The progress is to be read from the database.
     """
-
-    database: Path
-    image_path: Path
-    options: WholePipelineOptions
-
-    @property
-    def log(self) -> Path:
-        """File with COLMAP's messages."""
-        return self.database.with_name("mapper.log")
-
-    def run(self, _: Progress) -> int:
-        """Run the mapping and return the number of models."""
-        where = self.database, self.image_path, self.database.parent
-        with colmap_log(self.log):
-            if isinstance(self.options, pycolmap.GlobalPipelineOptions):
-                return len(pycolmap.global_mapping(*where, self.options))
-            return len(pycolmap.hierarchical_mapping(*where, self.options))
+    reader = pycolmap.ImageReaderOptions()
+    if mask_path is not None:
+        reader.mask_path = mask_path
+    with logging_into(log_folder):
+        pycolmap.extract_features(
+            database_path,
+            image_path,
+            image_names=list(image_names),
+            reader_options=reader,
+            extraction_options=options,
+            device=_device_of(options),
+        )
+    return len(image_names)
 
 
-@dataclass(frozen=True)
-class ExternalMapping:
-    """A mapping by a program that reads ``database.db`` in a folder, and writes ``sparse/0`` there.
+def match_share(
+    database_path: Path,
+    pairs: Sequence[tuple[int, int]],
+    matcher: pycolmap.FeatureMatchingOptions,
+    verification: pycolmap.TwoViewGeometryOptions,
+    log_folder: Path,
+    progress: Progress,
+) -> int:
+    """Match pairs of photos of a database in which each photo is named by its id; return the number of pairs."""
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = database_path.with_suffix(".txt")
+    pairing.match_list_path.write_text("".join(f"{first} {second}\n" for first, second in pairs))
+    with logging_into(log_folder), pycolmap.Database.open(database_path) as database:
+        # Number of pairs after which COLMAP writes its matches; it also keeps this many photos in memory.
+        pairing.block_size = max(1, _MAX_NUM_FEATURES * database.num_images() // (1 + database.num_descriptors()))
+        run_in_background(
+            lambda token: pycolmap.match_image_pairs(
+                database_path,
+                matcher,
+                pairing,
+                verification,
+                device=_device_of(matcher),
+                cancellation_token=token,
+            ),
+            progress,
+            database.num_verified_image_pairs,
+            len(pairs),
+        )
+    return len(pairs)
 
-    Attributes:
-        folder: with the database. words: the program and its arguments. environment: its environment variables.
+
+def _device_of(options: pycolmap.FeatureExtractionOptions | pycolmap.FeatureMatchingOptions) -> pycolmap.Device:
+    """Return the device that the options ask for; by default COLMAP uses a GPU if there is one, whatever they say."""
+    return pycolmap.Device.cuda if options.use_gpu else pycolmap.Device.cpu
+
+
+def map_at_once(
+    database_path: Path, image_path: Path, options: WholePipelineOptions, log_folder: Path, _: Progress
+) -> int:
+    """Map all photos at once, write the models beside the database, and return their number.
+
+    It reports no progress.
     """
-
-    folder: Path
-    words: Sequence[str]
-    environment: Mapping[str, str]
-
-    @property
-    def log(self) -> Path:
-        """File with all that the program prints."""
-        return self.folder / "mapper.log"
-
-    def run(self, _: Progress) -> int:
-        """Run the program until it ends, and return its exit status."""
-        end_group_with_parent()
-        with self.log.open("wb") as log:
-            done = subprocess.run(
-                self.words,
-                cwd=self.folder,
-                env=self.environment,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                check=False,
-            )
-        return done.returncode
+    with logging_into(log_folder):
+        if isinstance(options, pycolmap.GlobalPipelineOptions):
+            return len(pycolmap.global_mapping(database_path, image_path, database_path.parent, options))
+        return len(pycolmap.hierarchical_mapping(database_path, image_path, database_path.parent, options))
 
 
-def _run(work: FeatureExtraction | MatchingShare | WholeMapping | ExternalMapping, parent: Progress) -> int:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C may end the process at once: files written so far are intact
-    return work.run(parent)
-
-
-if __name__ == "__main__":
-    work_for_parent(_run)
+def run_program(words: Sequence[str], folder: Path, environment: Mapping[str, str], log: Path, _: Progress) -> int:
+    """Run a program in a folder until it ends, write all that it prints to ``log``, and return its exit status."""
+    end_group_with_parent()
+    with log.open("wb") as printed:
+        return subprocess.run(
+            words,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=printed,
+            stderr=subprocess.STDOUT,
+            check=False,
+        ).returncode

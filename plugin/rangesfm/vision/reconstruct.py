@@ -139,7 +139,7 @@ def _map(
     intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
     command = [] if mapper.command is None else [mapper.command]
     inputs = fingerprint(of_matches, mapper.method, *command, mapper.reproducible, mapper.pipeline, *intrinsics)
-    with space.logged():
+    with space.logged() as log_folder:
         if not all(rigs.are_known):
             space.steps.run(
                 "rigs",
@@ -147,7 +147,7 @@ def _map(
                 space.database,
                 lambda: rigs.apply(space.database),
                 lambda: _place_cameras(
-                    space, photos, rigs, mapping_options(camera, mapper, NO_RIGS, seed, space.database)
+                    space, photos, rigs, mapping_options(camera, mapper, NO_RIGS, seed, space.database), log_folder
                 ),
             )
         if has_closed_loops(space.steps) and not mapper.close_loops:
@@ -157,7 +157,7 @@ def _map(
             inputs,
             space.models / "0",
             lambda: _begin_mapping(space),
-            lambda: map_photos(space, photos, mapping_options(camera, mapper, rigs, seed, space.database)),
+            lambda: map_photos(space, photos, mapping_options(camera, mapper, rigs, seed, space.database), log_folder),
             unfinished=space.snapshots,
         )
 
@@ -168,7 +168,7 @@ def _begin_mapping(space: Workspace) -> None:
     forget_loops(space.steps, space.database)
 
 
-def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions) -> None:
+def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions, log_folder: Path) -> None:
     """Map the photos without rigs, and write the rigs' poses found in that model into the database.
 
     Camera poses that the configuration does give set the scale of that model, so that all poses have one unit.
@@ -178,11 +178,11 @@ def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: Mappin
             reference camera, taken at the same time.
     """
     with scratch_folder(space.output / "rigs") as folder:
-        without_rigs = Workspace(folder, space.progress, log=space.log)
+        without_rigs = Workspace(folder, space.progress)
         shutil.copyfile(space.database, without_rigs.database)
         with pycolmap.Database.open(without_rigs.database) as database:
             pycolmap.apply_rig_config([], database)
-        map_photos(without_rigs, photos, options)
+        map_photos(without_rigs, photos, options, log_folder)
         model = read_mapped_models(without_rigs.models)[0]
     rigs.rescale(model)
     why_not = (
@@ -236,5 +236,5 @@ def match_photos(
                 f" its camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
             )
         renewed = RenewedDatabase(space, photos, cameras, rigs, given, mapper, masks, for_features, for_matching)
-        with space.logged():
-            return photos, renewed.fill()
+        with space.logged() as log_folder:
+            return photos, renewed.fill(log_folder)

@@ -82,16 +82,16 @@ class RenewedDatabase:
         how = [self.matching.pairing_inputs, self.mapper.matcher, self.matching.seed]
         return fingerprint(self.feature_inputs, self.cameras.inputs, *([] if self.has_matches else how))
 
-    def fill(self) -> str:
+    def fill(self, log_folder: Path) -> str:
         """Find the features and matches that no earlier run has found; return the fingerprint of all they depend on."""
         database, photos, steps = self.space.database, self.photos, self.space.steps
         contents = list(self.contents.items())
         inputs = fingerprint(self.feature_inputs, self.cameras.inputs, contents, *self.rigs.inputs)
-        log, progress = self.space.log, self.space.progress
-        find = partial(extract_features, database, photos, self.features, log, progress, self.mapper.mask_path)
+        progress, masks = self.space.progress, self.mapper.mask_path
+        find = partial(extract_features, database, photos, self.features, log_folder, progress, masks)
         steps.run("features", inputs, database, self._begin, find)
         inputs = fingerprint(inputs, self.match_inputs)
-        steps.run("matching", inputs, database, self._begin_matching, self._match)
+        steps.run("matching", inputs, database, self._begin_matching, partial(self._match, log_folder))
         return inputs
 
     def _begin(self) -> None:
@@ -122,12 +122,12 @@ class RenewedDatabase:
             clear_matches(self.space.database)
         self._write_note()
 
-    def _match(self) -> None:
+    def _match(self, log_folder: Path) -> None:
         database, progress = self.space.database, self.space.progress
         if self.has_matches:
             verify_matches(database, self.photos, self.matching, progress)
         else:
-            match_features(database, self.photos, self.matching, self.space.log, progress)
+            match_features(database, self.photos, self.matching, log_folder, progress)
 
     def _create(self, path: Path) -> None:
         create_database(path, self.photos.names, self.cameras.cameras, self.cameras.of_photo)

@@ -166,7 +166,6 @@ class Workspace:
         folder: the folder.
         earlier: the steps of a complete reconstruction in another folder, to continue from.
         begin: see ``Steps``.
-        log: file for COLMAP's messages; None: one in this folder.
     """
 
     def __init__(
@@ -176,14 +175,13 @@ class Workspace:
         *,
         earlier: Steps | None = None,
         begin: Callable[[Mapping[str, str]], object] = lambda passed: None,
-        log: Path | None = None,
     ):
         self.progress = progress
         self.output = folder
         self.database = folder / DATABASE_NAME
         self.models = folder / MODELS_NAME
         self.snapshots = folder / SNAPSHOTS_NAME
-        self.log = log or folder / LOG_NAME
+        self.log = folder / LOG_NAME
         self.steps = Steps(folder / RECORD_NAME, progress, earlier, begin)
 
     def remove_old_models(self) -> None:
@@ -192,11 +190,14 @@ class Workspace:
             shutil.rmtree(folder, ignore_errors=True)
 
     @contextmanager
-    def logged(self) -> Iterator[None]:
-        """Write COLMAP's messages to the log inside the block, and name the log in the error of a failure."""
-        with colmap_log(self.log):
+    def logged(self) -> Iterator[Path]:
+        """Write COLMAP's messages to the log inside the block, and name the log in the error of a failure.
+
+        Yields the folder of the messages, as ``colmap_log`` does.
+        """
+        with colmap_log(self.log) as log_folder:
             try:
-                yield
+                yield log_folder
             except ReconstructionError as error:
                 raise ReconstructionError(f"{error} (COLMAP's log: {self.log})") from error
             except RuntimeError as error:
