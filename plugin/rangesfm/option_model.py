@@ -74,52 +74,44 @@ class Bounds:
         return f"{zero}a number of {self.unit} from {self.least:.10g} to {self.most:.10g}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class KeyMeta:
     """Annotation of a key: what its name and its type do not say.
 
     Attributes:
-        flag: name of the flag on the command line, without dashes; None: that of the key.
-        metavar: placeholder for the value in the help text; None: by the type.
-        expected: description of valid values, for messages; None: made from type and bounds.
+        flag: name of the flag on the command line, without dashes; empty: that of the key.
+        metavar: placeholder for the value in the help text; empty: by the type.
+        expected: description of valid values, for messages; empty: made from type and bounds.
         role: of a path, what kind of file or folder it leads to.
         is_key: whether users may write it into the survey file.
         is_common: whether most people need it, so that the short help of a command has its flag.
     """
 
-    flag: str | None = None
-    metavar: str | None = None
-    expected: str | None = None
+    flag: str = ""
+    metavar: str = ""
+    expected: str = ""
     role: PathRole | None = None
     is_key: bool = True
     is_common: bool = False
 
 
-@dataclass(frozen=True)
-class Key:
+@dataclass(frozen=True, kw_only=True)
+class Key(KeyMeta):
     """A key of a survey file: its place, and what its annotation and its docstring say.
+
+    Flag and expected values are never empty.
 
     Attributes:
         table: name of its table, without brackets.
         name: of the key in that table.
-        flag: as in ``KeyMeta``, never None.
-        metavar: as in ``KeyMeta``.
         type: of the value, without the None that means "not given".
-        expected: as in ``KeyMeta``, never None.
         meaning: the docstring on one line without its full stop, followed by the default.
-        role: as in ``KeyMeta``.
-        is_common: as in ``KeyMeta``.
     """
 
     table: str
     name: str
-    flag: str
-    metavar: str | None
     type: Any
-    expected: str
     meaning: str
-    role: PathRole | None
-    is_common: bool
 
     @property
     def dotted(self) -> str:
@@ -174,21 +166,17 @@ class Options(BaseModel):
             if not meta.is_key:
                 continue
             unit = next((unit for end, unit in _UNITS.items() if name.endswith(f"_{end}")), None)
-            expected = meta.expected or _described(hints[name], unit)
+            told = {"flag": meta.flag or name, "expected": meta.expected or _described(hints[name], unit)}
+            type_ = bare[name]
+            if get_origin(type_) in (Union, types.UnionType):
+                type_ = Union[tuple(arg for arg in get_args(type_) if arg is not types.NoneType)]  # noqa: UP007
             meaning = " ".join((field.description or "").split()).removesuffix(".")
-            meaning += _default(field.get_default(call_default_factory=True))
-            type_ = _without_none(bare[name])
-            keys[name] = Key(
-                cls.table,
-                name,
-                meta.flag or name,
-                meta.metavar,
-                type_,
-                expected,
-                meaning,
-                meta.role,
-                meta.is_common,
-            )
+            default = field.get_default(call_default_factory=True)
+            if default is not None and default not in ((), {}):
+                parts = default if isinstance(default, tuple) else (default,)
+                words = (f"{part:g}" if isinstance(part, float) else str(part).lower() for part in parts)
+                meaning += f" (default: {','.join(words)})"
+            keys[name] = Key(**{**vars(meta), **told}, table=cls.table, name=name, type=type_, meaning=meaning)
         return keys
 
     @classmethod
@@ -204,21 +192,6 @@ class Options(BaseModel):
         if len(where) > 1 and isinstance(value, Mapping) and where[1] in value:
             name, value, expected = f"{name}.{where[1]}", value[where[1]], expected.removeprefix(_TABLE_OF)
         return OptionError(f"[{cls.table}] {printable(name)} is {shown(value)}, expected {expected}", cls.table, name)
-
-
-def _default(value: Any) -> str:
-    """Return " (default: ...)" for a key with a default value, else an empty text."""
-    if value is None or value in ((), {}):
-        return ""
-    parts = value if isinstance(value, tuple) else (value,)
-    words = (f"{part:g}" if isinstance(part, float) else str(part).lower() for part in parts)
-    return f" (default: {','.join(words)})"
-
-
-def _without_none(hint: Any) -> Any:
-    if get_origin(hint) not in (Union, types.UnionType):
-        return hint
-    return Union[tuple(arg for arg in get_args(hint) if arg is not types.NoneType)]  # noqa: UP007 (a tuple of types)
 
 
 def _described(hint: Any, unit: str | None) -> str:

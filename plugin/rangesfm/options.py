@@ -110,9 +110,7 @@ class ImageOptions(KeyframeOptions):
     times: Annotated[Path | None, KeyMeta(flag="image_times", role="file", is_common=True)] = None
     """CSV image_name,timestamp_s with the times of the photos, or another table of photos and times (default: by
     rate_hz if given, else EXIF, else file names)."""
-    times_columns: Annotated[dict[str, str], KeyMeta(flag="image_times_columns", metavar="QUANTITY=NAME,..")] = Field(
-        default_factory=dict
-    )
+    times_columns: Annotated[dict[str, str], KeyMeta(flag="image_times_columns")] = Field(default_factory=dict)
     """Names of the columns of times (numbers, where they have no names) for image_name, timestamp and possibly date
     and nanoseconds (default: recognised)."""
     times_unit: Annotated[_TimeUnit | None, KeyMeta(flag="image_times_unit")] = None
@@ -207,7 +205,7 @@ class LogOptions(Options, table="ranges"):
     """The radio's log: a file, a folder of files, or a pattern such as uwb_*.csv."""
     format: Annotated[str | None, KeyMeta(flag="ranges_format")] = None
     """Format of the log (default: recognised by content)."""
-    columns: Annotated[dict[str, str], KeyMeta(metavar="QUANTITY=NAME,..")] = Field(default_factory=dict)
+    columns: dict[str, str] = Field(default_factory=dict)
     """Names of the log's columns (numbers, where they have no names) for timestamp (or image_name), anchor_id, range,
     tag_id, range_stddev, los; range:A1 for a column that holds the ranges of anchor A1. A log without ranges needs the
     time stamps of two-way ranging: tx1, rx1, tx2, rx2 and possibly tx3, rx3."""
@@ -295,9 +293,7 @@ class AnchorOptions(Options, table="anchors"):
     """CSV anchor_id,x_m,y_m,z_m, possibly with position_stddev_m, range_bias_m and range_bias_stddev_m, or another
     table of points or a GSI file; empty coordinates mean an unknown position (default: the anchors in the log, all
     unknown)."""
-    columns: Annotated[dict[str, str], KeyMeta(flag="anchor_columns", metavar="QUANTITY=NAME,..")] = Field(
-        default_factory=dict
-    )
+    columns: Annotated[dict[str, str], KeyMeta(flag="anchor_columns")] = Field(default_factory=dict)
     """Names of the columns of the file (numbers, where they have no names) for anchor_id, x, y, z, position_stddev,
     range_bias and range_bias_stddev; x is east and y north, if they are such (default: recognised)."""
     unit: Annotated[_LengthUnit | None, KeyMeta(flag="anchor_unit")] = None
@@ -317,9 +313,7 @@ class PointOptions(Options, table="points"):
     """CSV marker,x_m,y_m,z_m[,stddev_m,kind] with coordinates of marks in the site, or another table of points, or
     ODM's gcp_list.txt. A control point holds the map, a check point is only compared with it. The photos that show them
     are in the file of markers in [scale], in gcp_list.txt, or found (printed tags)."""
-    columns: Annotated[dict[str, str], KeyMeta(flag="point_columns", metavar="QUANTITY=NAME,..")] = Field(
-        default_factory=dict
-    )
+    columns: Annotated[dict[str, str], KeyMeta(flag="point_columns")] = Field(default_factory=dict)
     """Names of the columns of the file (numbers, where they have no names) for marker, x, y, z, stddev and kind; x is
     east and y north, if they are such (default: recognised)."""
     unit: Annotated[_LengthUnit | None, KeyMeta(flag="point_unit")] = None
@@ -342,9 +336,7 @@ class PositionOptions(Options, table="positions"):
     those in their EXIF data."""
     format: Annotated[str | None, KeyMeta(flag="positions_format")] = None
     """Format of the file: table, tum, nmea, rtklib, marvelmind or colmap (default: recognised by content)."""
-    columns: Annotated[dict[str, str], KeyMeta(flag="position_columns", metavar="QUANTITY=NAME,..")] = Field(
-        default_factory=dict
-    )
+    columns: Annotated[dict[str, str], KeyMeta(flag="position_columns")] = Field(default_factory=dict)
     """Names of the columns of a table (numbers, where they have no names) for timestamp or image_name, x, y, z, and
     possibly stddev (or stddev_x, stddev_y, stddev_z) and tag_id (default: recognised)."""
     timestamp_unit: Annotated[_TimeUnit | None, KeyMeta(flag="position_time_unit")] = None

@@ -103,8 +103,10 @@ def _metavar(item: Key) -> str:
         return "A,B,.." if get_args(hint)[-1] is Ellipsis else "X,Y,Z"
     if hint is int or int in get_args(hint):
         return "N"
+    if get_origin(hint) is dict:
+        return "QUANTITY=NAME,.." if get_args(hint)[1] is str else "KEY=VALUE,.."
     last = item.name.rpartition("_")[2]
-    return "KEY=VALUE,.." if get_origin(hint) is dict else _WORDS.get(last, last.upper())
+    return _WORDS.get(last, last.upper())
 
 
 def _converter(hint: Any) -> Callable[[str], Any]:
