@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import csv
 import tempfile
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import FOUND, TextTable, header_names, read_table, read_text, write_table
+from rangesfm.files.text_tables import FOUND, header_names, read_table, read_text, write_table
 
 
 def write(folder: Path, content: str | bytes) -> Path:
@@ -173,7 +171,7 @@ FORMULAS = ["=1+1", "+49 89 1", "-@SUM(1)", "@SUM(A1)", "\uff1d1", "'=1", "''-x"
 def test_what_is_written_is_read_as_it_was(text: str, tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     write_table(path, ("a", "b", "c"), [(text, text, "-1.5"), ("plain", text, "+2")])
-    table = read_table(path, ["a", "b", "c"], text=["a", "b"])
+    table = read_table(path, ["a", "b", "c"])
     assert (table.text("a"), table.text("b")) == ([text, "plain"], [text, text])
     assert (table.categories("a").names, table.categories("b").names) == ((text, "plain"), (text,))
     np.testing.assert_array_equal(table.numbers("c"), [-1.5, 2])
@@ -184,7 +182,7 @@ def test_whatever_is_written_is_read_as_it_was(texts: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "table.csv")
         write_table(path, ("a", "b"), [(text, "1") for text in texts])
-        assert read_table(path, ["a", "b"], text=["a"]).text("a") == texts
+        assert read_table(path, ["a", "b"]).text("a") == texts
 
 
 @pytest.mark.parametrize("text", FORMULAS)
@@ -200,57 +198,9 @@ def test_comments_of_the_user_are_comments_and_quoted_cells_are_cells(tmp_path: 
     assert (table.text("a"), table.text("b")) == (["#x"], ["2"])
 
 
-class TestFastWay:
-    """The fast way to read plain tables gives the same as the general way.
-
-    A comment has no meaning in a table, but makes the reader take the general way.
-    """
-
-    NUMBERS = (st.floats() | st.integers() | st.decimals(-1e7, 1e7, places=6)).map(str)
-    CELLS = NUMBERS | st.text("019.-+eE_ nainfx\u0661\u00e9\t\x0b\x85\0", max_size=5)
-
-    def said(self, table: Callable[[], TextTable]) -> list[object]:
-        """Return everything that can be read of columns a (numbers) and b (text), or the errors."""
-        asked: list[Callable[[TextTable], object]] = [
-            lambda table: table.numbers("a").tobytes(),
-            lambda table: table.numbers("a", empty=7.0).tobytes(),
-            lambda table: table.text("a"),
-            lambda table: table.text("b", empty="none"),
-            lambda table: (table.categories("b").names, table.categories("b").index.tolist()),
-            lambda table: table.categories("a", empty="none").names,
-            lambda table: str(table.error(0, "a", "something else")) if len(table) else "no row to be wrong",
-            lambda table: table.line.tolist(),
-        ]
-        answers: list[object] = []
-        for ask in asked:
-            try:
-                answers.append(ask(table()))
-            except InputError as error:
-                answers.append(str(error))
-        return answers
-
-    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-    @given(st.lists(st.lists(CELLS, min_size=3, max_size=3), min_size=1), st.sampled_from(",;\t"), st.data())
-    def test_is_that_of_all_tables(
-        self, tmp_path: Path, rows: list[list[str]], separator: str, data: st.DataObject
-    ) -> None:
-        if data.draw(st.integers(0, 9)) == 0:
-            rows[data.draw(st.integers(0, len(rows) - 1))].pop()
-        text = "\n".join(separator.join(row) for row in [["a", "other", "b"], *rows])
-        read = partial(read_table, required=["a", "b"], text=["b"], separator=separator)
-        fast = self.said(lambda: read(write(tmp_path, text)))
-        assert fast == self.said(lambda: read(write(tmp_path, text + "\n#")))
-
-    def test_it_is_taken(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        path = write(tmp_path, "a,other,b\r\n-1.5,x,7\r\n2e3,,8\r\n")
-        monkeypatch.setattr("rangesfm.files.text_tables._table_of_texts", lambda *_: pytest.fail("it is not"))
-        table = read_table(path, ["a", "b"], text=["b"])
-        np.testing.assert_array_equal(table.numbers("a"), [-1.5, 2000])
-        assert table.text("b") == ["7", "8"]
-
-    def test_a_name_does_not_make_a_packed_file(self, tmp_path: Path) -> None:
-        path = write(tmp_path, "a,b\n1,2\n").rename(tmp_path / "table.gz")
-        assert read_table(path, ["a"]).numbers("a").tolist() == [1.0]
+def test_a_name_does_not_make_a_packed_file(tmp_path: Path) -> None:
+    path = write(tmp_path, "a,b\n1,2\n").rename(tmp_path / "table.gz")
+    assert read_table(path, ["a"]).numbers("a").tolist() == [1.0]
 
 
 @pytest.mark.parametrize("num_names", [1, 7, 400])

@@ -16,9 +16,8 @@ import io
 import os
 import re
 import zlib
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import compress
 from pathlib import Path
 from types import MappingProxyType
@@ -49,7 +48,6 @@ _MAY_BEGIN_FORMULA = frozenset("'=+-@\uff1d\uff0b\uff0d\uff20 \u3000\xa0\t")
 _WINDOWS = "cp1252"
 # Signs of Windows-1252 beside its letters that occur in tables: units, quotes, dashes, and the blank of thousands.
 _WINDOWS_SIGNS = "\xb0\xb2\xb3\xb5\xb1\xa7\xb7\xa0\u20ac\u2018\u2019\u201c\u201d\u201e\u2013\u2014\u2026"
-_UNPACKED = (".gz", ".bz2", ".xz")  # numpy unpacks files with these endings, even if they are not packed
 
 
 @dataclass(frozen=True)
@@ -60,25 +58,19 @@ class TextTable:
         path: the file.
         columns: all names of the header row, in order.
         line: (n,) 1-based line of each row.
-        cells: for each requested column that the file has, its cells as text, or as numbers if it was read so.
-        reread: returns this table with all cells as text; None if they are.
+        cells: the cells of each requested column that the file has.
     """
 
     path: Path
     columns: tuple[str, ...]
     line: npt.NDArray[np.int64]
-    cells: Mapping[str, list[str] | npt.NDArray[np.float64]]
-    reread: Callable[[], TextTable] | None = None
+    cells: Mapping[str, list[str]]
 
     def __len__(self) -> int:
         return len(self.line)
 
     def where(self, chosen: Sequence[bool]) -> TextTable:
-        """Return the table with the rows that are true in ``chosen``, with all cells as text unless these are all."""
-        if all(chosen):
-            return self
-        if self.reread is not None:
-            return self.reread().where(chosen)
+        """Return the table with the rows that are true in ``chosen``."""
         cells = {name: [*compress(texts, chosen)] for name, texts in self.cells.items()}
         return TextTable(self.path, self.columns, self.line[np.array(chosen)], cells)
 
@@ -87,7 +79,7 @@ class TextTable:
 
     def text(self, column: str, *, empty: str | None = None) -> list[str]:
         """Return the cells without surrounding blanks; ``empty`` replaces empty cells, and None refuses them."""
-        texts = [_without_mark(cell.strip()) for cell in self._raw(column)]
+        texts = [_without_mark(cell.strip()) for cell in self.cells[column]]
         if "" in texts:
             if empty is None:
                 raise self.error(texts.index(""), column, "some text")
@@ -97,11 +89,11 @@ class TextTable:
     def begins_with_number(self, column: str) -> bool:
         """Return whether the first cell of the column is a number, or there is no cell."""
         cells = self.cells[column]
-        return not isinstance(cells, list) or not cells or _number(cells[0]) is not None
+        return not cells or _number(cells[0]) is not None
 
     def categories(self, column: str, *, empty: str | None = None) -> Categories:
         """Return the cells like ``text``, but as categories, which is fast where few texts differ."""
-        raw = Categories.from_texts(self._raw(column))
+        raw = Categories.from_texts(self.cells[column])
         names = [_without_mark(name.strip()) for name in raw.names]
         if "" in names and empty is None:
             raise self.error(int(np.argmax(raw.index == names.index(""))), column, "some text")
@@ -133,11 +125,10 @@ class TextTable:
         if column not in self and empty is not None:
             return np.full(len(self), empty)
         cells = self.cells[column]
-        values = np.array(list(map(_number, cells)), np.float64) if isinstance(cells, list) else cells
+        values = np.array(list(map(_number, cells)), np.float64)
         bad = np.flatnonzero(~np.isfinite(values)).tolist()
-        raw = self._raw(column) if bad else []
         for row in bad:
-            if empty is None or raw[row].strip().lower() not in missing:
+            if empty is None or cells[row].strip().lower() not in missing:
                 raise self.error(row, column, expected)
             values[row] = empty
         wrong = ~bounds.hold(values)
@@ -147,7 +138,7 @@ class TextTable:
 
     def error(self, row: int, column: str, expected: str) -> InputError:
         """Return the error that says what is in ``column`` of the 0-based ``row``, and what was expected."""
-        cell = self._raw(column)[row].strip()
+        cell = self.cells[column][row].strip()
         found = "empty" if not cell else cell if _number(cell) is not None else f"'{printable(cell)}'"
         return InputError(f"{column} is {found}, expected {expected}", self.path, int(self.line[row]))
 
@@ -156,20 +147,12 @@ class TextTable:
         if wrong.any():
             raise self.error(int(np.argmax(wrong)), column, expected)
 
-    def _raw(self, column: str) -> list[str]:
-        cells = self.cells[column]
-        if isinstance(cells, list):
-            return cells
-        assert self.reread is not None
-        return self.reread()._raw(column)
-
 
 def read_table(
     path: AnyPath,
     required: Sequence[str],
     optional: Sequence[str] = (),
     *,
-    text: Sequence[str] = (),
     aliases: Mapping[str, str] = NO_NAMES,
     separator: str = ",",
 ) -> TextTable:
@@ -178,8 +161,6 @@ def read_table(
     Args:
         required: columns that the file must have.
         optional: columns that it may have.
-        text: the columns that are not numbers. Any column can later be read as text or as numbers; this only makes
-            reading fast.
         aliases: other names of columns in the file, ``{name in the file: name}``.
         separator: one character; a blank means any run of blanks; FOUND: by the header row.
 
@@ -201,46 +182,19 @@ def read_table(
         raise InputError(f"no header row, expected {_expected(required, optional)}", path, header_line)
     _check_names(names, required, optional, path, header_line)
     wanted = {name: names.index(name) for name in known if name in names}
-    reread = partial(_table_of_texts, path, names, wanted, header_line, body, separator)
-    rows = None
-    if body and not body.isspace() and separator != " " and not any(character in body for character in '"#'):
-        # Cells of columns that are not requested are read as one character, because only their number matters.
-        types = ["U1" if name not in wanted else "O" if name in text else "f8" for name in names]
-        rows = _plain_rows(path, header_line, types, separator)
-    if rows is None or len(rows) != body.count("\n") + (not body.endswith("\n")):
-        return reread()
-    cells = {name: rows[f"f{k}"].tolist() if name in text else rows[f"f{k}"].copy() for name, k in wanted.items()}
-    return TextTable(path, tuple(names), header_line + 1 + np.arange(len(rows)), cells, reread)
-
-
-def _plain_rows(path: Path, num_skipped: int, types: list[str], separator: str) -> npt.NDArray[np.void] | None:
-    """Read all rows fast, with fields f0, f1, ... of the given types; None if any row does not fit."""
-    if path.suffix in _UNPACKED:
-        return None
-    try:
-        fields = [(f"f{k}", type) for k, type in enumerate(types)]
-        return np.loadtxt(path, fields, None, separator, skiprows=num_skipped, ndmin=1, encoding="utf-8-sig")
-    except ValueError:  # the general reader then reads the file, and finds the right message
-        return None
-
-
-def _table_of_texts(
-    path: Path, names: list[str], wanted: Mapping[str, int], header_line: int, body: str, separator: str
-) -> TextTable:
-    """Read all rows as text, with quoted cells, comments and blank lines."""
     lines: list[int] = []
-    cells: dict[str, list[str]] = {name: [] for name in wanted}
+    columns: dict[str, list[str]] = {name: [] for name in wanted}
     for line, row in enumerate(body.split("\n"), header_line + 1):
         if not _has_content(row):
             continue
-        found = _split_row(row, separator, path, line)
-        if len(found) != len(names):
-            num = f"{len(found)} cell{'s' * (len(found) != 1)}"
+        cells = _split_row(row, separator, path, line)
+        if len(cells) != len(names):
+            num = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
             raise InputError(f"has {num}, the header row has {len(names)}", path, line)
         lines.append(line)
         for name, index in wanted.items():
-            cells[name].append(found[index])
-    return TextTable(path, tuple(names), np.array(lines, dtype=np.int64), cells)
+            columns[name].append(cells[index])
+    return TextTable(path, tuple(names), np.array(lines, dtype=np.int64), columns)
 
 
 def write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -107,8 +107,7 @@ def _read_canonical(path: Path, options: PositionOptions) -> PositionLog:
         return _read_table(path, options)
     key = "timestamp" if has_columns(read_head(path), [_CANONICAL["timestamp"]]) else "image_name"
     optional = [name for quantity, name in _CANONICAL.items() if quantity not in (key, *AXES)]
-    text = ["image_name"]
-    table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, text=text, separator=FOUND)
+    table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, separator=FOUND)
     names = {quantity: name for quantity, name in _CANONICAL.items() if name in table}
     times = table.numbers(names["timestamp"], bounds=TIME_S) if key == "timestamp" else None
     return _log_of_table(table, names, dict.fromkeys(QUANTITIES, "m"), times, path, [], options)

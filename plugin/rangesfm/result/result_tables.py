@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.files.text_tables import TextTable, read_table, write_table
+from rangesfm.files.text_tables import read_table, write_table
 from rangesfm.ranging.range_observations import USED
 
 _Kind = TypeVar("_Kind", bound="TableFile")
@@ -57,7 +57,11 @@ class TableFile:
     def write(self, folder: Path) -> None:
         """Write the file into a folder. If that fails, no part of the file is left."""
         columns = self.columns()
-        cells = [_cells(getattr(self, name), column.format_spec) for name, column in columns.items()]
+        cells: list[Sequence[str]] = []
+        for name, (spec, _) in columns.items():
+            values = getattr(self, name)
+            is_text = spec == _TEXT
+            cells.append(values if is_text else [f"{x:{spec}}" if math.isfinite(x) else "" for x in values.tolist()])
         write_table(folder / self.NAME, list(columns), zip(*cells, strict=True))
 
     @classmethod
@@ -70,21 +74,13 @@ class TableFile:
         path, columns = folder / cls.NAME, cls.columns()
         if not path.is_file():
             return None
-        texts = [name for name, column in columns.items() if column.format_spec == _TEXT]
-        table = read_table(path, list(columns), text=texts)
-        return cls(**{name: _values(table, name, column) for name, column in columns.items()})
-
-
-def _cells(values: Any, format_spec: str) -> Iterable[str]:
-    if format_spec == _TEXT:
-        return tuple(values)
-    return (f"{value:{format_spec}}" if math.isfinite(value) else "" for value in values.tolist())
-
-
-def _values(table: TextTable, name: str, column: ColumnFormat) -> Any:
-    if column.format_spec == _TEXT:
-        return tuple(table.text(name, empty="" if column.may_be_empty else None))
-    return table.numbers(name, empty=np.nan if column.may_be_empty else None)
+        table, values = read_table(path, list(columns)), dict[str, Any]()
+        for name, (spec, may_be_empty) in columns.items():
+            if spec == _TEXT:
+                values[name] = tuple(table.text(name, empty="" if may_be_empty else None))
+            else:
+                values[name] = table.numbers(name, empty=np.nan if may_be_empty else None)
+        return cls(**values)
 
 
 @dataclass(frozen=True)

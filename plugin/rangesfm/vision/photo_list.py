@@ -68,7 +68,7 @@ def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] = NO_NAMES, uni
     if not head.strip():
         raise InputError(f"the file is empty, {_EXPECTED}", path)
     if not columns and unit is None and is_canonical_photo_list(head):
-        table = read_table(path, [*_CANONICAL.values()], text=["image_name"], separator=FOUND)
+        table = read_table(path, [*_CANONICAL.values()], separator=FOUND)
         times_s = table.numbers("timestamp_s", bounds=TIME_S)
         return _photo_list(table, _CANONICAL, times_s, "s", ())
     layout = find_layout(path)

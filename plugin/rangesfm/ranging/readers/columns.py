@@ -45,8 +45,6 @@ QUANTITIES = (
     *("los", "nlos", *STAMPS),
 )
 
-_TEXTS = ("image_name", "date", "anchor_id", "tag_id", "antenna")
-
 
 @dataclass(frozen=True)
 class RangeColumns:
@@ -88,10 +86,7 @@ def read_columns(path: Path, columns: RangeColumns, options: ReadOptions, format
     notes = [*columns.notes]
     if layout is None:
         required = dict.fromkeys([*columns.required.values(), *columns.wide, *anchors])
-        texts = [*(named[key] for key in _TEXTS if key in named), *anchors]
-        table = read_table(
-            path, [*required], [*columns.optional.values()], text=texts, separator=options.separator or FOUND
-        )
+        table = read_table(path, [*required], [*columns.optional.values()], separator=options.separator or FOUND)
     else:
         table, more = layout.read()
         notes += more
