@@ -13,6 +13,8 @@ from tests.studies.drifting_maps import lap_of_drift
 
 from rangesfm.diagnostics.anchor_sides import likelier_sides
 from rangesfm.diagnostics.linearized import ranges_on_map
+from rangesfm.measurements.joint_map import find_kind
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.workflows.metric_result import MetricResult
 
 DRIFT_M, NUM_KEYFRAMES = 0.5, 100
@@ -40,7 +42,7 @@ def test_an_anchor_that_drift_puts_on_the_wrong_side_is_brought_to_the_right_one
 
 
 def test_an_anchor_on_the_right_side_stays_there(crossed: MetricResult) -> None:
-    at = known(crossed.refined_with_ranges)
+    at = known(find_kind(known(crossed.at_refined).moved(), RangeScale))
     sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
     assert not sides.has_crossed
     assert sides.mirrors_m == {"A1": None}
@@ -59,7 +61,7 @@ def test_sides_that_the_ranges_do_not_tell_apart_are_both_given() -> None:
 
 
 def test_surveyed_anchors_are_left_alone(crossed: MetricResult) -> None:
-    at = known(crossed.refined_with_ranges)
+    at = known(find_kind(known(crossed.at_refined).moved(), RangeScale))
     on_map = ranges_on_map(at.posed, at.solution, at.bending)
     surveyed_m = replace(on_map.problem, anchor_mean_m=on_map.state.anchors_m, anchor_stddev_m=np.array([0.02]))
     assert likelier_sides(replace(on_map, problem=surveyed_m)).mirrors_m == {}

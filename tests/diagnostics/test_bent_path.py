@@ -19,6 +19,7 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 TAG_IN_CAM_M = (0.0, 0.0, 0.0)
@@ -43,7 +44,8 @@ def mown(seed: int) -> RangesOnMap:
     log = RangeLog.from_arrays(np.full(len(at_s), "A"), np.maximum(range_m, 0.1), timestamp_s=at_s)
     anchors = [Anchor("A", None)]
     found = initialize_scale(associate(log, path, TAG_IN_CAM_M), path, anchors, anchor_frame="unknown")
-    return ranges_on_map(known(found.problem), known(found.solution), WalkBending(in_first_camera(path)))
+    ranges = known(found.find(RangeScale))
+    return ranges_on_map(ranges.posed, ranges.solution, WalkBending(in_first_camera(path)))
 
 
 @pytest.mark.parametrize("seed", [3, 5])
@@ -79,7 +81,8 @@ def drifting(share: float, seed: int) -> tuple[ScaleEstimate, RangesOnMap, Array
     anchors = [Anchor(name, at) for name, at in zip("ABCD", anchors_m, strict=True)]
     found = initialize_scale(associate(log, path, TAG_IN_CAM_M), path, anchors, anchor_frame="site")
     bending = WalkBending(in_first_camera(path))
-    return found, ranges_on_map(known(found.problem), known(found.solution), bending), path.centers, places
+    ranges = known(found.find(RangeScale))
+    return found, ranges_on_map(ranges.posed, ranges.solution, bending), path.centers, places
 
 
 def test_a_path_that_drifts_is_placed_as_its_bent_form_lies_and_says_by_how_much() -> None:

@@ -14,13 +14,16 @@ from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.demo.simulated_radio import Radio, SimulatedRanges
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.similarity import IDENTITY, Similarity
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.inference.bending import WalkBending
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_by_lengths import LengthScale, lengths_between_points
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 Array = npt.NDArray[np.float64]
@@ -77,8 +80,9 @@ class Survey:
         self, frame: str, known: Collection[str] = (), log: RangeLog | None = None, **options: Any
     ) -> ScaleEstimate:
         """Run the scale stage on this survey's ranges, or on another log."""
-        anchors = self.anchors(frame, known)
-        return initialize_scale(self.observations(log), self.trajectory, anchors, anchor_frame=frame, **options)
+        anchors, others = self.anchors(frame, known), lengths_among(options.get("distances"), self.trajectory)
+        observations = self.observations(log)
+        return initialize_scale(observations, self.trajectory, anchors, anchor_frame=frame, others=others, **options)
 
     def log_with(self, range_m: Array) -> RangeLog:
         """Return the same log with other ranges."""
@@ -86,6 +90,14 @@ class Survey:
 
     def relative_error(self, estimate: ScaleEstimate) -> float:
         return estimate.value / self.site_from_sfm.scale - 1
+
+
+def lengths_among(distances: LocatedDistances | None, path: Trajectory) -> list[LengthScale]:
+    """Return the lengths between points among measured distances, if there are any, for ``initialize_scale``."""
+    found = None
+    if distances is not None:
+        found = lengths_between_points(distances, path, WalkBending(in_first_camera(path)))
+    return [] if found is None else [found]
 
 
 class MakeSurvey(Protocol):

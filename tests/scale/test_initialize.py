@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 from tests.known import known
+from tests.scale.conftest import lengths_among
 from tests.simulated.path import orbit_path
 from tests.simulated.positions_at_origin import known_positions
 
@@ -21,12 +22,15 @@ from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.inference.bending import WalkBending
+from rangesfm.measurements.joint_map import KindOnMap
 from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out
-from rangesfm.scale import initialize
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_by_positions import scale_by_positions
+from rangesfm.scale.scale_by_ranges import RangeScale
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey, Survey
@@ -401,8 +405,8 @@ def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_s
     assert held.value == pytest.approx(truth, rel=0.005)
     assert held.uncertainty.formal < 0.5 * alone.uncertainty.formal
     # The judged problem holds the scale no better than the lengths do in a map that bends.
-    lengths, posed = known(held.lengths), known(known(held.problem).ranges.distances)
-    assert posed.stddev_m[0] == pytest.approx(lengths.alone.stddev)
+    lengths, posed = known(held.find(LengthScale)), known(known(held.find(RangeScale)).posed.ranges.distances)
+    assert posed.stddev_m[0] == pytest.approx(lengths.alone.scale.stddev)
 
 
 @pytest.mark.parametrize("wrong", [0, 1])
@@ -412,7 +416,7 @@ def test_ranges_tell_which_of_two_distances_is_wrong(make_survey: MakeSurvey, wr
     mistyped = replace(distances, distance_m=distances.distance_m * np.where(np.arange(2) == wrong, 1.3, 1.0))
     found = survey.scale("unknown", distances=mistyped)
     low, high = found.interval_95
-    np.testing.assert_array_equal(known(found.lengths).is_kept, np.arange(2) != wrong)
+    np.testing.assert_array_equal(known(found.find(LengthScale)).is_kept, np.arange(2) != wrong)
     assert low < survey.truth("first_camera").scale < high
     assert found.value == pytest.approx(survey.scale("unknown", distances=distances).value, rel=0.005)
 
@@ -508,30 +512,19 @@ def taped(scale: float, stddev_m: float = 0.01) -> LocatedDistances:
     )
 
 
-def of_no_ranges(**given: Any) -> ScaleEstimate:
-    return initialize_scale(no_ranges(), turned_path(), [], anchor_frame="unknown", **given)
+def of_no_ranges(*kinds: KindOnMap) -> ScaleEstimate:
+    return initialize_scale(no_ranges(), turned_path(), [], anchor_frame="unknown", others=kinds)
 
 
-def test_lengths_that_agree_with_known_positions_make_the_scale_more_certain_and_others_have_no_say() -> None:
-    positions = points_in_site(3, 0.5)
-    positions = replace(positions, covariance_m2=100 * positions.covariance_m2)
-    alone = of_no_ranges(positions=positions)
-    both = of_no_ranges(positions=positions, distances=taped(0.502, 0.001))
+def test_lengths_that_agree_with_known_positions_make_the_scale_more_certain() -> None:
+    known_m = points_in_site(3, 0.5)
+    known_m = replace(known_m, covariance_m2=100 * known_m.covariance_m2)
+    positions = scale_by_positions(known_m, turned_path(), WalkBending(in_first_camera(turned_path())))
+    [lengths] = lengths_among(taped(0.502, 0.001), turned_path())
+    alone, both = of_no_ranges(positions), of_no_ranges(positions, lengths)
     assert (both.method, both.frame) == ("positions", "site")
-    assert [*both.by_kind] == ["lengths", "positions"]
     assert both.by_kind["positions"].stddev == pytest.approx(alone.value * alone.uncertainty.empirical)
-    assert both.by_kind["lengths"] == known(both.lengths).alone
+    assert both.by_kind["lengths"] == lengths.alone.scale
     assert both.uncertainty.empirical < 0.8 * alone.uncertainty.empirical
-    assert alone.value < both.value < known(both.lengths).value
-    lengths = known(both.lengths)
-    left_out = replace(lengths, is_kept=np.zeros(3, dtype=bool))
-    bending = WalkBending(in_first_camera(turned_path()))
-    given = initialize._Given(
-        no_ranges(), turned_path(), [], "unknown", ScaleOptions(), RangeModelOptions(), None, alone.positions, None,
-        bending, ("a remark",), None, 0,
-    )  # fmt: skip
-    without = given.without_ranges(left_out)
-    assert without.positions is alone.positions
-    assert without.by_kind == {}
-    assert without.lengths is left_out
-    assert without.reasons[-1] == "a remark"
+    assert alone.value < both.value < lengths.alone.scale.value
+    assert alone.by_kind == {}

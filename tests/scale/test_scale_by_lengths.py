@@ -14,12 +14,14 @@ from rangesfm.arrays import Array
 from rangesfm.distances.lengths_on_map import lengths_on_map
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.inference.bending import Bending, MapBending, bending_part
 from rangesfm.inference.linear_map import Columns
 from rangesfm.inference.noise import Component
-from rangesfm.inference.posterior import Observations, ScaleUncertainty
-from rangesfm.scale.scale_by_lengths import KnownLengths, LengthScale, scale_by_lengths
+from rangesfm.inference.posterior import Observations
+from rangesfm.scale.scale_by_lengths import LengthScale, lengths_between_points
+from rangesfm.scale.scale_by_ranges import with_lengths
 
 SCALE, TAPE_M = 0.45, 0.005
 NUM = 60
@@ -77,8 +79,8 @@ def scaled(
     others: Sequence[Observations] = (),
     bending: MapBending | None = None,
 ) -> LengthScale:
-    lengths = KnownLengths.of(distances, path, bending or Shaken(path))
-    return known(scale_by_lengths(lengths, SCALE if others else None, others))
+    lengths = known(lengths_between_points(distances, path, bending or Shaken(path)))
+    return lengths.tested(replace(IDENTITY, scale=SCALE) if others else lengths.start, others)
 
 
 def other(kind: str, longer: float = 0.0, stddev: float = 0.01) -> Observations:
@@ -99,7 +101,7 @@ def test_the_interval_holds_the_truth_and_honest_lengths_stay(median: float) -> 
         path = walked(rng)
         shaken = median * float(np.exp(0.8 * rng.standard_normal()))
         found = scaled(located(path, 3, rng, shaken), path, bending=Shaken(path, median))
-        off.append(np.log(found.value / SCALE) / found.uncertainty.empirical)
+        off.append(np.log(found.alone.scale.value / SCALE) / found.alone.uncertainty.empirical)
         num_left_out += int(np.count_nonzero(~found.is_kept))
     assert np.mean(np.abs(off) < 1.96) >= 0.9
     assert num_left_out <= 4
@@ -113,7 +115,7 @@ def test_a_mistyped_length_is_left_out_and_its_size_found(rng: np.random.Generat
     np.testing.assert_array_equal(found.is_kept, np.arange(5) != 2)
     assert found.too_long_m[2] == pytest.approx(off_m, abs=4 * found.stddev_m[2])
     assert found.statistic[2] > found.threshold
-    assert found.value == pytest.approx(SCALE, rel=0.01)
+    assert found.alone.scale.value == pytest.approx(SCALE, rel=0.01)
 
 
 def test_nothing_checks_a_single_length(rng: np.random.Generator) -> None:
@@ -131,12 +133,12 @@ def test_the_other_kinds_tell_whether_a_single_length_is_wrong(rng: np.random.Ge
     mistyped = replace(honest, distance_m=1.09 * honest.distance_m)
     left_out = scaled(mistyped, path, [other("ranges"), other("positions")])
     assert not left_out.is_used
-    assert len(left_out.beside_ranges(mistyped)) == 0
+    assert len(known(with_lengths(mistyped, [left_out]))) == 0
     assert left_out.too_long_m[0] == pytest.approx(0.09 * honest.distance_m[0], rel=0.2)
     assert scaled(mistyped, path, [other("ranges")]).is_used
     assert scaled(honest, path, [other("ranges"), other("positions", 0.09)]).is_used
     beside = scaled(honest, path, [other("ranges"), other("positions")])
-    assert beside.value == scaled(honest, path).value
+    assert beside.alone.scale == scaled(honest, path).alone.scale
     assert np.isfinite(beside.stddev_m[0])
 
 
@@ -145,7 +147,7 @@ def test_of_two_that_contradict_each_other_none_is_left_out_and_the_interval_say
     honest = located(path, 2, rng)
     found = scaled(replace(honest, distance_m=honest.distance_m * [1.0, 1.2]), path)
     assert found.is_kept.all()
-    assert found.uncertainty.empirical > 0.03
+    assert found.alone.uncertainty.empirical > 0.03
 
 
 def test_printed_sides_are_wrong_together(rng: np.random.Generator) -> None:
@@ -155,18 +157,16 @@ def test_printed_sides_are_wrong_together(rng: np.random.Generator) -> None:
     true_m = SCALE * sides.model_length
     sides = replace(sides, distance_m=true_m, stddev_m=0.01 * true_m)
     together = scaled(sides, path)
-    assert together.uncertainty.components["tape"] == pytest.approx(0.01, rel=0.05)
-    assert alone.uncertainty.components["tape"] < 0.6 * TAPE_M / (1.0 * np.sqrt(4))
+    assert together.alone.uncertainty.components["tape"] == pytest.approx(0.01, rel=0.05)
+    assert alone.alone.uncertainty.components["tape"] < 0.6 * TAPE_M / (1.0 * np.sqrt(4))
 
 
 def test_checks_have_no_say_and_two_ends_in_one_place_none_at_all(rng: np.random.Generator) -> None:
     path = walked(rng)
     given = located(path, 2, rng)
-    assert KnownLengths.of(replace(given, is_check=np.ones(2, dtype=bool)), path, Shaken(path)) is None
-    assert KnownLengths.of(None, path, Shaken(path)) is None
-    assert scale_by_lengths(None) is None
+    assert lengths_between_points(replace(given, is_check=np.ones(2, dtype=bool)), path, Shaken(path)) is None
     with pytest.raises(GeometryError, match="both its ends in one place"):
-        KnownLengths.of(replace(given, model_length=np.array([0.0, 1.0])), path, Shaken(path))
+        lengths_between_points(replace(given, model_length=np.array([0.0, 1.0])), path, Shaken(path))
 
 
 def test_without_bending_lengths_weigh_by_tape_and_marks(rng: np.random.Generator) -> None:
@@ -175,9 +175,9 @@ def test_without_bending_lengths_weigh_by_tape_and_marks(rng: np.random.Generato
     model, mark_stddev = np.array([4.0, 4.0]), np.array([0.0, 0.1])
     taped = LocatedDistances.of(np.array([2.0, 2.04]), np.full(2, 0.005), model_length=model)
     found = scaled(replace(taped, mark_stddev=mark_stddev), path)
-    own = 0.005**2 + (mark_stddev * found.value) ** 2
-    assert found.value == pytest.approx(np.average([0.5, 0.51], weights=1 / own), rel=1e-5)
-    stddevs = found.uncertainty.components
+    own = 0.005**2 + (mark_stddev * found.alone.scale.value) ** 2
+    assert found.alone.scale.value == pytest.approx(np.average([0.5, 0.51], weights=1 / own), rel=1e-5)
+    stddevs = found.alone.uncertainty.components
     assert np.hypot(stddevs["tape"], stddevs["marks"]) == pytest.approx(1 / np.sqrt(np.sum(2.0**2 / own)), rel=0.02)
 
 
@@ -223,19 +223,19 @@ def test_a_length_depends_on_the_poses_of_its_ends(rng: np.random.Generator) -> 
     np.testing.assert_allclose(by_pose[:, :, 3:].sum(axis=1), 0.0, atol=1e-12)
 
 
-def test_beside_ranges_one_length_stands_for_all_between_points() -> None:
-    one = np.ones(2)
-    lengths = LengthScale(0.5, ScaleUncertainty(0.13, {}), np.arange(2), one > 0, one, one, one, 1.0, one)
+def test_beside_ranges_one_length_stands_for_all_between_points(rng: np.random.Generator) -> None:
+    path = walked(rng)
+    lengths = scaled(located(path, 2, rng), path)
     taped = LocatedDistances.of(
         np.array([2.0, 7.0, 3.0]),
         np.array([0.1, 0.2, 0.3]),
         model_length=np.array([4.0, np.nan, 6.0]),
         anchor_pair=np.array([[-1, -1], [0, 1], [-1, -1]]),
     )
-    beside = lengths.beside_ranges(taped)
-    np.testing.assert_allclose(beside.distance_m, [0.5, 7.0])
-    np.testing.assert_allclose(beside.stddev_m, [0.5 * 0.13, 0.2])
+    beside, alone = known(with_lengths(taped, [lengths])), lengths.alone.scale
+    np.testing.assert_allclose(beside.distance_m, [alone.value, 7.0])
+    np.testing.assert_allclose(beside.stddev_m, [alone.stddev, 0.2])
     np.testing.assert_array_equal(beside.model_length, [1.0, np.nan])
     np.testing.assert_array_equal(beside.anchor_pair, [[-1, -1], [0, 1]])
-    assert lengths.beside_ranges(taped, 3.0).distance_m[0] == pytest.approx(1.5)
-    assert len(replace(lengths, is_kept=one < 0).beside_ranges(taped)) == 1
+    assert known(with_lengths(taped, [lengths], 3.0)).distance_m[0] == pytest.approx(3 * alone.value)
+    assert len(known(with_lengths(taped, [replace(lengths, is_kept=np.zeros(2, dtype=bool))]))) == 1

@@ -12,14 +12,13 @@ from tests.simulated.positions_at_origin import known_positions
 
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, moved_similarity
 from rangesfm.inference.bending import WalkBending
 from rangesfm.positions.grouped_positions import design_of_positions
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.scale.scale_by_positions import (
     _determine,
     _Search,
-    moved_similarity,
     refuse_open_turn,
     scale_by_positions,
 )

@@ -10,13 +10,17 @@ import pytest
 from tests.known import known
 
 from rangesfm.demo.simulated_radio import Radio
+from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.bending import WalkBending
 from rangesfm.inference.posterior import ScaleUncertainty
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.range_observations import RangeStatus
 from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_by_lengths import LengthScale
-from rangesfm.scale.scale_verdict import judge_lengths, judge_positions, refuse_unknown
+from rangesfm.scale.scale_by_lengths import lengths_between_points
+from rangesfm.scale.scale_by_positions import doubts_of_positions
+from rangesfm.scale.scale_verdict import Verdict, judge, refuse_unknown
 
 if TYPE_CHECKING:
     from tests.scale.conftest import MakeSurvey
@@ -147,13 +151,17 @@ def test_a_radio_that_reads_short_at_short_range_is_noticed(make_survey: MakeSur
 
 
 def test_known_positions_that_leave_the_scale_open_are_too_close_together() -> None:
-    options, narrow, wide = ScaleOptions(), ScaleUncertainty(0.01, {}), ScaleUncertainty(0.03, {})
-    assert judge_positions(3, narrow, options, has_check=True).verdict == "good"
-    assert judge_positions(4, narrow, options, has_check=False).verdict == "good"
-    alone = judge_positions(3, narrow, options, has_check=False)
+    narrow, wide = ScaleUncertainty(0.01, {}), ScaleUncertainty(0.03, {})
+
+    def judged(num: int, uncertainty: ScaleUncertainty, *, has_check: bool = False) -> Verdict:
+        return judge(doubts_of_positions(num, uncertainty, has_check=has_check), (), uncertainty, ScaleOptions())
+
+    assert judged(3, narrow, has_check=True).verdict == "good"
+    assert judged(4, narrow).verdict == "good"
+    alone = judged(3, narrow)
     assert (alone.verdict, len(alone.reasons)) == ("doubtful", 1)
     assert alone.reasons[0].startswith("the map rests on 3 known positions")
-    doubted = judge_positions(4, wide, options, has_check=False)
+    doubted = judged(4, wide)
     assert doubted.verdict == "doubtful"
     assert doubted.reasons == (
         "the scale is known to 5.9 % (95 % interval), worse than 4 %",
@@ -162,19 +170,23 @@ def test_known_positions_that_leave_the_scale_open_are_too_close_together() -> N
     with pytest.raises(
         GeometryError, match=r"only known to 21.6 % .*, worse than the 19.6 % allowed .* close together"
     ):
-        judge_positions(4, ScaleUncertainty(0.11, {}), options, has_check=False)
+        judged(4, ScaleUncertainty(0.11, {}))
 
 
 def test_short_lengths_are_said_to_be_short() -> None:
-    nothing = np.zeros(2)
-    two, one = (
-        LengthScale(1.0, ScaleUncertainty(0.01, {}), rows, rows > 0, nothing, nothing, nothing, 1.0, nothing)
-        for rows in (np.arange(2), np.arange(1))
-    )
-    options, narrow, wide = ScaleOptions(), ScaleUncertainty(0.01, {}), ScaleUncertainty(0.03, {})
-    assert judge_lengths(two, narrow, options).verdict == "good"
-    assert judge_lengths(one, narrow, options).reasons[0].startswith("the scale depends on one length")
-    doubted = judge_lengths(two, wide, options)
+    path = Trajectory(np.arange(2), ("a", "b"), np.arange(2.0), np.eye(3)[:2], np.tile(np.eye(3), (2, 1, 1)))
+    narrow, wide = ScaleUncertainty(0.01, {}), ScaleUncertainty(0.03, {})
+
+    def judged(num: int, uncertainty: ScaleUncertainty) -> Verdict:
+        one = np.ones(num)
+        lengths = known(
+            lengths_between_points(LocatedDistances.of(one, one, model_length=one), path, WalkBending(path))
+        )
+        return judge(lengths.doubts(uncertainty), (), uncertainty, ScaleOptions())
+
+    assert judged(2, narrow).verdict == "good"
+    assert judged(1, narrow).reasons[0].startswith("the scale depends on one length")
+    doubted = judged(2, wide)
     assert (doubted.verdict, doubted.reasons[1:]) == (
         "doubtful",
         ("the measured lengths are too short for their standard deviations",),

@@ -10,13 +10,12 @@ import numpy.typing as npt
 import pytest
 
 from rangesfm.demo.simulated_radio import Radio
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
-from rangesfm.inference.bending import Bending, WalkBending
-from rangesfm.inference.posterior import ScaleUncertainty, joined
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.bending import Bending
+from rangesfm.inference.posterior import ScaleUncertainty
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.errors.components import CLOCKS
-from rangesfm.scale.binned_ranges import binned_ranges
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
@@ -141,15 +140,13 @@ def test_a_map_that_bends_is_not_known_as_well_as_one_that_does_not(make_survey:
 def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(make_survey: MakeSurvey) -> None:
     found = make_survey(radio=Radio(range_stddev_m=0.05)).scale("first_camera", "ABCDE")
     assert found.errors.learned is not None
-    assert found.problem is not None
-    assert found.solution is not None
-    ranges = binned_ranges(found.problem, found.solution)
-    learnt = joined([ranges], WalkBending(in_first_camera(found.problem.trajectory)), *ranges.priors).learnt()
+    assert found.on_map is not None
+    learnt = found.on_map.problem
     for share in (1.0, 1e-3):
         told = replace(learnt, sizes={name: share * size for name, size in learnt.sizes.items()})
         known = told.posterior(is_fitted=True)
         stated = known.uncertainty.components
-        by_robust, _ = told.linear.with_weights(ranges.working_m2, told.noise.covariance_m2)
+        by_robust, _ = told.linear.with_weights(told.working_m2, told.noise.covariance_m2)
         best = np.array([stated[name] for name in stated if name != "reweighting"])
         chance = np.sqrt(by_robust[0, 0] - np.sum(best**2))
         assert stated["reweighting"] == abs(known.step[0]) <= 0.5 * chance * (1 + 1e-9)

@@ -17,14 +17,13 @@ from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.geometry.similarity import align_points
-from rangesfm.geometry.trajectory import in_first_camera
-from rangesfm.inference.bending import WalkBending
 from rangesfm.options import ScaleOptions
 from rangesfm.progress import Journal, SilentProgress
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.association import associate
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.range_equation import RangeProblem, RangeState
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
@@ -98,11 +97,9 @@ def run(survey: MadeSurvey, seed: int) -> Run:
             )
     except GeometryError as error:
         return Run(survey, None, None, refusal=str(error))
-    assert estimate.problem is not None
-    assert estimate.solution is not None
-    on_map = bent_to_ranges(
-        ranges_on_map(estimate.problem, estimate.solution, WalkBending(in_first_camera(survey.trajectory)))
-    )
+    ranges = estimate.find(RangeScale)
+    assert ranges is not None
+    on_map = bent_to_ranges(ranges_on_map(ranges.posed, ranges.solution, ranges.bending))
     estimate = estimate_by_bent(estimate, on_map, options)
     return Run(survey, estimate, diagnose_ranges(on_map, seed=seed), on_map)
 

@@ -52,6 +52,8 @@ from rangesfm.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.positions.position_log import PositionLog
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.site import Site
+from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.workflows.metric_result import MetricResult
 
@@ -182,6 +184,7 @@ def told(kind: str, seed: int) -> Line:
         return {**line, "refused": str(error)}
     scaled_m, final_m = (metric.trajectory.as_in(model).centers for model in (metric.scaled, metric.final))
     estimate, kept = metric.estimate, metric.kept_refinement is not None
+    positions, lengths = estimate.find(PositionScale), estimate.find(LengthScale)
     low, high = estimate.interval_95
     off_m, variances = final_m - survey.true_centers_m, metric.center_covariance_m2
     line |= {
@@ -199,8 +202,8 @@ def told(kind: str, seed: int) -> Line:
         "reasons": list(estimate.reasons),
         "place": None if metric.place is None else [metric.place.verdict, *metric.place.reasons],
         "worst_m": None if metric.place is None else metric.place.worst_keyframe_stddev_m,
-        "num_off": None if estimate.positions is None else int(np.sum(~estimate.positions.is_used)),
-        "num_lengths_off": None if estimate.lengths is None else int(np.sum(~estimate.lengths.is_kept)),
+        "num_off": None if positions is None else int(np.sum(~positions.used)),
+        "num_lengths_off": None if lengths is None else len(lengths.left_out),
     }
     if variances:
         known = np.array([variances[name] for name in metric.trajectory.image_names])

@@ -50,8 +50,12 @@ from tests.studies.measured_distances import KINDS
 
 import rangesfm
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
+from rangesfm.measurements.joint_map import find_kind
 from rangesfm.positions.grouped_positions import POSITIONS
 from rangesfm.ranging.readers import write_ranges_csv
+from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_by_positions import PositionScale
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.workflows import result_records
 from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.run_results import RunResult, write_results
@@ -225,7 +229,7 @@ def tables_of(metric: MetricResult) -> Values:
 
 def range_equations_of(metric: MetricResult) -> Values:
     """Return residuals of ranges, their derivatives by the map as a whole and the anchors, and the same of priors."""
-    at = metric.refined_with_ranges
+    at = None if metric.at_refined is None else find_kind(metric.at_refined.moved(), RangeScale)
     on_map = metric.on_map if at is None else ranges_on_map(at.posed, at.solution, at.bending)
     if on_map is None:
         return {}
@@ -241,20 +245,21 @@ def range_equations_of(metric: MetricResult) -> Values:
 
 def position_equations_of(metric: MetricResult) -> Values:
     """Return residuals of positions and control points, their derivatives by the map as a whole, and their errors."""
-    found = metric.by_positions
-    if found is None:
+    found, on_map = metric.find(PositionScale), metric.all_measured
+    if found is None or on_map is None:
         return {}
+    problem = on_map.problem
     return {
-        "positions residual": found.problem.linear.residual_m[found.problem.rows[POSITIONS]],
-        "positions derivatives": found.problem.linear.design[found.problem.rows[POSITIONS]],
-        "positions covariance": found.problem.noise_of(POSITIONS).covariance_m2,
+        "positions residual": problem.linear.residual_m[problem.rows[POSITIONS]],
+        "positions derivatives": problem.linear.design[problem.rows[POSITIONS]],
+        "positions covariance": problem.noise_of(POSITIONS).covariance_m2,
         "positions weight": found.fit.weights,
     }
 
 
 def length_equations_of(metric: MetricResult) -> Values:
     """Return residuals of measured lengths, derivatives of the scale by them, and their errors."""
-    found = metric.estimate.lengths
+    found = metric.find(LengthScale)
     if found is None:
         return {}
     return {
@@ -267,10 +272,11 @@ def length_equations_of(metric: MetricResult) -> Values:
 
 def noise_of(metric: MetricResult) -> Values:
     """Return the standard deviation of each component of the noise, as learnt for the final map."""
-    positions = metric.by_positions
+    on_map = metric.all_measured
+    has_positions = on_map is not None and POSITIONS in on_map.observed
     learnt = {
         "ranges": metric.estimate.errors.learned,
-        "positions": None if positions is None else positions.problem.noise_of(POSITIONS),
+        "positions": on_map.problem.noise_of(POSITIONS) if on_map is not None and has_positions else None,
     }
     return {
         f"{kind} noise {name}": np.array(stddev)
@@ -287,8 +293,8 @@ def covariances_of(metric: MetricResult) -> Values:
     found["scale half width"] = np.array(uncertainty.half_width_95)
     if metric.estimate.placement is not None:
         found["covariance placement"] = metric.estimate.placement
-    if metric.by_positions is not None:
-        found["covariance by positions"] = metric.by_positions.covariance
+    if metric.find(PositionScale) is not None and metric.all_measured is not None:
+        found["covariance by positions"] = metric.all_measured.posterior.place
     joint = None if metric.kept_refinement is None else metric.kept_refinement.covariance
     if joint is not None:
         found |= {

@@ -208,21 +208,24 @@ class Known:
         known_offset = antenna and replace(antenna, offset_s=None if antenna.log.timestamp_s is None else 0.0)
         known = replace(self.surveyed, antenna=known_offset).located(truth.reconstruction, path)
         assert known is not None
-        problem = photos_adjuster(self.truth, truth.reconstruction).problem
-        photos = PhotosAlone(NormalEquations.of(problem, truth.reconstruction, problem.num_residuals()), pixel_stddev)
+        photos_problem = photos_adjuster(self.truth, truth.reconstruction).problem
+        photos = PhotosAlone(
+            NormalEquations.of(photos_problem, truth.reconstruction, photos_problem.num_residuals()), pixel_stddev
+        )
         is_firm = np.ones(len(path), dtype=bool)
         bending = PhotoBending(
             photos, path.frame_ids, in_first_camera(path), path.world_from_cam[0], 1.0, is_firm, True
         )
         found = scale_by_positions(known, path, bending)
-        parts = {part.name: part.alike for part in found.problem.components}
-        covariance = found.problem.bending.formal_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))
-        grouping, at = found.observed.grouping, np.flatnonzero(~known.is_mark)
+        problem = found.alone.problem
+        parts = {part.name: part.alike for part in problem.components}
+        covariance = problem.bending.formal_m2 + sum(parts.get(name, 0.0) for name in ("marks", "points"))
+        grouping, at = found.grouped(found.alone).grouping, np.flatnonzero(~known.is_mark)
         own = np.zeros((len(known), len(known)))
         for name in RECEIVERS.keys() & {*self.names}:
             own[np.ix_(at, at)] = RECEIVERS[name].covariance_m2(known.time_s[at])
         covariance = covariance + grouping @ np.kron(own, np.eye(3)) @ grouping.T
-        used, design = found.problem.is_used, found.problem.linear.design
+        used, design = problem.is_used, problem.linear.design
         if known.velocity.any():  # the time offset is unknown, too
             design = np.column_stack([design, grouping @ known.velocity.ravel()])
         design = design[used]

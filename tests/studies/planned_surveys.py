@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from tests.scale.conftest import lengths_among
 from tests.simulated.path import lap_path, loop_path, sequence_path
 from tests.simulated.radio_errors import errors_of_radio
 from tests.simulated.surveys import METRES_PER_UNIT, in_world_of_its_own
@@ -209,6 +210,7 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
                 options=ScaleOptions(max_relative_stddev=0.5),
                 range_model=planned.range_model,
                 distances=distances,
+                others=lengths_among(distances, trajectory),
                 seed=seed,
             )
             metric_from_map, found["stated"] = estimate.metric_from_sfm, estimate.uncertainty.empirical

@@ -49,6 +49,7 @@ from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.scale.initialize import initialize_scale
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 FACTOR, MIN_STEP_S, MAX_GAP_S = 4.63, 0.1, 0.25
@@ -211,10 +212,10 @@ def one_survey(
 
 def judged(found: ScaleEstimate, path: Trajectory, options: ScaleOptions) -> tuple[ScaleEstimate, list[str]]:
     """Return the estimate as a run delivers it, and the likeliest mistake and those not told from it, in words."""
-    assert found.problem is not None
-    assert found.solution is not None
-    on_map = ranges_on_map(found.problem, found.solution, WalkBending(in_first_camera(path)))
-    on_map = likelier_sides(bent_to_ranges(on_map, found.solution.rivals)).on_map
+    ranges = found.find(RangeScale)
+    assert ranges is not None
+    on_map = ranges_on_map(ranges.posed, ranges.solution, WalkBending(in_first_camera(path)))
+    on_map = likelier_sides(bent_to_ranges(on_map, ranges.solution.rivals)).on_map
     return estimate_by_bent(found, on_map, options), [cause.words for cause in diagnose_ranges(on_map).causes]
 
 

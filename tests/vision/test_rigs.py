@@ -21,7 +21,7 @@ from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
 from rangesfm.inference.bending import WalkBending
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.scale.scale_by_lengths import KnownLengths, scale_by_lengths
+from rangesfm.scale.scale_by_lengths import lengths_between_points
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import read_image_times_csv
 from rangesfm.vision.photo_files import usable_photos
@@ -162,9 +162,9 @@ def test_one_baseline_at_two_visits_is_one_length_and_one_measured_anew_is_anoth
     taped = read_rigs(tmp_path / "rig_config.json").baselines(model, stddev_m)
     assert len(taped) == num_measured
     path = trajectory_from_reconstruction(model)
-    lengths = KnownLengths.of(locate_distances(Tape(taped), model, [], path), path, WalkBending(in_first_camera(path)))
-    found = known_scale(scale_by_lengths(lengths))
-    assert found.value == pytest.approx(1.0, rel=1e-3)
+    located = locate_distances(Tape(taped), model, [], path)
+    found = known_scale(lengths_between_points(located, path, WalkBending(in_first_camera(path)))).alone
+    assert found.scale.value == pytest.approx(1.0, rel=1e-3)
     expected = stddev_m / np.linalg.norm(pose.translation) / np.sqrt(num_measured)
     assert found.uncertainty.empirical == pytest.approx(expected, rel=1e-3)
 

@@ -29,9 +29,10 @@ from rangesfm.options import ScaleOptions
 from rangesfm.ranging.range_observations import status_by_weight
 from rangesfm.scale.binned_ranges import bias_covariance
 from rangesfm.scale.range_equation import RangeState, state_after
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_problem import ScaleProblem
-from rangesfm.scale.scale_verdict import judge
+from rangesfm.scale.scale_verdict import doubts_of_ranges, judge, remarks_on_anchors
 
 # Number of Gauss-Newton steps after which the bins are kept: with bins and outliers chosen anew each time, a map may
 # swing to and fro for ever.
@@ -112,9 +113,10 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     Raises:
         GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
     """
-    posed, solution, bent_by_m = estimate.problem, estimate.solution, bends_m(on_map)
-    if posed is None or solution is None or not len(bent_by_m):
+    ranges, bent_by_m = estimate.find(RangeScale), bends_m(on_map)
+    if ranges is None or not len(bent_by_m):
         return estimate
+    posed, solution = ranges.posed, ranges.solution
     problem = linearized(on_map).with_learnt_errors()
     if not drifts(problem):
         return estimate
@@ -122,7 +124,9 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     uncertainty, covariance = known.uncertainty, known.covariance
     state = state_after((problem.columns,), on_map.state, known.step)
     fit = replace(solution.fit, state=state, weights=problem.bins.robust_weight)
-    judged = judge(posed, replace(solution, fit=fit), uncertainty, {}, estimate.anchors, options)
+    bent = replace(solution, fit=fit)
+    doubts, remarks = doubts_of_ranges(posed, bent, uncertainty, {}), remarks_on_anchors(bent, estimate.anchors)
+    judged = judge(doubts, remarks, uncertainty, options)
     positions = zip(estimate.anchors, state.anchors_m, strict=True)
     drift = f"the path drifts by {rmse(bent_by_m[:, None]):.2g} m (root mean square) from where the ranges have it"
     status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()

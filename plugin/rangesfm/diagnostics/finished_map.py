@@ -19,7 +19,9 @@ from rangesfm.estimation.refine_summary import RefineSummary
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.measurements.joint_map import Doubt
 from rangesfm.ranging.range_observations import RangeStatus
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 # Allowance for comparing medians: ``_max_growth`` bounds sums of squares, while medians ignore a few large errors.
@@ -33,14 +35,6 @@ _MAX_POINTS_GROWTH = 2.0
 _MAX_RESIDUAL_GROWTH = 2.0
 # A keyframe hangs loose on the map if it is this many times less certain than the median one.
 _LOOSE = 10.0
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """A fault of a map, and what to do about it."""
-
-    reason: str
-    advice: str
 
 
 @dataclass(frozen=True)
@@ -115,8 +109,8 @@ def place_of_map(
     of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
     if found is not None:
         of_keyframes = found.centers[np.searchsorted(found.frame_ids, path.frame_ids)]
-        # With known positions the map was moved as a whole to where the best weights for errors that last have it.
-        of_map = found.similarity if estimate.positions is None else of_map
+        # Placed by other kinds, the map was moved as a whole to where the best weights for errors that last have it.
+        of_map = of_map if is_placed_by_others(estimate) else found.similarity
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))
@@ -130,6 +124,12 @@ def place_of_map(
     reasons = (*((in_words,) if is_wide or not doubts else ()), *loose, *doubts)
     x_m, y_m, z_m = stddevs[4:].tolist()
     return Place("doubtful" if is_wide or doubts else "good", reasons, (x_m, y_m, z_m), heading_deg, worst_m)
+
+
+def is_placed_by_others(estimate: ScaleEstimate) -> bool:
+    """Return whether other measurements than ranges place the map in the site."""
+    kinds = () if estimate.on_map is None else estimate.on_map.kinds
+    return any(each.places_map and not isinstance(each, RangeScale) for each in kinds)
 
 
 def _loose_ones(path: Trajectory, keyframes_m: Array) -> Iterator[str]:
@@ -240,8 +240,8 @@ def _elsewhere(old_points: Array, new_points: Array) -> Iterator[str]:
 
 def _apart_from_ranges(estimate: ScaleEstimate, summary: RefineSummary, path_m: Array) -> Iterator[str]:
     """Yield reasons if the ranges no longer fit, or a surveyed anchor moved by more than the extent of the path."""
-    if estimate.solution is not None:
-        old_m = float(np.median(np.abs(estimate.solution.fit.residuals_m)))
+    if (ranges := estimate.find(RangeScale)) is not None:
+        old_m = float(np.median(np.abs(ranges.solution.fit.residuals_m)))
         new_m = float(np.nanmedian(np.abs(summary.predicted_m - summary.observations.log.range_m)))
         if new_m > _MAX_RESIDUAL_GROWTH * max(old_m, estimate.noise_stddev_m):
             yield f"the difference of ranges and map grew from {old_m:.2g} to {new_m:.2g} m (median)"

@@ -19,13 +19,12 @@ from rangesfm.scale.scale_estimate import ScaleEstimate
 _MEASURE_AGAIN = "look whether it was mistyped, or measure it again"
 
 
-def diagnose_lengths(estimate: ScaleEstimate, tape: Tape) -> Diagnosis:
+def diagnose_lengths(lengths: LengthScale | None, estimate: ScaleEstimate, tape: Tape) -> Diagnosis:
     """Return the tests of measured lengths; empty if there are none.
 
     Args:
-        tape: the lengths that the scale was estimated with; ``estimate.lengths`` refers to its rows.
+        lengths: on the final map. tape: to whose rows these refer.
     """
-    lengths = estimate.lengths
     if lengths is None:
         return Diagnosis((), ())
     taped = [tape.distances[row] for row in lengths.rows.tolist()]

@@ -13,10 +13,12 @@ from rangesfm.diagnostics.hypothesis import in_axes
 from rangesfm.diagnostics.hypothesis_tests import MistakeTest, row_of_mistake
 from rangesfm.diagnostics.length_tests import against_other
 from rangesfm.inference.linear_map import FALSE_ALARM_RATE
+from rangesfm.measurements.joint_map import JointMap
 from rangesfm.options import LEVER_ARM_M
 from rangesfm.positions.grouped_positions import at_point
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, PositionScale
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 
 LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
@@ -45,19 +47,19 @@ _OF_ANTENNA = {
 
 @with_one_blas_thread
 def diagnose_positions(
-    positions: PositionScale | None, left_out: Collection[str], estimate: ScaleEstimate
+    positions: PositionScale | None, on_map: JointMap, left_out: Collection[str], estimate: ScaleEstimate
 ) -> Diagnosis:
     """Return the tests of known positions; empty if there are none.
 
     Args:
-        positions: on the final map. left_out: names of control points that contradict the others.
-        estimate: of the scale, by ranges, too, if there are any.
+        positions: on the final map. on_map: all that is measured in it.
+        left_out: names of control points that contradict the others. estimate: of the scale.
     """
     if positions is None:
         return Diagnosis((), ())
-    rows = [*_of_points(positions, left_out), *_of_antenna(positions)]
-    if estimate.problem is None:  # beside ranges, check points are compared with the map that both hold
-        rows += _of_check_points(positions, left_out)
+    rows = [*_of_points(positions, on_map, left_out), *_of_antenna(positions, on_map)]
+    if on_map.find(RangeScale) is None:  # beside ranges, check points are compared with the map that both hold
+        rows += _of_check_points(positions, on_map, left_out)
     reasons = [
         f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}; it is left out"
         for row in rows
@@ -74,28 +76,26 @@ def diagnose_positions(
     return Diagnosis(tuple(rows), tuple(reasons))
 
 
-def _of_points(positions: PositionScale, left_out: Collection[str]) -> Iterator[MistakeTest]:
+def _of_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:
     """Yield the test of each control point against all others."""
     known = positions.known
     for row in np.flatnonzero(known.is_mark).tolist():
         if not known.is_check[row] or known.names[row] in left_out:
-            yield _of_point(positions, _POINT, row, positions.threshold)
+            yield _of_point(positions, on_map, _POINT, row, positions.threshold)
 
 
-def _of_check_points(positions: PositionScale, left_out: Collection[str]) -> Iterator[MistakeTest]:
+def _of_check_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:
     """Yield the test of each check point against the control points, which it does not move."""
     known = positions.known
     rows = [row for row in np.flatnonzero(known.is_mark & known.is_check).tolist() if known.names[row] not in left_out]
     threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(len(rows), 1)))
     for row in rows:
-        yield replace(_of_point(positions, _CHECK_POINT, row, threshold), effect_on_scale=0.0)
+        yield replace(_of_point(positions, on_map, _CHECK_POINT, row, threshold), effect_on_scale=0.0)
 
 
-def _of_point(positions: PositionScale, kind: str, row: int, threshold: float) -> MistakeTest:
-    found, name = (
-        positions.problem.mistake(positions.columns_of(at_point(positions.known, row))),
-        positions.known.names[row],
-    )
+def _of_point(positions: PositionScale, on_map: JointMap, kind: str, row: int, threshold: float) -> MistakeTest:
+    columns, name = positions.columns_of(on_map, at_point(positions.known, row)), positions.known.names[row]
+    found = on_map.problem.mistake(columns)
     far = f"{np.linalg.norm(found.sizes):.2f} m from its coordinates ({in_axes(-found.sizes)})"
     return row_of_mistake(kind, name, found, threshold, f"the {kind} {name} is {far}", LOOK_AGAIN)
 
@@ -106,24 +106,24 @@ def _likeliest(rows: Sequence[MistakeTest]) -> Sequence[MistakeTest]:
     return sorted(found, key=lambda row: -row.statistic)[:1]
 
 
-def _of_antenna(positions: PositionScale) -> Iterator[MistakeTest]:
+def _of_antenna(positions: PositionScale, on_map: JointMap) -> Iterator[MistakeTest]:
     """Yield the tests of mistakes that change all positions of an antenna."""
-    known, rotation = positions.known, positions.site_from_model.rotation
-    is_antenna = ~known.is_mark & positions.is_used
+    known, placed = positions.known, on_map.estimate
+    rotation, is_antenna = placed.rotation, ~known.is_mark & positions.used
     if not is_antenna.any():
         return
     shown = is_antenna[:, None, None]
     columns = {_ARM: np.where(shown, rotation @ known.world_from_cam, 0.0)}
     if known.velocity.any() and not known.clock_stddev_s.any():  # an offset that was searched for has no mistake
-        moves = positions.site_from_model.scale * known.velocity @ rotation.T
+        moves = placed.scale * known.velocity @ rotation.T
         columns[_CLOCK] = np.where(shown, moves[:, :, None], 0.0)
-    if (known.is_mark & positions.is_used).sum() >= MIN_NUM_POSITIONS:
+    if (known.is_mark & positions.used).sum() >= MIN_NUM_POSITIONS:
         columns[_DATUM] = np.where(shown, np.eye(3), 0.0)
     # Clocks that differ by more than the positions last have no moment in common.
     most = {_ARM: LEVER_ARM_M.most, _CLOCK: float(np.ptp(known.time_s[is_antenna]))}
     for name, of_all in columns.items():
         by = of_all.reshape(3 * len(known), -1)
-        found = positions.problem.learnt(in_problem := positions.columns_of(by)).mistake(in_problem)
+        found = on_map.problem.learnt(in_problem := positions.columns_of(on_map, by)).mistake(in_problem)
         threshold = float(special.chdtri(max(found.num, 1), FALSE_ALARM_RATE / len(columns)))
         words, remedy, unit = _OF_ANTENNA[name]
         if np.linalg.norm(found.sizes) > most.get(name, np.inf):

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
+from rangesfm.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     import pycolmap
@@ -94,6 +96,20 @@ def in_first_camera(trajectory: Trajectory, unit: float = 1.0) -> Trajectory:
     """Return a path in the frame of its first pose, in a new unit that is ``unit`` times its own."""
     turn = trajectory.world_from_cam[0].T
     return trajectory.transformed(1 / unit, turn, -turn @ trajectory.centers[0] / unit)
+
+
+def first_camera_from(trajectory: Trajectory) -> Similarity:
+    """Return the rigid motion from the world of a path to the frame of its first camera."""
+    rotation = trajectory.world_from_cam[0].T
+    return Similarity(1.0, rotation, -rotation @ trajectory.centers[0])
+
+
+def moved_similarity(similarity: Similarity, step: Array, path: Trajectory) -> Similarity:
+    """Return a similarity moved by (7,) logarithm of the scale, turn and shift about the first camera of a path."""
+    origin = similarity.apply(path.centers[:1])[0]
+    rotation = Rotation.from_rotvec(step[1:4]).as_matrix() @ similarity.rotation
+    scale = similarity.scale * float(np.exp(np.clip(step[0], -1.0, 1.0)))
+    return Similarity(scale, rotation, origin + step[4:] - scale * rotation @ path.centers[0])
 
 
 def trajectory_from_reconstruction(

@@ -45,6 +45,12 @@ class Columns:
         """Columns of the map as a whole: the logarithm of the scale and, if estimated, the turn and the shift."""
         return [self.scale, *(range(self.frame, self.frame + 6) if self.frame >= 0 else ())]
 
+    def map_step(self, step: Array) -> Array:
+        """Return the (7,) step of the map as a whole in one (p,) of all unknowns; 0 where it is not estimated."""
+        of_map = np.zeros(7)
+        of_map[: len(self.of_map)] = step[self.of_map]
+        return of_map
+
     def placement(self, covariance: Array) -> Array | None:
         """Return the part (7, 7) of the map as a whole of a (p, p) covariance; None if its place is not estimated."""
         return None if self.frame < 0 else np.asarray(covariance[np.ix_(self.of_map, self.of_map)])

@@ -7,7 +7,7 @@ its own; the bending of the map is that of all.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,8 @@ from rangesfm.inference.bending import BENDS, Bending, MapBending
 from rangesfm.inference.linear_map import Columns, EstimatedMistake, LinearMap, Solved, regular
 from rangesfm.inference.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
 
+MAX_NUM_OBSERVATIONS = 450
+"""Largest number of observations of a map: learning their errors takes some twenty inversions of their covariance."""
 GIVEN = "given"
 """Effect of priors; not a component of the noise."""
 REWEIGHTING = "reweighting"
@@ -39,6 +41,7 @@ class Observations:
         alone_m2: (c, c) covariance as if each single one erred independently. working_m2: that which the robust
             weights assume.
         is_used: (c,) whether they take part in the estimate; the others are only tested or predicted.
+        prior_residual, prior_design: (r,), (r, p) of priors on the unknowns, in standard deviations.
     """
 
     kind: str
@@ -50,6 +53,8 @@ class Observations:
     alone_m2: Array
     working_m2: Array
     is_used: Mask
+    prior_residual: Array = field(default_factory=lambda: np.zeros(0))
+    prior_design: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,12 @@ class Posterior:
     def placement(self) -> Array | None:
         """(7, 7) covariance of the scale's logarithm, a turn and a shift; None if the map's place is not estimated."""
         return self.columns.placement(self.covariance)
+
+    @property
+    def place(self) -> Array:
+        """(7, 7) the same covariance, of a map that is placed."""
+        assert self.placement is not None, "the map is placed"
+        return self.placement
 
     @classmethod
     def of(cls, best: Solved, noise: Noise, formal: float, columns: Columns, step: Array, half: Array) -> Posterior:
@@ -342,17 +353,11 @@ class JointProblem:
         return np.asarray(noise_m2[rows, rows] - across @ cho_solve(factor, across.T) + left @ covariance @ left.T)
 
 
-def joined(
-    observations: Sequence[Observations],
-    bending: MapBending,
-    prior_residual: Array | None = None,
-    prior_design: Array | None = None,
-) -> JointProblem:
+def joined(observations: Sequence[Observations], bending: MapBending) -> JointProblem:
     """Join observations of all kinds on one map, with the usual sizes of their errors.
 
     Args:
         bending: of the map.
-        prior_residual, prior_design: (r,), (r, p) of the priors, by the unknowns of the kind that has the most.
     """
     columns = max((each.columns for each in observations), key=lambda each: each.num)
     ends = np.cumsum([len(each.residual_m) for each in observations])
@@ -366,9 +371,9 @@ def joined(
     components = (*own, *bent.parts)
     linear = LinearMap(
         np.concatenate([each.residual_m for each in observations]) + bent.shift_m,
-        np.vstack([_in_columns(each, columns) for each in observations]),
-        np.zeros(0) if prior_residual is None else prior_residual,
-        np.zeros((0, columns.num)) if prior_design is None else prior_design,
+        np.vstack([_in_columns(each.design, each.columns, columns) for each in observations]),
+        np.concatenate([each.prior_residual for each in observations]),
+        np.vstack([_in_columns(each.prior_design, each.columns, columns) for each in observations]),
         columns,
     )
     return JointProblem(
@@ -383,12 +388,11 @@ def joined(
     )
 
 
-def _in_columns(observations: Observations, columns: Columns) -> Array:
-    """Return the derivatives by all unknowns; kinds without anchors have those by the map as a whole."""
-    own = observations.design
-    if observations.columns.num == columns.num:
-        return own
-    widened = np.zeros((len(own), columns.num))
-    of_map = columns.of_map[: len(observations.columns.of_map)]
-    widened[:, of_map] = own[:, : len(of_map)]
+def _in_columns(design: Array, own: Columns, columns: Columns) -> Array:
+    """Return derivatives by all unknowns; kinds without anchors have those by the map as a whole."""
+    widened = np.zeros((len(design), columns.num))
+    if not len(design) or own.num == columns.num:
+        return design if len(design) else widened
+    of_map = columns.of_map[: len(own.of_map)]
+    widened[:, of_map] = design[:, : len(of_map)]
     return widened

@@ -23,20 +23,26 @@ from rangesfm.geometry.trajectory import in_first_camera
 from rangesfm.inference.bending import BENDS, MapBending, WalkBending
 from rangesfm.inference.linear_map import Columns
 from rangesfm.inference.noise import Component, noise_of_sizes, usual_sizes
-from rangesfm.inference.posterior import JointProblem, Observations, Posterior, ScaleUncertainty, joined
+from rangesfm.inference.posterior import (
+    MAX_NUM_OBSERVATIONS,
+    JointProblem,
+    Observations,
+    Posterior,
+    ScaleUncertainty,
+    joined,
+)
 from rangesfm.options import LENGTH_M, ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import START_STDDEV_M
-from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
 from rangesfm.scale.binned_ranges import RANGES, BinnedRanges, bias_covariance, binned_ranges
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import antenna_positions, fit_at
-from rangesfm.scale.scale_by_positions import planned_positions, refuse_open_turn
+from rangesfm.scale.scale_by_positions import doubts_of_positions, planned_positions, refuse_open_turn
 from rangesfm.scale.scale_problem import ScaleProblem
-from rangesfm.scale.scale_verdict import Verdict, judge, judge_positions
+from rangesfm.scale.scale_verdict import Verdict, doubts_of_ranges, judge
 from rangesfm.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
 
 # Numbers of ranges, of bins and of keyframes in the quick computation that compares plans.
@@ -124,8 +130,10 @@ class Expected:
             raise GeometryError(self.refusal)
         if self.ranges is None:
             has_check = any(point.kind == CHECK for point in self.planned.points)
-            return judge_positions(self.num_positions, self.uncertainty, ScaleOptions(), has_check=has_check)
-        return judge(self.ranges.posed, self.ranges.solution, self.uncertainty, {}, (), ScaleOptions())
+            doubts = doubts_of_positions(self.num_positions, self.uncertainty, has_check=has_check)
+        else:
+            doubts = doubts_of_ranges(self.ranges.posed, self.ranges.solution, self.uncertainty, {})
+        return judge(doubts, (), self.uncertainty, ScaleOptions())
 
     def mirror_image(self) -> str | None:
         """Return why the run will leave the position open, or None if it will not.
@@ -202,7 +210,7 @@ def expect_roughly(planned: PlannedSurvey, vision: VisionInformation | None = No
 
 def expect(
     planned: PlannedSurvey,
-    max_num_bins: int = MAX_NUM_BINS,
+    max_num_bins: int = MAX_NUM_OBSERVATIONS,
     num_keyframes: int = _NUM_KEYFRAMES,
     vision: VisionInformation | None = None,
 ) -> Expected:
@@ -228,7 +236,7 @@ def expect(
     observed += [] if positions is None else [positions]
     if (taped := planned.taped_lengths) is not None:
         observed.append(lengths_on_map(taped, 1.0, path, np.ones(len(taped), dtype=bool)))
-    problem, known, keyframe_stddevs_m = the_map.solved(observed, None if ranges is None else ranges.observed.priors)
+    problem, known, keyframe_stddevs_m = the_map.solved(observed)
     learned = None if ranges is None else LearnedErrors.of(problem.noise_of(RANGES), ranges.observed.bins)
     num_positions = 0 if positions is None else int(np.count_nonzero(positions.is_used)) // 3
     return Expected(planned, vision, ranges, known, learned, keyframe_stddevs_m, num_positions, notes)
@@ -288,14 +296,12 @@ class _BendingMap:
     bending: MapBending
     num_keyframes: int
 
-    def solved(
-        self, observed: Sequence[Observations], priors: tuple[Array, Array] | None = None
-    ) -> tuple[JointProblem, Posterior, Array]:
+    def solved(self, observed: Sequence[Observations]) -> tuple[JointProblem, Posterior, Array]:
         """Return what observations say of the map: the joint problem, its posterior, and (n,) stddevs of all keyframes.
 
         A keyframe's error is that of the map as a whole and its bending, as far as the observations leave it open.
         """
-        problem = joined([*observed, self._keyframes(observed)], self.bending, *(priors or (None, None)))
+        problem = joined([*observed, self._keyframes(observed)], self.bending)
         num_first = len(observed[0].residual_m)
         problem = replace(problem, sizes=self._sizes(problem.components, num_first))
         known = problem.expected_posterior()

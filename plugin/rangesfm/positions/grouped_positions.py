@@ -8,7 +8,7 @@ of these that last for some time or belong to a place.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import block_diag, csr_array, diags_array, kron
@@ -19,10 +19,9 @@ from rangesfm.geometry.similarity import Similarity, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.inference.linear_map import Columns
 from rangesfm.inference.noise import Component, independent_unknowns
-from rangesfm.inference.posterior import Observations
+from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, Observations
 from rangesfm.positions.known_positions import KnownPositions
 from rangesfm.ranging.errors.components import CLOCKS, FRAME
-from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 
 POSITIONS = "positions"
@@ -44,7 +43,7 @@ class GroupedPositions(Observations):
         grouping: (3 g, 3 k) sparse weights of the positions in the groups.
     """
 
-    grouping: csr_array
+    grouping: csr_array = field(kw_only=True)
 
 
 def grouped_positions(
@@ -57,7 +56,7 @@ def grouped_positions(
     lasting_s: Sequence[float],
     *,
     metres_per_unit: float = 1.0,
-    max_num_groups: int = MAX_NUM_BINS // 3,
+    max_num_groups: int = MAX_NUM_OBSERVATIONS // 3,
 ) -> GroupedPositions:
     """Group known positions, and linearise them about a similarity from the model of a path.
 

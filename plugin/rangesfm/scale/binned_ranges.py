@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.inference.bending import BENDS
-from rangesfm.inference.posterior import Observations, Posterior
+from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, Observations, Posterior
 from rangesfm.ranging.errors.components import CLOCKS, PLACES, OtherError
 from rangesfm.ranging.errors.learned import LearnedErrors, radio_components, widened
-from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS, RangeBins, by_poses, noisiness, range_bins
+from rangesfm.ranging.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
 from rangesfm.scale.range_equation import (
     RangeProblem,
     columns_of,
@@ -35,24 +35,16 @@ class BinnedRanges(Observations):
 
     Attributes:
         bins: of the ranges.
-        prior_residual, prior_design: (r,), (r, p) of the priors on anchors and on the map, in standard deviations.
     """
 
-    bins: RangeBins
-    prior_residual: Array
-    prior_design: Array
-
-    @property
-    def priors(self) -> tuple[Array, Array]:
-        """Residuals and derivatives of the priors."""
-        return self.prior_residual, self.prior_design
+    bins: RangeBins = field(kw_only=True)
 
 
 def binned_ranges(
     posed: ScaleProblem,
     solution: Solution,
     shared_m: Array | None = None,
-    max_num_bins: int = MAX_NUM_BINS,
+    max_num_bins: int = MAX_NUM_OBSERVATIONS,
     noise_m: float | None = None,
 ) -> BinnedRanges:
     """Average the ranges of a problem, and linearise them about its solution.

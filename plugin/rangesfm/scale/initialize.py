@@ -7,46 +7,31 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.arrays import Mask
-from rangesfm.distances.lengths_on_map import LENGTHS
 from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, ROUNDING
-from rangesfm.geometry.similarity import IDENTITY
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.geometry.trajectory import Trajectory, first_camera_from, in_first_camera
 from rangesfm.inference.bending import MapBending, WalkBending
-from rangesfm.inference.posterior import (
-    JointProblem,
-    Observations,
-    Posterior,
-    ScaleByKind,
-    ScaleUncertainty,
-    joined,
-)
+from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, ScaleUncertainty
+from rangesfm.measurements.joint_map import KindOnMap, fit_kinds, join_kinds, tested_kinds
 from rangesfm.options import RangeModelOptions, ScaleOptions
-from rangesfm.positions.known_positions import LASTING_S, KnownPositions
 from rangesfm.processes.threads import both, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.errors.learned import LearnedErrors
-from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, status_by_weight
 from rangesfm.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
-from rangesfm.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved, shared_errors_m
-from rangesfm.scale.range_equation import RangeProblem, solve
-from rangesfm.scale.scale_by_lengths import KnownLengths, LengthScale, scale_by_lengths
-from rangesfm.scale.scale_by_positions import PositionScale, moved_similarity, scale_by_positions
+from rangesfm.scale.binned_ranges import RANGES, shared_errors_m
+from rangesfm.scale.scale_by_ranges import RangeScale, placement_by, with_lengths
 from rangesfm.scale.scale_estimate import NOT_KNOWN, ScaleEstimate
-from rangesfm.scale.scale_problem import ScaleProblem, first_camera_from, scale_problem
-from rangesfm.scale.scale_verdict import judge, judge_lengths, judge_positions, levelled_places
+from rangesfm.scale.scale_problem import scale_problem
+from rangesfm.scale.scale_verdict import judge_map_of_kinds, levelled_places
 from rangesfm.scale.sensitivity import scale_sensitivity
-from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale, with_unknown_anchors
+from rangesfm.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
 from rangesfm.scale.two_candidate import TwoCandidate, two_candidate
 
-# Number of bins of ranges, and of coordinates of known positions, with which lengths are tested one by one.
-_NUM_BINS_OF_TESTS = 120
+# Number of observations with which it is tested which of them contradict the others.
+_NUM_OF_TESTS = 120
 
 
 @with_one_blas_thread
@@ -59,24 +44,22 @@ def initialize_scale(
     options: ScaleOptions | None = None,
     range_model: RangeModelOptions | None = None,
     distances: LocatedDistances | None = None,
-    positions: KnownPositions | None = None,
-    lasting_s: Sequence[float] = LASTING_S,
+    others: Sequence[KindOnMap] = (),
     bending: MapBending | None = None,
     site: Site | None = None,
     seed: int = 0,
 ) -> ScaleEstimate:
-    """Estimate scale and frame of an unscaled path from ranges, measured lengths, known positions, or several of them.
+    """Estimate scale and frame of an unscaled path from ranges, from measurements of other kinds, or from all of them.
 
     Args:
-        observations: ranges on ``trajectory``; may be empty if there are measured lengths.
+        observations: ranges on ``trajectory``; may be empty if there are other measurements.
         trajectory: the unscaled path.
         anchors: every anchor of the log, with its prior knowledge.
         anchor_frame: "site" (positions in a site frame: the map is carried there), "first_camera" (positions in the
             first keyframe's camera frame, metres) or "unknown" (positions are ignored; the map stays in the first
             camera's frame).
-        distances: measured ones, located in the model of ``trajectory``; those that are only checks are not used.
-        positions: known in the site and located in the model of ``trajectory``.
-        lasting_s: for how long errors of an antenna's positions last.
+        distances: measured ones, of which those between anchors are used beside ranges.
+        others: measurements of other kinds on ``trajectory``, those first that decide what is doubtful.
         bending: how the map is bent; None: it drifts as a map of poses does.
         site: frame of the anchors' positions; None: that in which they were given.
 
@@ -86,28 +69,61 @@ def initialize_scale(
     """
     options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     bending = bending or WalkBending(in_first_camera(trajectory))
-    lengths = KnownLengths.of(distances, trajectory, bending)
-    by_positions, remarks = None, tuple[str, ...]()
-    try:
-        if positions is not None and not (len(observations.log) and positions.is_check.all()):
-            by_positions = scale_by_positions(positions, trajectory, bending, lasting_s=lasting_s)
-    except GeometryError as error:
-        if not len(observations.log) and lengths is None:
-            raise GeometryError(f"the scale is not determined: {error}") from None
-        remarks = (f"the known positions are not used: {error}",)
-    given = _Given(
-        observations, trajectory, anchors, anchor_frame, options, range_model, distances, by_positions, lengths,
-        bending, remarks, site, seed,
-    )  # fmt: skip
-    others = [] if by_positions is None else [by_positions.observed]
-    at = None if by_positions is None else by_positions.fit.similarity.scale
-    by_lengths = scale_by_lengths(lengths, at, others)
-    return given.with_ranges(by_lengths) if len(observations.log) else given.without_ranges(by_lengths)
+    if not len(observations.log):
+        return _without_ranges(observations, trajectory, others, bending, options, range_model)
+    start = _RangeStart(
+        observations, trajectory, anchors, anchor_frame, options, range_model, distances, bending, site, seed
+    )
+    return start.estimate(_tested_without_ranges(others))
+
+
+def _without_ranges(
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    given: Sequence[KindOnMap],
+    bending: MapBending,
+    options: ScaleOptions,
+    range_model: RangeModelOptions,
+) -> ScaleEstimate:
+    """Return the estimate in the site if a kind places the map there, or else in the first camera's frame."""
+    kinds = _tested_without_ranges(given)
+    used = [each for each in kinds if each.is_used]
+    if not used:
+        raise GeometryError("the scale is not determined: nothing that was measured is in the map")
+    if len(used) == 1:
+        on_map = replace(used[0].alone, kinds=kinds)
+    else:
+        on_map = fit_kinds(kinds, trajectory, _first(used).start, bending)
+    judged = judge_map_of_kinds(on_map, options)
+    return ScaleEstimate(
+        on_map.estimate,
+        frame="site" if _first(used).places_map else "first_camera",
+        method=used[0].kind,
+        uncertainty=on_map.posterior.uncertainty,
+        verdict=judged.verdict,
+        reasons=judged.reasons,
+        advice=judged.advice,
+        observations=observations,
+        errors=RangeErrors.begin(observations, observations.placed_rows, range_model),
+        placement=on_map.posterior.placement,
+        on_map=on_map,
+        by_kind={} if len(used) == 1 and used[0].places_map else {each.kind: each.alone.scale for each in used},
+    )
+
+
+def _tested_without_ranges(kinds: Sequence[KindOnMap]) -> tuple[KindOnMap, ...]:
+    """Return the kinds with that left out which contradicts all others, before ranges have their say."""
+    return tested_kinds(kinds, _first(kinds).start, MAX_NUM_OBSERVATIONS, is_last=False) if kinds else ()
+
+
+def _first(kinds: Sequence[KindOnMap]) -> KindOnMap:
+    """Return the kind at whose placement a map starts: the first that places it, or the first of all."""
+    return next((each for each in kinds if each.places_map), kinds[0])
 
 
 @dataclass(frozen=True)
-class _Given:
-    """Arguments of ``initialize_scale``, with what the known positions say and the remarks on them."""
+class _RangeStart:
+    """Arguments of ``initialize_scale`` with ranges."""
 
     observations: RangeObservations
     trajectory: Trajectory
@@ -116,229 +132,84 @@ class _Given:
     options: ScaleOptions
     range_model: RangeModelOptions
     distances: LocatedDistances | None
-    by_positions: PositionScale | None
-    lengths: KnownLengths | None
     bending: MapBending
-    remarks: tuple[str, ...]
     site: Site | None
     seed: int
 
-    def without_ranges(self, lengths: LengthScale | None) -> ScaleEstimate:
-        """Return the estimate by known positions in the site, or by lengths in the first camera's frame."""
-        positions, options = self.by_positions, self.options
-        by_kind = _by_kind(lengths, positions)
-        if positions is not None:
-            if self.lengths is not None and lengths is not None and lengths.is_used:
-                positions = self._with_lengths(positions, self.lengths, lengths.is_kept)
-            metric_from_sfm, uncertainty = positions.site_from_model, positions.uncertainty
-            judged = judge_positions(positions.num_used, uncertainty, options, has_check=positions.has_check)
-        elif lengths is not None:
-            metric_from_sfm = replace(IDENTITY, scale=lengths.value) @ first_camera_from(self.trajectory)
-            uncertainty = lengths.uncertainty
-            by_kind = {LENGTHS: lengths.alone}
-            judged = judge_lengths(lengths, uncertainty, options)
-        else:
-            no_length = "measured length has both its ends in the map"
-            what = "known position is used" if self.distances is None else no_length
-            raise GeometryError(f"the scale is not determined: no {what}")
-        return ScaleEstimate(
-            metric_from_sfm,
-            frame="first_camera" if positions is None else "site",
-            method="lengths" if positions is None else "positions",
-            uncertainty=uncertainty,
-            verdict=judged.verdict,
-            reasons=(*judged.reasons, *self.remarks),
-            advice=judged.advice,
-            observations=self.observations,
-            errors=RangeErrors.begin(self.observations, self.observations.placed_rows, self.range_model),
-            placement=None if positions is None else positions.covariance,
-            positions=positions,
-            lengths=lengths,
-            by_kind=by_kind if LENGTHS in by_kind else {},
-            remarks=self.remarks,
-        )
-
-    def _with_lengths(self, positions: PositionScale, lengths: KnownLengths, is_kept: Mask) -> PositionScale:
-        """Return the estimate by known positions and measured lengths together."""
-        at = positions.fit.similarity
-        for _ in range(MAX_NUM_ROUNDS):  # the equations of the lengths are not linear in the logarithm of the scale
-            observed = positions.fit.at(at)
-            problem = joined([observed, lengths.observed(at.scale, is_kept)], self.bending).learnt()
-            known = problem.posterior(is_fitted=False)
-            at = moved_similarity(at, known.step, self.trajectory)
-            if abs(known.step[0]) < NEGLIGIBLE_STDDEVS**2 * known.uncertainty.empirical:
-                break
-        return replace(positions, site_from_model=at, observed=observed, problem=problem, posterior=known)
-
-    def with_ranges(self, lengths: LengthScale | None, *, is_checked: bool = False) -> ScaleEstimate:
-        """Return the estimate by ranges, and by lengths and positions, if there are any.
+    def estimate(self, others: tuple[KindOnMap, ...], *, is_last: bool = False) -> ScaleEstimate:
+        """Return the estimate by ranges and the other kinds.
 
         Args:
-            is_checked: whether the ranges had their say on which lengths are left out.
+            is_last: whether the ranges had their say on what is left out of the other kinds.
         """
-        observations, trajectory, options = self.observations, self.trajectory, self.options
-        by_positions, distances = self.by_positions, self.distances
-        if lengths is not None and distances is not None:
-            distances = lengths.beside_ranges(distances)
-        gravity = gravity_of(options.up_in_first_camera)
-        placement = None if by_positions is None else by_positions.prior(first_camera_from(trajectory))
-        posing = (observations, trajectory, self.anchors, self.anchor_frame, self.range_model, distances, gravity)
-        problem, open_place = scale_problem(*posing, placement, site=self.site), tuple[str, ...]()
-        try:
-            solution = solve_scale(problem, camera_side=options.camera_side, seed=self.seed)
-        except OpenPlaceError as error:
-            open_place = (f"the map gets metres, but no place in the site: {error}",)
-            problem = scale_problem(*posing, placement, place_is_open=True, site=self.site)
-            solution = solution_from(problem, error.in_first_camera)
-        table = _paper_table(solution)
-        by_kind = _by_kind(lengths, by_positions)
-        if by_kind:
-            alone = _by_ranges_alone(solution)
-            by_kind = {RANGES: self._by_ranges(problem, alone), **by_kind}
-            solution = _with_share(solution, _range_share(alone, by_kind[RANGES]))
-        if lengths is not None:
-            tested = self._tested(problem, solution, lengths.is_kept if is_checked else None)
-            if not np.array_equal(tested.is_kept, lengths.is_kept):
-                return self.with_ranges(tested, is_checked=True)
-            lengths = tested
-        joint, per_anchor = both(
-            lambda: self._joined(problem, solution, lengths),
-            lambda: scale_per_anchor(solution, observations.log.anchor_ids),
+        observations, options = self.observations, self.options
+        solved, open_place = self._solved(others)
+        ranges, used = solved, [each for each in others if each.is_used]
+        by_kind = {each.kind: each.alone.scale for each in used}
+        if used:
+            by_kind = {RANGES: solved.alone.scale, **by_kind}
+            ranges = solved.with_their_share
+            others, before = tested_kinds([ranges, *others], ranges.placed, _NUM_OF_TESTS, is_last=is_last)[1:], others
+            if [each.left_out for each in others] != [each.left_out for each in before]:
+                return self.estimate(others, is_last=True)
+        on_map, per_anchor = both(
+            lambda: join_kinds((ranges, *others), self.trajectory, ranges.placed, self.bending),
+            lambda: scale_per_anchor(ranges.solution, observations.log.anchor_ids),
         )
-        ranges, positions, all_kinds = joint
-        known = _known(all_kinds, solution)
-        learned = LearnedErrors.of(all_kinds.noise_of(RANGES), ranges.bins)
-        uncertainty, after = known.uncertainty, moved(solution, known)
-        found = anchor_estimates(after, observations.log.anchor_ids, known.covariance)
-        unplaced = self._with_unknown_anchors(problem, solution, lengths)
-        judged = judge(problem, solution, uncertainty, per_anchor, found, options, unplaced)
-        remarks = (*open_place, *self.remarks)
+        known, after = on_map.posterior, ranges.moved(on_map.posterior)
+        found = anchor_estimates(after.solution, observations.log.anchor_ids, known.covariance)
+        judged_ranges = replace(ranges, per_anchor=per_anchor, anchors=found)
+        on_map = replace(on_map, kinds=(judged_ranges, *others))
+        judged, problem, solution = judge_map_of_kinds(on_map, options), ranges.posed, ranges.solution
+        gravity, remarks = gravity_of(options.up_in_first_camera), open_place
         if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
             remarks = (*remarks, *levelled_places(gravity, self.anchors, found))
+        learned = ranges.learnt(on_map)
         errors = replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log))
         status = observations.status.copy()
         status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
         status[problem.rows] = status_by_weight(solution.fit.weights)
-        metric_from_sfm = after.fit.state.metric_from_model @ problem.first_camera_from_sfm
-        if positions is not None:
-            positions = replace(positions, site_from_model=metric_from_sfm, problem=all_kinds, posterior=known)
         robust = ScaleEstimate(
-            metric_from_sfm=metric_from_sfm,
+            metric_from_sfm=after.placed,
             frame=problem.frame,
             method="robust",
-            uncertainty=uncertainty,
+            uncertainty=known.uncertainty,
             verdict=judged.verdict,
-            reasons=(*judged.reasons, *remarks),
+            reasons=judged.reasons,
             advice=judged.advice,
-            sensitivity=scale_sensitivity(after, problem, all_kinds.of_kind(RANGES, known.gains), learned.bins),
+            sensitivity=scale_sensitivity(
+                after.solution, problem, on_map.problem.of_kind(RANGES, known.gains), learned.bins
+            ),
             per_anchor=per_anchor,
-            two_candidate=table,
+            two_candidate=_paper_table(solution),
             anchors=found,
             observations=replace(observations, status=status),
             errors=errors,
             noise_stddev_m=solution.noise_stddev_m,
-            problem=problem,
-            solution=solution,
             placement=known.placement,
-            remarks=remarks,
-            lengths=lengths,
-            positions=positions,
+            on_map=on_map,
             by_kind=by_kind,
             shared_errors_m=shared_errors_m(solution, learned, errors.learned.of_range)
             if by_kind and errors.learned
             else np.zeros((len(observations.log), 0)),
-        )
+        ).remarked(remarks)
         return robust if options.method == "robust" else _by_paper(robust, is_checked=options.method == "two-candidate")
 
-    def _joined(
-        self, problem: ScaleProblem, solution: Solution, lengths: LengthScale | None, most: int = MAX_NUM_BINS
-    ) -> tuple[BinnedRanges, PositionScale | None, JointProblem]:
-        """Return the ranges, the positions, and the problem of all kinds about a solution, with learnt errors.
-
-        Args:
-            most: number of bins of the ranges, and of coordinates of an antenna's positions.
-        """
-        placed, positions, others = solution.fit.state.metric_from_model, self.by_positions, list[Observations]()
-        if positions is not None:
-            most //= 2
-            at = positions.fit.at(placed @ problem.first_camera_from_sfm, most)
-            positions, others = replace(positions, observed=at), [at]
-        if self.lengths is not None and lengths is not None and lengths.is_used:
-            others.append(self.lengths.observed(placed.scale, lengths.is_kept))
-        ranges = binned_ranges(problem, solution, max_num_bins=most)
-        return ranges, positions, joined([ranges, *others], self.bending, *ranges.priors).learnt()
-
-    def _tested(self, problem: ScaleProblem, solution: Solution, is_kept: Mask | None) -> LengthScale:
-        """Return the lengths, with those left out that contradict all else; ``is_kept``: as of ``scale_by_lengths``."""
-        ranges, positions, _ = self._joined(problem, solution, None, _NUM_BINS_OF_TESTS)
-        others = [ranges] if positions is None else [ranges, positions.observed]
-        at = solution.fit.state.metric_from_model.scale
-        tested = scale_by_lengths(self.lengths, at, others, ranges.priors, is_kept)
-        assert tested is not None, "the lengths are the same"
-        return tested
-
-    def _by_ranges(self, problem: ScaleProblem, alone: Solution) -> ScaleByKind:
-        """Return the scale by ranges alone, given their solution."""
-        posed = replace(problem, ranges=_ranges_alone(problem.ranges))
-        ranges = binned_ranges(posed, alone)
-        known = _known(joined([ranges], self.bending, *ranges.priors).learnt(), alone)
-        return known.uncertainty.about(moved(alone, known).fit.state.metric_from_model.scale)
-
-    def _with_unknown_anchors(
-        self, posed: ScaleProblem, solution: Solution, lengths: LengthScale | None
-    ) -> ScaleUncertainty | None:
-        """Return the uncertainty if no place of an anchor were known; None where none is."""
-        if not np.isfinite(solution.problem.anchor_stddev_m).any():
-            return None
-        unknown = with_unknown_anchors(posed, solution.fit.state)
-        return _known(self._joined(*unknown, lengths)[2], unknown[1]).uncertainty
-
-
-def _known(problem: JointProblem, solution: Solution) -> Posterior:
-    """Return the posterior of a map at the solution of its ranges."""
-    is_alone = len(problem.rows) == 1
-    return problem.posterior(is_fitted=is_alone, formal=solution.fit.log_scale_stddev if is_alone else None)
-
-
-def _by_kind(lengths: LengthScale | None, positions: PositionScale | None) -> dict[str, ScaleByKind]:
-    """Return the scale by each kind of measurement besides ranges, if it takes part."""
-    by_lengths = {} if lengths is None or not lengths.is_used else {"lengths": lengths.alone}
-    return by_lengths if positions is None else {**by_lengths, "positions": positions.alone}
-
-
-def _range_share(alone: Solution, ranges: ScaleByKind) -> float:
-    """Return the formal over the learnt variance of the scale by ranges alone, at most 1.
-
-    Where ranges alone say nothing of the scale, they keep a share that has no effect: with none at all, nothing would
-    place the anchors.
-    """
-    formal = alone.fit.log_scale_stddev * alone.errors.inflation
-    return float(np.clip((formal * ranges.value / ranges.stddev) ** 2, ROUNDING, 1.0))
-
-
-def _with_share(solution: Solution, range_share: float) -> Solution:
-    """Return the solution of a rigid map with all ranges weighted by a further factor."""
-    problem = solution.problem
-    share = range_share * (np.ones(len(problem.range_m)) if problem.share is None else problem.share)
-    return _solved(solution, replace(problem, share=share))
-
-
-def _by_ranges_alone(solution: Solution) -> Solution:
-    """Return the solution without lengths between points and known positions, starting from that with them."""
-    return _solved(solution, _ranges_alone(solution.problem))
-
-
-def _solved(solution: Solution, problem: RangeProblem) -> Solution:
-    """Return the solution of another problem of the same ranges, starting from this one."""
-    return replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
-
-
-def _ranges_alone(problem: RangeProblem) -> RangeProblem:
-    distances = None if problem.distances is None else problem.distances.subset(~problem.distances.is_between_points)
-    if problem.placement is None:
-        return replace(problem, distances=distances)
-    is_placed = bool(np.isfinite(problem.anchor_stddev_m).any())
-    return replace(problem, distances=distances, placement=None, frame_is_free=is_placed)
+    def _solved(self, others: Sequence[KindOnMap]) -> tuple[RangeScale, tuple[str, ...]]:
+        """Return the ranges at the best solution of their problem, and why the map's place is open, if it is."""
+        path, gravity = self.trajectory, gravity_of(self.options.up_in_first_camera)
+        posing = (
+            *(self.observations, path, self.anchors, self.anchor_frame, self.range_model),
+            *(with_lengths(self.distances, others), gravity, placement_by(others, first_camera_from(path))),
+        )
+        problem, why_open = scale_problem(*posing, site=self.site), tuple[str, ...]()
+        try:
+            solution = solve_scale(problem, camera_side=self.options.camera_side, seed=self.seed)
+        except OpenPlaceError as error:
+            why_open = (f"the map gets metres, but no place in the site: {error}",)
+            problem = scale_problem(*posing, place_is_open=True, site=self.site)
+            solution = solution_from(problem, error.in_first_camera)
+        return RangeScale(problem, solution, path, 1.0, self.bending, np.zeros((len(problem.rows), 0))), why_open
 
 
 def _paper_table(solution: Solution) -> TwoCandidate | None:
@@ -375,7 +246,6 @@ def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:
         sensitivity=NOT_KNOWN,
         per_anchor={},
         by_kind={},
-        problem=None,
-        solution=None,
+        on_map=None,
         placement=None,
     )

@@ -6,29 +6,23 @@ It is fitted robustly, and control points that contradict the others are left ou
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy import special
-from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING, UNDETERMINED
+from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING, UNDETERMINED
 from rangesfm.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, path_shape
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.geometry.trajectory import Trajectory, moved_similarity
 from rangesfm.inference.bending import MapBending
 from rangesfm.inference.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, EstimatedMistake
-from rangesfm.inference.posterior import (
-    JointProblem,
-    Posterior,
-    ScaleByKind,
-    ScaleUncertainty,
-    joined,
-)
+from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, JointProblem, ScaleUncertainty, joined
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap
 from rangesfm.positions.grouped_positions import (
     POSITIONS,
     GroupedPositions,
@@ -40,10 +34,8 @@ from rangesfm.positions.grouped_positions import (
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions, LearntPositions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import FRAME
-from rangesfm.ranging.errors.range_bins import MAX_NUM_BINS
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import is_line
-from rangesfm.scale.placement_prior import PlacementPrior
 
 MIN_NUM_POSITIONS = 3
 """Fewest positions, not on one line, that determine a similarity."""
@@ -74,7 +66,7 @@ class PositionFit:
     lasting_s: tuple[float, ...]
     metres_per_unit: float = 1.0
 
-    def at(self, similarity: Similarity, max_num: int = MAX_NUM_BINS) -> GroupedPositions:
+    def at(self, similarity: Similarity, max_num: int = MAX_NUM_OBSERVATIONS) -> GroupedPositions:
         """Return the observations about a similarity, of which an antenna has at most ``max_num``."""
         return grouped_positions(
             self.known,
@@ -90,87 +82,82 @@ class PositionFit:
 
 
 @dataclass(frozen=True)
-class PositionScale:
-    """The scale and the place of a map by k known positions, perhaps with measurements of other kinds.
+class PositionScale(KindOnMap):
+    """k known positions on a map, and its scale and place by them alone.
 
     Attributes:
-        site_from_model: the estimate.
         fit: robust one of the positions alone.
         is_left_out: (k,) control points that contradict the others.
         threshold: squared error of a control point, in standard deviations, above which it is left out.
-        observed: the positions, about the similarity of the fit.
-        problem: of all measurements, with learnt errors. posterior: what they say of the map.
+        by_themselves: as ``alone``.
         inflation: standard deviation of the scale by the antenna's positions, divided by that for independent errors.
     """
 
-    site_from_model: Similarity
     fit: PositionFit
     is_left_out: Mask
     threshold: float
-    observed: GroupedPositions
-    problem: JointProblem
-    posterior: Posterior
+    by_themselves: JointMap
     inflation: float
+
+    kind = POSITIONS
+
+    @property
+    def start(self) -> Similarity:
+        """The similarity of the robust fit."""
+        return self.fit.similarity
+
+    @property
+    def alone(self) -> JointMap:
+        """The map by the positions alone, about the similarity of their fit."""
+        return self.by_themselves
+
+    @property
+    def places_map(self) -> bool:
+        """True: they are in the site."""
+        return True
+
+    def observed(
+        self, placed: Similarity, *, in_site: bool = True, max_num: int = MAX_NUM_OBSERVATIONS
+    ) -> GroupedPositions:
+        """Linearise the positions about a placement."""
+        del in_site
+        return self.fit.at(placed, max_num)
 
     @property
     def known(self) -> KnownPositions:
         """The positions."""
         return self.fit.known
 
-    @property
-    def value(self) -> float:
-        """Metres per unit of the model."""
-        return self.site_from_model.scale
-
-    @property
-    def uncertainty(self) -> ScaleUncertainty:
-        """Uncertainty of the scale."""
-        return self.posterior.uncertainty
-
-    @property
-    def alone(self) -> ScaleByKind:
-        """The scale, with its standard deviation."""
-        return self.uncertainty.about(self.value)
-
-    @property
-    def covariance(self) -> Array:
-        """(7, 7) covariance of the logarithm of the scale, a turn and a shift about the first camera."""
-        placement = self.posterior.placement
-        assert placement is not None, "known positions place the map"
-        return placement
-
-    @property
-    def stddev_m(self) -> Array:
-        """(k,) learnt standard deviations of a coordinate of the known positions, without errors that last."""
-        given, learnt = stddev_of(self.known.covariance_m2), self.problem.sizes
+    def stddevs_m(self, on_map: JointMap) -> Array:
+        """Return (k,) standard deviations of a coordinate, without errors that last, as learnt on a map."""
+        given, learnt = stddev_of(self.known.covariance_m2), on_map.problem.sizes
         base = np.where(np.isfinite(given), given, self.fit.stddev_m)
         return base * np.where(self.known.is_mark, learnt.get("points", 1.0), learnt.get("positions", 1.0))
 
-    def errors_of_antenna(self, problem: JointProblem) -> LearntPositions:
-        """Return the errors of the antenna's positions themselves: neither the map's bending nor that of a clock.
-
-        Args:
-            problem: of all measurements, with learnt errors.
-        """
-        groups, rows = self.observed.grouping[::3, ::3].nonzero()
+    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return the errors of the antenna's positions themselves: neither the map's bending nor that of a clock."""
+        observed = self.grouped(on_map)
+        groups, rows = observed.grouping[::3, ::3].nonzero()
         pairs = zip(groups.tolist(), rows.tolist(), strict=True)
         group_of = {self.known.names[row]: group for group, row in pairs if not self.known.is_mark[row]}
-        noise = problem.noise_of(POSITIONS)
+        noise = on_map.problem.noise_of(POSITIONS)
         own = (name for name in noise.names if name in ("places", FRAME) or name.startswith(POSITIONS))
-        return LearntPositions(group_of, noise.only(*own).covariance_m2)
+        return {"position": LearntPositions(group_of, noise.only(*own).covariance_m2)}
+
+    def grouped(self, on_map: JointMap) -> GroupedPositions:
+        """Return the groups of the positions on a map."""
+        observed = on_map.observed[POSITIONS]
+        assert isinstance(observed, GroupedPositions), "positions come in groups"
+        return observed
+
+    def columns_of(self, on_map: JointMap, of_positions: Array) -> Array:
+        """Return the columns (c, m) of a map's problem by those (3 k, m) of the positions."""
+        return on_map.columns(POSITIONS, self.grouped(on_map).grouping @ of_positions)
 
     @property
     def names_left_out(self) -> list[str]:
         """Names of the control points that contradict the others."""
         return [self.known.names[row] for row in np.flatnonzero(self.is_left_out).tolist()]
-
-    def prior(self, first_camera_from_model: Similarity) -> PlacementPrior:
-        """Return what the positions say of the place of the first camera's frame, by the best weights for their errors.
-
-        The problem of the ranges is solved and tested with it.
-        """
-        best = moved_similarity(self.fit.similarity, self.posterior.best_step, self.fit.path)
-        return PlacementPrior.of(best @ first_camera_from_model.inverse(), np.zeros(3), self.covariance)
 
     @property
     def takes_part(self) -> Mask:
@@ -178,28 +165,34 @@ class PositionScale:
         return np.asarray(~self.known.is_check & ~self.is_left_out)
 
     @property
-    def is_used(self) -> Mask:
+    def used(self) -> Mask:
         """(k,) positions that take part and are no outliers."""
         return np.asarray(self.takes_part & (self.known.is_mark | (self.fit.weights >= OUTLIER_BELOW)))
 
-    @property
-    def num_used(self) -> int:
-        return int(np.count_nonzero(self.is_used))
+    def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
+        """Yield that nothing tells which of three positions is wrong, and why the interval is wide."""
+        return doubts_of_positions(int(self.used.sum()), uncertainty, has_check=bool(self.known.is_check.any()))
 
-    @property
-    def has_check(self) -> bool:
-        """True if some of the positions only check the others."""
-        return bool(self.known.is_check.any())
 
-    def with_at_most(self, num: int) -> PositionScale:
-        """Return the same with at most so many observations of an antenna, as there are many of another kind."""
-        return replace(self, observed=self.fit.at(self.fit.similarity, num))
+def doubts_of_positions(num_used: int, uncertainty: ScaleUncertainty, *, has_check: bool) -> Iterator[Doubt]:
+    """Yield the faults of a map by known positions.
 
-    def columns_of(self, of_positions: Array) -> Array:
-        """Return the columns (c, m) of the joint problem by those (3 k, m) of the positions."""
-        columns = np.zeros((len(self.problem.is_used), of_positions.shape[1]))
-        columns[self.problem.rows[POSITIONS]] = self.observed.grouping @ of_positions
-        return columns
+    Args:
+        num_used: number of positions. has_check: whether others check them.
+    """
+    if num_used == MIN_NUM_POSITIONS and not has_check:
+        reason = f"the map rests on {num_used} known positions, so that nothing tells which of them is wrong if one is"
+        yield Doubt(reason, "survey a fourth control point, far from the others")
+    by_frame = uncertainty.components.get(FRAME, 0.0)
+    if NORMAL_95 * by_frame > DOUBTFUL_ABOVE:
+        reason = (
+            "a system whose positions err as these do may also measure the whole site too large or too small, by up to "
+            f"{100 * NORMAL_95 * by_frame:.1f} % (95 %): its positions alone cannot show that"
+        )
+        yield Doubt(reason, "tape a long distance in the map (--distances), or survey control points (--points)")
+    elif uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+        reason = "the known positions are too close together for their standard deviations"
+        yield Doubt(reason, "survey control points at the ends of the site, or walk farther")
 
 
 @with_one_blas_thread
@@ -233,19 +226,11 @@ def scale_by_positions(
     while (worst := search.worst(bending, learnt, threshold)) is not None:
         learnt = worst
     fit, observed, problem = learnt
-    posterior = problem.posterior(is_fitted=True, is_refined=refined is not None)
-    found = PositionScale(
-        site_from_model=moved_similarity(fit.similarity, posterior.step, path),
-        fit=fit,
-        is_left_out=used & ~fit.used,
-        threshold=threshold,
-        observed=observed,
-        problem=problem,
-        posterior=posterior,
-        inflation=_inflation(learnt),
-    )
-    refuse_open_turn(found.covariance)
-    return found
+    is_at_rest = refined is not None
+    posterior = problem.posterior(is_fitted=True, is_refined=is_at_rest)
+    alone = JointMap((), path, fit.similarity, bending, is_at_rest, {POSITIONS: observed}, problem, posterior)
+    refuse_open_turn(posterior.place)
+    return PositionScale(fit, used & ~fit.used, threshold, alone, _inflation(learnt))
 
 
 class _Learnt(NamedTuple):
@@ -385,14 +370,6 @@ def refuse_open_turn(covariance: Array) -> None:
             "the known positions are nearly on one line, which leaves the turn of the map about it open "
             f"({np.rad2deg(turn_stddev):.0f} degrees, 1 stddev): survey a point off that line"
         )
-
-
-def moved_similarity(similarity: Similarity, step: Array, path: Trajectory) -> Similarity:
-    """Return a similarity moved by (7,) logarithm of the scale, turn and shift about the first camera of a path."""
-    origin = similarity.apply(path.centers[:1])[0]
-    rotation = Rotation.from_rotvec(step[1:4]).as_matrix() @ similarity.rotation
-    scale = similarity.scale * float(np.exp(np.clip(step[0], -1.0, 1.0)))
-    return Similarity(scale, rotation, origin + step[4:] - scale * rotation @ path.centers[0])
 
 
 def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:

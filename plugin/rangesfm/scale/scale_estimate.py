@@ -4,24 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.inference.posterior import ScaleByKind, ScaleUncertainty
+from rangesfm.measurements.joint_map import JointMap, KindOnMap
+from rangesfm.options import ScaleOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.scale_by_lengths import LengthScale
-from rangesfm.scale.scale_problem import ScaleProblem
-from rangesfm.scale.solution import Solution
+from rangesfm.scale.scale_by_ranges import RangeScale
+from rangesfm.scale.scale_verdict import Verdict, judge_map_of_kinds
 from rangesfm.scale.two_candidate import TwoCandidate
 
-if TYPE_CHECKING:  # both import this module
-    from rangesfm.scale.scale_by_positions import PositionScale
-    from rangesfm.scale.scale_verdict import Verdict
+_Kind = TypeVar("_Kind", bound=KindOnMap)
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class ScaleEstimate:
     Attributes:
         metric_from_sfm: similarity from the world of the unscaled model to the metric world.
         frame: the metric world: "site" or "first_camera".
-        method: "robust", "two-candidate", "lengths" or "positions".
+        method: "robust", "two-candidate", or without ranges the first kind of measurement, such as "positions".
         uncertainty: relative standard deviations of the scale; infinite with two-candidate, which does not tell.
         verdict: "good" or "doubtful" (a refused scale is a GeometryError).
         reasons: why, in words.
@@ -65,17 +64,14 @@ class ScaleEstimate:
         observations: all ranges, with their status by final weight.
         errors: of all n ranges of the log, as weighted; their inflation widens the formal standard deviation.
         noise_stddev_m: standard deviation of an ordinary range.
-        problem, solution: what the estimate was computed from, by the robust weights; None where there were no ranges,
-            and with two-candidate.
+        on_map: what the estimate was computed from; None with two-candidate.
         placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
             first camera, from all error components; None in the first camera's frame.
-        lengths: what the measured lengths alone say; None without lengths between points of the map.
-        positions: what the known positions say; None if they do not determine the map's place.
-        shared_errors_m: (n, k) errors that the log's ranges share, for k independent standard deviations: what measured
-            lengths and known positions may correct. k is 0 where there are only ranges.
+        shared_errors_m: (n, k) errors that the log's ranges share, for k independent standard deviations: what other
+            kinds of measurement may correct. k is 0 where there are only ranges.
         remarks: those of the reasons that a refinement does not change.
         refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
-        by_kind: scale by "ranges", "lengths" and "positions", as far as available, where several of them were used.
+        by_kind: scale by each kind of measurement alone, such as "ranges"; empty where one gave place and scale.
     """
 
     metric_from_sfm: Similarity
@@ -92,20 +88,48 @@ class ScaleEstimate:
     two_candidate: TwoCandidate | None = None
     anchors: tuple[AnchorEstimate, ...] = ()
     noise_stddev_m: float = np.nan
-    problem: ScaleProblem | None = None
-    solution: Solution | None = None
+    on_map: JointMap | None = None
     placement: Array | None = None
-    lengths: LengthScale | None = None
-    positions: PositionScale | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
     shared_errors_m: Array = field(default_factory=lambda: np.zeros((0, 0)))
     remarks: tuple[str, ...] = ()
     refined_value: float | None = None
 
+    def find(self, kind: type[_Kind]) -> _Kind | None:
+        """Return the measurements of a kind that took part, or were tested; None without any."""
+        return None if self.on_map is None else self.on_map.find(kind)
+
+    def remarked(self, remarks: tuple[str, ...]) -> ScaleEstimate:
+        """Return the estimate with more remarks."""
+        return replace(self, reasons=(*self.reasons, *remarks), remarks=(*self.remarks, *remarks))
+
     def judged(self, judged: Verdict, **changes: Any) -> ScaleEstimate:
         """Return the estimate with a verdict and other changes; remarks stay among the reasons."""
         reasons = (*judged.reasons, *self.remarks)
         return replace(self, verdict=judged.verdict, reasons=reasons, advice=judged.advice, **changes)
+
+    def at_rest(self, on_map: JointMap, options: ScaleOptions) -> ScaleEstimate:
+        """Return the estimate by a refined map, which is moved to this scale.
+
+        Everything that is no judgement stays as it was before the refinement.
+
+        Raises:
+            GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
+        """
+        known, found = on_map.posterior, self
+        if (ranges := on_map.find(RangeScale)) is not None:
+            learned = ranges.learnt(on_map).spread(ranges.posed.rows, len(self.observations.log))
+            found = replace(
+                self,
+                errors=replace(self.errors, learned=learned),
+                noise_stddev_m=ranges.solution.noise_stddev_m,
+            )
+        return found.judged(
+            judge_map_of_kinds(on_map, options),
+            refined_value=on_map.scale.value,
+            uncertainty=known.uncertainty,
+            placement=known.placement,
+        )
 
     @property
     def value(self) -> float:

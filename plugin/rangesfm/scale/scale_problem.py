@@ -13,7 +13,7 @@ from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_rad
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of
-from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory
+from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory, first_camera_from
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
@@ -223,12 +223,6 @@ def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indice
             f"{len(keyframes)} keyframes; {MIN_RANGES} near {MIN_NUM_KEYFRAMES} are needed (do the clocks agree?)"
         )
     return rows, heard
-
-
-def first_camera_from(trajectory: Trajectory) -> Similarity:
-    """Return the rigid motion from the world of a path to the frame of its first camera."""
-    rotation = trajectory.world_from_cam[0].T
-    return Similarity(1.0, rotation, -rotation @ trajectory.centers[0])
 
 
 def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:

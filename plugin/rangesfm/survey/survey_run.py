@@ -11,11 +11,11 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.distances.locate_lengths import locate_distances
-from rangesfm.errors import InputError
+from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.clock_times import span_text
 from rangesfm.files.photo_names import told_none, told_unknown
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.inference.bending import MapBending
+from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.inference.bending import MapBending, WalkBending
 from rangesfm.progress import Journal
 from rangesfm.ranging.association import associate
 from rangesfm.ranging.clock.offset import TimeOffset
@@ -25,6 +25,7 @@ from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, 
 from rangesfm.scale.initialize import initialize_scale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map
 from rangesfm.survey.settings import Survey
 
 
@@ -128,9 +129,14 @@ class SurveyRun:
             GeometryError: the scale is not determined.
         """
         survey, inputs, distances = self.survey, self.inputs, None
-        if inputs.tape.distances:
-            distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids, path.trajectory)
-        return initialize_scale(
+        bending = bending or WalkBending(in_first_camera(path.trajectory))
+        others, remarks = kinds_in_map(inputs, MapOfPhotos(path.sfm, path.trajectory, bending))
+        if not (others or len(inputs.log)):
+            why = remarks or ("nothing that was measured is in the map",)
+            raise GeometryError(f"the scale is not determined: {'; '.join(why)}")
+        if inputs.tape.distances and len(inputs.log):
+            distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
+        found = initialize_scale(
             path.observations,
             path.trajectory,
             inputs.anchors,
@@ -138,12 +144,12 @@ class SurveyRun:
             options=survey.scale,
             range_model=survey.ranges,
             distances=distances,
-            positions=inputs.positions.located(path.sfm, path.trajectory),
-            lasting_s=inputs.positions.lasting_s,
+            others=others,
             bending=bending,
             site=inputs.site,
             seed=survey.output.seed,
         )
+        return found.remarked(remarks)
 
 
 def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:

@@ -115,5 +115,5 @@ def _delivered(metric: MetricResult) -> Trajectory:
     path, at = metric.trajectory.as_in(metric.final), metric.at_refined
     if at is None or metric.kept_refinement is None:
         return path
-    change = at.change(at.posterior)
+    change = at.estimate
     return path.transformed(change.scale, change.rotation, change.translation)

@@ -17,7 +17,6 @@ from rangesfm.diagnostics.anchor_sides import likelier_sides
 from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
 from rangesfm.diagnostics.finished_map import (
-    Doubt,
     doubts_of_map,
     doubts_of_pieces,
     place_of_map,
@@ -28,7 +27,7 @@ from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.diagnostics.position_tests import diagnose_positions
-from rangesfm.distances.locate_lengths import locate_distances, surveyed_distances
+from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model, by_photos
@@ -41,7 +40,9 @@ from rangesfm.geometry.poses import model_poses
 from rangesfm.geometry.similarity import IDENTITY, align_points
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.inference.bending import MapBending, WalkBending
+from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS
 from rangesfm.join.join_models import ModelVerdict, join_models
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, find_kind, join_kinds, tested_kinds
 from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.table import Measured, UsedPositions, anchors_at, antenna_at, ranges_of, ranges_of_map
 from rangesfm.positions.clock import POSITIONS
@@ -51,12 +52,13 @@ from rangesfm.ranging.clock.offset import TimeOffset
 from rangesfm.ranging.clock.time_offset import REMEDY
 from rangesfm.ranging.errors.components import CLOCKS
 from rangesfm.result.result_folder import is_refined_model
-from rangesfm.scale.at_map import MapWithRanges, MeasuredMap, tested_lengths
 from rangesfm.scale.binned_ranges import RANGES
-from rangesfm.scale.scale_by_lengths import KnownLengths, LengthScale
-from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
+from rangesfm.scale.scale_by_lengths import LengthScale
+from rangesfm.scale.scale_by_positions import PositionScale
+from rangesfm.scale.scale_by_ranges import RangeScale, ranges_on_refined_map
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_verdict import NOTHING_KNOWN, refuse_unknown
+from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.workflows.close_loops import RefinedMap, close_loops_of_survey
@@ -173,10 +175,9 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     predicted = ranges.predicted_m(MapState(model_poses(scaled, path.trajectory.frame_ids), ranges.blocks))
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
-    tape = inputs.tape
-    if (lengths := estimate.lengths) is not None:
-        tape = tape.without(lengths.rows[~lengths.is_kept].tolist())
-    known = inputs.positions.without(() if estimate.positions is None else estimate.positions.names_left_out)
+    lengths, positions = estimate.find(LengthScale), estimate.find(PositionScale)
+    tape = inputs.tape.without([*(() if lengths is None else lengths.left_out)])
+    known = inputs.positions.without(() if positions is None else positions.names_left_out)
     return MetricResult(
         path.trajectory, offset, offset_s, estimate, scaled, predicted, weights, tape=tape, positions=known,
         rivals=rivals, on_map=on_map,
@@ -212,10 +213,10 @@ def _with_cause(error: GeometryError, survey: Survey, on_map: RangesOnMap | None
 
 def _ranges_on_scaled(estimate: ScaleEstimate, bending: MapBending | None) -> RangesOnMap | None:
     """Return the ranges on the scaled map; a path without points is bent to the ranges. None without ranges."""
-    if estimate.problem is None or estimate.solution is None:
+    if (ranges := estimate.find(RangeScale)) is None:
         return None
-    bending = bending or WalkBending(in_first_camera(estimate.problem.trajectory))
-    return bent_to_ranges(ranges_on_map(estimate.problem, estimate.solution, bending), estimate.solution.rivals)
+    bending = bending or WalkBending(in_first_camera(ranges.posed.trajectory))
+    return bent_to_ranges(ranges_on_map(ranges.posed, ranges.solution, bending), ranges.solution.rivals)
 
 
 def _diagnose(survey: Survey, on_map: RangesOnMap | None) -> Diagnosis | None:
@@ -365,16 +366,17 @@ def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
     )
     gravity = gravity_of(run.survey.scale.up_in_first_camera)
     upward = () if gravity is None or estimate.frame != "site" else (gravity,)
-    used = () if estimate.positions is None else (_used_positions(estimate.positions, metric.positions),)
+    found, on_map = estimate.find(PositionScale), estimate.on_map
+    used = () if found is None or on_map is None else (_used_positions(found, on_map, metric.positions),)
     return Measured(replace(ranges, shared_errors_m=estimate.shared_errors_m), tape.control(), upward, used)
 
 
-def _used_positions(found: PositionScale, surveyed: SurveyedPositions) -> UsedPositions:
+def _used_positions(found: PositionScale, on_map: JointMap, surveyed: SurveyedPositions) -> UsedPositions:
     return UsedPositions(
         found.known,
         found.takes_part,
-        found.stddev_m,
-        found.site_from_model,
+        found.stddevs_m(on_map),
+        on_map.estimate,
         surveyed.markers,
         () if surveyed.antenna is None else (surveyed.antenna,),
     )
@@ -399,15 +401,13 @@ def _problem(
 def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> RefinedMap:
     """Learn the errors at a map at rest, and return it as a result with its covariance."""
     survey, estimate = run.survey, metric.estimate
-    at, factor = _measured_at_rest(metric, measured, rest), 1.0
+    at, factor = _measured_at_rest(run, metric, measured, rest), 1.0
     if at is not None:
-        if at.ranges is not None and survey.refine.time_offset_stddev_s:
-            at = replace(at, problem=at.problem.without(RANGES, CLOCKS))
+        if survey.refine.time_offset_stddev_s and at.find(RangeScale) is not None:
+            at = at.without(RANGES, CLOCKS)
         factor = at.problem.bending_factor
-        if at.learned is not None:
-            rest = rest.with_learnt({"range": at.learned})
-        if at.positions is not None:
-            rest = rest.with_learnt({"position": at.positions.errors_of_antenna(at.problem)})
+        for kind in at.kinds:
+            rest = rest.with_learnt(kind.learnt_errors(at))
     covariance = None
     if survey.refine.covariance:
         # Measurements too coarse to see any bending do not make it smaller than the noise of the features does.
@@ -447,7 +447,7 @@ def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, refined
         start: the scaled map.
     """
     metric = refined.metric
-    at = metric.refined_with_ranges
+    at = None if metric.kept_refinement is None else metric.find(RangeScale)
     if at is None or metric.kept_refinement is None:
         return refined
     sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
@@ -481,47 +481,42 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) 
     return WalkBending(in_first_camera(path, metres_per_unit))
 
 
-def _measured_at_rest(metric: MetricResult, measured: Measured, rest: MapAtRest) -> MeasuredMap | None:
+def _measured_at_rest(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> JointMap | None:
     """Return a map at rest with all that is measured in it; None where nothing is known of the scale's error."""
-    start, model = metric.estimate, rest.problem.metric
-    if start.method == "two-candidate" or (start.problem, start.positions, start.lengths) == (None, None, None):
+    start, model = metric.estimate.on_map, rest.problem.metric
+    if start is None:
         return None
-    path, positions, lengths, on_map = metric.trajectory.as_in(model), None, None, None
+    path = metric.trajectory.as_in(model)
     is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
     bending = _bending_at_rest(rest, path, scale)
-    if start.positions is not None:
-        surveyed = _surveyed_at_rest(metric.positions, rest)
-        known = surveyed.located(model, path)
-        assert known is not None, "the positions placed the map"
-        positions = scale_by_positions(
-            known, path, bending, refined=IDENTITY, lasting_s=surveyed.lasting_s, metres_per_unit=scale
-        )
-    if start.lengths is not None:
-        located = locate_distances(metric.tape, model, metric.observations.log.anchor_ids, path)
-        lengths = KnownLengths.of(located, path, bending, scale, start.lengths.rows)
-    tested = tested_lengths(lengths, positions, start.lengths)
-    if start.problem is not None:
-        on_map = _ranges_at_rest(metric, measured, rest, path, scale, bending, positions, tested)
-    return MeasuredMap.of(path, scale, bending, on_map, positions, lengths, tested)
+    inputs = replace(run.inputs, tape=metric.tape, positions=_surveyed_at_rest(metric.positions, rest))
+    others, _ = kinds_in_map(inputs, MapOfPhotos(model, path, bending, scale, rest.state.blocks, start.kinds))
+    others = tested_kinds(others, IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True) if others else ()
+    ranges = start.find(RangeScale)
+    of_ranges = (
+        () if ranges is None else (_ranges_at_rest(ranges, metric, measured, rest, path, scale, bending, others),)
+    )
+    return replace(join_kinds((*of_ranges, *others), path, IDENTITY, bending, is_at_rest=True), metres_per_unit=scale)
 
 
 def _ranges_at_rest(
+    start: RangeScale,
     metric: MetricResult,
     measured: Measured,
     rest: MapAtRest,
     path: Trajectory,
     scale: float,
     bending: MapBending,
-    positions: PositionScale | None,
-    lengths: LengthScale | None,
-) -> MapWithRanges:
+    others: Sequence[KindOnMap],
+) -> RangeScale:
     """Return the ranges on a map at rest, as a scale problem in the unit of the unscaled model."""
     ranges = ranges_of(rest.problem.kinds, measured.ranges)
     tags_m, centers_m = ranges.antennas_m(rest.state)
     anchors = anchors_at(ranges.anchors, rest.state.blocks)
-    return MapWithRanges.of(
-        metric.estimate,
+    return ranges_on_refined_map(
+        start,
+        others,
         path,
         scale,
         tags_m,
@@ -530,9 +525,8 @@ def _ranges_at_rest(
         np.array([anchor.range_bias_m for anchor in anchors]),
         ranges.errors,
         ranges.shared_m(rest.state)[ranges.rows],
+        metric.estimate.shared_errors_m[start.posed.rows],
         bending,
-        positions=positions,
-        lengths=lengths,
     )
 
 
@@ -549,7 +543,8 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     path = metric.trajectory.as_in(metric.final)
     bent_by_m = np.zeros(0) if on_map is None else bends_m(on_map)
     of_positions = _diagnose_positions(metric, path.centers, bent_by_m)
-    diagnosis, of_place = of_positions.with_more(diagnose_lengths(metric.estimate, metric.tape)), of_positions.reasons
+    of_lengths = diagnose_lengths(metric.find(LengthScale), metric.estimate, metric.tape)
+    diagnosis, of_place = of_positions.with_more(of_lengths), of_positions.reasons
     try:
         if (of_ranges := _diagnose(survey, on_map)) is not None:
             diagnosis = of_ranges.with_more(diagnosis)
@@ -584,7 +579,7 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     if not metric.final.num_points3D():
         return ()
     estimate, refinement = metric.estimate, metric.kept_refinement
-    is_learnt = estimate.problem is not None or estimate.positions is not None
+    is_learnt = metric.find(RangeScale) is not None or metric.find(PositionScale) is not None
     factor = refinement.bending_factor if refinement is not None and is_learnt else None
     doubt = doubt_of_lens(fit_lens(metric.final), factor, estimate.uncertainty.half_width_95)
     return () if doubt is None else (doubt,)
@@ -596,10 +591,12 @@ def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array
     Args:
         centers_m: (n, 3) keyframe centres in the final map. bent_by_m: (n,) as for ``place_of_map``.
     """
-    estimate, start = metric.estimate, metric.estimate.positions
+    estimate, on_map, start = metric.estimate, metric.all_measured, metric.estimate.find(PositionScale)
+    if on_map is None:
+        return Diagnosis((), ())
     left_out = () if start is None else start.names_left_out
-    diagnosis = diagnose_positions(metric.by_positions, left_out, estimate)
-    if estimate.problem is None or estimate.placement is None:
+    diagnosis = diagnose_positions(on_map.find(PositionScale), on_map, left_out, estimate)
+    if on_map.find(RangeScale) is None or estimate.placement is None:
         return diagnosis
     return diagnosis.with_more(
         diagnose_points(
@@ -611,22 +608,20 @@ def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array
                 estimate.placement,
                 centers_m[0],
                 float(bent_by_m.max(initial=0.0)),
-                by_antenna=estimate.positions is not None and not estimate.positions.known.is_mark.all(),
+                by_antenna=start is not None and not start.known.is_mark.all(),
             ),
         )
     )
 
 
-def _moved(metric: MetricResult, after: MeasuredMap) -> MetricResult:
-    """Return the result with the refined map moved as a whole."""
-    before, refinement = metric.at_refined, metric.kept_refinement
-    assert metric.refined is not None
-    assert before is not None
-    change = before.change(before.posterior)
-    if before.ranges is not None and after.ranges is not None and refinement is not None:
-        longer_m, state = after.ranges.predicted_m - before.ranges.predicted_m, after.ranges.solution.fit.state
-        refinement = refinement.moved(change, state.anchors_m, after.ranges.posed.rows, longer_m)
-    return replace(metric, refined=rescale(metric.refined, change), refinement=refinement, at_refined=after)
+def _moved(metric: MetricResult, at: JointMap) -> MetricResult:
+    """Return the result with the refined map moved as a whole to its estimate."""
+    refinement, before, after = metric.kept_refinement, at.find(RangeScale), find_kind(at.moved(), RangeScale)
+    assert metric.refined is not None, "a refined map"
+    if before is not None and after is not None and refinement is not None:
+        longer_m, state = after.predicted_m - before.predicted_m, after.solution.fit.state
+        refinement = refinement.moved(at.estimate, state.anchors_m, after.posed.rows, longer_m)
+    return replace(metric, refined=rescale(metric.refined, at.estimate), refinement=refinement)
 
 
 def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, RangesOnMap | None]:
@@ -636,14 +631,14 @@ def _estimated(survey: Survey, metric: MetricResult) -> tuple[MetricResult, Rang
         GeometryError: the scale is less certain than asked for.
     """
     start, at = metric.estimate, metric.at_refined
-    if at is not None and at.ranges is not None and metric.kept_refinement is not None:
-        on_map: RangesOnMap | None = ranges_on_map(at.ranges.posed, at.ranges.solution, at.ranges.bending)
+    ranges = None if at is None or metric.kept_refinement is None else at.find(RangeScale)
+    if ranges is not None:
+        on_map: RangesOnMap | None = ranges_on_map(ranges.posed, ranges.solution, ranges.bending)
     else:
         on_map = metric.on_map or _ranges_on_scaled(start, None)
     try:
         if at is not None and metric.kept_refinement is not None:
-            estimate, moved = at.judged(start, survey.scale)
-            metric = _moved(metric, moved)
+            estimate, metric = start.at_rest(at, survey.scale), _moved(metric, at)
         else:
             if start.method != "two-candidate":  # which has no interval
                 refuse_unknown(start.uncertainty.half_width_95, start.reasons, start.advice, survey.scale)

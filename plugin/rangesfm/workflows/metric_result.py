@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import pycolmap
@@ -22,15 +22,16 @@ from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.join_models import ModelVerdict
 from rangesfm.loops.loop_closure import LoopClosure
+from rangesfm.measurements.joint_map import JointMap, KindOnMap
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.clock.offset import TimeOffset
 from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.at_map import MapWithRanges, MeasuredMap
-from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.scale.scale_diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.scale.scale_estimate import ScaleEstimate
+
+_Kind = TypeVar("_Kind", bound=KindOnMap)
 
 
 class Rivals(NamedTuple):
@@ -69,7 +70,8 @@ class MetricResult:
         positions: the known positions, with those left out that contradict the others.
         rivals: other likely time offsets; None without any.
         on_map: the ranges on the scaled map; None where that map is only the start of a refinement, or without ranges.
-        at_refined: the refined map, and all that is measured in it; None without one.
+        at_refined: the map at rest with all that is measured in it, before it is moved to its estimate; None without
+            a refinement.
         loops: the loops that were closed in the refined map; None where none were looked for.
     """
 
@@ -90,7 +92,7 @@ class MetricResult:
     positions: SurveyedPositions = field(default_factory=SurveyedPositions)
     rivals: Rivals | None = None
     on_map: RangesOnMap | None = None
-    at_refined: MeasuredMap | None = None
+    at_refined: JointMap | None = None
     loops: LoopClosure | None = None
 
     @property
@@ -104,15 +106,16 @@ class MetricResult:
         return None if self.why_broken else self.refinement
 
     @property
-    def refined_with_ranges(self) -> MapWithRanges | None:
-        """Return the refined map with the ranges on it; None without any."""
-        return None if self.at_refined is None else self.at_refined.ranges
+    def all_measured(self) -> JointMap | None:
+        """Return the map from which the final one was moved to its estimate, with all that is measured in it.
 
-    @property
-    def by_positions(self) -> PositionScale | None:
-        """Return what the known positions say of the final map; None if they do not determine its place."""
-        kept = None if self.kept_refinement is None or self.at_refined is None else self.at_refined.positions
-        return kept or self.estimate.positions
+        None where nothing is known of the scale's error.
+        """
+        return (self.at_refined if self.kept_refinement is not None else None) or self.estimate.on_map
+
+    def find(self, kind: type[_Kind]) -> _Kind | None:
+        """Return the measurements of a kind on that map; None without any."""
+        return None if self.all_measured is None else self.all_measured.find(kind)
 
     @property
     def _stage(self) -> ScaleEstimate | RefineSummary:
@@ -174,7 +177,7 @@ class MetricResult:
         if self.refined is None:
             return None
         if self.at_refined is not None:
-            return self.at_refined.scale
+            return self.at_refined.metres_per_unit if self.why_broken else self.at_refined.scale.value
         return align_points(self.trajectory.centers, self.trajectory.as_in(self.refined).centers).scale
 
     def in_site(self, site: Site) -> MetricResult:

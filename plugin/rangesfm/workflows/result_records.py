@@ -37,6 +37,7 @@ from rangesfm.result.result_tables import (
     TimeOffsetCurve,
 )
 from rangesfm.result.summary import ResultSummary
+from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.workflows.metric_result import MetricResult
 
 # A length disagrees with the map beyond this number of standard deviations, which chance exceeds in one of 370 cases.
@@ -172,11 +173,11 @@ def _refinement(found: MetricResult) -> entries.RefineEntry | None:
 
 
 def _positions(found: MetricResult) -> entries.PositionsEntry | None:
-    track, scale = found.positions.antenna, found.by_positions
-    if track is None or scale is None:
+    track, scale, on_map = found.positions.antenna, found.find(PositionScale), found.all_measured
+    if track is None or scale is None or on_map is None:
         return None
-    mine, used = ~scale.known.is_mark, ~scale.known.is_mark & scale.is_used
-    off_m = scale.known.misclosures_m(scale.site_from_model)[used]
+    mine, used = ~scale.known.is_mark, ~scale.known.is_mark & scale.used
+    off_m = scale.known.misclosures_m(on_map.estimate)[used]
     summary = found.kept_refinement
     shift_s = (summary and summary.position_time_shift_s) or 0.0
     refined_m = None if summary is None else summary.antenna_in_cam_m
@@ -186,7 +187,7 @@ def _positions(found: MetricResult) -> entries.PositionsEntry | None:
         num_rejected=int((mine & ~used).sum()),
         rms_m=rms(np.linalg.norm(off_m, axis=1)),
         rms_by_axis_m=(rms(off_m[:, 0]), rms(off_m[:, 1]), rms(off_m[:, 2])) if len(off_m) else None,
-        stddev_m=median(scale.stddev_m[used]),
+        stddev_m=median(scale.stddevs_m(on_map)[used]),
         inflation=scale.inflation,
         time_offset_s=None if track.log.timestamp_s is None else (track.offset_s or 0.0) + shift_s,
         time_offset_stddev_s=None if track.log.timestamp_s is None else track.offset_stddev_s,

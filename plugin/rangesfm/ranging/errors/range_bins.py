@@ -11,12 +11,11 @@ from scipy.sparse import coo_array, csr_array
 from rangesfm.arrays import Array, Indices
 from rangesfm.geometry.robust_statistics import robust_stddev
 from rangesfm.geometry.similarity import Similarity
+from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS
 from rangesfm.ranging.errors.noise import MIN_NUM_OF_SCATTER
 from rangesfm.ranging.range_gradient import RangeGradient
 from rangesfm.ranging.range_observations import OnPath
 
-# The covariance of the bins is a full matrix, and learning it takes some twenty inversions.
-MAX_NUM_BINS = 450
 _SHORTEST_S = 0.5
 _LONGER = 1.25
 _MIN_NOISINESS, _MAX_NOISINESS = 0.5, 3.0
@@ -98,7 +97,7 @@ def range_bins(
     cam_from_world: Array,
     robust_weight: Array,
     noise_of_anchor: Array,
-    max_num: int = MAX_NUM_BINS,
+    max_num: int = MAX_NUM_OBSERVATIONS,
 ) -> RangeBins:
     """Average ranges in bins, with stretches of time long enough that there are at most ``max_num`` bins.
 

@@ -1,0 +1,250 @@
+"""What all kinds of measurement say of a map that moves as a whole (sections 5 to 7 of ``model.md``).
+
+A kind gives its observations about any placement of the map. All stages from the start to the verdict work on these,
+so that none of them names a kind.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
+from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
+from rangesfm.inference.bending import MapBending
+from rangesfm.inference.posterior import (
+    MAX_NUM_OBSERVATIONS,
+    JointProblem,
+    Observations,
+    Posterior,
+    ScaleByKind,
+    ScaleUncertainty,
+    joined,
+)
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class Doubt(NamedTuple):
+    """A fault of a map, and what to do about it."""
+
+    reason: str
+    advice: str = ""
+
+
+class KindOnMap(ABC):
+    """Measurements of one kind, located in a map that moves as a whole."""
+
+    kind: ClassVar[str]
+    """Name of the kind."""
+
+    @property
+    @abstractmethod
+    def start(self) -> Similarity:
+        """A placement near that by these measurements alone, which few wrong ones do not move."""
+
+    @property
+    @abstractmethod
+    def alone(self) -> JointMap:
+        """The map by these measurements alone, as ``fit_kinds`` finds it."""
+
+    @abstractmethod
+    def observed(self, placed: Similarity, *, in_site: bool, max_num: int) -> Observations:
+        """Linearise about a placement of the map.
+
+        Args:
+            placed: from the world of the map's path to the metric world. in_site: whether that is the site's, in which
+                turn and shift of the map are unknowns; else it is the first camera's frame.
+            max_num: largest number of observations, where single ones can be averaged.
+        """
+
+    @property
+    def places_map(self) -> bool:
+        """Whether they give the map its place in the site; the others give it metres in the first camera's frame."""
+        return False
+
+    @property
+    def is_used(self) -> bool:
+        """Whether any of them takes part."""
+        return True
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """Rows of those that contradict all else."""
+        return ()
+
+    def tested(self, placed: Similarity, others: Sequence[Observations], *, is_last: bool) -> Self:
+        """Return them with those left out that contradict all else.
+
+        Args:
+            placed: where the map is. others: observations of the other kinds there.
+            is_last: whether it was found before which are left out, so that they are only tested.
+        """
+        del placed, others, is_last
+        return self
+
+    def moved(self, known: Posterior) -> Self:
+        """Return them on the map that was moved to the estimate of a posterior."""
+        del known
+        return self
+
+    def posterior(self, problem: JointProblem) -> Posterior:
+        """Return what they say of the map alone, given the problem of them alone about the placement."""
+        return problem.posterior(is_fitted=False)
+
+    def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
+        """Yield faults that make an interval doubtful which rests on them first of all."""
+        del uncertainty
+        yield from ()
+
+    def remarks(self, on_map: JointMap) -> Iterator[Doubt]:
+        """Yield what is to be said of them on a map, without any doubt of its scale."""
+        del on_map
+        yield from ()
+
+    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return the errors learnt at a map at rest, for ``Measurements.with_learnt``, by kind of these."""
+        del on_map
+        return {}
+
+
+_Kind = TypeVar("_Kind", bound=KindOnMap)
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """A map with all that is measured in it.
+
+    Attributes:
+        kinds: of measurements, in the order of the table; the first that is used decides what is doubtful.
+        path: of the map. placed: from its world to the metric world, about which all is linear.
+        bending: of the map. is_at_rest: whether photos and measurements made it together; otherwise it is moved as one
+            piece.
+        observed: the observations of the kinds that are used, by kind.
+        problem: of all these, with learnt errors. posterior: what they say of the map.
+        metres_per_unit: of the unscaled model, in the world of the path.
+    """
+
+    kinds: tuple[KindOnMap, ...]
+    path: Trajectory
+    placed: Similarity
+    bending: MapBending
+    is_at_rest: bool
+    observed: Mapping[str, Observations]
+    problem: JointProblem
+    posterior: Posterior
+    metres_per_unit: float = 1.0
+
+    @property
+    def estimate(self) -> Similarity:
+        """From the world of the path to the metric world, at the estimate of the posterior."""
+        known = self.posterior
+        return moved_similarity(self.placed, known.columns.map_step(known.step), self.path)
+
+    @property
+    def scale(self) -> ScaleByKind:
+        """Metres per unit of the unscaled model, at the estimate."""
+        return self.posterior.uncertainty.about(self.estimate.scale * self.metres_per_unit)
+
+    @property
+    def uncertainty(self) -> ScaleUncertainty:
+        """Uncertainty of the scale."""
+        return self.posterior.uncertainty
+
+    def find(self, kind: type[_Kind]) -> _Kind | None:
+        """Return the measurements of a kind; None without any."""
+        return find_kind(self.kinds, kind)
+
+    def columns(self, kind: str, of_kind: Array) -> Array:
+        """Return the columns (c, m) of the problem by those (k, m) of the observations of one kind."""
+        columns = np.zeros((len(self.problem.is_used), of_kind.shape[1]))
+        columns[self.problem.rows[kind]] = of_kind
+        return columns
+
+    def rejoined(self, kinds: Sequence[KindOnMap], placed: Similarity) -> JointMap:
+        """Return the same map with other measurements, placed elsewhere."""
+        return join_kinds(kinds, self.path, placed, self.bending, is_at_rest=self.is_at_rest)
+
+    def without(self, kind: str, name: str) -> JointMap:
+        """Return the map at rest without one component of the errors of a kind."""
+        problem = self.problem.without(kind, name)
+        return replace(self, problem=problem, posterior=problem.posterior(is_fitted=True, is_refined=True))
+
+    def moved(self) -> tuple[KindOnMap, ...]:
+        """Return the kinds on the map that was moved to its estimate."""
+        return tuple(kind.moved(self.posterior) for kind in self.kinds)
+
+
+def find_kind(kinds: Sequence[KindOnMap], kind: type[_Kind]) -> _Kind | None:
+    """Return the measurements of a kind among all; None without any."""
+    return next((each for each in kinds if isinstance(each, kind)), None)
+
+
+def observations(
+    kinds: Sequence[KindOnMap], placed: Similarity, max_num: int = MAX_NUM_OBSERVATIONS
+) -> list[Observations]:
+    """Return the observations of the kinds that are used, about a placement, of which none crowds out another.
+
+    Args:
+        max_num: about the largest number of all together.
+    """
+    used = [each for each in kinds if each.is_used]
+    in_site, found, num = any(each.places_map for each in used), list[Observations](), 0
+    for k, each in reversed(list(enumerate(used))):
+        most = max(max_num - num, max_num // 2) if k == 0 else max_num // 2
+        found.append(each.observed(placed, in_site=in_site, max_num=most))
+        num += len(found[-1].residual_m)
+    return found[::-1]
+
+
+def tested_kinds(
+    kinds: Sequence[KindOnMap], placed: Similarity, max_num: int, *, is_last: bool
+) -> tuple[KindOnMap, ...]:
+    """Return the kinds, each with that left out which contradicts all others; arguments as of ``KindOnMap.tested``.
+
+    Args:
+        max_num: as of ``observations``.
+    """
+    found = observations(kinds, placed, max_num)
+    return tuple(
+        each.tested(placed, [other for other in found if other.kind != each.kind], is_last=is_last) for each in kinds
+    )
+
+
+def join_kinds(
+    kinds: Sequence[KindOnMap], path: Trajectory, placed: Similarity, bending: MapBending, *, is_at_rest: bool = False
+) -> JointMap:
+    """Join all measurements at a map, and learn their errors; arguments as of ``JointMap``."""
+    found, used = observations(kinds, placed), [each for each in kinds if each.is_used]
+    problem = joined(found, bending).learnt()
+    if is_at_rest:
+        known = problem.posterior(is_fitted=True, is_refined=True)
+    else:
+        known = used[0].posterior(problem) if len(used) == 1 else problem.posterior(is_fitted=False)
+    observed = {each.kind: each for each in found}
+    return JointMap(tuple(kinds), path, placed, bending, is_at_rest, observed, problem, known)
+
+
+def fit_kinds(kinds: Sequence[KindOnMap], path: Trajectory, placed: Similarity, bending: MapBending) -> JointMap:
+    """Join all measurements at the placement that they give, starting from another one.
+
+    The equations are not linear in the logarithm of the scale.
+    """
+    for _ in range(MAX_NUM_ROUNDS):
+        found = join_kinds(kinds, path, placed, bending)
+        if abs(found.posterior.step[0]) < NEGLIGIBLE_STDDEVS**2 * found.posterior.uncertainty.empirical:
+            break
+        placed = found.estimate
+    return found
+
+
+def in_first_cameras_frame(path: Trajectory, scale: float) -> Similarity:
+    """Return the placement of a map in the frame of its first camera, given the metres per unit of its path."""
+    return replace(IDENTITY, scale=scale) @ first_camera_from(path)

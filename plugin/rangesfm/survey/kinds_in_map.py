@@ -1,0 +1,92 @@
+"""The table of kinds: what a survey has measured besides ranges, located in a map. No stage names a kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import pycolmap
+
+from rangesfm.arrays import Array
+from rangesfm.distances.lengths_on_map import LENGTHS
+from rangesfm.distances.locate_lengths import locate_distances
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.similarity import IDENTITY
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.bending import MapBending
+from rangesfm.measurements.joint_map import KindOnMap, find_kind
+from rangesfm.measurements.kind import Block
+from rangesfm.positions.grouped_positions import POSITIONS
+from rangesfm.scale.scale_by_lengths import LengthScale, lengths_between_points
+from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
+from rangesfm.survey.inputs import RangingInputs
+
+
+@dataclass(frozen=True)
+class MapOfPhotos:
+    """A map in which measurements are to be located.
+
+    Attributes:
+        model: the map. path: of its keyframes. bending: of the map.
+        metres_per_unit: of the unscaled model, in the world of the path.
+        blocks: parameters that a refinement of the map has estimated, by name.
+        before: the kinds on the map before its refinement; empty for a map that moves as one piece.
+    """
+
+    model: pycolmap.Reconstruction
+    path: Trajectory
+    bending: MapBending
+    metres_per_unit: float = 1.0
+    blocks: Mapping[Block, Array] = field(default_factory=dict)
+    before: tuple[KindOnMap, ...] = ()
+
+
+def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
+    surveyed = inputs.positions
+    known = surveyed.located(at.model, at.path)
+    if known is None or known.is_check.all():
+        return None
+    return scale_by_positions(
+        known,
+        at.path,
+        at.bending,
+        refined=IDENTITY if at.before else None,
+        lasting_s=surveyed.lasting_s,
+        metres_per_unit=at.metres_per_unit,
+    )
+
+
+def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
+    if not inputs.tape.distances:
+        return None
+    found = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids, at.path)
+    like = find_kind(at.before, LengthScale)
+    return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, like)
+
+
+KINDS: dict[str, Callable[[RangingInputs, MapOfPhotos], KindOnMap | None]] = {
+    POSITIONS: _positions,
+    LENGTHS: _lengths,
+}
+"""How each kind is located in a map, by its name. Without ranges, the first that is used decides what is doubtful."""
+
+
+def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[KindOnMap, ...], tuple[str, ...]]:
+    """Return the kinds in a map, and why others are not used, in words.
+
+    Raises:
+        InputError: a measurement cannot be in the map. GeometryError: what was used before no longer can be.
+    """
+    found, remarks = list[KindOnMap](), list[str]()
+    for kind, locate in KINDS.items():
+        if at.before and all(kind != each.kind for each in at.before):
+            continue
+        try:
+            located = locate(inputs, at)
+        except GeometryError as error:
+            if at.before:
+                raise
+            remarks.append(f"the known {kind} are not used: {error}")
+            continue
+        found += [] if located is None else [located]
+    return tuple(found), tuple(remarks)
