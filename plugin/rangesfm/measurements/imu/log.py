@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -61,3 +62,21 @@ class ImuLog:
 
     def __len__(self) -> int:
         return len(self.timestamp_s)
+
+    @property
+    def name(self) -> str:
+        """Name of the file, for messages."""
+        return Path(self.path).name or "the inertial sensor"
+
+    @property
+    def step_s(self) -> float:
+        """Median time between samples."""
+        return float(np.median(np.diff(self.timestamp_s)))
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Longest time between samples over which the motion can be interpolated; longer ones are gaps in the log.
+
+        Hands and drones move with frequencies of some hertz: over a tenth of a second they turn evenly.
+        """
+        return max(0.1, 3 * self.step_s)
