@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import secrets
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from rangesfm.errors import InputError
-from rangesfm.files.contents import CHUNK_BYTES, open_regular
+from rangesfm.files.contents import State, open_regular, sha256_of, state_of
 from rangesfm.files.folders import stays_inside
 
 _NAME = "manifest.json"
 _VERSION = 1
-_SQLITE_MAGIC = b"SQLite format 3\x00"
-# Byte ranges of counters in SQLite's header. They change whenever the file is opened for writing, which COLMAP does
-# even to look at a database. Source: https://www.sqlite.org/fileformat2.html, sections 1.3.7 and 1.3.18.
-_SQLITE_COUNTERS = ((24, 28), (92, 96))
-
-_State = tuple[int, int, int]
 
 
 class Manifest:
@@ -46,7 +39,7 @@ class Manifest:
         self.token = secrets.token_hex(4)
         self.moves: list[tuple[str, str]] = []
         self._hashes: dict[str, list[str]] = {}
-        self._states: dict[str, _State] = {}
+        self._states: dict[str, State] = {}
         # Size, time of change and hash of the file last announced by ``expect``; a rename keeps size and time.
         self._expected: dict[str, tuple[tuple[int, int], str]] = {}
         if os.path.lexists(self._path):
@@ -63,18 +56,18 @@ class Manifest:
                 return file
         return None
 
-    def expect(self, files: Iterable[tuple[Path, Path]]) -> None:
-        """Count the content of each source as this tool's own at its target, in addition to what is own there already.
+    def expect(self, new: Mapping[Path, Path]) -> None:
+        """Count what is to go to each place as this tool's own there, in addition to what is own there already.
 
-        The record must be saved before the source is renamed to the target.
+        The record must be saved before the moves.
 
         Args:
-            files: pairs (source, target) of files or folders.
+            new: the present path of the file or folder for each place.
         """
-        for source, target in files:
+        for target, source in new.items():
             for file in _files_in(source):
                 name = self._name_of(target / file.relative_to(source))
-                state, found = _state_of(file.lstat()), content_hash(file)
+                state, found = state_of(file.lstat()), content_hash(file)
                 self._hashes.setdefault(name, []).append(found)
                 self._expected[name] = state[:2], found
 
@@ -90,7 +83,7 @@ class Manifest:
                     self._states.pop(other, None)
             for other, file in present.items():
                 if other in self._hashes:
-                    state = _state_of(file.lstat())
+                    state = state_of(file.lstat())
                     before, expected = self._expected.get(other, (None, ""))
                     self._hashes[other] = [expected if before == state[:2] else content_hash(file)]
                     self._states[other] = state
@@ -117,7 +110,9 @@ class Manifest:
                 record = json.loads(file.read().decode("utf-8", errors="surrogateescape"))
             if record["version"] != _VERSION:
                 raise ValueError(f"version {record['version']}")
-            self.token = _word(record["token"])
+            self.token = _text(record["token"])
+            if not self.token.isalnum():
+                raise ValueError(f"{self.token!r} is no token")
             self.moves = [(_text(source) and _name(source), _name(target)) for source, target in record["moves"]]
             for name, entry in record["files"].items():
                 self._hashes[_text(name)] = [_text(sha256) for sha256 in entry["sha256"]]
@@ -135,7 +130,7 @@ class Manifest:
         name, found = self._name_of(path), path.lstat()
         if name not in self._hashes or not stat.S_ISREG(found.st_mode):
             return False
-        state = _state_of(found)
+        state = state_of(found)
         if self._states.get(name) == state:
             return True
         if content_hash(path) not in self._hashes[name]:
@@ -149,16 +144,7 @@ class Manifest:
 
 def content_hash(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; the counters in the header of an SQLite database are ignored."""
-    digest = hashlib.sha256()
-    with open_regular(path) as file:
-        head = bytearray(file.read(CHUNK_BYTES))
-        if head.startswith(_SQLITE_MAGIC):
-            for first, end in _SQLITE_COUNTERS:
-                head[first:end] = bytes(end - first)
-        digest.update(head)
-        while chunk := file.read(CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
+    return sha256_of(path, but_counters=True)
 
 
 def _files_in(path: Path) -> Iterator[Path]:
@@ -173,10 +159,6 @@ def _files_in(path: Path) -> Iterator[Path]:
         yield from (Path(parent, name) for name in sorted(folders) if Path(parent, name).is_symlink())
 
 
-def _state_of(found: os.stat_result) -> _State:
-    return found.st_size, found.st_mtime_ns, found.st_ctime_ns
-
-
 def _text(value: object) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is no text")
@@ -186,10 +168,4 @@ def _text(value: object) -> str:
 def _name(value: object) -> str:
     if not stays_inside(_text(value)):
         raise ValueError(f"{value!r} is no path inside the folder")
-    return str(value)
-
-
-def _word(value: object) -> str:
-    if not _text(value).isalnum():
-        raise ValueError(f"{value!r} is no token")
     return str(value)

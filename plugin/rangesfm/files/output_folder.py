@@ -121,20 +121,18 @@ class OutputFolder:
         if last is not None:
             moves = [(None, last), *moves, *([(new[last], last)] if last in new else [])]
         self.require_own({target for _, target in moves})
-        self._manifest.expect((source, target) for target, source in new.items())
+        self._manifest.expect(new)
         self._manifest.moves = [
-            ("" if source is None else self._relative(source, self.private), self._relative(target, self.path))
+            (
+                "" if source is None else source.relative_to(self.private).as_posix(),
+                target.relative_to(self.path).as_posix(),
+            )
             for source, target in moves
         ]
         self._manifest.save()
         done: list[tuple[Path, Path]] = []
         try:
-            for source, target in moves:
-                if os.path.lexists(target):
-                    _rename(target, self.part(target.name), done)
-                if source is not None:
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    _rename(source, target, done)
+            self._move(moves, done)
         except BaseException:
             for before, after in reversed(done):
                 if os.path.lexists(after) and not os.path.lexists(before):
@@ -142,7 +140,7 @@ class OutputFolder:
             self._manifest.moves = []
             self._manifest.save()
             raise
-        self._settle([target for _, target in moves])
+        self._settle(target for _, target in moves)
         if last is not None:
             for folder in self._emptied:
                 remove(folder)
@@ -156,7 +154,16 @@ class OutputFolder:
         if self._manifest.is_empty and not (set(os.listdir(self.private)) - {"lock", "manifest.json"}):
             self._manifest.remove()
 
-    def _settle(self, targets: Sequence[Path]) -> None:
+    def _move(self, moves: Iterable[tuple[Path | None, Path]], done: list[tuple[Path, Path]]) -> None:
+        """Move each source to its target, after what is there has been moved away; ``done`` gets the renames."""
+        for source, target in moves:
+            if os.path.lexists(target):
+                _rename(target, self.part(target.name), done)
+            if source is not None:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                _rename(source, target, done)
+
+    def _settle(self, targets: Iterable[Path]) -> None:
         self._manifest.moves = []
         self._manifest.settle(targets)
         self._manifest.save()
@@ -169,21 +176,12 @@ class OutputFolder:
         if not moves:
             return
         self.require_own(target for _, target in moves)
-        new = {target: source for source, target in moves if source is not None}
-        for target, source in new.items():
-            if os.path.lexists(source):  # if not, it has been moved already
-                if os.path.lexists(target):
-                    os.rename(target, self.part(target.name))
-                target.parent.mkdir(parents=True, exist_ok=True)
-                os.rename(source, target)
-        for _, target in moves:
-            if target not in new and os.path.lexists(target):
-                os.rename(target, self.part(target.name))
-        self._settle([target for _, target in moves])
+        filled = {target for source, target in moves if source is not None}
+        # A source that is gone has been moved already; what was cleared first and then filled is not cleared again.
+        left = [(s, t) for s, t in moves if (t not in filled if s is None else os.path.lexists(s))]
+        self._move(left, [])
+        self._settle(target for _, target in moves)
         self._clear_parts()
-
-    def _relative(self, path: Path, folder: Path) -> str:
-        return path.relative_to(folder).as_posix()
 
     def _clear_parts(self) -> None:
         """Remove unfinished files whose process has ended, except those that a begun move still needs."""
