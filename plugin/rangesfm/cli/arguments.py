@@ -9,10 +9,8 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, NoReturn
 
-from rangesfm.cli.help_pages import HelpParser, HelpSection
-from rangesfm.errors import InputError
+from rangesfm.cli.help_pages import HelpSection, Parser
 from rangesfm.progress import Progress
 
 # Modules with commands, in the order in which the help lists the commands.
@@ -30,36 +28,12 @@ class Outcome:
 Execute = Callable[[argparse.Namespace, Progress], Outcome]
 
 
-class Parser(HelpParser):
-    """Parser that raises InputError where argparse would print its usage and exit.
+class Commands(Parser):
+    """Parser of the whole command line, with all commands, each described by its own module; its help lists them.
 
     Attributes:
-        later: functions that add arguments to this parser when it is first used. The parsers of all commands are made
-            on each run, but only one is used, and some arguments are slow to make.
-    """
-
-    def __init__(self, **options: Any):
-        super().__init__(**options)
-        self.later: list[Callable[[Parser], object]] = []
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        while self.later:
-            self.later.pop(0)(self)
-        return super().parse_known_args(args, namespace)
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see {self.prog} -h)")
-
-    def nearest_option(self, name: str) -> str | None:
-        """Return the known long option that is spelt most like ``name``; None if none is similar."""
-        return next(iter(difflib.get_close_matches(name, self._option_string_actions, 1)), None)
-
-
-class ProgramParser(Parser):
-    """Parser of the whole command line; its help lists the commands.
-
-    Attributes:
-        commands: all commands with their lines of help, by whether the short help lists them too.
+        by_name: parser of each command, in the order of the help.
+        listed: all commands with their lines of help, by whether the short help lists them too.
     """
 
     def __init__(self) -> None:
@@ -73,29 +47,10 @@ class ProgramParser(Parser):
             "  rangesfm COMMAND --help  everything about it; options may be spelt with _ or -",
         )
         self.more = None
-        self.commands: dict[bool, list[argparse.Action]] = {True: [], False: []}
         self.general.add_argument("--version", action=_PrintVersion)
-
-    def help_sections(self, *, is_full: bool) -> Sequence[HelpSection]:
-        common = HelpSection("commands", self.commands[True])
-        if not is_full:
-            return [common]
-        more = HelpSection("more commands", self.commands[False])
-        return [common, more, HelpSection("options", self.general._group_actions)]
-
-
-class Commands:
-    """All commands, each described by its own module, and the parser of the whole command line.
-
-    Attributes:
-        parser: of the whole command line.
-        by_name: parser of each command, in the order of the help.
-    """
-
-    def __init__(self) -> None:
-        self.parser = ProgramParser()
-        self._subparsers = self.parser.add_subparsers(prog="rangesfm", metavar="COMMAND", parser_class=Parser)
         self.by_name: dict[str, Parser] = {}
+        self.listed: dict[bool, list[argparse.Action]] = {True: [], False: []}
+        self._subparsers_of_commands = self.add_subparsers(prog="rangesfm", metavar="COMMAND", parser_class=Parser)
         for module in _MODULES:
             getattr(import_module(f"rangesfm.cli.{module}"), f"add_{module}_commands")(self)
 
@@ -109,12 +64,20 @@ class Commands:
             is_common: whether most people need it; the others are in a list of their own, in the full help only.
         """
         description, _, example = inspect.cleandoc(execute.__doc__ or "").partition("\n\nexample:")
-        parser: Parser = self._subparsers.add_parser(name, description=description, epilog=f"example:{example}")
+        parser: Parser = self._subparsers_of_commands.add_parser(
+            name, description=description, epilog=f"example:{example}"
+        )
         parser.general.add_argument("--quiet", action="store_true", help="print results and errors only")
         parser.set_defaults(execute=execute, command=name)
-        self.parser.commands[is_common].append(argparse.Action([], name, help=help))
+        self.listed[is_common].append(argparse.Action([], name, help=help))
         self.by_name[name] = parser
         return parser
+
+    def help_sections(self, *, is_full: bool) -> list[HelpSection]:
+        common: HelpSection = ("commands", self.listed[True], None)
+        if not is_full:
+            return [common]
+        return [common, ("more commands", self.listed[False], None), ("options", self.general._group_actions, None)]
 
 
 def normalize(argv: Sequence[str]) -> list[str]:
@@ -146,21 +109,17 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     commands = Commands()
     args: argparse.Namespace
     two = " ".join(argv[:2])  # argparse needs a command of two words as one argument
-    args, unknown = commands.parser.parse_known_args([two, *argv[2:]] if two in commands.by_name else list(argv))
+    args, unknown = commands.parse_known_args([two, *argv[2:]] if two in commands.by_name else list(argv))
     if not hasattr(args, "command"):
-        commands.parser.error("a command is missing, expected one of " + ", ".join(commands.by_name))
+        commands.error("a command is missing, expected one of " + ", ".join(commands.by_name))
     args.typed = ["rangesfm", *argv]
     if unknown:
-        commands.by_name[args.command].error(_unknown(unknown[0], commands.by_name[args.command]))
+        parser, name = commands.by_name[args.command], unknown[0].partition("=")[0]
+        if not name.startswith("-"):
+            parser.error(f"unexpected argument '{unknown[0]}'")
+        nearest = difflib.get_close_matches(name, parser._option_string_actions, 1)
+        parser.error(f"unknown option {name}" + (f"; the nearest known one is {nearest[0]}" if nearest else ""))
     return args
-
-
-def _unknown(argument: str, parser: Parser) -> str:
-    if not argument.startswith("-"):
-        return f"unexpected argument '{argument}'"
-    name = argument.partition("=")[0]
-    nearest = parser.nearest_option(name)
-    return f"unknown option {name}" + (f"; the nearest known one is {nearest}" if nearest else "")
 
 
 class _PrintVersion(argparse.Action):

@@ -1,23 +1,19 @@
-"""The two pages of help of a command: a short one for ``-h``, and everything for ``--help``."""
+"""Parser of a command, with two pages of help: a short one for ``-h``, and everything for ``--help``."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from itertools import groupby
-from typing import Any
+from typing import Any, NoReturn, TypeAlias
+
+from rangesfm.errors import InputError
 
 _OPTIONS = argparse.Action([], "options", metavar="[options]")  # stands for them all in the usage
 
 
-@dataclass(frozen=True)
-class HelpSection:
-    """A list of arguments or commands under a title, with a text below the title if there is one."""
-
-    title: str | None
-    actions: Sequence[argparse.Action]
-    text: str | None = None
+# A list of arguments or commands: its title, the arguments, and a text below the title.
+HelpSection: TypeAlias = tuple[str | None, Sequence[argparse.Action], str | None]
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -38,17 +34,21 @@ class PrintHelp(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, help="-h: what most people need; --help: everything")
 
     def __call__(self, parser: object, namespace: object, values: object, name: str | None = None) -> None:
-        assert isinstance(parser, HelpParser)
+        assert isinstance(parser, Parser)
         raise SystemExit(parser.help_page(is_full=name == "--help").rstrip("\n"))
 
 
-class HelpParser(argparse.ArgumentParser):
-    """Parser with two pages of help. The short one has the arguments that are in no group, and the common ones.
+class Parser(argparse.ArgumentParser):
+    """Parser that raises InputError where argparse would print its usage and exit.
+
+    Its short page of help has the arguments that are in no group, and the common ones.
 
     Attributes:
         common: attributes of the parsed arguments that hold the common ones of the groups.
         general: group of the options that all commands have.
         more: last lines of the short page.
+        later: functions that add arguments to this parser when it is first used. The parsers of all commands are made
+            on each run, but only one is used, and some arguments are slow to make.
     """
 
     def __init__(self, **options: Any):
@@ -56,8 +56,17 @@ class HelpParser(argparse.ArgumentParser):
         self.color = False  # with colours, those of Python 3.14, the text would contain control characters
         self.common: set[str] = set()
         self.more: str | None = f"everything:\n  {self.prog} --help"
+        self.later: list[Callable[[Parser], object]] = []
         self.general = self.add_argument_group("general")
         self.general.add_argument("-h", "--help", action=PrintHelp)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        while self.later:
+            self.later.pop(0)(self)
+        return super().parse_known_args(args, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message} (see {self.prog} -h)")
 
     def help_page(self, *, is_full: bool) -> str:
         """Return the text of ``--help`` (everything) or of ``-h``."""
@@ -66,22 +75,20 @@ class HelpParser(argparse.ArgumentParser):
         formatter.add_usage(self.usage, [_OPTIONS, *required], [])
         description = self.description or ""
         formatter.add_text(description if is_full else description.partition("\n\n")[0])
-        for section in self.help_sections(is_full=is_full):
-            formatter.start_section(section.title)
-            formatter.add_text(section.text)
-            formatter.add_arguments(section.actions)
+        for title, actions, text in self.help_sections(is_full=is_full):
+            formatter.start_section(title)
+            formatter.add_text(text)
+            formatter.add_arguments(actions)
             formatter.end_section()
         formatter.add_text(self.epilog)
         formatter.add_text(None if is_full else self.more)
         return formatter.format_help()
 
-    def help_sections(self, *, is_full: bool) -> Sequence[HelpSection]:
+    def help_sections(self, *, is_full: bool) -> list[HelpSection]:
         """Return the lists of a page: all groups, or what is common of them in two lists."""
         if is_full:
-            return [HelpSection(group.title, group._group_actions, group.description) for group in self._action_groups]
+            return [(group.title, group._group_actions, group.description) for group in self._action_groups]
         ungrouped = {action for group in self._action_groups[:2] for action in group._group_actions}
         shown = [action for action in self._actions if action in ungrouped or action.dest in self.common]
-        return [
-            HelpSection("arguments", [action for action in shown if not action.option_strings]),
-            HelpSection("options", [action for action in shown if action.option_strings]),
-        ]
+        arguments, options = ([a for a in shown if bool(a.option_strings) == is_option] for is_option in (False, True))
+        return [("arguments", arguments, None), ("options", options, None)]

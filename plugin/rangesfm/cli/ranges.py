@@ -9,7 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from rangesfm.cli.arguments import Commands, Outcome, Parser
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.cli.help_pages import Parser
 from rangesfm.cli.survey_flags import add_flags, position, survey_from_arguments
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.clock_times import span_text

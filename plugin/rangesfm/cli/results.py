@@ -7,7 +7,8 @@ import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rangesfm.cli.arguments import Commands, Outcome, Parser
+from rangesfm.cli.arguments import Commands, Outcome
+from rangesfm.cli.help_pages import Parser
 from rangesfm.cli.survey_flags import add_flags, flags_given, overrides_from_arguments, survey_from_arguments
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import require_apart

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
 
-from rangesfm.cli.arguments import Parser
+from rangesfm.cli.help_pages import Parser
 from rangesfm.errors import InputError
 from rangesfm.progress import SILENT, Progress
 
