@@ -149,7 +149,7 @@ def test_interrupted_as_soon_as_it_has_the_lock_it_leaves_nothing(
     def interrupt() -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rangesfm.files.output_folder._own_name", interrupt)
+    monkeypatch.setattr("socket.gethostname", interrupt)
     with pytest.raises(KeyboardInterrupt), sole_writer(tmp_path / "out"):
         pass
     assert os.listdir(tmp_path) == []

@@ -10,7 +10,7 @@ from tests.simulated.phone_survey import write_anchors, write_log, write_photos
 from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.errors import InputError
-from rangesfm.survey.survey_reader import read_survey
+from rangesfm.survey.survey_reader import read_survey, survey_from_tables
 from rangesfm.survey_discovery.understood import understand
 
 CAMERA = {"camera_model": "PINHOLE", "width": 96, "height": 64, "params": [90, 90, 48, 32], "tag_in_cam_m": [0, 0.1, 0]}
@@ -21,8 +21,8 @@ def test_a_whole_folder_is_a_survey(tmp_path: Path) -> None:
     write_log(tmp_path / "uwb.csv", 0.0)
     write_anchors(tmp_path / "anchors_surveyed.csv")
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA))
-    understood = understand([tmp_path], {})
-    assert understood.values == {
+    values, _ = understand([tmp_path], {})
+    assert values == {
         "images.path": tmp_path / "images",
         "ranges.path": tmp_path / "uwb.csv",
         "anchors.path": tmp_path / "anchors_surveyed.csv",
@@ -30,7 +30,7 @@ def test_a_whole_folder_is_a_survey(tmp_path: Path) -> None:
         "camera.params": (90, 90, 48, 32),
         "tag.tag_in_cam_m": (0, 0.1, 0),
     }
-    survey = understood.survey()
+    survey = survey_from_tables({}, tmp_path, values)
     assert survey.camera.params == (90, 90, 48, 32)
     assert survey.tag.tag_in_cam_m == (0, 0.1, 0)
 
@@ -42,12 +42,9 @@ def test_the_usual_name_is_meant_and_the_others_are_told(tmp_path: Path) -> None
     write_photos(tmp_path / "images_small", 2)
     write_log(tmp_path / "uwb.csv", 0.0)
     write_log(tmp_path / "uwb_old.csv", 0.0)
-    understood = understand([tmp_path], {})
-    assert understood.values == {"images.path": tmp_path / "images", "ranges.path": tmp_path / "uwb.csv"}
-    assert understood.notes == (
-        "images is used; left out: images_small",
-        "uwb.csv is used; left out: uwb_old.csv",
-    )
+    values, notes = understand([tmp_path], {})
+    assert values == {"images.path": tmp_path / "images", "ranges.path": tmp_path / "uwb.csv"}
+    assert notes == ["images is used; left out: images_small", "uwb.csv is used; left out: uwb_old.csv"]
 
 
 def test_what_nothing_tells_is_asked_for_all_at_once_with_the_flags(tmp_path: Path) -> None:
@@ -62,7 +59,7 @@ def test_what_nothing_tells_is_asked_for_all_at_once_with_the_flags(tmp_path: Pa
         "run_1.csv, run_2.csv: any of them may be [ranges] path; say which by --ranges PATH",
     )
     given = {"images.path": str(tmp_path / "b"), "ranges.path": tmp_path / "run_2.csv"}
-    assert understand([tmp_path], given).values == {
+    assert understand([tmp_path], given)[0] == {
         "images.path": tmp_path / "b",
         "ranges.path": tmp_path / "run_2.csv",
     }
@@ -71,7 +68,7 @@ def test_what_nothing_tells_is_asked_for_all_at_once_with_the_flags(tmp_path: Pa
 def test_files_of_one_anchor_each_are_one_log(tmp_path: Path) -> None:
     for anchor in ("A1", "A2"):
         write_log(tmp_path / f"run_{anchor}.csv", 0.0, anchors=(anchor,))
-    assert understand([tmp_path], {}).values == {"ranges.path": tmp_path / "run_A*.csv"}
+    assert understand([tmp_path], {})[0] == {"ranges.path": tmp_path / "run_A*.csv"}
 
 
 def test_a_folder_of_nothing_is_refused_with_what_is_there(tmp_path: Path) -> None:
@@ -85,38 +82,38 @@ def test_of_several_cameras_that_of_the_photos_size_is_taken(tmp_path: Path) -> 
     write_photos(tmp_path / "images", 3)
     cameras = tmp_path / "cameras.txt"
     cameras.write_text("1 PINHOLE 640 480 500 501 320 240\n2 PINHOLE 96 64 90 91 48 32\n")
-    values = understand([tmp_path], {}).values
+    values = understand([tmp_path], {})[0]
     assert (values["camera.model"], values["camera.params"]) == ("PINHOLE", (90, 91, 48, 32))
 
 
 def test_a_camera_of_another_size_is_left_out_but_its_lever_arm_holds(tmp_path: Path) -> None:
     write_photos(tmp_path / "images", 3)
     (tmp_path / "camera.json").write_text(json.dumps({**CAMERA, "width": 192, "height": 128}))
-    understood = understand([tmp_path], {})
-    assert understood.values == {"images.path": tmp_path / "images", "tag.tag_in_cam_m": (0, 0.1, 0)}
-    assert "0 of its cameras (192 x 128 pixels) fit the photos, so none is used" in understood.notes[-1]
+    values, notes = understand([tmp_path], {})
+    assert values == {"images.path": tmp_path / "images", "tag.tag_in_cam_m": (0, 0.1, 0)}
+    assert "0 of its cameras (192 x 128 pixels) fit the photos, so none is used" in notes[-1]
 
 
 def test_a_video_is_the_photos_also_in_a_folder_of_the_usual_name(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "walk.MOV").touch()
     write_log(tmp_path / "uwb.csv", 0.0)
-    understood = understand([tmp_path], {})
-    assert understood.values == {"images.path": tmp_path / "images" / "walk.MOV", "ranges.path": tmp_path / "uwb.csv"}
+    values, _ = understand([tmp_path], {})
+    assert values == {"images.path": tmp_path / "images" / "walk.MOV", "ranges.path": tmp_path / "uwb.csv"}
 
 
 def test_what_the_user_says_goes_before_what_is_found(tmp_path: Path) -> None:
     write_photos(tmp_path / "images", 3)
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA))
     given = {"tag.lever_arms_m": {"T1": (0, 0, 1)}, "camera.model": "SIMPLE_RADIAL"}
-    assert understand([tmp_path], given).values == {"images.path": tmp_path / "images", **given}
+    assert understand([tmp_path], given)[0] == {"images.path": tmp_path / "images", **given}
 
 
 def test_the_demos_own_files_are_understood(tmp_path: Path) -> None:
     made = make_small_demo(tmp_path / "demo", num_photos=10)
     told = read_survey(made.survey_path)
     made.survey_path.unlink()
-    survey = understand([made.folder], {}).survey()
+    survey = survey_from_tables({}, tmp_path, understand([made.folder], {})[0])
     for table, key in (("images", "path"), ("ranges", "path"), ("anchors", "path"), ("report", "reference")):
         assert getattr(getattr(survey, table), key) == getattr(getattr(told, table), key)
 
@@ -126,13 +123,13 @@ def test_points_whose_columns_have_unknown_names_stop_with_a_whole_command_where
 ) -> None:
     (tmp_path / "releve.csv").write_text("Foo;Bar;Baz;Qux\nA1;1.5;2.5;0.5\nA2;8.5;2.25;1.5\nA3;8.25;9.5;2.5\n")
     write_photos(tmp_path / "images", 3)
-    assert understand([tmp_path], {}).values == {"images.path": tmp_path / "images"}  # nobody asks for anchors
+    assert understand([tmp_path], {})[0] == {"images.path": tmp_path / "images"}  # nobody asks for anchors
     write_log(tmp_path / "uwb.csv", 0.0)
     with pytest.raises(InputError, match=r"releve\.csv: a table of anchors whose columns are not known") as caught:
         understand([tmp_path], {})
     assert any("--anchor_columns anchor_id=Foo,x=Bar,y=Baz,z=Qux" in line for line in caught.value.advice)
     write_anchors(tmp_path / "anchors.csv")
-    assert understand([tmp_path], {}).values["anchors.path"] == tmp_path / "anchors.csv"
+    assert understand([tmp_path], {})[0]["anchors.path"] == tmp_path / "anchors.csv"
 
 
 @pytest.mark.parametrize("name", ["anchors.xlsx", "my_anchors.txt", "Ancres.dxf"])

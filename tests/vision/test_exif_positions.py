@@ -70,10 +70,10 @@ def test_they_are_taken_where_nothing_else_is_in_metres(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     for k in range(3):
         write_photo(photos / f"{k}.jpg", PLACE)
-    found = understand([tmp_path], {})
-    assert found.values["positions.path"] == photos
-    assert "the positions are those in the EXIF data of 3 photos" in found.notes
+    values, notes = understand([tmp_path], {})
+    assert values["positions.path"] == photos
+    assert "the positions are those in the EXIF data of 3 photos" in notes
     (tmp_path / "distances.csv").write_text("from,to,distance_m\na,b,1.5\n")
-    found = understand([tmp_path], {})
-    assert "positions.path" not in found.values
-    assert f"3 photos have positions in their EXIF data: --positions {photos} uses them, too" in found.notes
+    values, notes = understand([tmp_path], {})
+    assert "positions.path" not in values
+    assert f"3 photos have positions in their EXIF data: --positions {photos} uses them, too" in notes

@@ -45,7 +45,7 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     from rangesfm.files.atomic import write_text
     from rangesfm.files.output_folder import free_output
-    from rangesfm.survey.survey_reader import read_survey
+    from rangesfm.survey.survey_reader import read_survey, survey_from_tables
     from rangesfm.survey_discovery.found_files import SURVEY_NAME
     from rangesfm.survey_discovery.survey_file import survey_text
     from rangesfm.survey_discovery.understood import understand
@@ -58,15 +58,15 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
         raise InputError(
             "is there already and is left as it is; --force writes it anew, --output_path PATH writes another", path
         )
-    understood = understand(folders, overrides_from_arguments(args), args.typed)
-    understood.survey()  # raises an error about bad values before anything is written
+    values, notes = understand(folders, overrides_from_arguments(args), args.typed)
+    survey_from_tables({}, Path.cwd(), values)  # raises an error about bad values before anything is written
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
     kept = _make_way(path) if path.is_file() else None
-    write_text(survey_text({**understood.values, "output.path": free_output(folder)}, folder), path)
+    write_text(survey_text({**values, "output.path": free_output(folder)}, folder), path)
     checked = check_survey(read_survey(path))
     lines = [f"wrote {path}" + (f", and kept the earlier one as {kept.name}" if kept else "")]
-    lines += [*told(checked, fault="missing"), *(f"note: {note}" for note in understood.notes)]
+    lines += [*told(checked, fault="missing"), *(f"note: {note}" for note in notes)]
     command = shlex.join(["rangesfm", "check" if checked.faults else "run", str(path)])
     missing = "write down what is missing (a flag is a key of the same name), then " if checked.faults else ""
     return Outcome([*lines, f"next: {missing}{command}"])

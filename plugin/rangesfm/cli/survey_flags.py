@@ -239,10 +239,10 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress = SILENT)
         from rangesfm.survey_discovery.understood import understand
 
         given = {"output.path": free_output(path.absolute()), **overrides}
-        understood = understand([path], given, getattr(args, "typed", ()))
-        for note in understood.notes:
+        values, notes = understand([path], given, getattr(args, "typed", ()))
+        for note in notes:
             progress.message(note)
-        return understood.survey()
+        return survey_from_tables({}, Path.cwd(), values)
     return read_survey(path, overrides, args.base_path)
 
 

@@ -219,14 +219,10 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
     made = [path for path in (private, key, *key.parents) if not os.path.lexists(path)]
     lock = FileLock(key / LOCK_NAME)
     make_output_folder(folder)
+    is_held = False
     try:
         _acquire(lock, folder, private, max_wait_s)
-    except BaseException:
-        if lock.is_locked:  # Ctrl-C came when the lock had just been acquired
-            _release(lock, private)
-        _remove_empty(made)
-        raise
-    try:
+        is_held = True
         held = OutputFolder(key)
         token = _held.set(MappingProxyType({**_held.get(), key: held}))
         try:
@@ -235,7 +231,8 @@ def sole_writer(folder: Path, *, max_wait_s: float = _MAX_WAIT_S) -> Iterator[Ou
             _held.reset(token)
             held.close()
     finally:
-        _release(lock, private)
+        if is_held or lock.is_locked:  # a Ctrl-C may come when the lock has just been acquired
+            _release(lock, private)
         _remove_empty(made)
 
 
@@ -333,8 +330,12 @@ def _acquire(lock: BaseFileLock, folder: Path, private: Path, max_wait_s: float)
         except OSError:  # the file system has no locks; the lock file still says who writes to the folder
             pass
         break
+    program, *arguments = sys.argv or ["python"]
+    command = " ".join(["rangesfm" if Path(program).name == "__main__.py" else Path(program).name, *arguments])
+    since = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+    holder = {"pid": os.getpid(), "host": socket.gethostname(), "command": command, "since": since}
     with suppress(OSError):  # on Windows a locked file cannot be written, and others are not told who holds the lock
-        path.write_text(_own_name(), encoding="utf-8")
+        path.write_text(json.dumps(holder), encoding="utf-8")
 
 
 def _release(lock: BaseFileLock, private: Path) -> None:
@@ -354,14 +355,6 @@ def _is_lock(path: Path) -> bool:
         return not text or text.startswith(_LOCK_BEGIN)
     except OSError:
         return False
-
-
-def _own_name() -> str:
-    program, *arguments = sys.argv or ["python"]
-    name = "rangesfm" if Path(program).name == "__main__.py" else Path(program).name
-    command = " ".join([name, *arguments])
-    since = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-    return json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "command": command, "since": since})
 
 
 def _holder(lock: Path) -> str:

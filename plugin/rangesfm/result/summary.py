@@ -140,7 +140,8 @@ class ResultSummary(Record):
         if self.points is not None:
             yield from self.points.lines()
         if offset.estimated:
-            value, within = _text(offset.value_s, "+.3f"), _text(_within_95(offset.stddev_s), ".3f")
+            within_s = None if offset.stddev_s is None else NORMAL_95 * offset.stddev_s
+            value, within = _text(offset.value_s, "+.3f"), _text(within_s, ".3f")
             yield f"time offset: image time = range time {value} s, within {within} s (95 %)"
         yield f"map: {self.map.num_photos} photos, {self.map.num_points3D} points, frame {self.frame}"
         if table is not None:
@@ -186,11 +187,6 @@ def _notable(sensitivity: entries.ScaleSensitivity) -> Iterator[str]:
     notable = [f"{number_text(v, '+.2f')} % per cm {what}" for what, v in values.items() if abs(v) > _NOTABLE_PERCENT]
     if notable:
         yield f"the scale depends strongly on single errors: it changes by {', by '.join(notable)}"
-
-
-def _within_95(stddev: float | None) -> float | None:
-    """Return half the width of the 95 % interval of a number with this standard deviation."""
-    return None if stddev is None else NORMAL_95 * stddev
 
 
 def _text(value: float | None, spec: str) -> str:

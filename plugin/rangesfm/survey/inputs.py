@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,10 +31,6 @@ from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.exif_positions import read_exif_positions
 from rangesfm.vision.rigs import read_rigs
-
-if TYPE_CHECKING:
-    pass
-
 
 # Distance between two anchors over the sum of the ranges to them. It is at most 1 where all are in metres; above each
 # of these numbers, the anchors are in that unit.
@@ -119,7 +114,9 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     """
     survey.require_metres()
     _check_rigs_are_metric(survey)
-    listed = _listed_anchors(survey)
+    file, listed = survey.anchors, None
+    if file.path is not None:
+        listed = read_anchor_list(file.path, columns=file.columns, unit=file.unit)
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
     if survey.ranges.path is None:
         log = RangeLog.from_arrays([], [], image_name=[])
@@ -162,12 +159,6 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     )
     log = log.in_time_order()
     return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions)
-
-
-def _listed_anchors(survey: Survey) -> AnchorList | None:
-    """Return the content of the anchor file, or None if there is none."""
-    anchors = survey.anchors
-    return None if anchors.path is None else read_anchor_list(anchors.path, columns=anchors.columns, unit=anchors.unit)
 
 
 def _ids(listed: AnchorList | None) -> list[str]:

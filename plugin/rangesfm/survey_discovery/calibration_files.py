@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,16 +81,13 @@ def _read_yaml(path: Path) -> Iterator[CameraCalibration]:
         coefficients = content["distortion_coefficients"]["data"]
         size = (content["image_width"], content["image_height"])
         yield _of_opencv(path, content["distortion_model"], (fx, fy, cx, cy), coefficients, size)
-    for name, camera in content.items():
+    for name, camera in content.items():  # Kalibr's
         if re.fullmatch(r"cam\d+", str(name)) and isinstance(camera, dict) and "camera_model" in camera:
-            yield _of_kalibr(path, camera)
-
-
-def _of_kalibr(path: Path, camera: Mapping[str, Any]) -> CameraCalibration:
-    if camera["camera_model"] != "pinhole":
-        raise InputError(f"camera_model is '{camera['camera_model']}', expected pinhole: COLMAP has no other", path)
-    model = camera.get("distortion_model", "none")
-    return _of_opencv(path, model, camera["intrinsics"], camera.get("distortion_coeffs", ()), camera["resolution"])
+            kind, coefficients = camera["camera_model"], camera.get("distortion_coeffs", ())
+            if kind != "pinhole":
+                raise InputError(f"camera_model is '{kind}', expected pinhole: COLMAP has no other", path)
+            distortion = camera.get("distortion_model", "none")
+            yield _of_opencv(path, distortion, camera["intrinsics"], coefficients, camera["resolution"])
 
 
 def _of_opencv(path: Path, distortion: str, pinhole: Any, coefficients: Any, size: Any) -> CameraCalibration:

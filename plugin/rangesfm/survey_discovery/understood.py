@@ -8,7 +8,6 @@ import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,7 @@ from rangesfm.ranging.readers import read_ranges
 from rangesfm.ranging.readers.lists import UnclearListError
 from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.sources.source import is_source, open_source
-from rangesfm.survey.settings import KEYS, METRIC_KEYS, Survey
-from rangesfm.survey.survey_reader import survey_from_tables
+from rangesfm.survey.settings import KEYS, METRIC_KEYS
 from rangesfm.survey_discovery.found_files import (
     ANCHORS,
     LOG,
@@ -47,34 +45,18 @@ _USUAL_NAMES = {
 _LEVER_ARMS = ("tag.tag_in_cam_m", "tag.lever_arms_m")
 
 
-@dataclass(frozen=True)
-class Understood:
-    """Values of a survey file, as found in folders and given by the user.
-
-    Attributes:
-        values: by dotted key; paths are absolute.
-        notes: lines that say what was left out, and why.
-    """
-
-    values: dict[str, Any]
-    notes: tuple[str, ...]
-
-    def survey(self) -> Survey:
-        """Return the survey for a run.
-
-        Raises:
-            InputError: a given value is not valid.
-        """
-        return survey_from_tables({}, Path.cwd(), self.values)
-
-
-def understand(folders: Sequence[Path], given: Mapping[str, object], command: Sequence[str] = ()) -> Understood:
+def understand(
+    folders: Sequence[Path], given: Mapping[str, object], command: Sequence[str] = ()
+) -> tuple[dict[str, Any], list[str]]:
     """Look into folders and choose the inputs of a run.
 
     Args:
         folders: to look into.
         given: values by dotted key from the user; inputs of these keys are not looked for.
         command: words of the command that the user has typed, for advice; empty: rangesfm init with the folders.
+
+    Returns:
+        Values of a survey file by dotted key, with absolute paths; and lines that say what was left out, and why.
 
     Raises:
         InputError: there are no inputs, or there are several of a kind and it is not clear which one to take, or a
@@ -133,7 +115,7 @@ def understand(folders: Sequence[Path], given: Mapping[str, object], command: Se
         raise InputError("found no photos, no radio log and no lengths in it", folders[0], advice=notes)
     _add_camera(values, found, notes)
     _add_exif_positions(values, notes)
-    return Understood(values, tuple(notes))
+    return values, notes
 
 
 def _questions(

@@ -308,15 +308,12 @@ def tables_of(found: MetricResult) -> Iterator[TableFile]:
         yield TagCorners(tuple(names), tuple(photos), *pixels.T)
     if len(found.observations.log):
         yield ranges_as_used(found)
-        yield from _scale_tables(found)
-
-
-def _scale_tables(found: MetricResult) -> Iterator[TableFile]:
-    rows, log = found.diagnostics.candidate_rows, found.observations.log
-    times = np.full(len(rows), np.nan) if log.timestamp_s is None else log.timestamp_s[rows]
-    anchor_ids = tuple(log.anchor_ids[k] for k in log.anchor_index[rows])
-    yield ScaleCandidates(times, anchor_ids, *found.diagnostics.candidates.T)
-    yield ScaleConsensus(found.diagnostics.curve_scales, found.diagnostics.num_agreeing.astype(np.float64))
+        diagnostics, log = found.diagnostics, found.observations.log
+        rows = diagnostics.candidate_rows
+        times = np.full(len(rows), np.nan) if log.timestamp_s is None else log.timestamp_s[rows]
+        anchor_ids = tuple(log.anchor_ids[k] for k in log.anchor_index[rows])
+        yield ScaleCandidates(times, anchor_ids, *diagnostics.candidates.T)
+        yield ScaleConsensus(diagnostics.curve_scales, diagnostics.num_agreeing.astype(np.float64))
 
 
 def ranges_as_used(found: MetricResult) -> RangesAsUsed:
