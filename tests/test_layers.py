@@ -156,7 +156,7 @@ def test_importing_the_package_imports_neither_pycolmap_nor_scipy() -> None:
 
 def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
     """Whoever adds a kind writes its module and its line in the table; no stage has to know of it."""
-    generic = {"joint_map", "kind", "marks", "places", "points", "prior", "table"}
+    generic = {"joint_map", "kind", "marks", "places", "points", "prior", "source", "table"}
     # What the survey reads, before there is anything to measure.
     generic |= {"imu", *(f"imu.{name}" for name in ("log", "signals", "formats", "turns", "alignment", "calibration"))}
     kinds = {module for module in MODULES if folder_of(module) == "measurements"} - {"measurements"}

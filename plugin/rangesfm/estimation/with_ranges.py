@@ -16,7 +16,7 @@ from rangesfm.estimation.refinement import joint_errors, refine
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.measurements.table import Measured, ranges_of_map
+from rangesfm.measurements.table import Measured, TapedLengths, Upwards, ranges_of_map
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
@@ -77,9 +77,8 @@ def refine_with_ranges(
     ranges = ranges_of_map(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors, errors, options)
     if shared_errors_m is not None:
         ranges = replace(ranges, shared_errors_m=shared_errors_m)
-    measured = Measured(
-        ranges, (tape or Tape()).control(), () if first_pose_is_fixed or gravity is None else (gravity,)
-    )
+    upwards = () if first_pose_is_fixed or gravity is None else (Upwards(gravity),)
+    measured = Measured(ranges, (TapedLengths(tape or Tape()), *upwards))
     with at_most(num_threads):
         problem = map_problem(
             metric,

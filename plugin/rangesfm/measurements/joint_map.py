@@ -27,6 +27,7 @@ from rangesfm.inference.posterior import (
     ScaleUncertainty,
     joined,
 )
+from rangesfm.measurements.source import Source
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -44,6 +45,8 @@ class KindOnMap(ABC):
 
     kind: ClassVar[str]
     """Name of the kind."""
+    is_in_fit: ClassVar[bool] = False
+    """Whether the fit of a map that may bend knows them; the map is moved as a whole to what others say."""
 
     @property
     @abstractmethod
@@ -108,6 +111,11 @@ class KindOnMap(ABC):
         """Yield what is to be said of them on a map, without any doubt of its scale."""
         del on_map
         yield from ()
+
+    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
+        """Return the measurements for the fit of a map that may bend, given all that is measured in it as one piece."""
+        del on_map
+        return ()
 
     def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
         """Return the errors learnt at a map at rest, for ``Measurements.with_learnt``, by kind of these."""
@@ -225,7 +233,7 @@ def join_kinds(
     found, used = observations(kinds, placed), [each for each in kinds if each.is_used]
     problem = joined(found, bending).learnt()
     if is_at_rest:
-        known = problem.posterior(is_fitted=True, is_refined=True)
+        known = problem.posterior(is_fitted=all(each.is_in_fit for each in used), is_refined=True)
     else:
         known = used[0].posterior(problem) if len(used) == 1 else problem.posterior(is_fitted=False)
     observed = {each.kind: each for each in found}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions import CLOCK as POSITIONS_CLOCK
 from rangesfm.measurements.positions import AntennaPositions, antenna_at
 from rangesfm.measurements.ranges import CLOCK, SHORT, Ranges, anchors_at, antenna_places
+from rangesfm.measurements.source import Source
 from rangesfm.options import RefineOptions
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.known_positions import KnownPositions
@@ -40,6 +41,8 @@ __all__ = [
     "SHORT",
     "Measured",
     "Ranges",
+    "TapedLengths",
+    "Upwards",
     "UsedPositions",
     "anchors_at",
     "antenna_at",
@@ -73,7 +76,49 @@ def ranges_of_map(
 
 
 @dataclass(frozen=True)
-class UsedPositions:
+class TapedLengths(Source):
+    """Lengths that were taped, between what the photos show or between anchors, of which the control ones take part."""
+
+    tape: Tape
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks of the lengths' ends."""
+        ends = {name for taped in self.tape.control().distances for name in taped.ends}
+        return {name: marker for name, marker in self.tape.markers.items() if name in ends}
+
+    def measurements(
+        self, points: NamedPoints, trajectory: Trajectory, options: RefineOptions
+    ) -> Iterator[Measurements]:
+        """Yield the lengths whose ends are in the map, if there are any."""
+        del trajectory, options
+        taped = [each for each in self.tape.control().distances if all(name in points for name in each.ends)]
+        if taped:
+            yield Lengths(
+                tuple(each.ends for each in taped),
+                points,
+                np.array([each.distance_m for each in taped]),
+                np.array([each.stddev_m for each in taped]),
+                {},
+            )
+
+
+@dataclass(frozen=True)
+class Upwards(Source):
+    """The upward direction in the first camera of a map in a site."""
+
+    gravity: Gravity
+
+    def measurements(
+        self, points: NamedPoints, trajectory: Trajectory, options: RefineOptions
+    ) -> Iterator[Measurements]:
+        """Yield the direction."""
+        del points, trajectory, options
+        yield UpwardDirection(self.gravity)
+
+
+@dataclass(frozen=True)
+class UsedPositions(Source):
     """Known positions that took part in an estimate of the scale, with the errors that it learnt.
 
     Attributes:
@@ -81,43 +126,85 @@ class UsedPositions:
         takes_part: (k,) all but check points and what contradicts the others. Outliers of an antenna are left to the
             loss, because on a map that is one piece drift looks like them.
         stddev_m: (k,) standard deviations of a coordinate.
-        site_from_model: the estimate. markers: of all points, by name. track: of the antenna, by tuple of at most one.
+        site_from_model: the estimate. of_points: marks of all points, by name. track: of the antenna, by tuple of at
+            most one.
     """
 
     known: KnownPositions
     takes_part: Mask
     stddev_m: Array
     site_from_model: Similarity
-    markers: Mapping[str, Marker]
+    of_points: Mapping[str, Marker]
     track: tuple[AntennaTrack, ...]
+
+    @property
+    def places_map(self) -> bool:
+        """True: they are in the site."""
+        return True
+
+    @property
+    def _marks(self) -> list[int]:
+        rows: list[int] = np.flatnonzero(self.takes_part & self.known.is_mark).tolist()
+        return rows
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks of the control points."""
+        return {name: self.of_points[name] for name in (self.known.names[row] for row in self._marks)}
+
+    def measurements(
+        self, points: NamedPoints, trajectory: Trajectory, options: RefineOptions
+    ) -> Iterator[Measurements]:
+        """Yield control points, and positions of the antenna."""
+        known = self.known
+        if rows := self._marks:
+            names = tuple(known.names[row] for row in rows)
+            yield ControlPoints(names, points, known.position_m[rows], self.stddev_m[rows], {})
+        if len(others := np.flatnonzero(self.takes_part & ~known.is_mark)):
+            yield self._of_antenna(others, trajectory, options)
+
+    def _of_antenna(self, rows: Indices, trajectory: Trajectory, options: RefineOptions) -> AntennaPositions:
+        known, [track] = self.known, self.track
+        arm_m = np.array(track.antenna_in_cam_m, np.float64)
+        (before, after), fraction = known.on_path[rows].T, known.fraction[rows]
+        turned = trajectory.world_from_cam @ arm_m
+        on_line = (1 - fraction)[:, None] * turned[before] + fraction[:, None] * turned[after]
+        beyond = self.site_from_model.scale * known.from_line[rows] + known.arms_m[rows] - on_line
+        times = np.zeros(len(trajectory)) if trajectory.timestamps_s is None else trajectory.timestamps_s
+        stated_m = np.sqrt(np.trace(known.covariance_m2[rows], axis1=1, axis2=2) / 3)
+        return AntennaPositions(
+            tuple(known.names[row] for row in rows.tolist()),
+            AntennaPlaces(
+                before, after, fraction, times[after] - times[before], beyond @ self.site_from_model.rotation.T
+            ),
+            known.position_m[rows],
+            _whitenings(known.covariance_m2[rows], self.stddev_m[rows]),
+            stated_share=np.where(known.is_stated[rows], np.nan_to_num(stated_m) / self.stddev_m[rows], 0.0),
+            group=stretch_labels(known.time_s[rows], STRETCH_S),
+            arm_m=arm_m,
+            arm_stddev_m=options.lever_arm_stddev_m,
+            clock_stddev_s=track.offset_stddev_s,
+            loss=RobustLoss(options.range_loss_scale, is_bounded=True),
+        )
 
 
 @dataclass(frozen=True)
 class Measured:
-    """All that was measured of a map.
-
-    Attributes:
-        ranges: of its log. tape: the control lengths. gravity, positions: at most one.
-    """
+    """All that was measured of a map: ranges of its log, and measurements of other kinds."""
 
     ranges: Ranges
-    tape: Tape = field(default_factory=Tape)
-    gravity: tuple[Gravity, ...] = ()
-    positions: tuple[UsedPositions, ...] = ()
+    sources: tuple[Source, ...] = ()
 
     @property
     def markers(self) -> dict[str, Marker]:
         """Marks in photos to which the measurements refer, by name."""
-        ends = {name for taped in self.tape.distances for name in taped.ends}
-        found = {name: marker for name, marker in self.tape.markers.items() if name in ends}
-        for used in self.positions:
-            found |= {name: used.markers[name] for name in _names_of_marks(used)}
-        return found
+        return {name: marker for source in self.sources for name, marker in source.markers.items()}
 
     @property
     def is_placed(self) -> bool:
-        """True if surveyed anchors or known positions place the map."""
-        return bool(self.positions) or any(np.isfinite(each.prior_position_stddev_m) for each in self.ranges.anchors)
+        """True if surveyed anchors or other measurements place the map."""
+        of_anchors = any(np.isfinite(each.prior_position_stddev_m) for each in self.ranges.anchors)
+        return of_anchors or any(source.places_map for source in self.sources)
 
     def kinds(
         self, poses: Poses, model: pycolmap.Reconstruction, frame_ids: Indices, trajectory: Trajectory
@@ -127,98 +214,40 @@ class Measured:
         Args:
             poses, frame_ids: of the model's frames, those of the trajectory first. trajectory: of the unscaled model.
         """
-        points = NamedPoints.in_model(model, frame_ids, self.markers, (a.anchor_id for a in self._placed_anchors))
-        ranges = self.ranges
+        placed = (each.anchor_id for each in self.ranges.anchors if np.isfinite(each.position_m).all())
+        points = NamedPoints.in_model(model, frame_ids, self.markers, placed)
+        kinds, ranges = list[Measurements](), self.ranges
         if len(ranges.rows):
             ranges = ranges.begun(MapState(poses, ranges.blocks))
-        kinds = tuple(replace(self, ranges=ranges)._kinds(points, trajectory))
+            kinds.append(ranges)
+        if len((by_radio := _lengths_by_radio(ranges, points)).ends):
+            kinds.append(by_radio)
+        for source in self.sources:
+            kinds += source.measurements(points, trajectory, ranges.options)
         return (*kinds, *(prior for kind in kinds for prior in kind.priors()))
 
-    @property
-    def _placed_anchors(self) -> Iterator[AnchorEstimate]:
-        return (each for each in self.ranges.anchors if np.isfinite(each.position_m).all())
 
-    def _kinds(self, points: NamedPoints, trajectory: Trajectory) -> Iterator[Measurements]:
-        if len(self.ranges.rows):
-            yield self.ranges
-        for lengths in (self._taped(points), self._by_radio(points)):
-            if len(lengths.ends):
-                yield lengths
-        for used in self.positions:
-            yield from _of_positions(used, points, trajectory, self.ranges.options)
-        for gravity in self.gravity:
-            yield UpwardDirection(gravity)
-
-    def _taped(self, points: NamedPoints) -> Lengths:
-        taped = [each for each in self.tape.distances if all(name in points for name in each.ends)]
-        return Lengths(
-            tuple(each.ends for each in taped),
-            points,
-            np.array([each.distance_m for each in taped]),
-            np.array([each.stddev_m for each in taped]),
-            {},
-        )
-
-    def _by_radio(self, points: NamedPoints) -> Lengths:
-        """Return the lengths between anchors that ranged to each other."""
-        ranges, anchors = self.ranges, self.ranges.anchors
-        used_m = ranges.errors.stddev_m
-        found = distances_by_radio(
-            ranges.observations.log,
-            float(np.median(used_m)) if len(used_m) else 0.0,
-            np.array([anchor.prior_bias_m for anchor in anchors]),
-            np.array([anchor.prior_bias_stddev_m for anchor in anchors]),
-            common_bias_stddev_m=0.0,
-        )
-        ends = [tuple(anchors[k].anchor_id for k in pair) for pair in found.anchor_pair.tolist()]
-        rows = [row for row, pair in enumerate(ends) if points.anchors.issuperset(pair)]
-        return Lengths(
-            tuple((ends[row][0], ends[row][1]) for row in rows),
-            points,
-            found.distance_m[rows],
-            found.stddev_m[rows],
-            {},
-            bias_stddev_m=ranges.errors.common_bias_stddev_m,
-            loss=ranges.errors.loss,
-        )
-
-
-def _names_of_marks(used: UsedPositions) -> list[str]:
-    return [used.known.names[row] for row in np.flatnonzero(used.takes_part & used.known.is_mark).tolist()]
-
-
-def _of_positions(
-    used: UsedPositions, points: NamedPoints, trajectory: Trajectory, options: RefineOptions
-) -> Iterator[Measurements]:
-    known = used.known
-    if len(rows := np.flatnonzero(used.takes_part & known.is_mark)):
-        yield ControlPoints(
-            tuple(known.names[row] for row in rows.tolist()), points, known.position_m[rows], used.stddev_m[rows], {}
-        )
-    rows = np.flatnonzero(used.takes_part & ~known.is_mark)
-    if not len(rows):
-        return
-    [track] = used.track
-    arm_m = np.array(track.antenna_in_cam_m, np.float64)
-    (before, after), fraction = known.on_path[rows].T, known.fraction[rows]
-    turned = trajectory.world_from_cam @ arm_m
-    on_line = (1 - fraction)[:, None] * turned[before] + fraction[:, None] * turned[after]
-    beyond = used.site_from_model.scale * known.from_line[rows] + known.arms_m[rows] - on_line
-    times = np.zeros(len(trajectory)) if trajectory.timestamps_s is None else trajectory.timestamps_s
-    stated_m = np.sqrt(np.trace(known.covariance_m2[rows], axis1=1, axis2=2) / 3)
-    positions = AntennaPositions(
-        tuple(known.names[row] for row in rows.tolist()),
-        AntennaPlaces(before, after, fraction, times[after] - times[before], beyond @ used.site_from_model.rotation.T),
-        known.position_m[rows],
-        _whitenings(known.covariance_m2[rows], used.stddev_m[rows]),
-        stated_share=np.where(known.is_stated[rows], np.nan_to_num(stated_m) / used.stddev_m[rows], 0.0),
-        group=stretch_labels(known.time_s[rows], STRETCH_S),
-        arm_m=arm_m,
-        arm_stddev_m=options.lever_arm_stddev_m,
-        clock_stddev_s=track.offset_stddev_s,
-        loss=RobustLoss(options.range_loss_scale, is_bounded=True),
+def _lengths_by_radio(ranges: Ranges, points: NamedPoints) -> Lengths:
+    """Return the lengths between anchors that ranged to each other."""
+    anchors, used_m = ranges.anchors, ranges.errors.stddev_m
+    found = distances_by_radio(
+        ranges.observations.log,
+        float(np.median(used_m)) if len(used_m) else 0.0,
+        np.array([anchor.prior_bias_m for anchor in anchors]),
+        np.array([anchor.prior_bias_stddev_m for anchor in anchors]),
+        common_bias_stddev_m=0.0,
     )
-    yield positions
+    ends = [tuple(anchors[k].anchor_id for k in pair) for pair in found.anchor_pair.tolist()]
+    rows = [row for row, pair in enumerate(ends) if points.anchors.issuperset(pair)]
+    return Lengths(
+        tuple((ends[row][0], ends[row][1]) for row in rows),
+        points,
+        found.distance_m[rows],
+        found.stddev_m[rows],
+        {},
+        bias_stddev_m=ranges.errors.common_bias_stddev_m,
+        loss=ranges.errors.loss,
+    )
 
 
 def _whitenings(covariances_m2: Array, stddevs_m: Array) -> Array:

@@ -47,6 +47,7 @@ class LengthScale(KindOnMap):
     redundancy: Array
 
     kind = LENGTHS
+    is_in_fit = True
 
     def observed(
         self, placed: Similarity, *, in_site: bool = False, max_num: int = MAX_NUM_OBSERVATIONS

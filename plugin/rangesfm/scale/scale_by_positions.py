@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,8 @@ from rangesfm.inference.bending import MapBending
 from rangesfm.inference.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, EstimatedMistake
 from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, JointProblem, ScaleUncertainty, joined
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap
+from rangesfm.measurements.source import Source
+from rangesfm.measurements.table import UsedPositions
 from rangesfm.positions.grouped_positions import (
     POSITIONS,
     GroupedPositions,
@@ -32,6 +34,7 @@ from rangesfm.positions.grouped_positions import (
     stddev_of,
 )
 from rangesfm.positions.known_positions import LASTING_S, KnownPositions, LearntPositions
+from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import FRAME
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
@@ -91,6 +94,7 @@ class PositionScale(KindOnMap):
         threshold: squared error of a control point, in standard deviations, above which it is left out.
         by_themselves: as ``alone``.
         inflation: standard deviation of the scale by the antenna's positions, divided by that for independent errors.
+        surveyed: what the positions were given as.
     """
 
     fit: PositionFit
@@ -98,8 +102,10 @@ class PositionScale(KindOnMap):
     threshold: float
     by_themselves: JointMap
     inflation: float
+    surveyed: SurveyedPositions = field(default_factory=SurveyedPositions)
 
     kind = POSITIONS
+    is_in_fit = True
 
     @property
     def start(self) -> Similarity:
@@ -133,6 +139,13 @@ class PositionScale(KindOnMap):
         given, learnt = stddev_of(self.known.covariance_m2), on_map.problem.sizes
         base = np.where(np.isfinite(given), given, self.fit.stddev_m)
         return base * np.where(self.known.is_mark, learnt.get("points", 1.0), learnt.get("positions", 1.0))
+
+    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
+        """Return the positions that take part in the fit."""
+        antenna, markers = self.surveyed.antenna, self.surveyed.markers
+        track = () if antenna is None else (antenna,)
+        stddevs_m = self.stddevs_m(on_map)
+        return (UsedPositions(self.known, self.takes_part, stddevs_m, on_map.estimate, markers, track),)
 
     def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
         """Return the errors of the antenna's positions themselves: neither the map's bending nor that of a clock."""

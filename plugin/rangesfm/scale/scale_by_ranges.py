@@ -48,6 +48,7 @@ class RangeScale(KindOnMap):
     anchors: tuple[AnchorEstimate, ...] = ()
 
     kind = RANGES
+    is_in_fit = True
 
     @property
     def places_map(self) -> bool:

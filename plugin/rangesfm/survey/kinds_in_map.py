@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pycolmap
 
@@ -46,7 +46,7 @@ def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
     known = surveyed.located(at.model, at.path)
     if known is None or known.is_check.all():
         return None
-    return scale_by_positions(
+    found = scale_by_positions(
         known,
         at.path,
         at.bending,
@@ -54,6 +54,7 @@ def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
         lasting_s=surveyed.lasting_s,
         metres_per_unit=at.metres_per_unit,
     )
+    return replace(found, surveyed=surveyed)
 
 
 def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:

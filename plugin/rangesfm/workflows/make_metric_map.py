@@ -44,7 +44,15 @@ from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS
 from rangesfm.join.join_models import ModelVerdict, join_models
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, find_kind, join_kinds, tested_kinds
 from rangesfm.measurements.kind import MapState
-from rangesfm.measurements.table import Measured, UsedPositions, anchors_at, antenna_at, ranges_of, ranges_of_map
+from rangesfm.measurements.table import (
+    Measured,
+    TapedLengths,
+    Upwards,
+    anchors_at,
+    antenna_at,
+    ranges_of,
+    ranges_of_map,
+)
 from rangesfm.positions.clock import POSITIONS
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most
@@ -364,21 +372,11 @@ def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
         estimate.errors,
         options,
     )
-    gravity = gravity_of(run.survey.scale.up_in_first_camera)
-    upward = () if gravity is None or estimate.frame != "site" else (gravity,)
-    found, on_map = estimate.find(PositionScale), estimate.on_map
-    used = () if found is None or on_map is None else (_used_positions(found, on_map, metric.positions),)
-    return Measured(replace(ranges, shared_errors_m=estimate.shared_errors_m), tape.control(), upward, used)
-
-
-def _used_positions(found: PositionScale, on_map: JointMap, surveyed: SurveyedPositions) -> UsedPositions:
-    return UsedPositions(
-        found.known,
-        found.takes_part,
-        found.stddevs_m(on_map),
-        on_map.estimate,
-        surveyed.markers,
-        () if surveyed.antenna is None else (surveyed.antenna,),
+    gravity, on_map = gravity_of(run.survey.scale.up_in_first_camera), estimate.on_map
+    of_kinds = () if on_map is None else (source for kind in on_map.kinds for source in kind.sources(on_map))
+    upwards = () if gravity is None or estimate.frame != "site" else (Upwards(gravity),)
+    return Measured(
+        replace(ranges, shared_errors_m=estimate.shared_errors_m), (TapedLengths(tape), *of_kinds, *upwards)
     )
 
 

@@ -1,0 +1,143 @@
+"""A kind of measurement that the program does not know takes part in all stages by its row in the table of kinds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.conftest import Command, WalkedSurvey
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.inference.linear_map import Columns
+from rangesfm.inference.noise import Component
+from rangesfm.inference.posterior import Observations, ScaleUncertainty
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.survey import kinds_in_map
+from rangesfm.survey.kinds_in_map import MapOfPhotos
+
+STEPS, STEPS_STDDEV_M = "steps", 0.02
+SAID = "a step counter does not know how long a step is"
+
+
+@dataclass(frozen=True)
+class Steps(KindOnMap):
+    """How far the camera came from one keyframe to the next, as a step counter has it.
+
+    Attributes:
+        distance_m: (n - 1,).
+    """
+
+    distance_m: Array
+    at: MapOfPhotos
+
+    kind = STEPS
+
+    @property
+    def away(self) -> Array:
+        return np.diff(self.at.path.centers, axis=0)
+
+    @property
+    def start(self) -> Similarity:
+        scales = self.distance_m / np.linalg.norm(self.away, axis=1)
+        return in_first_cameras_frame(self.at.path, float(np.median(scales)))
+
+    @cached_property
+    def alone(self) -> JointMap:
+        return fit_kinds((self,), self.at.path, self.start, self.at.bending)
+
+    def observed(self, placed: Similarity, *, in_site: bool, max_num: int) -> Observations:
+        num, path, nothing = len(self.distance_m), self.at.path, np.zeros(0, dtype=np.int64)
+        predicted_m = placed.scale * np.linalg.norm(self.away, axis=1)
+        along = self.away / np.linalg.norm(self.away, axis=1)[:, None] @ path.world_from_cam[0]
+        by_pose, rows = np.zeros((num, num + 1, 6)), np.arange(num)
+        by_pose[rows, rows + 1, 3:] = placed.scale * self.at.metres_per_unit * along
+        by_pose[rows, rows, 3:] = -placed.scale * self.at.metres_per_unit * along
+        noise_m2 = STEPS_STDDEV_M**2 * np.eye(num)
+        return Observations(
+            kind=STEPS,
+            columns=Columns(0, -1, nothing, nothing, 1),
+            design=predicted_m[:, None],
+            residual_m=predicted_m - self.distance_m,
+            by_pose=by_pose.reshape(num, -1),
+            components=(Component(STEPS, noise_m2),),
+            alone_m2=noise_m2,
+            working_m2=noise_m2,
+            is_used=np.ones(num, dtype=bool),
+        )
+
+    def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
+        yield Doubt(SAID)
+
+
+@pytest.fixture
+def counted(walked_survey: WalkedSurvey, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    """Add the kind to the table; all its distances are by a factor too long, which may be changed."""
+    by_photo = dict(zip(walked_survey.image_names, walked_survey.centers_m, strict=True))
+    rng, factor = np.random.default_rng(0), {"longer": 1.0}
+    noise_m = STEPS_STDDEV_M * rng.standard_normal(len(by_photo) - 1)
+
+    def locate(inputs: Any, at: MapOfPhotos) -> Steps:
+        true_m = np.linalg.norm(np.diff([by_photo[name] for name in at.path.image_names], axis=0), axis=1)
+        return Steps(factor["longer"] * true_m + noise_m, at)
+
+    monkeypatch.setitem(kinds_in_map.KINDS, STEPS, locate)
+    return factor
+
+
+def refined(
+    survey: WalkedSurvey, command: Command, *flags: str, has_ranges: bool = True
+) -> tuple[dict[str, Any], float]:
+    """Refine the map, and return its ``result.json`` and by how much the metric map is too large."""
+    given = survey.flags if has_ranges else ("--input_path", "sparse/0", "--images", "images.csv")
+    command("refine", *given, *flags, "--no_report", "--quiet", "--output_path", "out", cwd=survey.folder)
+    out = survey.folder / "out"
+    model = pycolmap.Reconstruction(out / "sparse_metric" / "0")
+    centers_m = {image.name: image.projection_center() for image in model.images.values()}
+    path_m = np.array([centers_m[name] for name in survey.image_names])
+    lengths_m = [float(np.linalg.norm(np.diff(at_m, axis=0), axis=1).sum()) for at_m in (path_m, survey.centers_m)]
+    return json.loads((out / "result.json").read_text(encoding="utf-8")), lengths_m[0] / lengths_m[1] - 1
+
+
+@pytest.mark.parametrize("flags", [("--anchor_frame", "unknown"), ("--anchors", "anchors.csv")])
+def test_beside_ranges_it_has_its_say_in_the_scale_and_the_refined_map_is_moved_to_it(
+    flags: tuple[str, ...], own_survey: WalkedSurvey, counted: dict[str, float], rangesfm_command: Command
+) -> None:
+    with_it, off = refined(own_survey, rangesfm_command, *flags)
+    true_scale = own_survey.site_from_sfm.scale
+    by_kind = with_it["scale"]["by_kind"]
+    assert set(by_kind) == {"ranges", STEPS}
+    assert by_kind[STEPS]["value"] == pytest.approx(true_scale, abs=3 * by_kind[STEPS]["stddev"])
+    assert with_it["scale"]["stddev_empirical"] < min(each["stddev"] for each in by_kind.values())
+    low, high = with_it["scale"]["interval_95"]
+    assert low < true_scale < high
+    assert abs(off) < (high - low) / (high + low)
+    assert SAID not in with_it["scale"]["reasons"]
+    # The refinement knows ranges alone: what moves the map is what this kind says of it as a whole.
+    counted["longer"] = 1.01
+    longer, further_off = refined(own_survey, rangesfm_command, *flags)
+    assert 0.001 < further_off - off < 0.01
+    assert longer["scale"]["value"] / with_it["scale"]["value"] - 1 == pytest.approx(further_off - off, rel=0.05)
+
+
+def test_alone_it_gives_the_map_its_metres_and_says_what_is_doubtful(
+    own_survey: WalkedSurvey, counted: dict[str, float], rangesfm_command: Command
+) -> None:
+    ends, length_m = own_survey.image_names[::20][:2], np.linalg.norm(np.diff(own_survey.centers_m[::20][:2], axis=0))
+    check = f"from,to,distance_m,stddev_m,kind\n{ends[0]},{ends[1]},{length_m:.3f},0.01,check\n"
+    (own_survey.folder / "checks.csv").write_text(check)
+    found, off = refined(own_survey, rangesfm_command, "--distances", "checks.csv", has_ranges=False)
+    scale = found["scale"]
+    assert (scale["method"], found["frame"], scale["verdict"]) == (STEPS, "first_camera", "doubtful")
+    assert scale["reasons"][0] == SAID
+    assert abs(off) < 1.96 * scale["stddev_empirical"] / scale["value"] < 0.02
+    assert scale["by_kind"][STEPS]["value"] == pytest.approx(scale["value"], rel=0.01)
+    counted["longer"] = 1.01
+    _, further_off = refined(own_survey, rangesfm_command, "--distances", "checks.csv", has_ranges=False)
+    assert (1 + further_off) / (1 + off) == pytest.approx(1.01, abs=1e-4)
