@@ -12,7 +12,7 @@ from distributed import KilledWorker
 from rangesfm.batch.batch_page import render_batch
 from rangesfm.batch.batch_state import STATUSES, BatchState, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job
-from rangesfm.batch.workers import MAX_STOP_S, Crew, KilledError, crew_of
+from rangesfm.batch.workers import MAX_STOP_S, Crew, KilledError, on_scheduler, on_this_machine
 from rangesfm.ceres.installation_checks import recorded_versions
 from rangesfm.errors import FAILED, Failure
 from rangesfm.files.atomic import sole_writer, write_text
@@ -63,7 +63,9 @@ def run_batch(
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
     with sole_writer(output_path):
         if surveys:
-            with crew_of(options, len(surveys), inbox, say) as crew:
+            here = not options.scheduler
+            crew_of = on_this_machine(options, len(surveys), inbox, say) if here else on_scheduler(options, inbox, say)
+            with crew_of as crew:
                 try:
                     write_batch_results(batch_state, output_path)
                     index_of = {crew.submit(index, survey): index for index, survey in surveys.items()}

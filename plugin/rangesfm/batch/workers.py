@@ -58,26 +58,18 @@ class Crew:
 
 
 @contextmanager
-def crew_of(
+def on_this_machine(
     options: BatchOptions, num_surveys: int, inbox: queue.SimpleQueue[Any], say: Callable[[str], None]
 ) -> Iterator[Crew]:
-    """Yield who runs the surveys, by the options.
+    """Yield threads of this process, as many as cores and memory allow.
 
     Args:
         inbox: is put the messages of surveys, each with the survey's index before it.
         say: is told remarks for the user.
 
     Raises:
-        InputError: more threads are asked for than there are cores, or there is no such scheduler.
+        InputError: more threads are asked for than there are cores.
     """
-    with _on_scheduler(options, inbox, say) if options.scheduler else _here(options, num_surveys, inbox, say) as crew:
-        yield crew
-
-
-@contextmanager
-def _here(
-    options: BatchOptions, num_surveys: int, inbox: queue.SimpleQueue[Any], say: Callable[[str], None]
-) -> Iterator[Crew]:
     num_at_once, num_threads, memory_bytes, note = share_this_machine(options, num_surveys, CPU_COUNT, MEMORY_LIMIT)
     if note:
         say(note)
@@ -108,7 +100,12 @@ def _here(
 
 
 @contextmanager
-def _on_scheduler(options: BatchOptions, inbox: queue.SimpleQueue[Any], say: Callable[[str], None]) -> Iterator[Crew]:
+def on_scheduler(options: BatchOptions, inbox: queue.SimpleQueue[Any], say: Callable[[str], None]) -> Iterator[Crew]:
+    """Yield the workers of a Dask scheduler; arguments as in ``on_this_machine``.
+
+    Raises:
+        InputError: there is no such scheduler, or its workers cannot run surveys.
+    """
     with workers_of(options.scheduler) as client:
         at_once = num_at_once(client)
         if not at_once:

@@ -133,7 +133,12 @@ def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:
     if options.frame == "result":
         return map_
     if options.frame == "level":
-        return near_origin(moved(map_, Similarity(1.0, _level_from_world(map_, options.up), np.zeros(3))))
+        vertical = up_in_world(map_.trajectory, options.up, is_site=map_.is_site)
+        if map_.is_site:  # it is only tilted, not turned about z, because its heading is that of the site
+            level = np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [vertical])[0].as_matrix())
+        else:
+            level = level_axes(map_.trajectory, vertical)
+        return near_origin(moved(map_, Similarity(1.0, level, np.zeros(3))))
     return moved(map_, map_.georeference_for("the frame 'enu' needs a georeference").enu_from_world)
 
 
@@ -231,17 +236,6 @@ def direction(text: str) -> tuple[float, float, float]:
 def _unit(vector: Array) -> Array:
     unit: Array = vector / np.linalg.norm(vector)
     return unit
-
-
-def _level_from_world(map_: MetricMap, up: str) -> Array:
-    """Return the rotation (3, 3) into a level frame.
-
-    A map in the site is only tilted, not turned about z, because its heading is that of the site.
-    """
-    vertical = up_in_world(map_.trajectory, up, is_site=map_.is_site)
-    if map_.is_site:
-        return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [vertical])[0].as_matrix())
-    return level_axes(map_.trajectory, vertical)
 
 
 def level_axes(trajectory: Trajectory, vertical: Array) -> Array:

@@ -67,7 +67,15 @@ def join_models(run: SurveyRun, parts: Sequence[PathOfModel]) -> JoinedModels:
     exclusive = each_on_one_path([part.observations for part in parts])
     parts = [replace(part, observations=of) for part, of in zip(parts, exclusive, strict=True)]
     first = _first_in_time(parts)
-    scaled, reasons = _scaled_alone(run, parts, first)
+    scaled: dict[int, ScaledModel] = {}
+    reasons: dict[int, str] = {}  # why the own ranges of a model do not determine its scale, or why it is not placed
+    for k, part in enumerate(parts):
+        try:
+            scaled[k] = scaled_alone(run, part, has_first_camera=k == first)
+        except GeometryError as error:
+            if k == 0:
+                raise
+            reasons[k] = str(error)
     placements = place_models(list(scaled.values()))
     reasons |= {k: reason for k, reason in zip(scaled, placements.reasons, strict=True) if reason}
     if first in reasons and run.inputs.anchor_frame == "first_camera":
@@ -96,26 +104,6 @@ def _first_in_time(parts: Sequence[PathOfModel]) -> int:
         for path in (part.trajectory for part in parts)
     ]
     return starts.index(min(starts))
-
-
-def _scaled_alone(
-    run: SurveyRun, parts: Sequence[PathOfModel], first: int
-) -> tuple[dict[int, ScaledModel], dict[int, str]]:
-    """Return the models whose scale their own ranges determine, and for the other models the reason.
-
-    Both are by the models' indices in ``parts``. The first model must be among the scaled ones, else a GeometryError
-    is raised.
-    """
-    scaled: dict[int, ScaledModel] = {}
-    reasons: dict[int, str] = {}
-    for k, part in enumerate(parts):
-        try:
-            scaled[k] = scaled_alone(run, part, has_first_camera=k == first)
-        except GeometryError as error:
-            if k == 0:
-                raise
-            reasons[k] = str(error)
-    return scaled, reasons
 
 
 def scaled_alone(run: SurveyRun, part: PathOfModel, *, has_first_camera: bool) -> ScaledModel:

@@ -70,12 +70,8 @@ CONFIG: Spec = {
 }
 
 
-def page_charts(figures: list[Figure]) -> dict[str, list[Spec]]:
-    """Return the data from which the script of the page, assets/view/charts.js, draws each figure, by figure name."""
-    return {figure.name: [_page_chart(panel) for panel in figure.panels] for figure in figures}
-
-
-def _page_chart(panel: Panel) -> Spec:
+def page_chart(panel: Panel) -> Spec:
+    """Return the data from which the script of the page, assets/view/charts.js, draws a panel."""
     spec = panel_spec(panel, lambda i: {"name": f"series{i}"})
     encodings = ["x"] if panel.rows else ["x", "y"]
     spec["layer"][0]["params"] = [ZOOM | {"select": ZOOM["select"] | {"encodings": encodings}}]

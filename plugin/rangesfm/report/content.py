@@ -43,13 +43,13 @@ class Content:
     """Everything that a report shows of a result folder; parts that the folder lacks are None or empty.
 
     Attributes:
-        title: name of the result.
+        title: as given, or the name of the folder; where that is the default one, of the survey folder around it.
         by: who made the survey; None where nobody said it.
         summary: content of ``result.json``; ``result`` reads the tables beside it.
         images_path: folder of the photos; None where it is not known.
         ranges: content of ``ranges.csv``; None without ranges.
         tags_in_cam_m: (n, 3) lever arm of each range's tag, in the camera frame; n is 0 without ranges.
-        range_times_s: (n,) time of each range in seconds since the first; NaN where unknown.
+        range_times_s: (n,) time of each range, or of its photo, in seconds since the first; NaN where unknown.
         scaled, refined: the camera's path before and after the refinement; ``final`` is the refined path, else the
             scaled one.
         reference_m: (k, 3) true positions in the frame of the map; ``reference_by_photo`` has the same by photo, each
@@ -81,11 +81,18 @@ class Content:
         """
         self.result, self.summary = result, result.summary
         given = self.summary.settings.report
-        self.title, self.by = title or given.title or _title(real_path(home or result.path)), by or given.by
+        folder = real_path(home or result.path)
+        own_name = folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
+        self.title, self.by = title or given.title or own_name, by or given.by
         self.images_path = images_path or result.images_path
         self.ranges = result.read(RangesAsUsed)
         self.tags_in_cam_m = result.lever_arms_m(() if self.ranges is None else self.ranges.tag_id)
-        self.range_times_s = _range_times(self.ranges, result.timestamps_s or {}) if self.ranges else np.zeros(0)
+        self.range_times_s = np.zeros(0)
+        if self.ranges is not None:
+            of_photos = result.timestamps_s or {}
+            times = np.array([of_photos.get(name, np.nan) for name in self.ranges.image_name], dtype=np.float64)
+            times = np.where(np.isfinite(self.ranges.timestamp_s), self.ranges.timestamp_s, times)
+            self.range_times_s = times - np.min(times, initial=np.inf, where=np.isfinite(times))
         scaled, refined = models = [result.read_model(stage) for stage in ("sparse_scaled", "sparse_metric")]
         self.scaled, self.refined = (None if model is None else path_in_result(model, result) for model in models)
         self.final = self.refined or self.scaled
@@ -134,11 +141,6 @@ class Content:
         return distances if np.isfinite(distances).any() else None
 
 
-def _title(folder: Path) -> str:
-    """Return the name of the folder; where it has the default name, that of the survey folder around it."""
-    return folder.parent.name if folder.name == DEFAULT_FOLDER and folder.parent.name else folder.name
-
-
 def _cameras(
     scaled: pycolmap.Reconstruction | None, refined: pycolmap.Reconstruction | None
 ) -> Iterator[CameraIntrinsics]:
@@ -151,11 +153,3 @@ def _cameras(
         focal = camera.mean_focal_length()
         half_angles = (camera.width / (2 * focal), camera.height / (2 * focal))
         yield CameraIntrinsics(title, tuple(zip(names, *values)), half_angles)
-
-
-def _range_times(ranges: RangesAsUsed, image_times_s: dict[str, float]) -> Array:
-    """Return the time of each range (its own, or that of its photo) in seconds since the first, NaN where unknown."""
-    of_image = np.array([image_times_s.get(name, np.nan) for name in ranges.image_name], dtype=np.float64)
-    times = np.where(np.isfinite(ranges.timestamp_s), ranges.timestamp_s, of_image)
-    since_first: Array = times - np.min(times, initial=np.inf, where=np.isfinite(times))
-    return since_first

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from rangesfm.files.atomic import new_file
 from rangesfm.report import figures_mistakes, figures_path, figures_ranges, figures_scale, report_tables, text
-from rangesfm.report.chart import ASSETS, css, page_charts
+from rangesfm.report.chart import ASSETS, css, page_chart
 from rangesfm.report.checks import quality_checks
 from rangesfm.report.content import Content
 from rangesfm.report.facts import facts_of
@@ -124,7 +124,8 @@ def render_page(template: str, *, sections: Sequence[Section] = (), **values: An
         sections: of the page. The page holds its script, which also draws the 3-D view, only where they have figures.
         values: of the template's variables; text that is not Markup is escaped.
     """
-    charts = page_charts([figure for section in sections for figure in section.figures])
+    figures = [figure for section in sections for figure in section.figures]
+    charts = {figure.name: [page_chart(panel) for panel in figure.panels] for figure in figures}
     script, source = None, "'none'"
     if charts:  # three.js and Vega, then this package's own files in one scope
         libraries = "".join(_asset(f"vendor/{name}.min.js") for name in ("three", "vega"))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
-from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.files.atomic import new_file
 from rangesfm.geometry.map_errors import Kind, MapErrors, PartErrors
@@ -44,31 +42,30 @@ def read_map_errors(folder: Path) -> MapErrors | None:
     path = folder / JOINT_COVARIANCE_NAME
     if not path.is_file():
         return None
+    parts: dict[Kind, PartErrors] = {}
+    sizes: set[int] = set()
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             scale_stddev = float(arrays[_SCALE_STDDEV])
-            parts = {kind: _part_errors(arrays, kind) for kind in _KINDS if f"{kind}_ids" in arrays}
+            for kind in _KINDS:
+                if f"{kind}_ids" not in arrays:
+                    continue
+                ids = arrays[f"{kind}_ids"].tolist()
+                modes, rests, by_scale = (
+                    arrays[f"{kind}_{name}"].astype(np.float64) for name in ("modes", "rests", "by_scale")
+                )
+                num, size, num_modes = modes.shape
+                if (len(ids), rests.shape, by_scale.shape) != (num, (num, size, size), (num, size)):
+                    raise ValueError("arrays of different lengths")
+                if not all(np.isfinite(values).all() for values in (modes, rests, by_scale)):
+                    raise ValueError("not finite")
+                parts[kind] = PartErrors(tuple(ids), modes, rests, by_scale)
+                sizes.add(num_modes)
     except (
         *(ArithmeticError, EOFError, LookupError, MemoryError, NotImplementedError, OSError, RuntimeError, TypeError),
         *(ValueError, zipfile.BadZipFile, zlib.error),
     ) as error:
         raise InputError("is damaged, expected the file as a run wrote it", path) from error
-    if not parts or len({of.modes.shape[2] for of in parts.values()}) > 1:
+    if len(sizes) != 1:
         raise InputError("is damaged, expected the file as a run wrote it", path)
     return MapErrors(parts, scale_stddev)
-
-
-def _part_errors(arrays: Mapping[str, Array], kind: Kind) -> PartErrors:
-    """Return the errors of the parts of one kind.
-
-    Raises:
-        ValueError: the arrays do not belong together, or hold other values than finite numbers.
-    """
-    ids, modes = arrays[f"{kind}_ids"].tolist(), arrays[f"{kind}_modes"].astype(np.float64)
-    rests, by_scale = (arrays[f"{kind}_{name}"].astype(np.float64) for name in ("rests", "by_scale"))
-    num, size = modes.shape[:2] if modes.ndim == 3 else (-1, -1)
-    if (len(ids), rests.shape, by_scale.shape) != (num, (num, size, size), (num, size)):
-        raise ValueError("arrays of different lengths")
-    if not all(np.isfinite(values).all() for values in (modes, rests, by_scale)):
-        raise ValueError("not finite")
-    return PartErrors(tuple(ids), modes, rests, by_scale)

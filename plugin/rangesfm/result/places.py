@@ -44,11 +44,6 @@ def recorded_settings(survey: Survey) -> dict[str, Any]:
     return tables
 
 
-def recorded_inputs(entries: list[dict[str, Any]], survey: Survey) -> list[dict[str, Any]]:
-    """Return the entries of ``input_hashes``, with paths as the result of the survey records them."""
-    return [{**entry, "path": recorded_path(path_of(entry["path"]), survey.output.path)} for entry in entries]
-
-
 def input_beside(folder: Path, recorded: str) -> Path | None:
     """Return the recorded path of an input if it is in the result folder or in the folder around it, else None.
 

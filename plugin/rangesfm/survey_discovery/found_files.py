@@ -209,7 +209,14 @@ def _key_of(path: Path) -> str | None:
         unsure = error
     is_table = path.suffix.lower() in _TABLE_EXTENSIONS
     if unsure is None:  # columns that look like those of a log may be those of a list
-        return _list_like_log(path) or LOG
+        layout = find_layout(path)
+        if layout is None:
+            return LOG
+        # A short table without names is asked about.
+        is_short = not layout.has_names and len(layout.columns[0].cells) <= _MOST_POINTS
+        with nullcontext() if is_short else suppress(UnclearListError):
+            return (_list_of(path) if is_short or layout.has_names else None) or LOG
+        return LOG
     if key := next((key for key, is_such in _TABLES.items() if is_such(head)), None):
         return POSITIONS if key == REFERENCE and not _MEASURED.isdisjoint(words_of(path.stem)) else key
     with nullcontext() if is_table else suppress(UnclearListError):
@@ -217,19 +224,6 @@ def _key_of(path: Path) -> str | None:
             return key
     if unsure.advice and is_table:
         raise unsure
-    return None
-
-
-def _list_like_log(path: Path) -> str | None:
-    """Return the key as ``_list_of`` for a table that may also be a log by its columns.
-
-    Raises:
-        UnclearListError: it is a short table without names that may be a list.
-    """
-    layout = find_layout(path)
-    is_short = layout is not None and not layout.has_names and len(layout.columns[0].cells) <= _MOST_POINTS
-    with nullcontext() if is_short else suppress(UnclearListError):
-        return _list_of(path) if is_short or (layout is not None and layout.has_names) else None
     return None
 
 

@@ -8,10 +8,8 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis import Correction
 from rangesfm.errors import GeometryError, number_text
 from rangesfm.ranging.range_observations import RangeObservations, RangeStatus
-from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.workflows.make_metric_map import metric_map
 from rangesfm.workflows.metric_result import MetricResult
@@ -29,7 +27,14 @@ def with_likeliest_cause(run: SurveyRun, path: PathOfModel, metric: MetricResult
         run.journal.warn("no mistake is corrected: the map is joined from several models")
         return run, metric
     cause = metric.diagnosis.causes[0]
-    corrected = replace(run, inputs=_corrected_inputs(run.inputs, cause.correction, metric.diagnosis.rows))
+    inputs, log, correction = run.inputs, run.inputs.log, cause.correction
+    known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
+    anchors = tuple(replace(anchor, position_m=known[anchor.anchor_id]) for anchor in inputs.anchors)
+    moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in log.tag_ids]).reshape(-1, 3)
+    if correction.longer_m is not None:
+        log = replace(log, range_m=log.range_m - _spread(correction.longer_m, metric.diagnosis.rows, len(log)))
+    inputs = replace(inputs, anchors=anchors, tag_in_cam_m=inputs.tag_in_cam_m + moves, log=log)
+    corrected = replace(run, inputs=inputs)
     try:
         moved = replace(path, observations=_observations(corrected, path, metric, metric.diagnosis))
         is_refined = metric.refined is not None
@@ -41,23 +46,6 @@ def with_likeliest_cause(run: SurveyRun, path: PathOfModel, metric: MetricResult
     said = f"adopted: {cause.words}; the scale changed by {change} %, from {metric.estimate.value:.6g}"
     run.journal.warn(said)
     return corrected, adopted.doubted((said,))
-
-
-def _corrected_inputs(inputs: RangingInputs, correction: Correction, rows: Indices) -> RangingInputs:
-    """Return the inputs with corrected anchors, lever arms and ranges.
-
-    Args:
-        inputs: of the survey.
-        correction: of the mistake; its arrays are for k ranges.
-        rows: (k,) numbers of these ranges in the log.
-    """
-    known = {anchor.anchor_id: anchor.position_m for anchor in inputs.anchors} | {**correction.anchors_m}
-    anchors = tuple(replace(anchor, position_m=known[anchor.anchor_id]) for anchor in inputs.anchors)
-    moves = np.array([correction.tag_moves_m.get(tag, np.zeros(3)) for tag in inputs.log.tag_ids]).reshape(-1, 3)
-    log = inputs.log
-    if correction.longer_m is not None:
-        log = replace(log, range_m=log.range_m - _spread(correction.longer_m, rows, len(log)))
-    return replace(inputs, anchors=anchors, tag_in_cam_m=inputs.tag_in_cam_m + moves, log=log)
 
 
 def _observations(run: SurveyRun, path: PathOfModel, metric: MetricResult, diagnosis: Diagnosis) -> RangeObservations:

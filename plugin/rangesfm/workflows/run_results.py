@@ -13,13 +13,14 @@ from rangesfm.comparison.with_reference import format_table, papers_table, refer
 from rangesfm.distances.lengths_on_map import BENDING
 from rangesfm.errors import BAD_INPUT, InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
+from rangesfm.files.atomic import path_of
 from rangesfm.geometry.georeference import Georeference
 from rangesfm.geometry.reference import write_reference
 from rangesfm.report import write_report_of
 from rangesfm.report.content import Content
 from rangesfm.result.entries import ComparisonRow
 from rangesfm.result.joint_covariance import write_map_errors
-from rangesfm.result.places import recorded_inputs, recorded_settings
+from rangesfm.result.places import recorded_path, recorded_settings
 from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_result, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.input_hashes import input_hashes
@@ -78,7 +79,7 @@ def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
             georeference=georeference,
             versions=recorded_versions(),
             settings=recorded_settings(survey),
-            inputs=recorded_inputs(input_hashes(survey), survey),
+            inputs=[{**one, "path": recorded_path(path_of(one["path"]), folder)} for one in input_hashes(survey)],
             seconds=journal.all_seconds(),
             computed=datetime.now(timezone.utc).isoformat(timespec="seconds"),
             warnings=journal.warnings,
