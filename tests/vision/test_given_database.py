@@ -51,7 +51,7 @@ def test_its_features_matches_and_cameras_are_used_and_it_stays_as_it_is(
     before = sha256_of(given)
     monkeypatch.setattr(pycolmap, "extract_features", None)
     monkeypatch.setattr(pycolmap, "geometric_verification", None)
-    monkeypatch.setattr("rangesfm.vision.renewed_database.match_features", None)
+    monkeypatch.setattr("rangesfm.vision.photo_matching.match_features", None)
     summary = reconstructed(room, given, listener)
     assert summary.num_registered == len(room.names)
     assert content_of(given.with_name("out") / "database.db") == content_of(earlier)

@@ -14,10 +14,10 @@ from PIL import Image
 from rangesfm.errors import InputError, OptionError
 from rangesfm.files.atomic import sole_writer
 from rangesfm.options import CameraOptions, MapperOptions
-from rangesfm.progress import SilentProgress
-from rangesfm.vision.reconstruct import match_photos
+from rangesfm.progress import SILENT
+from rangesfm.vision.photo_matching import photo_matching
 from rangesfm.vision.rigs import NO_RIGS
-from rangesfm.vision.steps import Workspace
+from rangesfm.vision.unpublished import UnpublishedReconstruction
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Room
@@ -41,9 +41,14 @@ def masks(room: Room, tmp_path: Path) -> Path:
 def leftmost_features(room: Room, masks: Path) -> list[float]:
     """Return the leftmost feature of each photo, as a share of its width."""
     mapper = MapperOptions(mask_path=masks)
-    with sole_writer(masks.with_name("out")) as output:
-        space = Workspace(output.private, SilentProgress())
-        match_photos(room.folder, room.names[:NUM_PHOTOS], CameraOptions(), mapper, NO_RIGS, 0, space)
+    with (
+        sole_writer(masks.with_name("out")) as output,
+        UnpublishedReconstruction(output, SILENT, restart=True) as new,
+        photo_matching(room.folder, room.names[:NUM_PHOTOS], CameraOptions(), mapper, NO_RIGS, 0, new) as matching,
+    ):
+        space = new.begin(matching.plan, with_loops_closed=False)
+        with space.logged() as log_folder:
+            matching.fill(space, log_folder)
         with pycolmap.Database.open(space.database) as database:
             return [float(database.read_keypoints(id_)[:, 0].min() / 256) for id_ in range(1, NUM_PHOTOS + 1)]
 

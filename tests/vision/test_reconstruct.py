@@ -397,7 +397,7 @@ class TestOtherPhotos:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patched:
-            patched.setattr("rangesfm.vision.renewed_database.RenewedDatabase._match", die)
+            patched.setattr("rangesfm.vision.photo_matching.PhotoMatching._match", die)
             with pytest.raises(KeyboardInterrupt):
                 reconstruct(room.folder, room.names, tmp_path, camera=room.camera, mapper=MAPPER)
         database = unfinished(tmp_path) / "database.db"
@@ -414,7 +414,7 @@ class TestOtherPhotos:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patched:
-            patched.setattr("rangesfm.vision.renewed_database.RenewedDatabase._write_note", die)
+            patched.setattr("rangesfm.vision.photo_matching.PhotoMatching._write_note", die)
             with pytest.raises(KeyboardInterrupt):
                 reconstruct(changed.folder, room.names, output, camera=room.camera, mapper=MAPPER)
         reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER, progress=listener)

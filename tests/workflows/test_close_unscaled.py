@@ -21,7 +21,7 @@ from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.progress import SILENT, Journal, Progress, SilentProgress
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.loop_database import LoopDatabase
-from rangesfm.vision.steps import Steps
+from rangesfm.vision.steps import Workspace
 from rangesfm.workflows.close_unscaled import close_loops_of_models
 from rangesfm.workflows.loop_matching import LoopMatching
 
@@ -57,7 +57,7 @@ class Reconstructed:
             (made / "sparse" / "0").mkdir(parents=True)
             rescale(looped.chain(), replace(IDENTITY, scale=0.4)).write_binary(made / "sparse" / "0")
             write_matches(made / "database.db", looped.truth, looped.neighbours, with_descriptors=True)
-            Steps(made / "reconstruct.json", SILENT).note("made", {})
+            Workspace(made, SILENT).note("made", {})
             output.publish({out / path.name: path for path in made.iterdir()})
             made.rmdir()
         return cls(looped, out)

@@ -25,8 +25,8 @@ def colmap_log(path: Path) -> Iterator[Path]:
             with logging_into(folder):
                 yield folder
         finally:
-            with path.open("ab") as log:
-                for part in sorted(folder.iterdir()):
+            for part in sorted(folder.iterdir()):
+                with path.open("ab") as log:
                     log.write(part.read_bytes())
 
 

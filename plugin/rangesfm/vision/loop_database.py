@@ -22,7 +22,7 @@ from rangesfm.files.manifest import content_hash
 from rangesfm.files.output_folder import OutputFolder, remove
 from rangesfm.progress import SILENT, Progress
 from rangesfm.vision.matching import MatchingOptions, match_pairs
-from rangesfm.vision.steps import DATABASE_NAME, LOG_NAME, RECORD_NAME, Steps
+from rangesfm.vision.steps import DATABASE_NAME, LOG_NAME, RECORD_NAME, Workspace
 
 Pair = tuple[int, int]
 """Ids of two photos, the smaller one first."""
@@ -31,25 +31,21 @@ _FOLDER_NAME, _SOURCE_NAME, _NOTE = "loops", "source.txt", "loops"
 _LOOPS, _TIES, _CLOSED = "pairs", "ties", "closed"
 
 
-def forget_loops(steps: Steps, path: Path | None = None) -> None:
-    """Remove the matches of all loops that a reconstruction's record notes from its database, and the notes.
-
-    Args:
-        path: of the database; None: it has just been made without loops.
-    """
-    if noted := steps.notes.get(_NOTE, {}):
-        if path is not None:
-            _forget(path, set[Pair]().union(*(_noted(steps, kind) for kind in noted)))
-        steps.note(_NOTE, {})
+def forget_loops(space: Workspace, *, with_matches: bool = False) -> None:
+    """Remove the notes of loops from a reconstruction's record, and if asked for their matches from its database."""
+    if noted := space.notes.get(_NOTE, {}):
+        if with_matches:
+            _forget(space.database, set[Pair]().union(*(_noted(space, kind) for kind in noted)))
+        space.note(_NOTE, {})
 
 
-def has_closed_loops(steps: Steps) -> bool:
+def has_closed_loops(space: Workspace) -> bool:
     """Return whether the loops of a reconstruction's models were closed, as far as there are any."""
-    return _CLOSED in steps.notes.get(_NOTE, {})
+    return _CLOSED in space.notes.get(_NOTE, {})
 
 
-def _noted(steps: Steps, kind: str) -> set[Pair]:
-    return {(first, second) for first, second in steps.notes.get(_NOTE, {}).get(kind, [])}
+def _noted(space: Workspace, kind: str) -> set[Pair]:
+    return {(first, second) for first, second in space.notes.get(_NOTE, {}).get(kind, [])}
 
 
 def _forget(path: Path, pairs: Collection[Pair]) -> None:
@@ -181,8 +177,8 @@ class LoopDatabase:
         """Remove the copy."""
         remove(self.folder)
 
-    def _record(self) -> Steps:
-        return Steps(self.folder / RECORD_NAME, SILENT)
+    def _record(self) -> Workspace:
+        return Workspace(self.folder, SILENT)
 
     def _tried(self) -> set[Pair]:
         return self._noted(_LOOPS)

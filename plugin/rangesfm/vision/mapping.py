@@ -198,7 +198,7 @@ def _map_incrementally(
     if begun is not None:
         num_registered = _num_registered(begun)
         space.progress.message(f"mapping: continues from {num_registered} photos of an earlier run")
-    with scratch_folder(space.output / "mapping") as folder:
+    with scratch_folder(space.folder / "mapping") as folder:
         snapshots = Snapshots(space.snapshots, folder, options.min_model_size)
 
         def add_photo(mapping: UnfinishedMapping) -> None:
@@ -233,7 +233,7 @@ def _map_in_child(
     It works in a folder with a copy of the database, into which it may write what it finds about pairs.
     """
     space.progress.message("mapping: this mapper shows no progress, and starts anew after an interruption")
-    with scratch_folder(space.output / "mapping") as folder:
+    with scratch_folder(space.folder / "mapping") as folder:
         database_path = Path(shutil.copyfile(space.database, folder / DATABASE_NAME))
         if isinstance(mapper, ExternalMapper):
             return _map_by_program(space, folder, image_path, mapper, log_folder / "external_mapper")

@@ -14,14 +14,10 @@ from rangesfm.files.atomic import scratch_folder, sole_writer
 from rangesfm.files.contents import AnyPath
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.progress import SILENT, Progress
-from rangesfm.vision.camera import cameras_of_photos, check_camera
-from rangesfm.vision.features import feature_options
-from rangesfm.vision.given_database import opened
-from rangesfm.vision.loop_database import forget_loops, has_closed_loops
+from rangesfm.vision.loop_database import forget_loops
 from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_mapped_models
-from rangesfm.vision.matching import matching_options
-from rangesfm.vision.photo_files import Photos, contents_of_masks, usable_photos
-from rangesfm.vision.renewed_database import RenewedDatabase
+from rangesfm.vision.photo_files import Photos
+from rangesfm.vision.photo_matching import photo_matching
 from rangesfm.vision.rigs import NO_RIGS, Rigs
 from rangesfm.vision.steps import Workspace, fingerprint
 from rangesfm.vision.unpublished import UnpublishedReconstruction
@@ -105,67 +101,52 @@ def reconstruct_in(
 
     The options have been checked by ``pipeline_options``.
     """
-    space = unpublished.space
-    photos, inputs = match_photos(image_path, image_names, camera, mapper, rigs, seed, space)
-    _map(space, photos, inputs, camera, mapper, rigs, seed)
-    found = read_mapped_models(unpublished.models_path)
+    progress = unpublished.progress
+    with photo_matching(image_path, image_names, camera, mapper, rigs, seed, unpublished) as matching:
+        intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
+        command = [] if mapper.command is None else [mapper.command]
+        of_matches = matching.plan["matching"]
+        mapping = fingerprint(of_matches, mapper.method, *command, mapper.reproducible, mapper.pipeline, *intrinsics)
+        placing = {} if all(rigs.are_known) else {"rigs": mapping}
+        plan = {**matching.plan, **placing, "mapping": mapping}
+        space = unpublished.begin(plan, with_loops_closed=mapper.close_loops)
+        with space.logged() as log_folder:
+
+            def options(rigs: Rigs) -> MappingOptions:
+                return mapping_options(camera, mapper, rigs, seed, space.database)
+
+            matching.fill(space, log_folder)
+            if placing:
+                space.run(
+                    "rigs",
+                    mapping,
+                    lambda: rigs.apply(space.database),
+                    lambda: _place_cameras(space, matching.photos, rigs, options(NO_RIGS), log_folder),
+                )
+            space.run(
+                "mapping",
+                mapping,
+                lambda: _begin_mapping(space),
+                lambda: map_photos(space, matching.photos, options(rigs), log_folder),
+            )
+    found = read_mapped_models(space.models)
     if len(found) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in found)
-        space.progress.message(f"{len(found)} separate models of {sizes} photos")
+        progress.message(f"{len(found)} separate models of {sizes} photos")
     return ReconstructionSummary(
         found,
         len(image_names),
         found[0].num_reg_images(),
-        space.steps.seconds,
-        space.steps.earlier_seconds,
+        space.seconds,
+        space.earlier_seconds,
         unpublished.log_path,
     )
-
-
-def _map(
-    space: Workspace,
-    photos: Photos,
-    of_matches: str,
-    camera: CameraOptions,
-    mapper: MapperOptions,
-    rigs: Rigs,
-    seed: int,
-) -> None:
-    """Map the photos in the workspace's database into models.
-
-    Args:
-        of_matches: fingerprint of the matches.
-    """
-    intrinsics = [table.intrinsics_in_mapping for table in camera.tables]
-    command = [] if mapper.command is None else [mapper.command]
-    inputs = fingerprint(of_matches, mapper.method, *command, mapper.reproducible, mapper.pipeline, *intrinsics)
-    with space.logged() as log_folder:
-        if not all(rigs.are_known):
-            space.steps.run(
-                "rigs",
-                inputs,
-                space.database,
-                lambda: rigs.apply(space.database),
-                lambda: _place_cameras(
-                    space, photos, rigs, mapping_options(camera, mapper, NO_RIGS, seed, space.database), log_folder
-                ),
-            )
-        if has_closed_loops(space.steps) and not mapper.close_loops:
-            space.steps.repeat("mapping")
-        space.steps.run(
-            "mapping",
-            inputs,
-            space.models / "0",
-            lambda: _begin_mapping(space),
-            lambda: map_photos(space, photos, mapping_options(camera, mapper, rigs, seed, space.database), log_folder),
-            unfinished=space.snapshots,
-        )
 
 
 def _begin_mapping(space: Workspace) -> None:
     """Remove old models, and the matches of the loops that were found by them."""
     space.remove_old_models()
-    forget_loops(space.steps, space.database)
+    forget_loops(space, with_matches=True)
 
 
 def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: MappingOptions, log_folder: Path) -> None:
@@ -177,7 +158,7 @@ def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: Mappin
         ReconstructionError: there is no model, or no photo of some rig camera is in it together with one of its
             reference camera, taken at the same time.
     """
-    with scratch_folder(space.output / "rigs") as folder:
+    with scratch_folder(space.folder / "rigs") as folder:
         without_rigs = Workspace(folder, space.progress)
         shutil.copyfile(space.database, without_rigs.database)
         with pycolmap.Database.open(without_rigs.database) as database:
@@ -196,45 +177,3 @@ def _place_cameras(space: Workspace, photos: Photos, rigs: Rigs, options: Mappin
     with pycolmap.Database.open(space.database) as database:
         if any(pose is None for rig in database.read_all_rigs() for pose in rig.non_ref_sensors.values()):
             raise ReconstructionError(why_not)
-
-
-def match_photos(
-    image_path: Path,
-    image_names: Sequence[str],
-    camera: CameraOptions,
-    mapper: MapperOptions,
-    rigs: Rigs,
-    seed: int,
-    space: Workspace,
-) -> tuple[Photos, str]:
-    """Write features and matches of the photos into the workspace's database.
-
-    Returns the photos used, whose ids in the database are 1, 2, ..., and the fingerprint of the matches. Arguments and
-    errors are those of ``reconstruct``.
-    """
-    check_camera(camera)
-    for_features = feature_options(mapper)
-    for_matching = matching_options(mapper, len(image_names), seed)
-    if for_features.use_gpu:
-        space.progress.message("features and matching: on the GPU")
-    photos = usable_photos(image_path, image_names)
-    cameras = cameras_of_photos(camera, photos, rigs)
-    masks = contents_of_masks(mapper.mask_path, photos)
-    if photos.left_out:
-        name, reason = next(iter(photos.left_out.items()))
-        num, num_all = len(photos.left_out), len(photos.left_out) + len(photos.names)
-        space.progress.message(f"{num} of {num_all} photos are left out; the first, {name}, {reason}")
-    with opened(mapper.database_path, photos, space.output) as given:
-        if given is not None:
-            space.progress.message(given.note)
-            photos = given.photos
-            is_open = all(table.model is None for table in camera.tables)
-            cameras = given.cameras() if is_open else cameras_of_photos(camera, photos, rigs)
-        if cameras.guessed:
-            space.progress.message(
-                f"the camera's parameters belong to photos of another shape than {cameras.guessed[0]}: COLMAP guesses"
-                f" its camera ({len(cameras.guessed)} of {len(cameras.cameras)} cameras)"
-            )
-        renewed = RenewedDatabase(space, photos, cameras, rigs, given, mapper, masks, for_features, for_matching)
-        with space.logged() as log_folder:
-            return photos, renewed.fill(log_folder)

@@ -9,6 +9,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,13 @@ DATABASE_NAME, MODELS_NAME, LOG_NAME, RECORD_NAME = "database.db", "sparse", "ma
 RECONSTRUCTION_NAMES = (DATABASE_NAME, MODELS_NAME, LOG_NAME, RECORD_NAME)
 """Files and folders of a complete reconstruction."""
 SNAPSHOTS_NAME = "mapping_snapshot"
+# What each step makes, and then what it leaves where it is interrupted.
+_MADE_BY = {
+    "features": (DATABASE_NAME,),
+    "matching": (DATABASE_NAME,),
+    "rigs": (DATABASE_NAME,),
+    "mapping": (f"{MODELS_NAME}/0", SNAPSHOTS_NAME),
+}
 
 
 def fingerprint(*inputs: Any) -> str:
@@ -29,160 +37,83 @@ def fingerprint(*inputs: Any) -> str:
     return hashlib.sha256(json.dumps(inputs, sort_keys=True, default=str).encode()).hexdigest()
 
 
-class Steps:
-    """A series of steps, each of which needs the one before; their state is kept in a JSON file.
+class Workspace:
+    """Folder in which a reconstruction is made in steps, each of which needs the one before.
+
+    The state of the steps is kept in a JSON file there, the record.
 
     Attributes:
-        notes: other plain values kept in that file, by name; see ``note``.
+        folder: the folder. database, models, snapshots, log: files and folders in it.
+        notes: other plain values in the record, by name; see ``note``.
         seconds: duration of each step that was done in this run, by name.
         earlier_seconds: of each step that was taken over, as far as the record has it.
     """
 
-    def __init__(
-        self,
-        record_path: Path,
-        progress: Progress,
-        earlier: Steps | None = None,
-        begin: Callable[[Mapping[str, str]], object] = lambda passed: None,
-    ):
-        """Read the record of earlier runs.
-
-        Args:
-            record_path: the JSON file.
-            earlier: the same steps, complete, with their results in another folder. A step that was done there with the
-                same inputs is not done here.
-            begin: called before the first step that has to be done here, with the inputs of the steps before it, by
-                name. The record is read again afterwards.
-        """
-        self._path = record_path
-        self._progress = progress
-        self._earlier = earlier
-        self._begin = begin
-        self._passed: dict[str, str] = {}
-        self._read_record()
-        self.seconds: dict[str, float] = {}
-        self.earlier_seconds: dict[str, float] = {}
-
-    def run(
-        self,
-        name: str,
-        inputs: str,
-        output: Path,
-        prepare: Callable[[], object],
-        work: Callable[[], object],
-        *,
-        unfinished: Path | None = None,
-    ) -> None:
-        """Do a step, unless it was done with the same inputs and its output is still there.
-
-        Args:
-            inputs: fingerprint of all that the step depends on.
-            output: file or folder that the step makes.
-            prepare: removes old results; skipped where ``work`` was interrupted on the same inputs.
-            work: does the step, continuing from what an interruption left.
-            unfinished: where an interruption leaves its results, if not in ``output``.
-        """
-        if self._earlier is not None:
-            if self._earlier._has(name, inputs, output.relative_to(self._path.parent)):
-                self._passed[name] = inputs
-                self._take_over(name, self._earlier._record[name])
-                return
-            self.begin()
-        state = self._record.get(name, {})
-        is_same = state.get("inputs") == inputs
-        if is_same and state.get("done") and output.exists():
-            self._take_over(name, state)
-            return
-        self._progress.stage(name)
-        start = time.perf_counter()
-        if not (is_same and (output.exists() or (unfinished is not None and unfinished.exists()))):
-            self.forget(name)
-            prepare()
-        self._set_state(name, inputs, done=False)
-        work()
-        self.seconds[name] = time.perf_counter() - start
-        self._set_state(name, inputs, done=True, seconds=self.seconds[name])
-
-    @property
-    def has_begun(self) -> bool:
-        """Return whether the results are in this folder, not in that of the earlier steps."""
-        return self._earlier is None
-
-    def begin(self) -> None:
-        """Do all further steps in this folder, building on what the earlier steps have done."""
-        self._begin(self._passed)
-        self._earlier = None
-        self._read_record()
-
-    def has_done(self, steps: Mapping[str, str]) -> bool:
-        """Return whether all these steps are recorded as done with these inputs, given by the steps' names."""
-        states = [(self._record.get(name, {}), inputs) for name, inputs in steps.items()]
-        return all(state.get("done") is True and state.get("inputs") == inputs for state, inputs in states)
-
-    def _has(self, name: str, inputs: str, output: Path) -> bool:
-        return self.has_done({name: inputs}) and (self._path.parent / output).exists()
-
-    def _read_record(self) -> None:
-        source = self._path if self._earlier is None else self._earlier._path
-        self._record, self.notes = _read(source, "steps"), _read(source, "notes")
-
-    def repeat(self, first: str) -> None:
-        """Do this step and those after it again, even if they were done with the same inputs."""
-        if self._earlier is not None:
-            self.begin()
-        self.forget(first)
-
-    def forget(self, first: str) -> None:
-        """Remove this step and those after it from the record."""
-        names = list(self._record)
-        for name in names[names.index(first) :] if first in names else ():
-            del self._record[name]
-        self._write()
-
-    def note(self, name: str, value: dict[str, Any]) -> None:
-        """Keep a value for the next run, independently of the state of the steps."""
-        self.notes[name] = value
-        if self._earlier is None:
-            self._write()
-
-    def _take_over(self, name: str, state: Mapping[str, Any]) -> None:
-        seconds = state.get("seconds")
-        if isinstance(seconds, float) and 0 <= seconds < math.inf:
-            self.earlier_seconds[name] = seconds
-        self._progress.message(f"{name}: taken over from an earlier run")
-
-    def _set_state(self, name: str, inputs: str, **state: Any) -> None:
-        self._record[name] = {"inputs": inputs, **state}
-        self._write()
-
-    def _write(self) -> None:
-        write_json({"steps": self._record, "notes": self.notes}, self._path)
-
-
-class Workspace:
-    """Folder in which a reconstruction is made, with the record of what earlier runs have done there.
-
-    Args:
-        folder: the folder.
-        earlier: the steps of a complete reconstruction in another folder, to continue from.
-        begin: see ``Steps``.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        progress: Progress,
-        *,
-        earlier: Steps | None = None,
-        begin: Callable[[Mapping[str, str]], object] = lambda passed: None,
-    ):
+    def __init__(self, folder: Path, progress: Progress):
         self.progress = progress
-        self.output = folder
+        self.folder = folder
         self.database = folder / DATABASE_NAME
         self.models = folder / MODELS_NAME
         self.snapshots = folder / SNAPSHOTS_NAME
         self.log = folder / LOG_NAME
-        self.steps = Steps(folder / RECORD_NAME, progress, earlier, begin)
+        self._steps, self.notes = (_read(folder / RECORD_NAME, part) for part in ("steps", "notes"))
+        self.seconds: dict[str, float] = {}
+        self.earlier_seconds: dict[str, float] = {}
+
+    def num_done(self, plan: Mapping[str, str]) -> int:
+        """Return how many of the first steps of a plan are done.
+
+        Args:
+            plan: for each step, the fingerprint of all that it depends on.
+        """
+        return len([*takewhile(lambda step: self._is_done(*step), plan.items())])
+
+    def run(self, name: str, inputs: str, prepare: Callable[[], object], work: Callable[[], object]) -> None:
+        """Do a step, unless it was done with the same inputs and what it makes is still there.
+
+        Args:
+            inputs: fingerprint of all that the step depends on.
+            prepare: removes old results; skipped where ``work`` was interrupted on the same inputs.
+            work: does the step, continuing from what an interruption left.
+        """
+        state = self._steps.get(name, {})
+        if self._is_done(name, inputs):
+            seconds = state.get("seconds")
+            if isinstance(seconds, float) and 0 <= seconds < math.inf:
+                self.earlier_seconds[name] = seconds
+            self.progress.message(f"{name}: taken over from an earlier run")
+            return
+        self.progress.stage(name)
+        start = time.perf_counter()
+        if state.get("inputs") != inputs or not any((self.folder / made).exists() for made in _MADE_BY[name]):
+            self.forget(name)
+            self._write()
+            prepare()
+        self._steps[name] = {"inputs": inputs, "done": False}
+        self._write()
+        work()
+        self.seconds[name] = time.perf_counter() - start
+        self._steps[name] = {"inputs": inputs, "done": True, "seconds": self.seconds[name]}
+        self._write()
+
+    def _is_done(self, name: str, inputs: str) -> bool:
+        state = self._steps.get(name, {})
+        is_same = state.get("done") is True and state.get("inputs") == inputs
+        return is_same and (self.folder / _MADE_BY[name][0]).exists()
+
+    def forget(self, first: str) -> None:
+        """Do this step and those after it again, even if they were done with the same inputs."""
+        names = list(self._steps)
+        for name in names[names.index(first) :] if first in names else ():
+            del self._steps[name]
+
+    def note(self, name: str, value: dict[str, Any]) -> None:
+        """Keep a value for the next run, independently of the state of the steps."""
+        self.notes[name] = value
+        self._write()
+
+    def _write(self) -> None:
+        write_json({"steps": self._steps, "notes": self.notes}, self.folder / RECORD_NAME)
 
     def remove_old_models(self) -> None:
         """Remove the models in this folder, complete and unfinished ones."""

@@ -24,7 +24,7 @@ from rangesfm.progress import Journal
 from rangesfm.result.result_folder import RESULT_NAMES
 from rangesfm.survey.settings import Survey
 from rangesfm.vision.loop_database import has_closed_loops
-from rangesfm.vision.steps import MODELS_NAME, RECORD_NAME, Steps
+from rangesfm.vision.steps import MODELS_NAME, Workspace
 from rangesfm.workflows.loop_matching import LoopMatching
 from rangesfm.workflows.matched_map import MatchedMap, MergeTracks
 
@@ -40,7 +40,7 @@ def close_loops_of_models(
         models: of the output folder, which has their database and record.
     """
     with sole_writer(survey.output.path) as output:
-        if has_closed_loops(Steps(output.path / RECORD_NAME, journal.progress)):
+        if has_closed_loops(Workspace(output.path, journal.progress)):
             return models[0]
         if (matching := LoopMatching.for_survey(survey, journal.progress, output)) is None:
             return models[0]
