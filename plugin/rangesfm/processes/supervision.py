@@ -205,10 +205,7 @@ def supervise(
             process.kill()  # has no effect if it has ended
             process.wait()
         died_of = signal.Signals(-process.returncode) if process.returncode < 0 else None
-        errors.seek(0)
-        said = [line.strip().lstrip("# ") for line in errors.read().decode(errors="replace").split("\n")]
-        why = next((line[:_MAX_LINE] for line in reversed(said) if line and not _STACK_TRACE.match(line)), "")
-        return Ended(last, died_of, needed_bytes, stopped_at < math.inf, why)
+        return Ended(last, died_of, needed_bytes, stopped_at < math.inf, _last_line(errors))
 
 
 def _used_bytes(process: subprocess.Popen[bytes]) -> int:
@@ -226,6 +223,12 @@ def _read_lines(stream: IO[bytes], lines: queue.SimpleQueue[bytes | None]) -> No
             if line.endswith(b"\n"):  # a line without it is incomplete, because the process was killed
                 lines.put(line)
     lines.put(None)
+
+
+def _last_line(errors: IO[bytes]) -> str:
+    errors.seek(0)
+    lines = [line.strip().lstrip("# ") for line in errors.read().decode(errors="replace").split("\n")]
+    return next((line[:_MAX_LINE] for line in reversed(lines) if line and not _STACK_TRACE.match(line)), "")
 
 
 def run_child(work: Callable[[Progress], int], update: Callable[[int], object] = lambda _: None) -> int:
