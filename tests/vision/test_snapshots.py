@@ -16,7 +16,7 @@ from tests.outputs import names_in, unfinished
 from rangesfm.options import MapperOptions
 from rangesfm.progress import SILENT, Progress
 from rangesfm.vision import snapshots as snapshots_module
-from rangesfm.vision.incremental_mapping import Size, UnfinishedMapping
+from rangesfm.vision.incremental_mapping import UnfinishedMapping, size_of
 from rangesfm.vision.reconstruct import reconstruct
 from rangesfm.vision.snapshots import Snapshots
 
@@ -140,7 +140,7 @@ def test_a_mapping_that_is_killed_loses_seconds(
     monkeypatch.setattr("time.monotonic", lambda: now_s)
     monkeypatch.setattr("time.time_ns", lambda: 1_700_000_000_000_000_000)  # all within one millisecond
     model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
-    mapping = UnfinishedMapping((), model, Size.measured(model))
+    mapping = UnfinishedMapping((), model, size_of(model))
     (tmp_path / "scratch").mkdir()
     snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch", min_model_size=10)
     names: list[str] = []

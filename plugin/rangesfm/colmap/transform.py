@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,7 +43,7 @@ def joined_model(
     """
     joined = pycolmap.Reconstruction()
     for model in models:
-        _Addition(joined, model, is_of_one_database).make()
+        _add_model(joined, model, is_of_one_database=is_of_one_database)
     joined.update_point_3d_errors()
     return joined
 
@@ -60,61 +59,54 @@ def without_photos(model: pycolmap.Reconstruction, image_names: Collection[str])
     return rest
 
 
-@dataclass(frozen=True)
-class _Addition:
-    """A model that is being added to the joined one."""
-
-    joined: pycolmap.Reconstruction
-    model: pycolmap.Reconstruction
-    is_of_one_database: bool
-
-    def make(self) -> None:
-        rig_ids, camera_ids = self._add_rigs()
-        image_ids = _free_ids(self.model.reg_image_ids(), self.joined.images)
-        frame_ids = _free_ids(self.model.reg_frame_ids(), self.joined.frames)
-        for old_id, new_id in frame_ids.items():
-            frame = self.model.frame(old_id)
-            self._add_frame(frame, new_id, rig_ids[frame.rig_id], camera_ids, image_ids)
-        for _, point in sorted(self.model.points3D.items()):
-            seen = point.track.elements
-            track = [pycolmap.TrackElement(image_ids[element.image_id], element.point2D_idx) for element in seen]
-            self.joined.add_point3D(point.xyz, pycolmap.Track(track), point.color)
-
-    def _add_rigs(self) -> tuple[dict[int, int], dict[int, int]]:
-        """Add rigs and cameras; return their new ids, by their ids in the model."""
-        same = {
-            rig_id
-            for rig_id in self.model.rigs
-            if self.joined.exists_rig(rig_id)
-            and (self.is_of_one_database or _description(self.joined, rig_id) == _description(self.model, rig_id))
-        }
-        cameras_of = {rig_id: _camera_ids(rig) for rig_id, rig in self.model.rigs.items()}
-        shared = {camera_id for rig_id in same for camera_id in cameras_of[rig_id]}
-        camera_ids = _free_ids(set(self.model.cameras) - shared, self.joined.cameras) | {id_: id_ for id_ in shared}
-        rig_ids = _free_ids(set(self.model.rigs) - same, self.joined.rigs) | {id_: id_ for id_ in same}
-        for old_id in sorted(set(self.model.rigs) - same):
-            for camera_id in cameras_of[old_id]:
-                camera = pycolmap.Camera(self.model.camera(camera_id).todict())
-                camera.camera_id = camera_ids[camera_id]
-                self.joined.add_camera(camera)
-            self.joined.add_rig(_renumbered(self.model.rig(old_id), rig_ids[old_id], camera_ids))
-        return rig_ids, camera_ids
-
-    def _add_frame(
-        self, frame: pycolmap.Frame, frame_id: int, rig_id: int, camera_ids: dict[int, int], image_ids: dict[int, int]
-    ) -> None:
-        copy, images = pycolmap.Frame(), []
-        copy.frame_id, copy.rig_id = frame_id, rig_id
-        for image in sorted((self.model.image(data_id.id) for data_id in frame.image_ids), key=lambda i: i.image_id):
+def _add_model(joined: pycolmap.Reconstruction, model: pycolmap.Reconstruction, *, is_of_one_database: bool) -> None:
+    rig_ids, camera_ids = _add_rigs(joined, model, is_of_one_database=is_of_one_database)
+    image_ids = _free_ids(model.reg_image_ids(), joined.images)
+    for old_id, new_id in _free_ids(model.reg_frame_ids(), joined.frames).items():
+        frame, copy, images = model.frame(old_id), pycolmap.Frame(), []
+        copy.frame_id, copy.rig_id = new_id, rig_ids[frame.rig_id]
+        for image in sorted((model.image(data_id.id) for data_id in frame.image_ids), key=lambda i: i.image_id):
             pixels = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
             images.append(pycolmap.Image(image.name, pixels, camera_ids[image.camera_id], image_ids[image.image_id]))
-            images[-1].frame_id = frame_id
+            images[-1].frame_id = new_id
             copy.add_data_id(images[-1].data_id)
         copy.rig_from_world = pose_of(frame)
-        self.joined.add_frame(copy)
+        joined.add_frame(copy)
         for image in images:
-            self.joined.add_image(image)
-        self.joined.register_frame(frame_id)
+            joined.add_image(image)
+        joined.register_frame(new_id)
+    for _, point in sorted(model.points3D.items()):
+        seen = point.track.elements
+        track = [pycolmap.TrackElement(image_ids[element.image_id], element.point2D_idx) for element in seen]
+        joined.add_point3D(point.xyz, pycolmap.Track(track), point.color)
+
+
+def _add_rigs(
+    joined: pycolmap.Reconstruction, model: pycolmap.Reconstruction, *, is_of_one_database: bool
+) -> tuple[dict[int, int], dict[int, int]]:
+    """Add rigs and cameras; return their new ids, by their ids in the model."""
+    same = {
+        rig_id
+        for rig_id in model.rigs
+        if joined.exists_rig(rig_id)
+        and (is_of_one_database or _description(joined, rig_id) == _description(model, rig_id))
+    }
+    cameras_of = {rig_id: _camera_ids(rig) for rig_id, rig in model.rigs.items()}
+    shared = {camera_id for rig_id in same for camera_id in cameras_of[rig_id]}
+    camera_ids = _free_ids(set(model.cameras) - shared, joined.cameras) | {id_: id_ for id_ in shared}
+    rig_ids = _free_ids(set(model.rigs) - same, joined.rigs) | {id_: id_ for id_ in same}
+    for old_id in sorted(set(model.rigs) - same):
+        for camera_id in cameras_of[old_id]:
+            camera = pycolmap.Camera(model.camera(camera_id).todict())
+            camera.camera_id = camera_ids[camera_id]
+            joined.add_camera(camera)
+        rig, copy = model.rig(old_id), pycolmap.Rig()
+        copy.rig_id = rig_ids[old_id]
+        copy.add_ref_sensor(_camera_sensor(camera_ids[rig.ref_sensor_id.id]))
+        for sensor, pose in rig.non_ref_sensors.items():
+            copy.add_sensor(_camera_sensor(camera_ids[sensor.id]), pose)
+        joined.add_rig(copy)
+    return rig_ids, camera_ids
 
 
 def _free_ids(wanted: Iterable[int], taken: Iterable[int]) -> dict[int, int]:
@@ -144,15 +136,6 @@ def _description(model: pycolmap.Reconstruction, rig_id: int) -> Any:
         for camera in map(model.camera, _camera_ids(rig))
     ]
     return rig.ref_sensor_id.id, others, cameras
-
-
-def _renumbered(rig: pycolmap.Rig, rig_id: int, camera_ids: Mapping[int, int]) -> pycolmap.Rig:
-    copy = pycolmap.Rig()
-    copy.rig_id = rig_id
-    copy.add_ref_sensor(_camera_sensor(camera_ids[rig.ref_sensor_id.id]))
-    for sensor, pose in rig.non_ref_sensors.items():
-        copy.add_sensor(_camera_sensor(camera_ids[sensor.id]), pose)
-    return copy
 
 
 def _camera_sensor(camera_id: int) -> pycolmap.sensor_t:

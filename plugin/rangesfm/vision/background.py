@@ -20,7 +20,7 @@ def run_in_background(
     work: Callable[[pycolmap.CancellationToken], Result],
     progress: Progress,
     count: Callable[[], int],
-    num_total: int | None,
+    num_total: int,
 ) -> Result:
     """Run ``work`` in a thread and report its progress meanwhile.
 
@@ -31,7 +31,7 @@ def run_in_background(
     Args:
         work: passes the token on to COLMAP. If its calls do not release Python's global lock, Ctrl-C and progress are
             handled only when they call back.
-        count: returns how many of ``num_total`` items (None: unknown) are done.
+        count: returns how many of ``num_total`` items are done; it may exceed them.
 
     Raises:
         ReconstructionError: COLMAP raised an error of its own.
@@ -43,7 +43,7 @@ def run_in_background(
         try:
             future = executor.submit(work, token)
             while not wait([future], timeout=_POLL_INTERVAL_S).done:
-                _say(progress, count, num_total)
+                progress.update(min(count(), num_total), num_total)
         except BaseException as error:
             token.cancel()
             if isinstance(error, KeyboardInterrupt):
@@ -53,10 +53,5 @@ def run_in_background(
         result = future.result()
     except (RuntimeError, ValueError) as error:
         raise ReconstructionError("COLMAP stopped: " + " ".join(str(error).split())) from error
-    _say(progress, count, num_total)
+    progress.update(min(count(), num_total), num_total)
     return result
-
-
-def _say(progress: Progress, count: Callable[[], int], num_total: int | None) -> None:
-    num_done = count()
-    progress.update(num_done if num_total is None else min(num_done, num_total), num_total)

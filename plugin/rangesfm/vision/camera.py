@@ -126,11 +126,20 @@ def _of_one_table(options: CameraOptions, photos: Photos, rigs: Rigs) -> PhotoCa
     if options.model is not None and options.params is not None:
         known = calibrated_cameras(options.model, options.params, photos.sizes)
     for camera in known.values():
-        _check_size(camera)
+        for index, size_px in zip(camera.principal_point_idxs(), (camera.width, camera.height), strict=False):
+            if not 0 < camera.params[index] < size_px:
+                raise InputError(
+                    f"[camera] params are {camera.params.tolist()} ({camera.params_info}), expected a principal point"
+                    f" inside the photos of {camera.width} x {camera.height} pixels: do they belong to another image"
+                    " size?"
+                )
+    reader = pycolmap.ImageReaderOptions()
+    if options.model is not None:
+        reader.camera_model = options.model
     cameras = tuple(
         pycolmap.Camera(known[photos.sizes[first]].todict())
         if photos.sizes[first] in known
-        else _guessed(options.model, photos, first)
+        else pycolmap.infer_camera_from_image(photos.folder / photos.names[first], reader)
         for first in firsts
     )
     guessed = tuple(photos.names[first] for first in firsts if known and photos.sizes[first] not in known)
@@ -163,19 +172,3 @@ def _maker(path: Path) -> tuple[str, ...]:
     """Return the EXIF values that tell cameras and focal lengths apart; empty without EXIF."""
     tags = exif_tags(path)
     return tuple(str(tags[tag]).strip("\0 ") for tag in _TELLING_TAGS if tag in tags)
-
-
-def _guessed(model: str | None, photos: Photos, place: int) -> pycolmap.Camera:
-    reader = pycolmap.ImageReaderOptions()
-    if model is not None:
-        reader.camera_model = model
-    return pycolmap.infer_camera_from_image(photos.folder / photos.names[place], reader)
-
-
-def _check_size(camera: pycolmap.Camera) -> None:
-    for index, size_px in zip(camera.principal_point_idxs(), (camera.width, camera.height), strict=False):
-        if not 0 < camera.params[index] < size_px:
-            raise InputError(
-                f"[camera] params are {camera.params.tolist()} ({camera.params_info}), expected a principal point"
-                f" inside the photos of {camera.width} x {camera.height} pixels: do they belong to another image size?"
-            )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeAlias
 
 import pycolmap
 
@@ -27,16 +28,13 @@ class _StoppedError(Exception):
     """Raised in a callback to stop COLMAP's mapping, whose parts watch neither a cancellation nor the time."""
 
 
-@dataclass(frozen=True)
-class Size:
-    """Size of a model: numbers of its registered frames and of its points."""
+Size: TypeAlias = tuple[int, int]
+"""Size of a model: numbers of its registered frames and of its points."""
 
-    num_frames: int
-    num_points: int
 
-    @classmethod
-    def measured(cls, model: pycolmap.Reconstruction) -> Size:
-        return cls(model.num_reg_frames(), model.num_points3D())
+def size_of(model: pycolmap.Reconstruction) -> Size:
+    """Return the size of a model."""
+    return model.num_reg_frames(), model.num_points3D()
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ def incremental_mapping(
             raise _StoppedError
 
     def begin(growing: pycolmap.Reconstruction) -> None:
-        adjustments.begin(growing, left.pop().size_at_adjustment if left else Size.measured(growing))
+        adjustments.begin(growing, left.pop().size_at_adjustment if left else size_of(growing))
 
     whens = pycolmap.IncrementalPipelineCallback
     pipeline.add_callback(whens.INITIAL_IMAGE_PAIR_REG_CALLBACK, partial(call, begin))
@@ -103,21 +101,14 @@ def incremental_mapping(
     if pipeline.database_cache.num_images():
         mapper = pycolmap.IncrementalMapper(pipeline.database_cache)
         if unfinished is not None:
-            _take_up(unfinished, mapper, manager)
+            for model in finished:  # so that COLMAP knows which photos they have
+                mapper.begin_reconstruction(model)
+                mapper.end_reconstruction(discard=False)
+            with TemporaryDirectory() as folder:  # a manager only takes a model from the disk
+                unfinished.growing.write_binary(folder)
+                manager.read(folder)
         _map_with_relaxed_demands(pipeline, mapper)
     return models()
-
-
-def _take_up(
-    unfinished: UnfinishedMapping, mapper: pycolmap.IncrementalMapper, manager: pycolmap.ReconstructionManager
-) -> None:
-    """Tell COLMAP which photos the finished models have, and which model it should continue."""
-    for model in unfinished.finished:
-        mapper.begin_reconstruction(model)
-        mapper.end_reconstruction(discard=False)
-    with TemporaryDirectory() as folder:  # a manager only takes a model from the disk
-        unfinished.growing.write_binary(folder)
-        manager.read(folder)
 
 
 class _WholeAdjustments:
@@ -136,28 +127,28 @@ class _WholeAdjustments:
         self._ratios = options.ba_global_frames_ratio, options.ba_global_points_ratio
         self._steps = options.ba_global_frames_freq, options.ba_global_points_freq
         self._poses: dict[int, bytes] = {}
-        self.size_at_last = Size(0, 0)
+        self.size_at_last: Size = (0, 0)
 
     def begin(self, model: pycolmap.Reconstruction, size_at_last: Size) -> None:
         """Begin with a model, new or continued."""
         self._poses, self.size_at_last = _poses(model), size_at_last
-        now, last = Size.measured(model), size_at_last
+        now, last = size_of(model), size_at_last
         if now == last:
             self._count_as_usual()
             return
         of_frames, of_points = self._ratios
         options = self._options
         # Half a frame less, so that rounding does not matter.
-        options.ba_global_frames_ratio = (math.ceil(of_frames * last.num_frames) - 0.5) / now.num_frames
-        options.ba_global_points_ratio = (math.ceil(of_points * last.num_points) - 0.5) / now.num_points
-        options.ba_global_frames_freq = self._steps[0] + last.num_frames - now.num_frames
-        options.ba_global_points_freq = self._steps[1] + last.num_points - now.num_points
+        options.ba_global_frames_ratio = (math.ceil(of_frames * last[0]) - 0.5) / now[0]
+        options.ba_global_points_ratio = (math.ceil(of_points * last[1]) - 0.5) / now[1]
+        options.ba_global_frames_freq = self._steps[0] + last[0] - now[0]
+        options.ba_global_points_freq = self._steps[1] + last[1] - now[1]
 
     def add_photo(self, model: pycolmap.Reconstruction) -> None:
         """Note whether the model has been adjusted, which changes all poses."""
         before, self._poses = self._poses, _poses(model)
         if all(self._poses[id_] != pose for id_, pose in before.items() if id_ in self._poses):
-            self.size_at_last = Size.measured(model)
+            self.size_at_last = size_of(model)
             self._count_as_usual()
 
     def _count_as_usual(self) -> None:
@@ -185,30 +176,21 @@ def adjust_whole(
     solver = to_the_end.ceres.solver_options
     solver.function_tolerance, solver.gradient_tolerance = _WHOLE_FUNCTION_TOLERANCE, 0.0
     to_the_end.ceres.solver_options = solver
-    _adjust_all(mapper, model, options, to_the_end)
-    model.update_point_3d_errors()
-    mapper.end_reconstruction(discard=False)
-
-
-def _adjust_all(
-    mapper: pycolmap.IncrementalMapper,
-    model: pycolmap.Reconstruction,
-    options: pycolmap.IncrementalPipelineOptions,
-    bundle_adjustment: pycolmap.BundleAdjustmentOptions,
-) -> None:
-    """Adjust the whole model and update its tracks in turns, until the tracks hardly change, as COLMAP does."""
+    # The model and its tracks are adjusted in turns, until the tracks hardly change, as in COLMAP.
     of_mapper, triangulation = options.get_mapper(), options.get_triangulation()
     mapper.complete_and_merge_tracks(triangulation)
     mapper.retriangulate(triangulation)
     for _ in range(options.ba_global_max_refinements):
         num_observations = model.compute_num_observations()
         mapper.observation_manager.filter_observations_with_negative_depth()
-        mapper.adjust_global_bundle(of_mapper, bundle_adjustment)
+        mapper.adjust_global_bundle(of_mapper, to_the_end)
         model.normalize()
         num_changed = mapper.complete_and_merge_tracks(triangulation) + mapper.filter_points(of_mapper)
         if num_changed < options.ba_global_max_refinement_change * num_observations:
             break
     mapper.filter_frames(of_mapper)
+    model.update_point_3d_errors()
+    mapper.end_reconstruction(discard=False)
 
 
 def _map_with_relaxed_demands(pipeline: pycolmap.IncrementalPipeline, mapper: pycolmap.IncrementalMapper) -> None:

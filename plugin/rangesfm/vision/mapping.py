@@ -7,7 +7,6 @@ import os
 import shlex
 import shutil
 import signal
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -133,22 +132,6 @@ def mapping_options(
     with pycolmap.Database.open(database_path) as database:
         cameras = {found.camera_id: found for found in database.read_all_cameras()}
         camera_of_photo = [(image.name, cameras[image.camera_id]) for image in database.read_all_images()]
-    kept, refined_last = _held_cameras(camera, camera_of_photo)
-    options.constant_cameras |= kept
-    whole = copy.deepcopy(options)
-    whole.num_threads = growing.num_threads
-    options.constant_cameras |= refined_last
-    if options.constant_cameras >= set(cameras):
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
-        # Registration of a photo by its matches alone looks at these two options, not at constant_cameras.
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    return MappingOptions(growing, whole if refined_last else None)
-
-
-def _held_cameras(
-    camera: CameraOptions, camera_of_photo: Sequence[tuple[str, pycolmap.Camera]]
-) -> tuple[set[int], set[int]]:
-    """Return the ids of cameras that are held fixed throughout, and of those held fixed while the map grows."""
     as_given = cameras_as_given(camera, camera_of_photo)
     held: dict[str, set[int]] = {"kept": set(), "refined last": set(), "refined": set()}
     for name, found in camera_of_photo:
@@ -156,7 +139,15 @@ def _held_cameras(
         # For photos of another shape than the calibrated ones COLMAP guesses the camera, and a guess is not held fixed.
         if found.camera_id in as_given or table.params is None:
             held[table.intrinsics_in_mapping].add(found.camera_id)
-    return held["kept"], held["refined last"]
+    options.constant_cameras |= held["kept"]
+    whole = copy.deepcopy(options)
+    whole.num_threads = growing.num_threads
+    options.constant_cameras |= held["refined last"]
+    if options.constant_cameras >= set(cameras):
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        # Registration of a photo by its matches alone looks at these two options, not at constant_cameras.
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    return MappingOptions(growing, whole if held["refined last"] else None)
 
 
 def map_photos(space: Workspace, photos: Photos, options: MappingOptions, log_folder: Path) -> None:

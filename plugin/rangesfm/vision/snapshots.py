@@ -6,14 +6,13 @@ import json
 import os
 import shutil
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import InputError
 from rangesfm.files.contents import open_regular
 from rangesfm.files.records import write_json
-from rangesfm.vision.incremental_mapping import Size, UnfinishedMapping
+from rangesfm.vision.incremental_mapping import UnfinishedMapping
 
 # Time between two snapshots: at least this, and so long that writing them takes a twentieth of the time at most.
 _MIN_INTERVAL_S = 5.0
@@ -52,7 +51,7 @@ class Snapshots:
 def _write(mapping: UnfinishedMapping, folder: Path) -> Path:
     """Write the models into a new folder, named by the time in milliseconds as COLMAP does; return the folder."""
     folder.mkdir()
-    write_json(asdict(mapping.size_at_adjustment), folder / _SIZE_NAME)
+    write_json([*mapping.size_at_adjustment], folder / _SIZE_NAME)
     for number, model in enumerate(mapping.models):
         (folder / str(number)).mkdir()
         model.write_binary(folder / str(number))
@@ -64,12 +63,12 @@ def newest_snapshot(path: Path) -> UnfinishedMapping | None:
     for folder in sorted(path.iterdir(), reverse=True) if path.is_dir() else ():
         try:
             with open_regular(folder / _SIZE_NAME) as file:
-                size = Size(**json.loads(file.read()))
+                num_frames, num_points = map(int, json.loads(file.read()))
             numbers = sorted(int(model.name) for model in folder.iterdir() if model.name.isdecimal())
             *finished, growing = (read_model(folder / str(number)) for number in numbers)
         except (InputError, OSError, ValueError, TypeError):
             continue
-        return UnfinishedMapping(tuple(finished), growing, size)
+        return UnfinishedMapping(tuple(finished), growing, (num_frames, num_points))
     return None
 
 
