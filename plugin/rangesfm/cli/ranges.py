@@ -245,10 +245,11 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
     _require_apart(args, args.anchors)
     anchors = _read_anchors(args) if args.anchors is not None else ()
     log = _read_log(args, [anchor.anchor_id for anchor in anchors])
-    lines = [
-        *_summary(summarize_ranges(log), _notes_of(log)),
-        *_places(read_anchors_in_log(args.log, format=log.format)),
-    ]
+    lines = _summary(summarize_ranges(log), _notes_of(log))
+    in_log = read_anchors_in_log(args.log, format=log.format)
+    if known := [(anchor.anchor_id, anchor.position_m) for anchor in in_log if anchor.position_m is not None]:
+        lines += ["", "positions of anchors in the log (x, y, z in metres):"]
+        lines += [f"  {anchor_id}  " + "  ".join(f"{value:.3f}" for value in place) for anchor_id, place in known]
     if args.output_path is not None:
         write_ranges_csv(log, args.output_path)
         lines += ["", f"written to {args.output_path}"]
@@ -297,12 +298,6 @@ def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
         align_rows(rows),
         *(["", align_rows([["between", "", *_LENGTHS], *pairs], num_left=2)] if pairs else []),
     ]
-
-
-def _places(anchors: Sequence[Anchor]) -> list[str]:
-    known = [(anchor.anchor_id, anchor.position_m) for anchor in anchors if anchor.position_m is not None]
-    rows = (f"  {anchor_id}  " + "  ".join(f"{value:.3f}" for value in place) for anchor_id, place in known)
-    return ["", "positions of anchors in the log (x, y, z in metres):", *rows] if known else []
 
 
 def _time(summary: RangeSummary) -> str:

@@ -65,9 +65,7 @@ class ModelRow:
     """Comparison of one model with the first model.
 
     Attributes:
-        name: of the model.
         is_metric: whether the model is known to be in metres.
-        num_photos: number of its photos.
         base_from_model: best similarity from this model to the first; None with fewer than three common photos.
         common_names: names of the photos in both, in the order of the first model.
         moved, moved_aligned: (n,) distance of each common camera from its position in the first model, before and after

@@ -39,19 +39,15 @@ _MIN_LEAN = 0.01
 
 @dataclass(frozen=True)
 class MetricMap:
-    """A metric model, and what a COLMAP model cannot hold.
+    """A model in metres, and what a COLMAP model cannot hold; what is not known is None or empty.
 
     Attributes:
-        reconstruction: model in metres.
-        timestamps_s: time of each photo on the camera's clock, by name; None if unknown.
-        anchors_m: position (3,) of each anchor by id, in the world of the model; empty if unknown.
-        metric_from_sfm: similarity from the world of the unscaled model to that of this model; None if unknown.
+        timestamps_s: time of each photo on the camera's clock, by name.
+        anchors_m: position (3,) of each anchor by id, in the world of the model.
+        metric_from_sfm: similarity from the world of the unscaled model to that of this model.
         relative_scale_stddev: relative stddev that the scale gives every length in the map; inf if unknown.
-        images_path: folder of the photos; None if unknown.
-        database_path: COLMAP's database of the photos; None if unknown.
         is_site: whether the world of the model is the site frame of the anchors, where z is up by convention.
-        georeference: place of the model's world on the Earth; None if unknown.
-        center_covariance_m2: covariance (3, 3) of each keyframe's projection centre by photo; empty if unknown.
+        center_covariance_m2: covariance (3, 3) of each keyframe's projection centre by photo.
         offset_m: (3,) what was subtracted from all coordinates, to have the origin near the cameras.
     """
 

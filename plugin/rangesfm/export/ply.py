@@ -80,9 +80,7 @@ class _Header:
 
     Attributes:
         lines: of the header, "end_header" included.
-        num_bytes: length of the header.
         encoding: a key of ``_ORDERS``.
-        num_vertices: number of vertices.
         columns: numpy type code of each property of a vertex, by name.
     """
 

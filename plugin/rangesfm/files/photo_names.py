@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -22,10 +23,10 @@ def photos_meant(listed: Sequence[str], photos: Collection[str]) -> list[str]:
     several photos, or some photo has several names, tells nothing: two cameras may name their photos alike.
     """
     are_apart = len({photo.casefold() for photo in photos}) == len({*photos})
-    same = {name: _slashed(name.casefold() if are_apart else name) for name in {*listed, *photos}}
+    same = {name: (name.casefold() if are_apart else name).replace("\\", "/") for name in {*listed, *photos}}
     photo_of, names = {same[photo]: photo for photo in photos}, {same[name] for name in listed}
     found = {name: name for name in names & photo_of.keys()}
-    forms: tuple[Callable[[str], str], ...] = (str, _without_ending)
+    forms: tuple[Callable[[str], str], ...] = (str, partial(_ENDING.sub, ""))
     for form, by_photo in product(forms, (False, True)):
         left = photo_of.keys() - {*found.values()}
         more = _in_form(form, names - found.keys(), left, by_photo=by_photo)
@@ -57,14 +58,6 @@ def told_none(file: str, listed: Sequence[str], photos: Sequence[str]) -> str:
     """Return what an error says where none of the names in a file means a photo of the map."""
     first, other = printable(listed[0]), printable(photos[0])
     return f"none of the photos that {file} names, such as {first}, is in the map, which has {other}"
-
-
-def _slashed(name: str) -> str:
-    return name.replace("\\", "/")
-
-
-def _without_ending(name: str) -> str:
-    return _ENDING.sub("", name)
 
 
 def _tails(name: str) -> Iterator[str]:

@@ -55,7 +55,6 @@ class TextTable:
     """The requested columns of a file, n rows.
 
     Attributes:
-        path: the file.
         columns: all names of the header row, in order.
         line: (n,) 1-based line of each row.
         cells: the cells of each requested column that the file has.

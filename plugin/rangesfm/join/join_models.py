@@ -25,7 +25,6 @@ class ModelVerdict:
 
     Attributes:
         name: name for the user, such as "sparse/0".
-        num_images: number of its photos.
         estimate: estimate of its scale by its own ranges; None if they do not determine it.
         joined_from_sfm: transformation from its unscaled world to that of the joined unscaled model; None if the model
             is left out.
@@ -45,8 +44,6 @@ class JoinedModels:
 
     Attributes:
         path: the joined model, in the world and unit of the first model.
-        verdicts: the outcome for each model.
-        notes: lines for the user.
     """
 
     path: PathOfModel

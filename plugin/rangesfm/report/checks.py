@@ -21,11 +21,8 @@ class QualityCheck:
     """One number, with a traffic light if the verdict has a limit for it.
 
     Attributes:
-        name: heading of the check.
         meaning: one sentence that says what the value is.
         value: NaN where the run did not measure it.
-        unit: of value and limit.
-        decimals: of the value as shown.
         limit: the verdict is doubtful if the value is larger; inf: the value alone does not change the verdict.
         key: of the value in ``result.json``; empty where it is computed from several.
         times: factor of the value over that in ``result.json``.

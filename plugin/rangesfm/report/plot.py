@@ -49,7 +49,6 @@ class Mark(NamedTuple):
         name: of its kind, for the legend.
         color: name of a colour of the page's style.
         shape: "triangle" or "disc".
-        x, y: in the units of the axes.
         label: text beside it; "" for none.
         title: text that the pointer shows, and name in the CSV file.
     """
@@ -71,8 +70,6 @@ class Panel:
         title: text above it; "" for none.
         description: text for readers who cannot see it.
         labels: of the x and the y axis.
-        series: data drawn in it.
-        marks: marked places in it.
         x_range, y_range: of the axes; None: the range of the data.
         size: width and height between the axes, in pixels.
         keeps_shape: whether its height follows its width, so that both axes keep the same scale.
@@ -114,8 +111,6 @@ class Figure:
 
     Attributes:
         name: of its files, without ending.
-        caption: text that says what is shown.
-        panels: one or several.
         layout: "single", "views" (two side by side) or "panels" (many).
         table: name of the data on the page that the CSV file is made of, where they are too many to be stored twice;
             empty: the series themselves.

@@ -67,10 +67,8 @@ class ReportTable:
     """A table of the page. The page leaves it out if it has no rows.
 
     Attributes:
-        caption: heading of the table.
         header: names of the columns; empty for a table without a header.
         rows: cells of each row, the first of which names the row. Text that is not Markup is escaped.
-        note: text below the table.
         kind: class of the table's own CSS style; None: that of all tables.
         is_narrow: whether it can stand beside other narrow tables.
     """

@@ -55,7 +55,6 @@ class ScenePath:
 
     Attributes:
         id: of its layer.
-        name: shown to the reader.
         color: name of a colour of the page's style.
         trajectory: in the frame of the scene, metres.
         has_orientations: whether camera orientations are known, so that frusta can be drawn.

@@ -81,7 +81,6 @@ class ResultFolder:
     """The output folder of a run, read back for comparison, export, report and joining.
 
     Attributes:
-        path: of the folder.
         summary: content of ``result.json``.
         timestamps_s: time of each photo by name; None where the photos have no times.
     """

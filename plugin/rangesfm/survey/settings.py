@@ -41,8 +41,6 @@ class OptionsOrigin:
     """Origin of options, for messages. Any two are equal, so that surveys are compared without it.
 
     Attributes:
-        path: of the file; None if there is none.
-        text: content of the file.
         overridden: dotted keys whose values came from flags or from the caller.
     """
 

@@ -35,7 +35,6 @@ class PathOfModel:
 
     Attributes:
         name: name for the user, such as "sparse/0".
-        sfm: the unscaled model.
         trajectory: path of its photos that have a time.
         observations: ranges on that path, from the log that all models share.
         time_offset: estimate of the time offset, with which the ranges were placed; None where it was given or is not
@@ -54,7 +53,6 @@ class SurveyRun:
     """A survey at work.
 
     Attributes:
-        survey: options.
         inputs: what was read from its files, measured in metres.
         journal: is told of stages and warnings.
     """

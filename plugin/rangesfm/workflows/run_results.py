@@ -37,8 +37,6 @@ class RunResult:
     """Outcome of a run. Its files are read by ``read_result_folder``.
 
     Attributes:
-        output_path: folder of the result.
-        summary: content of ``result.json``.
         lines: summary for the user.
     """
 
