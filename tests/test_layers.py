@@ -158,7 +158,10 @@ def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
     """Whoever adds a kind writes its module and its line in the table; no stage has to know of it."""
     generic = {"joint_map", "kind", "marks", "places", "points", "prior", "source", "table"}
     # What the survey reads, before there is anything to measure.
-    generic |= {"imu", *(f"imu.{name}" for name in ("log", "signals", "formats", "turns", "alignment", "calibration"))}
+    generic |= {
+        "imu",
+        *(f"imu.{name}" for name in ("log", "signals", "formats", "turns", "alignment", "calibration", "sensor")),
+    }
     kinds = {module for module in MODULES if folder_of(module) == "measurements"} - {"measurements"}
     kinds -= {f"measurements.{name}" for name in generic}
     assert {"measurements.ranges", "measurements.lengths", "measurements.positions"} <= kinds

@@ -55,6 +55,7 @@ _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Numbers = Annotated[tuple[_Number, ...], Field(strict=False)]
 _Times = Annotated[tuple[_Time, ...], Field(strict=False)]
 _Three = Annotated[tuple[_Number, _Number, _Number], Field(strict=False)]
+_Four = Annotated[tuple[_Number, _Number, _Number, _Number], Field(strict=False)]
 _Texts = Annotated[tuple[str, ...], Field(strict=False)]
 _OfLeverArm = Annotated[float, Field(ge=LEVER_ARM_M.least, le=LEVER_ARM_M.most)]
 _LeverArm = Annotated[tuple[_OfLeverArm, _OfLeverArm, _OfLeverArm], Field(strict=False)]
@@ -72,6 +73,12 @@ def _direction(vector: tuple[float, float, float]) -> tuple[float, float, float]
     if max(map(abs, vector)) < 1e-6:
         raise ValueError("is 0,0,0")
     return vector
+
+
+def _unit_quaternion(xyzw: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if abs(sum(x * x for x in xyzw) - 1.0) > 0.02:  # rounded to two digits
+        raise ValueError("no unit quaternion")
+    return xyzw
 
 
 def _is_of(name: str, pattern: str) -> bool:
@@ -364,6 +371,39 @@ class PositionOptions(Options, table="positions"):
     file says; in both cases it is estimated with the map)."""
     lasting_s: Annotated[Annotated[float, Field(ge=1e-2, le=1e5)] | None, KeyMeta(flag="position_lasting_s")] = None
     """Time for which an error of the positions lasts (default: a mixture of 3, 30 and 300 s, learnt with the map)."""
+
+    @property
+    def time_offset_s(self) -> float | None:
+        """Return the given time offset, or None where it is to be searched for."""
+        return None if self.time_offset == "auto" else self.time_offset
+
+
+class ImuOptions(Options, table="imu"):
+    """The log of an inertial sensor (IMU) that is fixed to the camera: of a phone, an action camera or a rig."""
+
+    path: Annotated[Path | None, KeyMeta(flag="imu", metavar="PATH", role="log")] = None
+    """CSV timestamp_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2, another table with
+    the rates and accelerations of three axes, the folder or zip archive of a phone's recording, or a ROS bag."""
+    rotation_imu_to_cam_xyzw: Annotated[
+        Annotated[_Four, AfterValidator(_unit_quaternion)] | None,
+        KeyMeta(metavar="X,Y,Z,W", expected="a list of 4 numbers: a quaternion x, y, z, w of length 1"),
+    ] = None
+    """Rotation that takes the sensor's axes to the camera's (right, down, forward). It is compared with the turns of
+    the photos (default: found from these)."""
+    imu_in_cam_m: Annotated[_LeverArm | None, KeyMeta(flag="imu_in_cam", metavar="X,Y,Z")] = None
+    """Lever arm: position of the sensor in the camera frame (right, down, forward), metres (default: at the camera)."""
+    time_offset: Annotated[
+        Literal["auto"] | _Time,
+        KeyMeta(
+            flag="imu_time_offset",
+            metavar="auto|SECONDS",
+            expected='"auto" or seconds, at most 1e+10 of them',
+        ),
+    ] = "auto"
+    """Time offset between the clocks: image time = time of the log + offset. auto: found from the turns of the photos,
+    with which a given one is compared."""
+    noise: Annotated[Path | None, KeyMeta(flag="imu_noise", metavar="YAML", role="file")] = None
+    """Kalibr's imu.yaml, with the densities of the sensor's noise (default: learnt)."""
 
     @property
     def time_offset_s(self) -> float | None:

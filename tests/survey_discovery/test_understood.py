@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from tests.measurements.imu.test_formats import android
 from tests.simulated.phone_survey import write_anchors, write_log, write_photos
 from tests.simulated.small_demo import make_small_demo
 
@@ -33,6 +34,19 @@ def test_a_whole_folder_is_a_survey(tmp_path: Path) -> None:
     survey = survey_from_tables({}, tmp_path, values)
     assert survey.camera.params == (90, 90, 48, 32)
     assert survey.tag.tag_in_cam_m == (0, 0.1, 0)
+
+
+def test_a_phones_recording_and_a_calibration_of_both_are_the_inertial_sensor(tmp_path: Path) -> None:
+    write_photos(tmp_path / "images", 3)
+    write_log(tmp_path / "uwb.csv", 0.0)
+    android(tmp_path)
+    rows = [[0, -1, 0, 0.1], [0, 0, -1, 0], [1, 0, 0, -0.02], [0, 0, 0, 1]]
+    camera = "camera_model: pinhole, intrinsics: [90, 90, 48, 32], resolution: [96, 64]"
+    (tmp_path / "camchain-imucam.yaml").write_text(f"cam0: {{{camera}, T_cam_imu: {rows}}}\n")
+    values, _ = understand([tmp_path], {})
+    assert values["imu.path"] == tmp_path / "2026-09-22_10-00-00"
+    assert values["imu.rotation_imu_to_cam_xyzw"] == [0.5, -0.5, 0.5, 0.5]
+    assert values["imu.imu_in_cam_m"] == [0.1, 0.0, -0.02]
 
 
 def test_the_usual_name_is_meant_and_the_others_are_told(tmp_path: Path) -> None:

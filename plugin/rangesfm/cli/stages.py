@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 _SCALE_KEYS = (
     *("images.path", "images.model", "images.times", "images.rig_config", "images.baseline_stddev_m"),
-    *("ranges", "anchors", "tag", "points", "positions", "mapper.num_threads", "scale", "markers", "export", "report"),
-    "output",
+    *("ranges", "anchors", "tag", "points", "positions", "imu", "mapper.num_threads", "scale", "markers", "export"),
+    *("report", "output"),
 )
 _DEMO_FOLDER = "rangesfm_demo"
 _MIN_NUM_PHOTOS = 20  # fewer walk too short a way to tell the time offset

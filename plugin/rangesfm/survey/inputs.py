@@ -14,6 +14,7 @@ from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.folders import natural_order
 from rangesfm.geometry.reference import Reference
+from rangesfm.measurements.imu.sensor import InertialSensor, read_sensor
 from rangesfm.options import LogOptions
 from rangesfm.positions.antenna_track import AntennaTrack
 from rangesfm.positions.control_point_file import read_control_points
@@ -58,6 +59,7 @@ class RangingInputs:
         notes: warnings for the user.
         assumed: lines about how the files were read.
         positions: known positions of marks, in the frame of the anchors.
+        imu: inertial sensor on the camera; None without one.
     """
 
     log: RangeLog
@@ -70,11 +72,12 @@ class RangingInputs:
     notes: tuple[str, ...]
     assumed: tuple[str, ...] = ()
     positions: SurveyedPositions = field(default_factory=SurveyedPositions)
+    imu: InertialSensor | None = None
 
     @property
     def needs_times(self) -> bool:
-        """True if the photos' times are needed, for ranges or positions by time."""
-        return self.log.image_name is None or self.positions.needs_times
+        """True if the photos' times are needed, for ranges or positions by time, or for an inertial sensor."""
+        return self.log.image_name is None or self.positions.needs_times or self.imu is not None
 
     def listed_photos(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Yield the photos that each file names, after what it says of them."""
@@ -147,7 +150,8 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         log, curve_notes = correct_ranges(log, read_error_curve(curve_path))
     tape = Tape() if survey.scale.distances is None else read_tape(survey.scale.distances, survey.scale.markers)
     reference = None if survey.report.reference is None else read_true_positions(survey.report.reference)
-    notes = (*_warnings(log, anchors, survey), *curve_notes)
+    imu = read_sensor(survey.imu)
+    notes = (*_warnings(log, anchors, survey), *curve_notes, *(() if imu is None else imu.log.doubts))
     assumed = (
         *log.notes,
         *_kinds_of_ranges(log),
@@ -156,9 +160,10 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
         *positions.notes,
         *tape.notes,
         *(() if reference is None else reference.notes),
+        *(() if imu is None else imu.log.notes),
     )
     log = log.in_time_order()
-    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions)
+    return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions, imu)
 
 
 def _ids(listed: AnchorList | None) -> list[str]:

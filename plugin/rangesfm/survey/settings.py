@@ -20,6 +20,7 @@ from rangesfm.options import (
     CameraOptions,
     ExportOptions,
     ImageOptions,
+    ImuOptions,
     MapperOptions,
     MarkerOptions,
     OutputOptions,
@@ -103,6 +104,7 @@ class Survey(BaseModel):
     tag: TagOptions = TagOptions()
     points: PointOptions = PointOptions()
     positions: PositionOptions = PositionOptions()
+    imu: ImuOptions = ImuOptions()
     mapper: MapperOptions = MapperOptions()
     scale: ScaleOptions = ScaleOptions()
     markers: MarkerOptions = MarkerOptions()

@@ -156,11 +156,7 @@ def absolute_value(value: object, folder: Path) -> object:
 
 
 def _require_files(survey: Survey) -> None:
-    try:
-        paths = [*input_paths(survey)]
-    except InputError as error:
-        raise OptionError(f"[ranges] path: {error}", "ranges", "path") from None
-    for key, role, path in paths:
+    for key, role, path in input_paths(survey):
         if role == "file" and not os.path.isfile(path):
             found = f"{path} is a folder, expected a file" if os.path.isdir(path) else f"there is no file {path}"
             table, _, name = key.partition(".")
@@ -176,7 +172,11 @@ def input_paths(survey: Survey) -> Iterator[tuple[str, PathRole, Path]]:
         table, _, name = dotted_key.partition(".")
         path = getattr(getattr(survey, table), name)
         if path is not None and role == "log":
-            yield from ((dotted_key, "log" if file.is_dir() else "file", file) for file in files_of_log(path))
+            try:
+                files = files_of_log(path)
+            except InputError as error:
+                raise OptionError(f"[{table}] {name}: {error}", table, name) from None
+            yield from ((dotted_key, "log" if file.is_dir() else "file", file) for file in files)
         elif path is not None and role == "file_or_photos":
             yield dotted_key, "photos" if path.is_dir() else "file", path
         elif path is not None and role != "output":

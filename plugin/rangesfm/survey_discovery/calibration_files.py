@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -28,12 +29,14 @@ class CameraCalibration:
         params: in COLMAP's order and pixel convention.
         size_px: width and height of its photos; None if the file does not say.
         tag_in_cam_m: lever arm of the radio's tag; None if the file does not say.
+        cam_from_imu: (4, 4) rows of kalibr's T_cam_imu; None if the file does not say.
     """
 
     model: str
     params: tuple[float, ...]
     size_px: tuple[int, int] | None = None
     tag_in_cam_m: tuple[float, float, float] | None = None
+    cam_from_imu: tuple[tuple[float, ...], ...] | None = None
 
 
 def read_calibrations(path: Path) -> tuple[CameraCalibration, ...]:
@@ -87,7 +90,21 @@ def _read_yaml(path: Path) -> Iterator[CameraCalibration]:
             if kind != "pinhole":
                 raise InputError(f"camera_model is '{kind}', expected pinhole: COLMAP has no other", path)
             distortion = camera.get("distortion_model", "none")
-            yield _of_opencv(path, distortion, camera["intrinsics"], coefficients, camera["resolution"])
+            found = _of_opencv(path, distortion, camera["intrinsics"], coefficients, camera["resolution"])
+            yield replace(found, cam_from_imu=_rigid(camera["T_cam_imu"])) if "T_cam_imu" in camera else found
+
+
+def _rigid(rows: Any) -> tuple[tuple[float, ...], ...]:
+    """Return the rows of a matrix (4, 4) of a rotation and a shift.
+
+    Raises:
+        ValueError: it is none.
+    """
+    matrix = np.array(rows, np.float64)
+    turned = matrix[:3, :3] @ matrix[:3, :3].T if matrix.shape == (4, 4) else np.zeros((3, 3))
+    if not np.allclose(turned, np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
+        raise ValueError("T_cam_imu is no rotation and shift of 4 x 4 numbers")
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def _of_opencv(path: Path, distortion: str, pinhole: Any, coefficients: Any, size: Any) -> CameraCalibration:

@@ -19,6 +19,8 @@ from rangesfm.files.bags import is_bag, is_bag_folder
 from rangesfm.files.folders import IMAGE_EXTENSIONS, LEFT_BY_RUNS, walk
 from rangesfm.files.text_tables import has_columns, read_head
 from rangesfm.geometry.reference import is_reference_file
+from rangesfm.measurements.imu.formats import is_imu_log
+from rangesfm.measurements.imu.signals import kind_of_file
 from rangesfm.positions.control_point_file import is_point_file
 from rangesfm.positions.position_formats import is_of_positions
 from rangesfm.ranging.anchors import anchor_file
@@ -35,7 +37,7 @@ from rangesfm.vision import photo_list
 from rangesfm.vision.photo_files import MIN_NUM_PHOTOS
 
 PHOTOS, MODEL, LOG, TIMES, ANCHORS = "images.path", "images.model", "ranges.path", "images.times", "anchors.path"
-POINTS, POSITIONS, REFERENCE = "points.path", "positions.path", "report.reference"
+POINTS, POSITIONS, REFERENCE, IMU = "points.path", "positions.path", "report.reference", "imu.path"
 # Words in the name of a file whose positions are measured, not true ones to compare with.
 _MEASURED = frozenset({"position", "positions", "gps", "gnss", "rtk", "ppk", "pozyx", "marvelmind"})
 _NOT_READ = {
@@ -111,14 +113,15 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
     unused: dict[str, list[Path]] = defaultdict(list)
     notes: list[str] = []
     unsure: dict[Path, InputError] = {}
-    for path in _entries(folders):
+    for path, of_folder in _entries(folders):
         if path in without:
+            continue
+        if of_folder is not None:
+            (models if of_folder == MODEL else paths[of_folder]).append(path)
             continue
         try:
             if reason := _reason_by_name(path):
                 unused[reason].append(path)
-            elif path.is_dir() and not is_bag_folder(path):
-                (models if _is_model(path) else paths[PHOTOS]).append(path)
             elif is_video(path):
                 paths[PHOTOS].append(path)
             elif cameras := read_calibrations(path):
@@ -126,6 +129,7 @@ def look_into(folders: Sequence[Path], without: Collection[Path] = ()) -> Found:
             else:
                 has_photos = is_bag(path) and has_images(path)
                 paths[PHOTOS] += [path] if has_photos else []
+                paths[IMU] += [path] if is_bag(path) and is_imu_log(path) else []
                 if key := _key_of(path):
                     paths[key].append(path)
                 elif not has_photos:
@@ -193,7 +197,7 @@ def _key_of(path: Path) -> str | None:
         return LOG
     head = read_head(path)
     if not head.strip() or "\0" in head:
-        return None
+        return IMU if is_imu_log(path) else None
     if LENGTHS.is_such(path):  # between photos it could be read as a log that names photos
         return "scale.distances"
     if MARKS.is_such(path):
@@ -217,6 +221,8 @@ def _key_of(path: Path) -> str | None:
         with nullcontext() if is_short else suppress(UnclearListError):
             return (_list_of(path) if is_short or layout.has_names else None) or LOG
         return LOG
+    if is_imu_log(path):
+        return IMU
     if key := next((key for key, is_such in _TABLES.items() if is_such(head)), None):
         return POSITIONS if key == REFERENCE and not _MEASURED.isdisjoint(words_of(path.stem)) else key
     with nullcontext() if is_table else suppress(UnclearListError):
@@ -248,8 +254,11 @@ def _list_of(path: Path) -> str | None:
     return None
 
 
-def _entries(folders: Sequence[Path]) -> Iterator[Path]:
-    """Yield files, bags, models and folders of photos in folders, without survey files. Links are followed once.
+def _entries(folders: Sequence[Path]) -> Iterator[tuple[Path, str | None]]:
+    """Yield files and bags in folders, without survey files, and folders that are an input as a whole.
+
+    These come with their dotted key: models, folders of photos, and recordings of a phone with a file for each sensor.
+    Links are followed once.
 
     Raises:
         InputError: a path is not a folder.
@@ -262,13 +271,16 @@ def _entries(folders: Sequence[Path]) -> Iterator[Path]:
             subfolders.clear()
         elif is_bag_folder(folder) or _is_model(folder):
             subfolders.clear()
-            yield folder
+            yield folder, MODEL if _is_model(folder) else None
         else:
             photos = {name for name in names if name.lower().endswith(IMAGE_EXTENSIONS)}
             if len(photos) >= MIN_NUM_PHOTOS:
-                yield folder
+                yield folder, PHOTOS
                 names = [name for name in names if name not in photos]
-            yield from (folder / name for name in names if name != SURVEY_NAME)
+            if is_imu_log(folder):
+                yield folder, IMU
+                names = [name for name in names if kind_of_file(Path(name).stem) is None]
+            yield from ((folder / name, None) for name in names if name != SURVEY_NAME)
 
 
 def _is_model(folder: Path) -> bool:

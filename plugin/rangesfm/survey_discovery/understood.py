@@ -11,6 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from rangesfm.errors import InputError
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.ranging.readers.lists import UnclearListError
@@ -19,6 +22,7 @@ from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, METRIC_KEYS
 from rangesfm.survey_discovery.found_files import (
     ANCHORS,
+    IMU,
     LOG,
     MODEL,
     PHOTOS,
@@ -39,6 +43,7 @@ _USUAL_NAMES = {
     "anchors.path": ("anchors",),
     POSITIONS: ("positions", "gnss", "gps"),
     POINTS: ("points", "control_points", "gcp_list"),
+    IMU: ("imu", "imu0", "gyro_accel"),
     "report.reference": ("reference", "groundtruth", "ground_truth", "truth"),
     "camera": ("camera", "cameras"),
 }
@@ -195,6 +200,14 @@ def _add_camera(values: dict[str, Any], found: Found, notes: list[str]) -> None:
     if len(arms) == 1 and not values.keys() & {*_LEVER_ARMS}:
         values["tag.tag_in_cam_m"] = arms[0]
         notes.append(f"the lever arm is that of {path.name}")
+    sits = next((camera.cam_from_imu for camera in cameras if camera.cam_from_imu is not None), None)
+    if IMU in values and sits is not None:
+        matrix = np.array(sits)
+        values.setdefault(
+            "imu.rotation_imu_to_cam_xyzw", Rotation.from_matrix(matrix[:3, :3]).as_quat().round(9).tolist()
+        )
+        values.setdefault("imu.imu_in_cam_m", matrix[:3, 3].tolist())
+        notes.append(f"the place of the inertial sensor is that of {path.name}")
     if known := {"camera.model", "camera.params", MODEL} & values.keys():
         why = "a COLMAP model has its own cameras" if MODEL in known else "the camera is given"
         notes.append(f"{path.name}: its camera is not used ({why})")

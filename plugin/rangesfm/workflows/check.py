@@ -175,6 +175,12 @@ def _facts_of_others(survey: Survey, inputs: RangingInputs) -> Iterator[str]:
         only = "" if len(inputs.log) else ", which alone determine the scale (no ranges)"
         yield f"taped distances: {len(inputs.tape.distances)}{only}"
     yield from inputs.positions.facts()
+    if (imu := inputs.imu) is not None:
+        times_s = imu.log.timestamp_s
+        yield (
+            f"inertial sensor: {len(imu.log)} samples at {1 / imu.log.step_s:.0f} Hz in {imu.log.name}, from "
+            f"{span_text(times_s[0], times_s[-1])}"
+        )
     if survey.markers.dictionary is not None:
         side = "" if survey.markers.side_m is None else f" of {survey.markers.side_m:g} m"
         yield f"tags: those of {survey.markers.dictionary}{side} will be looked for in the photos"
@@ -187,7 +193,7 @@ def _tell_of_times(
     survey: Survey, inputs: RangingInputs, keyframes: Sequence[str], times: ImageTimes | None, checked: CheckedSurvey
 ) -> None:
     radio_s = inputs.log.timestamp_s
-    if times is not None and radio_s is None and inputs.positions.needs_times:
+    if times is not None and radio_s is None:
         first_s, last_s = times.timestamps_s[[0, -1]]
         checked.facts.append(f"times: {len(keyframes)} keyframes from {span_text(first_s, last_s)} ({times.source})")
         return

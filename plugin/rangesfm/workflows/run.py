@@ -15,6 +15,8 @@ from rangesfm.distances.markers import locatable
 from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.atomic import sole_writer
+from rangesfm.geometry.numerics import NORMAL_95
+from rangesfm.measurements.imu.sensor import InertialSensor
 from rangesfm.positions.clock import find_antenna_offset
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
@@ -165,6 +167,7 @@ def map_in_metres(
         run.journal.warn(*positions.notes_on(path.sfm))
         tape_in_map = locatable(tape, path.sfm) if tape.distances else Tape()
         run = replace(run, inputs=replace(run.inputs, tape=tape_in_map, positions=positions))
+        run = replace(run, inputs=replace(run.inputs, imu=_imu_on_path(run, path)))
     # Scale, refinement of photos and ranges together, and judgement of the final map.
     made = replace(metric_map(run, path, refine=refine), models=verdicts)
     if run.survey.scale.adopt:
@@ -188,6 +191,30 @@ def _positions_on_path(run: SurveyRun, path: PathOfModel) -> SurveyedPositions:
             raise
         run.journal.warn(f"the positions of the antenna are not used: {error}")
         return replace(positions, antenna=None)
+
+
+def _imu_on_path(run: SurveyRun, path: PathOfModel) -> InertialSensor | None:
+    """Return the inertial sensor aligned with the photos, after warnings; it is left out if these do not tell how.
+
+    Raises:
+        InputError: the photos have no times, or were not taken while the sensor was recorded. GeometryError: the turns
+            do not tell how the sensor sits, and nothing else is measured.
+    """
+    if run.inputs.imu is None:
+        return None
+    try:
+        aligned = run.inputs.imu.aligned_with(path.trajectory)
+    except GeometryError as error:
+        if {*run.survey.metric_keys} <= {"imu.path"}:
+            raise
+        run.journal.warn(f"the inertial sensor is not used: {error}")
+        return None
+    if (found := aligned.alignment) is not None:
+        run.journal.warn(*found.mistakes)
+        half_s = NORMAL_95 * found.time_offset_stddev_s
+        offset = f"{found.time_offset_s:+.4f} +- {half_s:.4f} s (95 %)"
+        run.journal.note(f"time offset of the inertial sensor: {offset}, by {found.num_turns} turns of the photos")
+    return aligned
 
 
 def with_results(run: SurveyRun, made: MetricResult) -> RunResult:

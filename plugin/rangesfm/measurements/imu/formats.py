@@ -105,13 +105,22 @@ def read_imu(path: Path) -> ImuLog:
 
 
 def is_imu_log(path: Path) -> bool:
-    """Return whether a file is the log of an inertial sensor, by its beginning."""
-    return {GYRO, ACCEL} <= {triple.kind for triple in find_triples(_names(path))}
-
-
-def is_imu_folder(path: Path) -> bool:
-    """Return whether a folder has a table of a gyroscope and one of an accelerometer, as phones write them."""
-    return {GYRO, ACCEL} <= {kind for file in path.glob("*.csv") for kind in _kinds(file)}
+    """Return whether a table, folder, archive or bag is the log of an inertial sensor, by the names in it."""
+    try:
+        if is_bag(path):
+            with open_bag(path) as bag:
+                return any(type_name(one.msgtype) == "Imu" for one in bag.connections)
+        if path.is_dir():
+            # A file with both is a log of its own.
+            parts = [{*_kinds(file)} for file in path.glob("*.csv")]
+            return {GYRO, ACCEL} <= {kind for part in parts if not {GYRO, ACCEL} <= part for kind in part}
+        if _is_zip(path):
+            with zipfile.ZipFile(path) as archive:
+                names = map(PurePosixPath, archive.namelist())
+                return {GYRO, ACCEL} <= {kind_of_file(name.stem) for name in names if name.suffix.lower() in _TABLES}
+        return {GYRO, ACCEL} <= {triple.kind for triple in find_triples(_names(path))}
+    except (InputError, OSError, ValueError, zipfile.BadZipFile):
+        return False
 
 
 def _kinds(path: Path) -> Iterator[str | None]:
@@ -424,7 +433,8 @@ def _joined(gyro: _Signal, accel: _Signal, path: Path, notes: list[str]) -> ImuL
         raise InputError(f"a rate is {np.degrees(fastest):.3g} deg/s, expected {most}", gyro.path)
     if log.step_s > _SLOWEST_STEP_S:
         raise InputError(f"has a sample each {log.step_s:.2g} s, expected 50 a second or more", path)
-    return replace(log, notes=(*notes, *(f"{path.name}: {note}" for note in _doubts(log, gyro, accel))))
+    doubts = (f"{path.name}: {doubt}" for doubt in _doubts(log, gyro, accel))
+    return replace(log, notes=tuple(notes), doubts=tuple(doubts))
 
 
 def _require_samples(signal: _Signal, path: Path) -> None:

@@ -42,6 +42,7 @@ class ImuLog:
         path: the file, for messages; empty if made in memory.
         noise: as a file states it; None if none does.
         notes: assumptions made in reading the file, as lines for the user.
+        doubts: what is not as it should be, as lines for the user: gaps, few samples, values at the end of the scale.
     """
 
     timestamp_s: Array
@@ -50,6 +51,7 @@ class ImuLog:
     path: str = ""
     noise: ImuNoise | None = None
     notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         num = len(self.timestamp_s)
