@@ -25,7 +25,7 @@ from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import SurveyRun
-from rangesfm.vision.loop_database import LoopDatabase
+from rangesfm.vision.loop_database import LoopMatching
 from rangesfm.workflows.close_loops import RefinedMap, close_loops_of_survey
 from rangesfm.workflows.metric_result import MetricResult
 from rangesfm.workflows.run import refine_model
@@ -98,7 +98,7 @@ class ClosedLaps:
 def closed(laps: Laps) -> ClosedLaps:
     before, listener = content_hash(laps.database), Listener()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoopDatabase, "keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(LoopMatching, "keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             refine_model(laps.survey, progress=SilentProgress())
     written: list[MetricResult] = []

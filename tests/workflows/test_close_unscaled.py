@@ -20,10 +20,9 @@ from rangesfm.loops.candidates import Views
 from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.progress import SILENT, Journal, Progress, SilentProgress
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.loop_database import LoopDatabase
+from rangesfm.vision.loop_database import LoopMatching
 from rangesfm.vision.steps import Workspace
 from rangesfm.workflows.close_unscaled import close_loops_of_models
-from rangesfm.workflows.loop_matching import LoopMatching
 
 
 class Listener(SilentProgress):
@@ -82,7 +81,7 @@ def test_a_model_without_any_measurement_has_its_loops_closed_though_it_was_inte
     made, listener = Reconstructed.of(around_a_room(), tmp_path / "out"), Listener()
     open_m, before = made.error_m(made.model), (tmp_path / "out" / "sparse" / "0" / "points3D.bin").read_bytes()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoopDatabase, "keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(LoopMatching, "keep", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             made.close()
     assert (tmp_path / "out" / "sparse" / "0" / "points3D.bin").read_bytes() == before
@@ -104,7 +103,7 @@ def test_one_that_was_stopped_before_its_model_took_its_place_closes_them_again(
     made = Reconstructed.of(around_a_room(), tmp_path / "out")
     open_m = made.error_m(made.model)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LoopDatabase, "publish_with", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(LoopMatching, "publish_with", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             made.close()
     assert made.error_m(made.model) == open_m

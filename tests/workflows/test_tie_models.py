@@ -23,7 +23,7 @@ from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.vision.image_times import ImageTimes
-from rangesfm.workflows.loop_matching import LoopMatching
+from rangesfm.vision.loop_database import LoopMatching
 from rangesfm.workflows.place_ranges import place_ranges
 from rangesfm.workflows.tie_models import tie_by_photos
 

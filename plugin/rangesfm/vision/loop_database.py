@@ -8,7 +8,6 @@ from __future__ import annotations
 import shutil
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -20,9 +19,9 @@ from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.files.manifest import content_hash
 from rangesfm.files.output_folder import OutputFolder, remove
-from rangesfm.progress import SILENT, Progress
+from rangesfm.progress import Progress
 from rangesfm.vision.matching import MatchingOptions, match_pairs
-from rangesfm.vision.steps import DATABASE_NAME, LOG_NAME, RECORD_NAME, Workspace
+from rangesfm.vision.steps import DATABASE_NAME, RECORD_NAME, Workspace
 
 Pair = tuple[int, int]
 """Ids of two photos, the smaller one first."""
@@ -55,51 +54,38 @@ def _forget(path: Path, pairs: Collection[Pair]) -> None:
             database.delete_two_view_geometry(*pair)
 
 
-@dataclass(frozen=True)
-class LoopDatabase:
-    """A copy of a database, in a folder of its own, to which matches of loops are added.
+class LoopMatching(Workspace):
+    """A copy of a database, in a folder of its own, in which pairs of photos are matched that may be loops.
 
-    Attributes:
-        folder: private folder of the output folder. It also has a copy of the record, which notes all pairs that were
-            tried as loops.
-        has_record: whether that record belongs to a reconstruction in the output folder.
+    Its notes tell all pairs that were tried.
+
+    Args:
+        source: the database. An interrupted run may have copied the same one and added matches to it.
+        options: of the matching.
     """
 
-    folder: Path
-    has_record: bool
-
-    @classmethod
-    def copied(cls, source: Path, output: OutputFolder) -> LoopDatabase:
-        """Copy a database, unless an interrupted run has copied the same one and added matches to it."""
+    def __init__(self, source: Path, options: MatchingOptions, progress: Progress, output: OutputFolder):
         folder, record = output.private / _FOLDER_NAME, output.newest(output.path / RECORD_NAME)
-        has_record = record.is_file() and source == output.newest(output.path / DATABASE_NAME)
-        if source.parent == folder:  # this run has closed loops before, and closes them again
-            return cls(folder, has_record)
-        made_from = f"{content_hash(source)} {content_hash(record) if has_record else ''}"
-        mark = folder / _SOURCE_NAME
-        if not (mark.is_file() and mark.read_text() == made_from and (folder / DATABASE_NAME).is_file()):
-            remove(folder)
-            folder.mkdir()
-            shutil.copyfile(source, folder / DATABASE_NAME)
-            if (log := source.with_name(source.name + "-wal")).is_file():
-                shutil.copyfile(log, folder / log.name.replace(source.name, DATABASE_NAME))
-            if has_record:
-                shutil.copyfile(record, folder / RECORD_NAME)
-            mark.write_text(made_from)
-        return cls(folder, has_record)
-
-    @property
-    def path(self) -> Path:
-        return self.folder / DATABASE_NAME
-
-    @property
-    def log(self) -> Path:
-        """File with COLMAP's messages."""
-        return self.folder / LOG_NAME
+        self.options = options
+        # Whether the database is that of a reconstruction in the output folder.
+        self._has_record = record.is_file() and source == output.newest(output.path / DATABASE_NAME)
+        if source.parent != folder:  # else this run has closed loops before, and closes them again
+            made_from = f"{content_hash(source)} {content_hash(record) if self._has_record else ''}"
+            mark = folder / _SOURCE_NAME
+            if not (mark.is_file() and mark.read_text() == made_from and (folder / DATABASE_NAME).is_file()):
+                remove(folder)
+                folder.mkdir()
+                shutil.copyfile(source, folder / DATABASE_NAME)
+                if (log := source.with_name(source.name + "-wal")).is_file():
+                    shutil.copyfile(log, folder / log.name.replace(source.name, DATABASE_NAME))
+                if self._has_record:
+                    shutil.copyfile(record, folder / RECORD_NAME)
+                mark.write_text(made_from)
+        super().__init__(folder, progress)
 
     def why_unfit(self, model: pycolmap.Reconstruction) -> str | None:
         """Return why the photos of a model cannot be matched by this database; None if they can."""
-        with pycolmap.Database.open(self.path) as database:
+        with pycolmap.Database.open(self.database) as database:
             name_of = {image.image_id: image.name for image in database.read_all_images()}
             rig_of = {frame.frame_id: frame.rig_id for frame in database.read_all_frames()}
             for image_id in model.reg_image_ids():
@@ -116,20 +102,20 @@ class LoopDatabase:
     def known(self) -> dict[int, set[int]]:
         """Return the photos that each photo was matched with by the mapping or tied with, by its id."""
         known: dict[int, set[int]] = defaultdict(set)
-        with pycolmap.Database.open(self.path) as database:
+        with pycolmap.Database.open(self.database) as database:
             pairs = {*map(pycolmap.pair_id_to_image_pair, database.read_num_matches()[0])}
-        for first, second in pairs - self._tried():
+        for first, second in pairs - _noted(self, _LOOPS):
             known[first].add(second)
             known[second].add(first)
         return known
 
-    def match(self, pairs: list[Pair], options: MatchingOptions, progress: Progress) -> dict[Pair, Indices]:
+    def match(self, pairs: list[Pair]) -> dict[Pair, Indices]:
         """Match pairs, and return the matches (m, 2) of those that are verified by a two-view geometry."""
-        self._note(_LOOPS, {*self._tried(), *pairs} - self._noted(_TIES))
+        self._note_pairs(_LOOPS, {*_noted(self, _LOOPS), *pairs} - _noted(self, _TIES))
         with colmap_log(self.log) as log_folder:
-            match_pairs(self.path, pairs, options, log_folder, progress)
+            match_pairs(self.database, pairs, self.options, log_folder, self.progress)
         verified: dict[Pair, Indices] = {}
-        with pycolmap.Database.open(self.path) as database:
+        with pycolmap.Database.open(self.database) as database:
             for pair in pairs:
                 matches = np.asarray(database.read_two_view_geometry(*pair).inlier_matches, dtype=np.int64)
                 if len(matches) >= MIN_NUM_SHARED:
@@ -139,20 +125,20 @@ class LoopDatabase:
     def keep(self, proposed: Collection[Pair], verified: Collection[Pair], accepted: Collection[Pair]) -> None:
         """Forget the matches of all pairs that were tried as loops, except those that are accepted or do not match."""
         right = {*accepted, *(set(proposed) - set(verified))}
-        _forget(self.path, self._tried() - right)
-        self._note(_LOOPS, right)
+        _forget(self.database, _noted(self, _LOOPS) - right)
+        self._note_pairs(_LOOPS, right)
 
     def keep_ties(self, proposed: Collection[Pair], accepted: Collection[Pair]) -> None:
         """Forget the matches of all pairs that were proposed as ties, now or before, except those that are accepted."""
-        _forget(self.path, self._noted(_TIES).union(proposed).difference(accepted))
-        self._note(_LOOPS, self._tried().difference(proposed))
-        self._note(_TIES, accepted)
+        _forget(self.database, _noted(self, _TIES).union(proposed).difference(accepted))
+        self._note_pairs(_LOOPS, _noted(self, _LOOPS).difference(proposed))
+        self._note_pairs(_TIES, accepted)
 
     def keep_closed(self) -> None:
         """Let the pairs that were kept as loops belong to the models, which are to be published with the database."""
         (self.folder / _SOURCE_NAME).unlink()  # a run that is stopped before that must not go on with this copy
-        self._note(_CLOSED, self._tried())
-        self._note(_LOOPS, ())
+        self._note_pairs(_CLOSED, _noted(self, _LOOPS))
+        self._note_pairs(_LOOPS, ())
 
     def publish(self, output: OutputFolder) -> None:
         """Let the database, and the record that notes its loops, take their places with the next whole result."""
@@ -170,22 +156,12 @@ class LoopDatabase:
         self.discard()
 
     def _places(self, output: OutputFolder) -> dict[Path, Path]:
-        names = (DATABASE_NAME, RECORD_NAME) if self.has_record else (DATABASE_NAME,)
+        names = (DATABASE_NAME, RECORD_NAME) if self._has_record else (DATABASE_NAME,)
         return {output.path / name: self.folder / name for name in names}
 
     def discard(self) -> None:
         """Remove the copy."""
         remove(self.folder)
 
-    def _record(self) -> Workspace:
-        return Workspace(self.folder, SILENT)
-
-    def _tried(self) -> set[Pair]:
-        return self._noted(_LOOPS)
-
-    def _noted(self, kind: str) -> set[Pair]:
-        return _noted(self._record(), kind)
-
-    def _note(self, kind: str, pairs: Collection[Pair]) -> None:
-        record = self._record()
-        record.note(_NOTE, {**record.notes.get(_NOTE, {}), kind: sorted(pairs)})
+    def _note_pairs(self, kind: str, pairs: Collection[Pair]) -> None:
+        self.note(_NOTE, {**self.notes.get(_NOTE, {}), kind: sorted(pairs)})

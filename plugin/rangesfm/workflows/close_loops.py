@@ -16,7 +16,7 @@ from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.loops.loop_closure import LoopClosure
 from rangesfm.loops.rounds import TriedPairs, close_in_rounds
 from rangesfm.survey.survey_run import SurveyRun
-from rangesfm.workflows.loop_matching import LoopMatching
+from rangesfm.workflows.loop_matching import loop_matching
 from rangesfm.workflows.matched_map import MatchedMap, MergeTracks
 from rangesfm.workflows.metric_result import MetricResult
 
@@ -46,20 +46,20 @@ def close_loops_of_survey(run: SurveyRun, refined: RefinedMap, refine: Refine) -
     if not run.survey.mapper.close_loops or metric.kept_refinement is None:
         return metric
     with sole_writer(run.survey.output.path) as output:
-        if (matching := LoopMatching.for_survey(run.survey, run.journal.progress, output)) is None:
+        if (matching := loop_matching(run.survey, run.journal.progress, output)) is None:
             return metric
         if metric.map_errors is None:
             run.journal.warn("loops are not closed, because the covariance of the poses is not known")
             return metric
-        if why_not := matching.database.why_unfit(metric.final):
-            matching.database.discard()
+        if why_not := matching.why_unfit(metric.final):
+            matching.discard()
             if run.survey.images.model is not None:
                 raise InputError(why_not, run.survey.mapper.database_path)
             return metric
         metric_map, seed = _MetricMap(run, refined, refine), run.survey.output.seed
         last, tried = close_in_rounds(MatchedMap(metric_map, matching, run.journal, seed, asks_vocabulary=False))
         last.keep(tried)
-        matching.database.publish(output)
+        matching.publish(output)
         return _told(run, metric, last.map.refined.metric, tried)
 
 

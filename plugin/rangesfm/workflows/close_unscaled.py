@@ -23,9 +23,9 @@ from rangesfm.loops.rounds import TriedPairs, close_in_rounds
 from rangesfm.progress import Journal
 from rangesfm.result.result_folder import RESULT_NAMES
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.loop_database import has_closed_loops
+from rangesfm.vision.loop_database import LoopMatching, has_closed_loops
 from rangesfm.vision.steps import MODELS_NAME, Workspace
-from rangesfm.workflows.loop_matching import LoopMatching
+from rangesfm.workflows.loop_matching import loop_matching
 from rangesfm.workflows.matched_map import MatchedMap, MergeTracks
 
 
@@ -42,13 +42,13 @@ def close_loops_of_models(
     with sole_writer(survey.output.path) as output:
         if has_closed_loops(Workspace(output.path, journal.progress)):
             return models[0]
-        if (matching := LoopMatching.for_survey(survey, journal.progress, output)) is None:
+        if (matching := loop_matching(survey, journal.progress, output)) is None:
             return models[0]
         try:
             closed = _closed(survey, models[0], matching, journal)
         except (GeometryError, SolverError) as error:
             journal.warn(f"loops are not closed: {error}")
-            matching.database.discard()
+            matching.discard()
             return models[0]
         _publish(output, matching, closed)
         return closed or models[0]
@@ -63,7 +63,7 @@ def _closed(
         GeometryError: the photos do not determine the poses, or have other features in the database.
         SolverError: the model cannot be adjusted.
     """
-    if why_not := matching.database.why_unfit(model):
+    if why_not := matching.why_unfit(model):
         raise GeometryError(why_not)
     with journal.stage("refinement"):
         start = _UnscaledMap.at_rest_by_photos(survey, model)
@@ -71,7 +71,7 @@ def _closed(
         raise GeometryError("the covariance of the poses is not known")
     last, tried = close_in_rounds(MatchedMap(start, matching, journal, survey.output.seed, asks_vocabulary=True))
     last.keep(tried)
-    matching.database.keep_closed()
+    matching.keep_closed()
     journal.progress.message(_told(tried))
     return last.map.model if tried.closed else None
 
@@ -149,10 +149,10 @@ def _publish(output: OutputFolder, matching: LoopMatching, closed: pycolmap.Reco
     Results that were made from the model before are removed.
     """
     if closed is None:
-        matching.database.publish_with(output)
+        matching.publish_with(output)
         return
-    models, staged = output.path / MODELS_NAME, matching.database.folder / MODELS_NAME
+    models, staged = output.path / MODELS_NAME, matching.folder / MODELS_NAME
     shutil.copytree(models, staged, dirs_exist_ok=True, ignore=lambda *_: ["0"])
     (staged / "0").mkdir(exist_ok=True)
     write_binary_model(closed, staged / "0")
-    matching.database.publish_with(output, {models: staged}, [output.path / name for name in RESULT_NAMES])
+    matching.publish_with(output, {models: staged}, [output.path / name for name in RESULT_NAMES])

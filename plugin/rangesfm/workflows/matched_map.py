@@ -18,9 +18,8 @@ from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.resection import Loop
 from rangesfm.loops.rounds import MAX_NUM_PAIRS, TriedPairs, find_in
 from rangesfm.progress import Journal
-from rangesfm.vision.loop_database import Pair
+from rangesfm.vision.loop_database import LoopMatching, Pair
 from rangesfm.vision.photos_alike import pairs_alike
-from rangesfm.workflows.loop_matching import LoopMatching
 
 MergeTracks = Callable[[pycolmap.Reconstruction], None]
 """Makes one point of those that two passes saw apart, in place."""
@@ -79,16 +78,16 @@ class MatchedMap(Generic[_Map]):
         if (finder := self._finder) is None:
             return [], tried
         with self.journal.stage("loops"):
-            return find_in(finder, self.matching.match, self.matching.database.known(), tried, self._alike)
+            return find_in(finder, self.matching.match, self.matching.known(), tried, self._alike)
 
     def with_closed(self, loops: Sequence[Loop], tried: TriedPairs) -> MatchedMap[_Map] | None:
         self.keep(tried)
-        finder, database = self._finder, self.matching.database
+        finder, matching = self._finder, self.matching
         assert finder is not None, "it has found the loops"
 
         def merge(model: pycolmap.Reconstruction) -> None:
-            with colmap_log(database.log):
-                merge_tracks(model, database.path, seed=self.seed)
+            with colmap_log(matching.log):
+                merge_tracks(model, matching.database, seed=self.seed)
 
         with self.journal.stage("refinement"):
             closed = self.map.with_loops(finder.relative_poses(loops), merge)
@@ -99,13 +98,12 @@ class MatchedMap(Generic[_Map]):
 
     def keep(self, tried: TriedPairs) -> None:
         """Keep the matches of closed loops alone in the database, and what was tried in vain."""
-        self.matching.database.keep(tried.proposed, tried.verified, tried.closed)
+        self.matching.keep(tried.proposed, tried.verified, tried.closed)
 
     def _alike(self, known: Mapping[int, Set[int]]) -> list[Pair]:
         if not self.asks_vocabulary:
             return []
-        database = self.matching.database
-        return pairs_alike(database.path, known, database.log, max_num=MAX_NUM_PAIRS, seed=self.seed)
+        return pairs_alike(self.matching.database, known, self.matching.log, max_num=MAX_NUM_PAIRS, seed=self.seed)
 
     @cached_property
     def _finder(self) -> LoopFinder | None:

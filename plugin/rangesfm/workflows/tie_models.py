@@ -27,7 +27,7 @@ from rangesfm.vision.loop_database import Pair
 from rangesfm.vision.mapping import mapping_options
 from rangesfm.vision.photos_alike import pairs_alike
 from rangesfm.vision.rigs import read_rigs
-from rangesfm.workflows.loop_matching import LoopMatching
+from rangesfm.workflows.loop_matching import loop_matching
 from rangesfm.workflows.place_ranges import place_ranges
 
 # Largest difference of two ranges beyond the distance of their places, in standard deviations of a range.
@@ -48,19 +48,19 @@ def tie_by_photos(run: SurveyRun, paths: Sequence[PathOfModel], times: ImageTime
     if len(paths) == 1:
         return list(paths)
     with sole_writer(run.survey.output.path) as output:
-        if (matching := LoopMatching.for_survey(run.survey, run.journal.progress, output)) is None:
+        if (matching := loop_matching(run.survey, run.journal.progress, output)) is None:
             return list(paths)
         with run.journal.stage("loops"):
             groups = [set(path.sfm.reg_image_ids()) for path in paths]
             own = {image_id: group for group in groups for image_id in group}
             seed, database = run.survey.output.seed, matching.database
-            proposed = pairs_alike(database.path, own, database.log, max_num=MAX_NUM_PAIRS, seed=seed)
+            proposed = pairs_alike(database, own, matching.log, max_num=MAX_NUM_PAIRS, seed=seed)
             tied, pairs = _tied(run, paths, matching.match(proposed))
-            database.keep_ties(proposed, pairs)
-            with colmap_log(database.log):
+            matching.keep_ties(proposed, pairs)
+            with colmap_log(matching.log):
                 for path in (path for path in tied if not any(path is one for one in paths)):
-                    adjust_whole(database.path, path.sfm, options=_options(run, database.path))
-            database.publish(output)
+                    adjust_whole(database, path.sfm, options=_options(run, database))
+            matching.publish(output)
     if not pairs:
         return list(paths)
     models = sorted((path.sfm for path in tied), key=lambda model: -model.num_reg_images())
