@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.rotations import cross_matrices, left_jacobian
+from rangesfm.geometry.rotations import cross_matrices, left_jacobians
 from rangesfm.geometry.similarity import Similarity
 
 
@@ -47,7 +47,7 @@ class PlacementPrior:
             left: (3, 3) left Jacobian of the rotation vector, as in ``Gravity.jacobian``.
         """
         grown = similarity.scale * similarity.rotation @ self.middle
-        own = left_jacobian(Rotation.from_matrix(similarity.rotation @ self.mean.rotation.T))
+        own = left_jacobians(Rotation.from_matrix(similarity.rotation @ self.mean.rotation.T).as_rotvec())
         slopes = np.zeros((7, 7))
         slopes[0, 0] = 1.0
         slopes[1:4, 1:4] = np.linalg.inv(own) @ left

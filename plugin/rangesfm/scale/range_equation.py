@@ -24,7 +24,7 @@ from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
-from rangesfm.geometry.rotations import left_jacobian
+from rangesfm.geometry.rotations import left_jacobians
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.inference.linear_map import Columns
 from rangesfm.ranging.errors.noise import bias_whitening
@@ -394,7 +394,8 @@ def _left_of_step(start: RangeState, state: RangeState) -> Array:
 
     The rotation vector acts on the left of the start's rotation, so away from zero its derivative needs this factor.
     """
-    return left_jacobian(Rotation.from_matrix(state.metric_from_model.rotation @ start.metric_from_model.rotation.T))
+    turned = Rotation.from_matrix(state.metric_from_model.rotation @ start.metric_from_model.rotation.T)
+    return left_jacobians(turned.as_rotvec())
 
 
 def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) -> Array:

@@ -1,0 +1,72 @@
+"""What is known of an inertial sensor before its log is looked at: sizes of its errors, with their sources."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.measurements.imu.preintegration import (
+    ACCEL_BIAS,
+    ACCEL_SCALE,
+    CLOCK,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    NUM_OF_SENSOR,
+)
+
+GRAVITY_M_S2 = 9.80
+"""Length of gravity: the middle between equator and pole at sea level (WGS 84: 9.780 to 9.832)."""
+GRAVITY_STDDEV = 0.0015
+"""Relative standard deviation of that length over the earth."""
+
+
+@dataclass(frozen=True)
+class KnownSize:
+    """Size of an error over sensors.
+
+    Attributes:
+        median: of the standard deviation. spread: standard deviation of its logarithm; 0: it is known.
+    """
+
+    median: float
+    spread: float
+
+
+# Data sheets of phones' sensors (BMI160, LSM6DSO, MPU-9250) state 0.004 to 0.01 deg/s and 70 to 300 ug per root of Hz.
+# kalibr advises several times as much; a tactical sensor has a tenth. The median lies between, with a spread to match.
+NOISE = (KnownSize(2e-4, 1.0), KnownSize(3e-3, 1.0))
+"""White noise of gyroscope, rad/s/sqrt(Hz), and accelerometer, m/s^2/sqrt(Hz)."""
+# Calibrations of TUM-VI (2e-6, 9e-5) and of EuRoC (2e-5, 3e-3).
+WALK = (KnownSize(6e-6, 1.2), KnownSize(5e-4, 1.2))
+"""Random walk of the biases, rad/s/sqrt(s) and m/s^2/sqrt(s)."""
+
+
+@dataclass(frozen=True)
+class SensorPrior:
+    """Standard deviations of what is constant.
+
+    Attributes:
+        gyro_bias_rad_s, accel_bias_m_s2: offsets at zero (BMI160: 3 deg/s, 40 mg; MPU-9250: 5 deg/s, 60 to 80 mg).
+        gyro_scale, accel_scale: shares by which an axis reads too much (MPU-9250, product specification 1.1: 3 % each).
+        clock_s: of the offset between the clocks of sensor and photos.
+        turn_rad, arm_m: of the mounting's rotation, and of its place.
+    """
+
+    clock_s: float
+    turn_rad: float
+    arm_m: float
+    gyro_bias_rad_s: float = 0.05
+    accel_bias_m_s2: float = 0.5
+    gyro_scale: float = 0.03
+    accel_scale: float = 0.03
+
+    @property
+    def of_sensor(self) -> Array:
+        """(13,) of the sensor's numbers."""
+        found = np.empty(NUM_OF_SENSOR)
+        found[GYRO_BIAS], found[ACCEL_BIAS] = self.gyro_bias_rad_s, self.accel_bias_m_s2
+        found[GYRO_SCALE], found[ACCEL_SCALE] = self.gyro_scale, self.accel_scale
+        found[CLOCK] = self.clock_s
+        return found
