@@ -12,12 +12,11 @@ from tests.conftest import SITE_M, WalkedSurvey
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
-from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.distances.map_points import MapPoint
 from rangesfm.distances.tape import CLICKED_STDDEV_PX, Marker
 from rangesfm.geometry.map_errors import MapPointErrors
+from rangesfm.inference.mistakes import MistakeTest, MistakeTests
 from rangesfm.positions.control_points import ControlPoint, ControlPoints
 
 STDDEV_M, NUM_POINTS = 0.01, 6
@@ -33,7 +32,7 @@ class Marked:
 
     def diagnosis(
         self, seed: int, wrong_m: Array | None = None, placed_stddev: float = 0.0, kind: str = "check"
-    ) -> Diagnosis:
+    ) -> MistakeTests:
         """Test points that were surveyed with errors, in a map whose scale, turn and shift are known so well."""
         at_m = self.true_m + STDDEV_M * np.random.default_rng(seed).standard_normal(self.true_m.shape)
         at_m = at_m if wrong_m is None else at_m + wrong_m

@@ -119,6 +119,7 @@ def test_beside_ranges_it_has_its_say_in_the_scale_and_the_refined_map_is_moved_
     assert low < true_scale < high
     assert abs(off) < (high - low) / (high + low)
     assert SAID not in with_it["scale"]["reasons"]
+    assert [test["rejected"] for test in with_it["tests"] if test["name"] == f"{STEPS} against ranges"] == [False]
     # The refinement knows ranges alone: what moves the map is what this kind says of it as a whole.
     counted["longer"] = 1.01
     longer, further_off = refined(own_survey, rangesfm_command, *flags)

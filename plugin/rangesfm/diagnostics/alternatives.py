@@ -9,11 +9,12 @@ from itertools import combinations
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis import MEASURE_AGAIN, Correction, corrected, in_axes, where_ranges_meet
+from rangesfm.diagnostics.hypothesis import MEASURE_AGAIN, Correction, corrected, where_ranges_meet
 from rangesfm.diagnostics.linearized import RangesOnMap
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.geometry.robust_statistics import CAUCHY
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points
+from rangesfm.inference.mistakes import in_axes
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.ranging.readers.units import FOOT_M
 from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, solve

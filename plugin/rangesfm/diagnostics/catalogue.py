@@ -13,7 +13,6 @@ from rangesfm.diagnostics.hypothesis import (
     Effect,
     Hypothesis,
     duration_s,
-    in_axes,
     is_given,
     longer,
     longest_m,
@@ -22,6 +21,7 @@ from rangesfm.diagnostics.hypothesis import (
     too_long,
 )
 from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.inference.mistakes import in_axes
 
 SAME_HEIGHT_M = 1e-3
 """Nobody measures heights of anchors that agree to within this, metres."""

@@ -10,12 +10,12 @@ import numpy as np
 from rangesfm.arrays import Indices
 from rangesfm.diagnostics.alternatives import LEAST_USED
 from rangesfm.diagnostics.bent_path import drifts
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest, Test, row_of
+from rangesfm.diagnostics.hypothesis_tests import Test, row_of
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
 from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
-from rangesfm.diagnostics.scale_bound import HiddenMistake
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE
+from rangesfm.inference.mistakes import MistakeTest, MistakeTests
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
 
@@ -37,24 +37,18 @@ _OF_SINGLE_RANGES = ("range noise", "anchor's outliers", _MIXED_UP)
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """The tests of a map and the mistakes that they found.
+class Diagnosis(MistakeTests):
+    """The tests of a map and the mistakes that they found; without reasons, at most one that could stay hidden.
 
     Attributes:
-        tests: rows of the table; what was found comes first.
-        reasons: sentences, the likeliest cause first; without any, at most a mistake that could stay hidden.
-        causes: the likeliest cause, and those that cannot be told from it.
+        causes: the likeliest cause in the ranges, and those that cannot be told from it.
         rows: (n,) rows of the log to which the corrections refer.
-        hidden: mistakes that the tests may miss.
     """
 
-    tests: tuple[MistakeTest, ...]
-    reasons: tuple[str, ...]
     causes: tuple[Cause, ...] = ()
     rows: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    hidden: tuple[HiddenMistake, ...] = ()
 
-    def with_more(self, more: Diagnosis) -> Diagnosis:
+    def with_more(self, more: MistakeTests) -> Diagnosis:
         """Return the verdict with tests of something other than ranges added."""
         tests = (*more.tests, *self.tests)
         reasons, hidden = (*self.reasons, *more.reasons), (*self.hidden, *more.hidden)
@@ -74,7 +68,8 @@ def diagnose_ranges(on_map: RangesOnMap, *, seed: int = 0) -> Diagnosis:
     reasons = [f"{row.words}: {row.remedy}" for row in (*before, *seen)]
     if found.causes:
         reasons.insert(len(before), causes_in_words(found.causes))
-    return Diagnosis(rows, tuple(reasons or _what_could_hide(found)), found.causes, on_map.posed.rows, found.hidden)
+    said = tuple(reasons or _what_could_hide(found))
+    return Diagnosis(rows, said, found.hidden, found.causes, on_map.posed.rows)
 
 
 def _before_causes(found: Findings, shown: Sequence[MistakeTest]) -> list[MistakeTest]:

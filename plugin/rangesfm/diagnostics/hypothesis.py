@@ -178,10 +178,6 @@ def too_long(size: Array) -> str:
     return f"read about {abs(size[0]):.2f} m too {'long' if size[0] > 0 else 'short'}"
 
 
-def in_axes(shift: Array) -> str:
-    return f"{shift[0]:+.2f}, {shift[1]:+.2f}, {shift[2]:+.2f} m"
-
-
 def corrected(on_map: RangesOnMap, correction: Correction) -> RangesOnMap:
     """Return the ranges with anchors, lever arms, times and lengths corrected; ``left_out`` is not applied."""
     problem, mean_m = on_map.problem, on_map.problem.anchor_mean_m.copy()

@@ -14,6 +14,7 @@ from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.geometry.numerics import UNDETERMINED
 from rangesfm.inference.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
+from rangesfm.inference.mistakes import MistakeTest, finite, row_of_mistake
 
 # Random surveys from which the thresholds come: 20 of them exceed one.
 _NUM_DRAWS = 1000
@@ -54,45 +55,6 @@ class Test(EstimatedMistake):
     def is_rejected(self) -> bool:
         """True if the estimated size is possible and chance alone does not explain the observations."""
         return self.is_possible and self.statistic > self.threshold
-
-
-@dataclass(frozen=True)
-class MistakeTest:
-    """One hypothesis on one survey, as a row of the table.
-
-    Attributes:
-        name, subject: its kind, and what it is about: an anchor's id, or nothing.
-        statistic, threshold: a larger statistic than the threshold means that the mistake, or one that looks like it,
-            was made. The statistic is 0 if its estimated size is impossible.
-        words: what is the case if it was made. remedy: what to do then.
-        unit: of ``size``, ``stddev`` and ``smallest_detectable``; "1": a ratio.
-        size, stddev: of the mistake, estimated; the length of a vector. None: not estimated, or impossible.
-        smallest_detectable: a mistake of this size is found in four cases of five; None: it cannot be detected.
-        redundancy: how much of the mistake the other observations check, 0 to 1; None: not known.
-        is_checked: whether some mistake of this kind that is possible would be found; None: not known.
-        effect_on_scale, effect_on_place_m: largest effect of a mistake of that size, relative and as root mean square
-            along the path; None: unlimited.
-    """
-
-    name: str
-    subject: str
-    statistic: float
-    threshold: float
-    words: str
-    remedy: str
-    unit: str = ""
-    size: float | None = None
-    stddev: float | None = None
-    smallest_detectable: float | None = None
-    effect_on_scale: float | None = None
-    effect_on_place_m: float | None = None
-    redundancy: float | None = None
-    is_checked: bool | None = None
-
-    @property
-    def rejected(self) -> bool:
-        """True if chance alone does not explain the statistic."""
-        return self.statistic > self.threshold
 
 
 class Factorization(Solved):
@@ -221,27 +183,3 @@ def row_of(test: Test) -> MistakeTest:
         redundancy=test.redundancy,
         is_checked=test.is_checked,
     )
-
-
-def row_of_mistake(
-    name: str, subject: str, found: EstimatedMistake, threshold: float, words: str, remedy: str, unit: str = "m"
-) -> MistakeTest:
-    """Return the row of the table for a mistake: one number with its sign, or the length of a vector."""
-    return MistakeTest(
-        name,
-        subject,
-        found.statistic,
-        threshold,
-        words,
-        remedy,
-        unit,
-        size=float(found.sizes[0] if len(found.sizes) == 1 else np.linalg.norm(found.sizes)) if found.is_seen else None,
-        stddev=finite(float(np.linalg.norm(found.stddevs))),
-        smallest_detectable=finite(found.smallest_detectable),
-        effect_on_scale=finite(found.effect_on_log_scale),
-    )
-
-
-def finite(value: float) -> float | None:
-    """Return the value, or None if it is infinite."""
-    return float(value) if np.isfinite(value) else None

@@ -18,11 +18,11 @@ from scipy.stats import chi2
 from rangesfm import ceres
 from rangesfm.ceres.bundle_adjustment import bundle_adjustment, keyframe_centers
 from rangesfm.colmap.reprojection import point_errors
-from rangesfm.diagnostics.scale_bound import RISK
 from rangesfm.errors import SolverError
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR, MEDIAN_FACTOR
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE
 from rangesfm.geometry.similarity import align_points
+from rangesfm.inference.mistakes import RISK
 from rangesfm.measurements.joint_map import Doubt
 from rangesfm.options import CameraOptions, RefineOptions
 

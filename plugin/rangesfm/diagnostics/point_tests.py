@@ -11,17 +11,15 @@ from scipy import special
 from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis import in_axes
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest, row_of_mistake
-from rangesfm.diagnostics.position_tests import LOOK_AGAIN
 from rangesfm.distances.map_points import MapPoint, MapPoints
 from rangesfm.distances.tape import CHECK, CONTROL
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import similarity_motions
 from rangesfm.inference.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
+from rangesfm.inference.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
 from rangesfm.positions.control_points import ControlPoint, ControlPoints, marks_seen
 from rangesfm.processes.threads import with_one_blas_thread
+from rangesfm.scale.position_tests import LOOK_AGAIN
 
 _ONE_FRAME = "look whether points and anchors are in one frame, and measured to the same height of the antennas"
 _ALL = "frame of the points"
@@ -61,7 +59,7 @@ def diagnose_points(
     errors: MapErrors | None,
     scale_stddev: float,
     placed: Placed,
-) -> Diagnosis:
+) -> MistakeTests:
     """Test whether each point, and all of them together, are where the map has them; empty if there are none.
 
     The residuals have the covariance of the coordinates as stated, of the marks in the photos, and of the map, whose
@@ -74,11 +72,11 @@ def diagnose_points(
         scale_stddev: as for ``MapErrors.joint``.
     """
     if points is None:
-        return Diagnosis((), ())
+        return MistakeTests()
     is_seen = marks_seen(points, model)
     tested = [of for of, seen in zip(points.points, is_seen, strict=True) if seen and of.kind in (CONTROL, CHECK)]
     if not tested:
-        return Diagnosis((), ())
+        return MistakeTests()
     finder = MapPoints(model, {}, points.markers, np.nan, points.markers_path or points.path)
     found = [finder.find_marker(of.name) for of in tested]
     of_map = placed.of(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)
@@ -88,7 +86,7 @@ def diagnose_points(
     off_m = np.ravel([at.position_m - of.position_m for of, at in zip(tested, found, strict=True)])
     rows = _tested(off_m, np.diag(own) + of_map, tested)
     reasons = tuple(f"{row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in rows if row.rejected)
-    return Diagnosis(tuple(rows), reasons)
+    return MistakeTests(tuple(rows), reasons)
 
 
 def _tested(off_m: Array, covariance_m2: Array, points: Sequence[ControlPoint]) -> list[MistakeTest]:

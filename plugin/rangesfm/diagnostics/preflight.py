@@ -17,12 +17,12 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError, number_text
 from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.inference.linear_map import FALSE_ALARM_RATE
+from rangesfm.positions.known_positions import MIN_NUM_POSITIONS
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
 from rangesfm.ranging.range_log import RangeKind, RangeLog
 from rangesfm.ranging.readers.table import CANONICAL, MAPPED, TABLE
 from rangesfm.ranging.readers.units import UNITS_PER_METRE
-from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 

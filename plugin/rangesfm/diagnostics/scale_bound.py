@@ -11,7 +11,6 @@ equivalence of three RAIM methods", Navigation 39, 1992).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import special
@@ -20,45 +19,9 @@ from scipy.optimize import brentq
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Test
 from rangesfm.diagnostics.mistake_words import mistake_in_words
-from rangesfm.inference.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.inference.linear_map import noncentrality
+from rangesfm.inference.mistakes import RISK, HiddenMistake
 from rangesfm.inference.posterior import ScaleUncertainty
-from rangesfm.scale.scale_by_lengths import LengthScale
-
-RISK = 1e-4
-"""Probability with which the scale may be off by more than the bound."""
-# Number of sizes of a mistake that are tried.
-_NUM_SIZES = 80
-
-
-@dataclass(frozen=True)
-class HiddenMistake:
-    """A mistake that a test may miss.
-
-    Attributes:
-        words: for people.
-        slope: change of the scale's logarithm by a mistake that moves the test by one standard deviation; inf for a
-            mistake that no test sees.
-        threshold, num: of the test, and its degrees of freedom.
-        most: largest change of the scale's logarithm by such a mistake that people would not notice.
-    """
-
-    words: str
-    slope: float
-    threshold: float
-    num: int
-    most: float
-
-    @property
-    def sizes(self) -> tuple[Array, Array]:
-        """Possible changes of the scale's logarithm (k,), and the probabilities (k,) that the test misses them."""
-        if not np.isfinite(self.slope):
-            return np.array([self.most]), np.ones(1)
-        # A mistake that moves the test farther beyond its threshold is missed with a smaller probability than the risk.
-        farthest = np.sqrt(self.threshold) - special.ndtri(RISK)
-        if self.slope > 0:
-            farthest = min(farthest, self.most / self.slope)
-        moves = np.linspace(0.0, farthest, _NUM_SIZES)
-        return self.slope * moves, np.asarray(special.chndtr(self.threshold, max(self.num, 1), moves**2))
 
 
 def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:
@@ -74,23 +37,6 @@ def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:
         for test in tests
         if not test.hypothesis.is_in_interval
     )
-
-
-def hidden_lengths(lengths: LengthScale, against_stddev: float | None) -> tuple[HiddenMistake, ...]:
-    """Return mistakes of measured lengths.
-
-    Args:
-        against_stddev: relative standard deviation of the comparison with ranges or positions; None without any.
-    """
-    is_checked = np.isfinite(lengths.stddev_m)
-    slopes = (np.abs(lengths.by_metre) * lengths.stddev_m)[is_checked]
-    hidden = [HiddenMistake("length", slope, lengths.threshold, 1, np.inf) for slope in slopes.tolist()]
-    if against_stddev is not None:
-        threshold = float(special.chdtri(1, FALSE_ALARM_RATE))
-        hidden.append(HiddenMistake("lengths", against_stddev, threshold, 1, np.inf))
-    elif not is_checked.all():
-        hidden.append(HiddenMistake("length", np.inf, np.inf, 1, np.inf))
-    return tuple(hidden)
 
 
 def scale_bound(uncertainty: ScaleUncertainty, hidden: Sequence[HiddenMistake]) -> tuple[float, str]:

@@ -14,13 +14,13 @@ from rangesfm.diagnostics.hypothesis import (
     Correction,
     Hypothesis,
     duration_s,
-    in_axes,
     longer,
     longest_m,
     of_bins,
     too_long,
 )
 from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.inference.mistakes import in_axes
 from rangesfm.scale.range_equation import antenna_positions
 
 # Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.

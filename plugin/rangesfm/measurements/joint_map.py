@@ -6,18 +6,22 @@ so that none of them names a kind.
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
+from scipy import special
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
 from rangesfm.inference.bending import MapBending
+from rangesfm.inference.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.inference.mistakes import MistakeTest, MistakeTests, finite
 from rangesfm.inference.posterior import (
     MAX_NUM_OBSERVATIONS,
     JointProblem,
@@ -47,6 +51,16 @@ class KindOnMap(ABC):
     """Name of the kind."""
     is_in_fit: ClassVar[bool] = False
     """Whether the fit of a map that may bend knows them; the map is moved as a whole to what others say."""
+
+    @property
+    def words(self) -> str:
+        """What they are, for people."""
+        return self.kind
+
+    @property
+    def remedy(self) -> str:
+        """What to do if they contradict another kind, for people."""
+        return f"check the {self.words}"
 
     @property
     @abstractmethod
@@ -111,6 +125,26 @@ class KindOnMap(ABC):
         """Yield what is to be said of them on a map, without any doubt of its scale."""
         del on_map
         yield from ()
+
+    def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
+        """Return the tests of mistakes in them.
+
+        Args:
+            on_map: all that is measured in the map. by_kind: the scale by each kind alone, where several are used.
+        """
+        against = self.against_others(on_map, by_kind)
+        return MistakeTests(against, tuple(f"{row.words}: {row.remedy}" for row in against if row.rejected))
+
+    def against_others(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> tuple[MistakeTest, ...]:
+        """Return the tests that compare the scale with that by each of the kinds before in the table."""
+        before = itertools.takewhile(lambda each: each.kind != self.kind, on_map.kinds)
+        used = (each for each in before if {each.kind, self.kind} <= by_kind.keys())
+        return tuple(against_other(self, each, by_kind[self.kind], by_kind[each.kind]) for each in used)
+
+    def entry(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return their own entry of ``result.json``, whose key is their name; empty without one."""
+        del on_map
+        return {}
 
     def sources(self, on_map: JointMap) -> tuple[Source, ...]:
         """Return the measurements for the fit of a map that may bend, given all that is measured in it as one piece."""
@@ -188,6 +222,27 @@ class JointMap:
     def moved(self) -> tuple[KindOnMap, ...]:
         """Return the kinds on the map that was moved to its estimate."""
         return tuple(kind.moved(self.posterior) for kind in self.kinds)
+
+
+def against_other(kind: KindOnMap, other: KindOnMap, first: ScaleByKind, second: ScaleByKind) -> MistakeTest:
+    """Return the test that compares the scales from two kinds of measurement."""
+    apart = float(np.log(first.value / second.value))
+    stddev = float(np.hypot(first.stddev / first.value, second.stddev / second.value))
+    smallest = finite(float(np.sqrt(noncentrality(1))) * stddev)
+    return MistakeTest(
+        f"{kind.kind} against {other.kind}",
+        "",
+        (apart / stddev) ** 2 if np.isfinite(stddev) else 0.0,
+        float(special.chdtri(1, FALSE_ALARM_RATE)),
+        words=f"by the {kind.words} the map is {100 * (np.exp(apart) - 1):+.1f} % larger than by the {other.words}; "
+        f"their errors together explain {100 * stddev:.1f} % (1 stddev)",
+        remedy=f"{kind.remedy}, and {other.remedy}",
+        unit="1",
+        size=apart,
+        stddev=finite(stddev),
+        smallest_detectable=smallest,
+        effect_on_scale=smallest,
+    )
 
 
 def find_kind(kinds: Sequence[KindOnMap], kind: type[_Kind]) -> _Kind | None:

@@ -23,9 +23,9 @@ from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.walls import AT_WALL_M, lead_through
 from rangesfm.positions.control_points import ControlPoint
+from rangesfm.positions.known_positions import MIN_NUM_POSITIONS
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.scale.scale_verdict import CALIBRATE, FEW_RANGES
 
 # Changes of an anchor's height that are tried, metres.

@@ -11,11 +11,12 @@ import numpy as np
 
 from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.finished_map import place_in_words
-from rangesfm.diagnostics.hypothesis_tests import Factorization, MistakeTest, row_of
+from rangesfm.diagnostics.hypothesis_tests import Factorization, row_of
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
 from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.numerics import NORMAL_95
+from rangesfm.inference.mistakes import MistakeTest
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey

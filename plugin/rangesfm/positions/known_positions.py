@@ -16,6 +16,9 @@ LASTING_S = (3.0, 30.0, 300.0)
 """Times for which errors of an antenna's positions last, seconds: those of filters and reflections for seconds, those
 of the troposphere, of satellites and of echoes in a hall for minutes. A mixture follows any time between."""
 
+MIN_NUM_POSITIONS = 3
+"""Fewest positions, not on one line, that determine a similarity."""
+
 
 @dataclass(frozen=True)
 class KnownPositions:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,14 +12,25 @@ from scipy import special
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.distances.lengths_on_map import LENGTHS, lengths_on_map
 from rangesfm.distances.locate_lengths import LocatedDistances
-from rangesfm.errors import GeometryError
+from rangesfm.distances.tape import TapedDistance
+from rangesfm.errors import GeometryError, number_text
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import Similarity, path_shape
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.inference.bending import MapBending
-from rangesfm.inference.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS
-from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Observations, ScaleUncertainty, joined
+from rangesfm.inference.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, noncentrality
+from rangesfm.inference.mistakes import HiddenMistake, MistakeTest, MistakeTests, finite
+from rangesfm.inference.posterior import (
+    MAX_NUM_OBSERVATIONS,
+    JointProblem,
+    Observations,
+    ScaleByKind,
+    ScaleUncertainty,
+    joined,
+)
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+
+_MEASURE_AGAIN = "look whether it was mistyped, or measure it again"
 
 
 @dataclass(frozen=True)
@@ -34,6 +45,7 @@ class LengthScale(KindOnMap):
         too_long_m, stddev_m: (m,) excess of each length over what all other kept measurements predict, and its standard
             deviation; inf where nothing predicts it, and before a test.
         redundancy: (m,) how much of an error of each length the others check, 0 to 1 (Baarda's redundancy number).
+        taped: the m lengths as they were given.
     """
 
     lengths: LocatedDistances
@@ -45,8 +57,10 @@ class LengthScale(KindOnMap):
     too_long_m: Array
     stddev_m: Array
     redundancy: Array
+    taped: tuple[TapedDistance, ...] = ()
 
     kind = LENGTHS
+    words, remedy = "measured lengths", "measure a length again"
     is_in_fit = True
 
     def observed(
@@ -103,6 +117,58 @@ class LengthScale(KindOnMap):
                 "the measured lengths are too short for their standard deviations", "measure more and longer lengths"
             )
 
+    def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
+        """Return the tests of each length against all else, and of all of them against other kinds."""
+        rows = list(self._tests_of_each())
+        left_out = [
+            f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}; it is left out"
+            for row, is_kept in zip(rows, self.is_kept, strict=True)
+            if not is_kept
+        ]
+        open_words = [row.words for row, is_kept in zip(rows, self.is_kept, strict=True) if is_kept and row.rejected]
+        either = [f"either {'; or '.join(open_words)}: {_MEASURE_AGAIN}"] if open_words else []
+        against = self.against_others(on_map, by_kind)
+        reasons = (*left_out, *either, *(f"{row.words}: {row.remedy}" for row in against if row.rejected))
+        # Printed tags are shown only if something was found: their sides are many and alike.
+        told = [row for row, one in zip(rows, self.taped, strict=True) if row.rejected or not one.is_printed]
+        told.sort(key=lambda row: row.threshold - row.statistic)
+        return MistakeTests((*told, *against), reasons, tuple(self._hidden(against)))
+
+    def _tests_of_each(self) -> Iterator[MistakeTest]:
+        for k, one in enumerate(self.taped):
+            size_m, stddev_m = float(self.too_long_m[k]), float(self.stddev_m[k])
+            smallest_m = float(np.sqrt(noncentrality(1))) * stddev_m
+            is_known = np.isfinite(stddev_m)
+            between = f"{one.ends[0]} to {one.ends[1]}"
+            yield MistakeTest(
+                "length",
+                between,
+                float(self.statistic[k]),
+                self.threshold,
+                words=f"the length from {between} is given as {one.distance_m:.3f} m, but all else gives "
+                f"{one.distance_m - size_m:.3f} m ({number_text(size_m, '+.3f')} m)",
+                remedy=_MEASURE_AGAIN,
+                unit="m",
+                size=size_m if is_known else None,
+                stddev=finite(stddev_m),
+                smallest_detectable=finite(smallest_m),
+                effect_on_scale=finite(abs(float(self.by_metre[k])) * smallest_m) if is_known else None,
+                redundancy=float(self.redundancy[k]),
+                is_checked=bool(is_known),
+            )
+
+    def _hidden(self, against: Sequence[MistakeTest]) -> Iterator[HiddenMistake]:
+        """Yield mistakes that the tests may miss, of each length, and of all if they are compared with other kinds."""
+        is_checked = np.isfinite(self.stddev_m)
+        for slope in (np.abs(self.by_metre) * self.stddev_m)[is_checked].tolist():
+            yield HiddenMistake("length", slope, self.threshold, 1, np.inf)
+        compared = [row.stddev for row in against if row.stddev is not None]
+        if compared:
+            threshold = float(special.chdtri(1, FALSE_ALARM_RATE))
+            yield HiddenMistake("lengths", min(compared), threshold, 1, np.inf)
+        elif not is_checked.all():
+            yield HiddenMistake("length", np.inf, np.inf, 1, np.inf)
+
     def tested(self, placed: Similarity, others: Sequence[Observations], *, is_last: bool = False) -> LengthScale:
         """Return the lengths with outlying ones left out; arguments as of ``KindOnMap.tested``."""
         num = len(self.rows)
@@ -144,11 +210,13 @@ def lengths_between_points(
     bending: MapBending,
     metres_per_unit: float = 1.0,
     like: LengthScale | None = None,
+    taped: Sequence[TapedDistance] = (),
 ) -> LengthScale | None:
     """Return the lengths among measured distances, before any test; None where there is none between points.
 
     Args:
         like: the same lengths in another map, of which the same are kept; None: all that are no checks.
+        taped: the distances as they were given, for the tests.
 
     Raises:
         GeometryError: both ends of a length are in one place of the map.
@@ -161,7 +229,8 @@ def lengths_between_points(
         raise GeometryError("a measured length has both its ends in one place of the map")
     lengths, nothing = distances.subset(np.isin(np.arange(len(distances)), rows)), np.zeros(len(rows))
     kept = np.ones(len(rows), dtype=bool) if like is None else like.is_kept
-    return LengthScale(lengths, rows, path, bending, metres_per_unit, kept, nothing, nothing + np.inf, nothing)
+    given = tuple(taped[row] for row in rows.tolist()) if taped else ()
+    return LengthScale(lengths, rows, path, bending, metres_per_unit, kept, nothing, nothing + np.inf, nothing, given)
 
 
 def _test(problem: JointProblem, columns: Array) -> tuple[float, float, float]:

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.arrays import Array, Indices, Mask, median, rms
+from rangesfm.distances.tape import LEFT_OUT
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING, UNDETERMINED
 from rangesfm.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
@@ -21,7 +22,8 @@ from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, pat
 from rangesfm.geometry.trajectory import Trajectory, moved_similarity
 from rangesfm.inference.bending import MapBending
 from rangesfm.inference.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, EstimatedMistake
-from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, JointProblem, ScaleUncertainty, joined
+from rangesfm.inference.mistakes import MistakeTests
+from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, JointProblem, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap
 from rangesfm.measurements.source import Source
 from rangesfm.measurements.table import UsedPositions
@@ -33,15 +35,14 @@ from rangesfm.positions.grouped_positions import (
     grouped_positions,
     stddev_of,
 )
-from rangesfm.positions.known_positions import LASTING_S, KnownPositions, LearntPositions
+from rangesfm.positions.known_positions import LASTING_S, MIN_NUM_POSITIONS, KnownPositions, LearntPositions
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.ranging.errors.components import FRAME
 from rangesfm.ranging.range_observations import OUTLIER_BELOW
 from rangesfm.scale.anchor_plane import is_line
+from rangesfm.scale.position_tests import tests_of_positions
 
-MIN_NUM_POSITIONS = 3
-"""Fewest positions, not on one line, that determine a similarity."""
 # Most triples for a start.
 _MAX_NUM_TRIPLES = 300
 # Largest standard deviation of a turn of the map, radians, for which its effect is linear.
@@ -105,6 +106,7 @@ class PositionScale(KindOnMap):
     surveyed: SurveyedPositions = field(default_factory=SurveyedPositions)
 
     kind = POSITIONS
+    words, remedy = "known positions", "look at the units of both"
     is_in_fit = True
 
     @property
@@ -140,6 +142,26 @@ class PositionScale(KindOnMap):
         base = np.where(np.isfinite(given), given, self.fit.stddev_m)
         return base * np.where(self.known.is_mark, learnt.get("points", 1.0), learnt.get("positions", 1.0))
 
+    def entry(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return how the positions of an antenna fit the map; empty without an antenna."""
+        track = self.surveyed.antenna
+        if track is None:
+            return {}
+        mine, used = ~self.known.is_mark, ~self.known.is_mark & self.used
+        off_m, is_timed = self.known.misclosures_m(on_map.estimate)[used], track.log.timestamp_s is not None
+        return {
+            "num": len(track.log),
+            "num_used": int(used.sum()),
+            "num_rejected": int((mine & ~used).sum()),
+            "rms_m": rms(np.linalg.norm(off_m, axis=1)),
+            "rms_by_axis_m": tuple(map(rms, off_m.T)) if len(off_m) else None,
+            "stddev_m": median(self.stddevs_m(on_map)[used]),
+            "inflation": self.inflation,
+            "time_offset_s": (track.offset_s or 0.0) if is_timed else None,
+            "time_offset_stddev_s": track.offset_stddev_s if is_timed else None,
+            "antenna_in_cam_m": np.array(track.antenna_in_cam_m).tolist(),
+        }
+
     def sources(self, on_map: JointMap) -> tuple[Source, ...]:
         """Return the positions that take part in the fit."""
         antenna, markers = self.surveyed.antenna, self.surveyed.markers
@@ -169,8 +191,14 @@ class PositionScale(KindOnMap):
 
     @property
     def names_left_out(self) -> list[str]:
-        """Names of the control points that contradict the others."""
-        return [self.known.names[row] for row in np.flatnonzero(self.is_left_out).tolist()]
+        """Names of the control points that contradict the others, or did so before."""
+        points = () if self.surveyed.points is None else self.surveyed.points.points
+        before = [point.name for point in points if point.kind == LEFT_OUT]
+        return [*(self.known.names[row] for row in np.flatnonzero(self.is_left_out).tolist()), *before]
+
+    def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
+        """Return the tests of each control point, of the antenna's positions, and of all against other kinds."""
+        return tests_of_positions(self, on_map, self.against_others(on_map, by_kind))
 
     @property
     def takes_part(self) -> Mask:

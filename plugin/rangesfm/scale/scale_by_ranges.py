@@ -47,7 +47,8 @@ class RangeScale(KindOnMap):
     per_anchor: Mapping[str, float] = field(default_factory=dict)
     anchors: tuple[AnchorEstimate, ...] = ()
 
-    kind = RANGES
+    kind = words = RANGES
+    remedy = "calibrate the radio (rangesfm ranges calibrate)"
     is_in_fit = True
 
     @property

@@ -62,7 +62,7 @@ def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
         return None
     found = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids, at.path)
     like = find_kind(at.before, LengthScale)
-    return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, like)
+    return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, like, inputs.tape.distances)
 
 
 KINDS: dict[str, Callable[[RangingInputs, MapOfPhotos], KindOnMap | None]] = {

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.errors import InputError
+from rangesfm.positions.known_positions import MIN_NUM_POSITIONS
 from rangesfm.ranging.readers import read_ranges
 from rangesfm.ranging.readers.lists import UnclearListError
-from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS
 from rangesfm.sources.source import is_source, open_source
 from rangesfm.survey.settings import KEYS, METRIC_KEYS
 from rangesfm.survey_discovery.found_files import (

@@ -22,11 +22,9 @@ from rangesfm.diagnostics.finished_map import (
     place_of_map,
     why_broken,
 )
-from rangesfm.diagnostics.length_tests import diagnose_lengths
 from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
-from rangesfm.diagnostics.position_tests import diagnose_positions
 from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.map_problem import MapProblem, map_problem
@@ -40,6 +38,7 @@ from rangesfm.geometry.poses import model_poses
 from rangesfm.geometry.similarity import IDENTITY, align_points
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.inference.bending import MapBending, WalkBending
+from rangesfm.inference.mistakes import MistakeTests
 from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS
 from rangesfm.join.join_models import ModelVerdict, join_models
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, find_kind, join_kinds, tested_kinds
@@ -540,16 +539,17 @@ def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt
     metric, on_map = _estimated(survey, metric)
     path = metric.trajectory.as_in(metric.final)
     bent_by_m = np.zeros(0) if on_map is None else bends_m(on_map)
-    of_positions = _diagnose_positions(metric, path.centers, bent_by_m)
-    of_lengths = diagnose_lengths(metric.find(LengthScale), metric.estimate, metric.tape)
-    diagnosis, of_place = of_positions.with_more(of_lengths), of_positions.reasons
+    place_is_tested, others = _tested_without_ranges(metric, path.centers, bent_by_m)
+    diagnosis, of_place = Diagnosis(), tuple(reason for each in place_is_tested for reason in each.reasons)
     try:
         if (of_ranges := _diagnose(survey, on_map)) is not None:
-            diagnosis = of_ranges.with_more(diagnosis)
+            diagnosis = of_ranges
             if any(cause.correction.anchors_m for cause in of_ranges.causes):  # the anchors are elsewhere
                 of_place = (causes_in_words(of_ranges.causes), *of_place)
     except np.linalg.LinAlgError as error:
         journal.warn(f"mistakes were not tested, because the ranges determine too little: {error}")
+    for tested in (*place_is_tested, *others):
+        diagnosis = diagnosis.with_more(tested)
     journal.warn(*(metric.estimate.reasons if metric.estimate.verdict != "good" else ()), *diagnosis.reasons)
     by_rivals = () if metric.rivals is None else metric.rivals.doubts
     doubts: list[Doubt] = []
@@ -583,33 +583,29 @@ def _doubts_of_lens(metric: MetricResult) -> tuple[Doubt, ...]:
     return () if doubt is None else (doubt,)
 
 
-def _diagnose_positions(metric: MetricResult, centers_m: Array, bent_by_m: Array) -> Diagnosis:
-    """Return the tests of known positions against each other, and of points against a map that ranges hold, too.
+def _tested_without_ranges(
+    metric: MetricResult, centers_m: Array, bent_by_m: Array
+) -> tuple[list[MistakeTests], list[MistakeTests]]:
+    """Return the tests of other kinds than ranges: of those that place the map, and of the others.
+
+    Points are tested against a map that ranges hold, too.
 
     Args:
         centers_m: (n, 3) keyframe centres in the final map. bent_by_m: (n,) as for ``place_of_map``.
     """
-    estimate, on_map, start = metric.estimate, metric.all_measured, metric.estimate.find(PositionScale)
+    estimate, on_map = metric.estimate, metric.all_measured
     if on_map is None:
-        return Diagnosis((), ())
-    left_out = () if start is None else start.names_left_out
-    diagnosis = diagnose_positions(on_map.find(PositionScale), on_map, left_out, estimate)
-    if on_map.find(RangeScale) is None or estimate.placement is None:
-        return diagnosis
-    return diagnosis.with_more(
-        diagnose_points(
-            metric.positions.points,
-            metric.final,
-            metric.map_errors,
-            estimate.uncertainty.empirical,
-            Placed(
-                estimate.placement,
-                centers_m[0],
-                float(bent_by_m.max(initial=0.0)),
-                by_antenna=start is not None and not start.known.is_mark.all(),
-            ),
-        )
-    )
+        return [], []
+    kinds = [each for each in on_map.kinds if not isinstance(each, RangeScale)]
+    placing, others = ([each for each in kinds if each.places_map is does] for does in (True, False))
+    of_place = [each.tests(on_map, estimate.by_kind) for each in placing]
+    if len(kinds) < len(on_map.kinds) and estimate.placement is not None:
+        positions = on_map.find(PositionScale)
+        by_antenna = positions is not None and not positions.known.is_mark.all()
+        placed = Placed(estimate.placement, centers_m[0], float(bent_by_m.max(initial=0.0)), by_antenna=by_antenna)
+        stddev = estimate.uncertainty.empirical
+        of_place.append(diagnose_points(metric.positions.points, metric.final, metric.map_errors, stddev, placed))
+    return of_place, [each.tests(on_map, estimate.by_kind) for each in others]
 
 
 def _moved(metric: MetricResult, at: JointMap) -> MetricResult:

@@ -13,13 +13,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Mask, median, rms
-from rangesfm.diagnostics.hypothesis_tests import finite
 from rangesfm.diagnostics.mistake_words import CHECKED_KINDS, mistake_in_words
-from rangesfm.diagnostics.scale_bound import RISK, scale_bound
+from rangesfm.diagnostics.scale_bound import scale_bound
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import CHECK, CONTROL, LEFT_OUT
 from rangesfm.errors import number_text
 from rangesfm.geometry.similarity import IDENTITY, Similarity
+from rangesfm.inference.mistakes import RISK, finite
 from rangesfm.join.join_models import ModelVerdict
 from rangesfm.positions.known_marks import locate_points
 from rangesfm.ranging.range_log import RangeKind
@@ -37,7 +37,6 @@ from rangesfm.result.result_tables import (
     TimeOffsetCurve,
 )
 from rangesfm.result.summary import ResultSummary
-from rangesfm.scale.scale_by_positions import PositionScale
 from rangesfm.workflows.metric_result import MetricResult
 
 # A length disagrees with the map beyond this number of standard deviations, which chance exceeds in one of 370 cases.
@@ -64,13 +63,20 @@ def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
         check_ranges=_check_ranges(found),
         refine=_refinement(found),
         loops=_loops(found),
-        positions=_positions(found),
         points=points_entry(found),
         tests=tuple(map(entries.MistakeEntry.model_validate, diagnosis.tests if diagnosis else ())),
         reliability=_reliability(found),
         models=tuple(_model(model, estimate.metric_from_sfm) for model in found.models),
+        **_entries_of_kinds(found),
         **others,
     )
+
+
+def _entries_of_kinds(found: MetricResult) -> dict[str, Any]:
+    """Return the own entries of the kinds of measurement, by name."""
+    on_map = found.all_measured
+    of_kinds = {} if on_map is None else {kind.kind: kind.entry(on_map) for kind in on_map.kinds}
+    return {name: entry for name, entry in of_kinds.items() if entry}
 
 
 def _similarity(similarity: Similarity) -> entries.SimilarityEntry:
@@ -170,29 +176,6 @@ def _refinement(found: MetricResult) -> entries.RefineEntry | None:
         "time_offset_change_s": summary.time_shift_s,
     }
     return entries.RefineEntry.model_validate({**vars(summary), **others})
-
-
-def _positions(found: MetricResult) -> entries.PositionsEntry | None:
-    track, scale, on_map = found.positions.antenna, found.find(PositionScale), found.all_measured
-    if track is None or scale is None or on_map is None:
-        return None
-    mine, used = ~scale.known.is_mark, ~scale.known.is_mark & scale.used
-    off_m = scale.known.misclosures_m(on_map.estimate)[used]
-    summary = found.kept_refinement
-    shift_s = (summary and summary.position_time_shift_s) or 0.0
-    refined_m = None if summary is None else summary.antenna_in_cam_m
-    return entries.PositionsEntry(
-        num=len(track.log),
-        num_used=int(used.sum()),
-        num_rejected=int((mine & ~used).sum()),
-        rms_m=rms(np.linalg.norm(off_m, axis=1)),
-        rms_by_axis_m=(rms(off_m[:, 0]), rms(off_m[:, 1]), rms(off_m[:, 2])) if len(off_m) else None,
-        stddev_m=median(scale.stddevs_m(on_map)[used]),
-        inflation=scale.inflation,
-        time_offset_s=None if track.log.timestamp_s is None else (track.offset_s or 0.0) + shift_s,
-        time_offset_stddev_s=None if track.log.timestamp_s is None else track.offset_stddev_s,
-        antenna_in_cam_m=(track.antenna_in_cam_m if refined_m is None else refined_m).tolist(),
-    )
 
 
 def _reliability(found: MetricResult) -> entries.ReliabilityEntry | None:

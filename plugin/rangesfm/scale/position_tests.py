@@ -1,28 +1,26 @@
-"""Tests of known positions: each control point against all others, and positions against measured lengths."""
+"""Tests of known positions: each control point against all others, and those of an antenna together."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import special
 
-from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.hypothesis import in_axes
-from rangesfm.diagnostics.hypothesis_tests import MistakeTest, row_of_mistake
-from rangesfm.diagnostics.length_tests import against_other
 from rangesfm.inference.linear_map import FALSE_ALARM_RATE
+from rangesfm.inference.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
 from rangesfm.measurements.joint_map import JointMap
 from rangesfm.options import LEVER_ARM_M
 from rangesfm.positions.grouped_positions import at_point
+from rangesfm.positions.known_positions import MIN_NUM_POSITIONS
 from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.scale_by_positions import MIN_NUM_POSITIONS, PositionScale
-from rangesfm.scale.scale_by_ranges import RangeScale
-from rangesfm.scale.scale_estimate import ScaleEstimate
+
+if TYPE_CHECKING:  # which imports this module
+    from rangesfm.scale.scale_by_positions import PositionScale
 
 LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
-_COMPARE = "calibrate the radio (rangesfm ranges calibrate), and look at the units of both"
 _POINT, _CHECK_POINT = "control point", "check point"
 _ARM, _CLOCK, _DATUM = "antenna's lever arm", "antenna's clock", "datum shift"
 # Words, remedy and unit of the mistakes of an antenna's positions.
@@ -46,19 +44,16 @@ _OF_ANTENNA = {
 
 
 @with_one_blas_thread
-def diagnose_positions(
-    positions: PositionScale | None, on_map: JointMap, left_out: Collection[str], estimate: ScaleEstimate
-) -> Diagnosis:
-    """Return the tests of known positions; empty if there are none.
+def tests_of_positions(positions: PositionScale, on_map: JointMap, against: Sequence[MistakeTest]) -> MistakeTests:
+    """Return the tests of known positions.
 
     Args:
-        positions: on the final map. on_map: all that is measured in it.
-        left_out: names of control points that contradict the others. estimate: of the scale.
+        on_map: all that is measured in the map. against: tests that compare the positions with other kinds.
     """
-    if positions is None:
-        return Diagnosis((), ())
+    left_out = positions.names_left_out
     rows = [*_of_points(positions, on_map, left_out), *_of_antenna(positions, on_map)]
-    if on_map.find(RangeScale) is None:  # beside ranges, check points are compared with the map that both hold
+    # Beside others that place the map, check points are compared with the map that all hold.
+    if not any(each.places_map and each.kind != positions.kind for each in on_map.kinds):
         rows += _of_check_points(positions, on_map, left_out)
     reasons = [
         f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}; it is left out"
@@ -69,11 +64,10 @@ def diagnose_positions(
     reasons += [f"probably {row.words} ({np.sqrt(row.statistic):.0f} stddevs): {row.remedy}" for row in likely]
     if doubted := [row.words for row in rows if row.rejected and row.name == _POINT and row.subject not in left_out]:
         reasons.append(f"either {'; or '.join(doubted)}: {LOOK_AGAIN}")
-    against = list(against_other(estimate, "positions", "ranges", _COMPARE))
     reasons += [f"{row.words}: {row.remedy}" for row in against if row.rejected]
     rows += against
     rows.sort(key=lambda row: row.threshold - row.statistic)
-    return Diagnosis(tuple(rows), tuple(reasons))
+    return MistakeTests(tuple(rows), tuple(reasons))
 
 
 def _of_points(positions: PositionScale, on_map: JointMap, left_out: Collection[str]) -> Iterator[MistakeTest]:
