@@ -3,54 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
-from rangesfm.files.text_tables import FOUND, TextTable, header_names, is_plain_table, read_head, read_table
-from rangesfm.option_model import Bounds
+from rangesfm.files.text_tables import header_names, is_plain_table, read_head
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.layout import MISSING, ColumnSample, Layout, find_layout
-from rangesfm.ranging.readers.lists import read_list
-from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
-
-
-@dataclass(frozen=True)
-class MeasuredList:
-    """The rows of a list.
-
-    Attributes:
-        table: the rows. columns: name of the column of each quantity that the list has. units: of these, if they are
-            lengths.
-        notes: lines for the user about how the file was read; empty for the canonical CSV.
-    """
-
-    table: TextTable
-    columns: Mapping[str, str]
-    units: Mapping[str, str | None]
-    notes: tuple[str, ...] = ()
-
-    def text(self, quantity: str, empty: str | None = None) -> list[str]:
-        """Return the cells of a quantity; ``empty`` replaces those that are empty or missing, and None refuses them."""
-        if quantity not in self.columns and empty is not None:
-            return [empty] * len(self.table)
-        return self.table.text(self.columns[quantity], empty=empty)
-
-    def metres(self, quantity: str, bounds: Bounds, empty: float | None = None) -> Array:
-        """Return lengths (n,) in metres; else as for ``text``."""
-        if quantity not in self.columns and empty is not None:
-            return np.full(len(self.table), empty)
-        name = self.columns[quantity]
-        per_metre = UNITS_PER_METRE[self.units[quantity] or "m"]
-        if per_metre == 1:
-            return self.table.numbers(name, empty=empty, missing=MISSING, bounds=bounds)
-        filled = None if empty is None else empty * per_metre
-        values = self.table.numbers(name, empty=filled, missing=MISSING, expected=str(bounds)) / per_metre
-        self.table.refuse(~bounds.hold(values), name, str(bounds))
-        return values
+from rangesfm.ranging.readers.lists import ListRows, layout_of_list, read_canonical_rows, read_rows
 
 
 @dataclass(frozen=True)
@@ -71,24 +31,17 @@ class ListForm:
     find: Callable[[Layout], dict[str, list[ColumnSample]] | None]
     by_values: Callable[[Layout], dict[str, list[ColumnSample]] | None]
 
-    def read(self, path: Path) -> MeasuredList:
+    def read(self, path: Path) -> ListRows:
         """Read a list.
 
         Raises:
             InputError: the file is no such list, or a line is not a row of the table.
         """
-        head = read_head(path)
-        if is_plain_table(head, self.required.values()):
-            table = read_table(path, [*self.required.values()], [*self.optional.values()], separator=FOUND)
-            both = {**self.required, **self.optional}
-            columns = {quantity: name for quantity, name in both.items() if name in table}
-            return MeasuredList(table, columns, dict.fromkeys(columns))
+        if is_plain_table(read_head(path), self.required.values()):
+            rows = read_canonical_rows(path, {**self.required, **self.optional}, [*self.required.values()])
+            return replace(rows, missing=MISSING)
         expected = f"expected {','.join(self.required.values())}"
-        if not head.strip():
-            raise InputError(f"the file is empty, {expected}", path)
-        layout = find_layout(path)
-        if layout is None:
-            raise InputError(f"no table of {self.what}, {expected}", path)
+        layout = layout_of_list(path, self.what, expected)
         found = (self.find if layout.has_names else self.by_values)(layout) or {}
         for quantity in self.required:
             if (num := len(those := found.get(quantity, []))) != 1:
@@ -97,9 +50,7 @@ class ListForm:
                 message = f"a table of {self.what} in which {which} {self.required[quantity]}; found {listed}"
                 raise InputError(f"{message}; {expected}", path)
         columns = _single(found)
-        table, notes = read_list(layout, columns)
-        units = {quantity: named_length_unit(f"{name} {layout.units[name]}") for quantity, name in columns.items()}
-        return MeasuredList(table, columns, units, tuple(f"{path.name}: {note}" for note in notes))
+        return read_rows(path, layout, columns, of=[quantity for quantity in ("distance",) if quantity in columns])
 
     def is_such(self, path: Path) -> bool:
         """Return whether a file is such a list by the names of its columns."""

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rangesfm.distances.measured_lists import LENGTHS, MARKS, MeasuredList
+from rangesfm.distances.measured_lists import LENGTHS, MARKS
 from rangesfm.distances.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
+from rangesfm.ranging.readers.lists import ListRows
 
 # Standard deviation of a length measured with care by a steel tape.
 DEFAULT_STDDEV_M = 0.01
@@ -31,7 +32,7 @@ def read_tape(distances_path: AnyPath, markers_path: AnyPath | None = None) -> T
     return Tape(_distances(listed), markers, Path(distances_path), of_markers, listed.notes)
 
 
-def _distances(listed: MeasuredList) -> tuple[TapedDistance, ...]:
+def _distances(listed: ListRows) -> tuple[TapedDistance, ...]:
     table = listed.table
     if not len(table):
         raise InputError("holds no distance, expected one per line", table.path)

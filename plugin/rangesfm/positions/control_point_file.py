@@ -2,40 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from rangesfm.arrays import Array
 from rangesfm.distances.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker
 from rangesfm.distances.tape_file import read_markers
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import (
-    FOUND,
-    TextTable,
-    has_columns,
-    is_number,
-    is_plain_table,
-    read_head,
-    read_table,
-    read_text,
-    repeated,
-)
+from rangesfm.files.text_tables import has_columns, is_number, is_plain_table, read_head, read_text, repeated
 from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
 from rangesfm.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.positions.position_log import crs_of_line
 from rangesfm.ranging.anchors.anchor_file import find_anchor_columns, like_anchors
-from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
-from rangesfm.ranging.readers.lists import UnclearListError, check_columns, read_list
-from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
+from rangesfm.ranging.readers.layout import Layout
+from rangesfm.ranging.readers.lists import (
+    AXES,
+    ListRows,
+    UnclearListError,
+    columns_by_user,
+    layout_of_list,
+    read_canonical_rows,
+    read_rows,
+)
 from rangesfm.ranging.readers.vocabulary import KIND
 
 POINT_COLUMNS = ("marker", "x_m", "y_m", "z_m")
 _CANONICAL = {"marker": "marker", "x": "x_m", "y": "y_m", "z": "z_m", "stddev": "stddev_m", "kind": "kind"}
 QUANTITIES = tuple(_CANONICAL)
-_AXES = ("x", "y", "z")
 _KINDS = (CONTROL, CHECK)
 _EXPECTED = f"expected a table with {','.join(POINT_COLUMNS)}"
 _NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
@@ -58,8 +53,6 @@ def read_control_points(options: PointOptions, markers_path: Path | None) -> Con
     if path is None:
         return None
     head = read_head(path)
-    if not head.strip():
-        raise InputError(f"the file is empty, {_EXPECTED}", path)
     markers = {} if markers_path is None else read_markers(markers_path)
     read = _gcp_list if is_gcp_list(head) else _table
     found = replace(read(path, options, head), markers_path=markers_path)
@@ -81,17 +74,14 @@ def is_point_file(head: str) -> bool:
 
 def _table(path: Path, options: PointOptions, head: str) -> ControlPoints:
     if not options.columns and options.unit is None and is_plain_table(head, POINT_COLUMNS):
-        table = read_table(path, POINT_COLUMNS, ["stddev_m", "kind"], separator=FOUND)
-        return _points(table, _CANONICAL, dict.fromkeys(QUANTITIES, "m"), ("",), options, [])
-    layout = find_layout(path)
-    if layout is None:
-        raise InputError(f"no table, {_EXPECTED}", path)
-    columns = _columns_by_user(options.columns, layout, path) if options.columns else _found_columns(path, layout, head)
-    table, notes = read_list(layout, columns)
-    by_name = {column.name: column.unit for column in layout.columns}
-    own = {quantity: named_length_unit(f"{name} {by_name[name]}") for quantity, name in columns.items()}
-    units = {quantity: (options.unit if quantity in _AXES else None) or unit or "m" for quantity, unit in own.items()}
-    return _points(table, columns, units, MISSING, options, notes)
+        return _points(read_canonical_rows(path, _CANONICAL, POINT_COLUMNS), options)
+    layout = layout_of_list(path, "points", _EXPECTED)
+    columns = (
+        columns_by_user(options.columns, QUANTITIES, ("marker", *AXES), layout, path)
+        if options.columns
+        else _found_columns(path, layout, head)
+    )
+    return _points(read_rows(path, layout, columns, options.unit), options)
 
 
 def _found_columns(path: Path, layout: Layout, head: str) -> dict[str, str]:
@@ -116,48 +106,21 @@ def _found_columns(path: Path, layout: Layout, head: str) -> dict[str, str]:
     return columns | ({"kind": kinds[0]} if len(kinds) == 1 else {})
 
 
-def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
-    check_columns(columns, QUANTITIES, layout, path)
-    if missing := [quantity for quantity in ("marker", *_AXES) if quantity not in columns]:
-        raise InputError(f"columns do not name {', '.join(missing)}, expected marker, x, y and z", path)
-    return {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
-
-
-def _points(
-    table: TextTable,
-    names: Mapping[str, str],
-    units: Mapping[str, str],
-    missing: Sequence[str],
-    options: PointOptions,
-    notes: Sequence[str],
-) -> ControlPoints:
-    """Return the points of a table, given the column and the unit of each quantity."""
+def _points(rows: ListRows, options: PointOptions) -> ControlPoints:
+    table = rows.table
     if not len(table):
         raise InputError("names no point, expected one per line", table.path)
-    markers = table.text(names["marker"])
+    markers = rows.text("marker")
     if again := repeated(markers):
-        raise table.error(again[0], names["marker"], "each point once")
-
-    def metres(quantity: str) -> Array:
-        per_metre = UNITS_PER_METRE[units[quantity]]
-        values = table.numbers(names[quantity], expected=str(COORDINATE_M)) / per_metre
-        table.refuse(~COORDINATE_M.hold(values), names[quantity], str(COORDINATE_M))
-        return values
-
-    positions = np.column_stack([metres(axis) for axis in _AXES])
-    stddevs, is_given = np.full(len(table), options.stddev_m), names.get("stddev", "") in table
-    if is_given:
-        per_metre = UNITS_PER_METRE[units["stddev"]]
-        stddevs = table.numbers(names["stddev"], empty=options.stddev_m * per_metre, missing=missing) / per_metre
-        table.refuse(~STDDEV_M.hold(stddevs), names["stddev"], str(STDDEV_M))
-    kinds = [CONTROL] * len(table)
-    if names.get("kind", "") in table:
-        kinds = [kind.lower() for kind in table.text(names["kind"], empty=CONTROL)]
-        table.refuse(np.array([kind not in _KINDS for kind in kinds]), names["kind"], f"{CONTROL} or {CHECK}")
-    rows = zip(markers, positions, stddevs.tolist(), kinds, table.line.tolist(), strict=True)
-    points = tuple(ControlPoint(*row) for row in rows)
-    told = tuple(f"{table.path.name}: {note}" for note in notes)
-    return ControlPoints(points, {}, is_given, None, table.path, None, told)
+        raise table.error(again[0], rows.columns["marker"], "each point once")
+    positions = np.column_stack([rows.metres(axis, COORDINATE_M) for axis in AXES])
+    stddevs = rows.metres("stddev", STDDEV_M, options.stddev_m)
+    kinds = [kind.lower() for kind in rows.text("kind", CONTROL)]
+    if (wrong := np.array([kind not in _KINDS for kind in kinds])).any():
+        table.refuse(wrong, rows.columns["kind"], f"{CONTROL} or {CHECK}")
+    each = zip(markers, positions, stddevs.tolist(), kinds, table.line.tolist(), strict=True)
+    points = tuple(ControlPoint(*row) for row in each)
+    return ControlPoints(points, {}, "stddev" in rows.columns, None, table.path, None, rows.notes)
 
 
 def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:

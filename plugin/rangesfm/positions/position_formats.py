@@ -42,9 +42,9 @@ from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head
 from rangesfm.ranging.anchors.site import WIDEST_DEG
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.columns import read_timestamps
-from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
-from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns
-from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
+from rangesfm.ranging.readers.layout import MISSING
+from rangesfm.ranging.readers.lists import Choice, UnclearListError, columns_by_user, layout_of_list, length_units
+from rangesfm.ranging.readers.units import UNITS_PER_METRE
 
 _CANONICAL = {
     "timestamp": "timestamp_s",
@@ -85,8 +85,6 @@ def read_positions(options: PositionOptions) -> PositionLog | None:
             raise InputError(f"unknown format of positions '{printable(options.format)}'; the nearest is '{near}'")
         return POSITION_READERS[options.format][1](path, options)
     head = read_head(path)
-    if not head.strip():
-        raise InputError(f"the file is empty, {_EXPECTED}", path)
     if options.columns:
         return _read_table(path, options)
     read = next((read for is_it, read in POSITION_READERS.values() if is_it(head)), _read_table)
@@ -114,11 +112,9 @@ def _read_canonical(path: Path, options: PositionOptions) -> PositionLog:
 
 
 def _read_table(path: Path, options: PositionOptions) -> PositionLog:
-    layout = find_layout(path)
-    if layout is None:
-        raise InputError(f"no table, {_EXPECTED}", path)
+    layout = layout_of_list(path, "positions", _EXPECTED)
     columns, notes = (
-        (_columns_by_user(options.columns, layout, path), [])
+        (columns_by_user(options.columns, QUANTITIES, (*AXES, "timestamp or image_name"), layout, path), [])
         if options.columns
         else find_position_columns(path, layout)
     )
@@ -133,12 +129,8 @@ def _read_table(path: Path, options: PositionOptions) -> PositionLog:
 
         said = options.timestamp_unit
         times, _ = read_timestamps(table, columns, layout.units, said, notes, ask, slowest_s=_SLOWEST_S)
-    by_name = {column.name: column.unit for column in layout.columns}
-    named = {quantity: named_length_unit(f"{name} {by_name[name]}") for quantity, name in columns.items()}
-    units = {quantity: (options.unit if quantity in AXES else None) or unit or "m" for quantity, unit in named.items()}
-    others = sorted({units[axis] for axis in AXES} - {"m"})
-    notes += [f"coordinates are in {' and '.join(others)}"] if others else []
-    return _log_of_table(table, columns, units, times, path, notes, options)
+    units, more = length_units(layout, columns, options.unit)
+    return _log_of_table(table, columns, units, times, path, [*notes, *more], options)
 
 
 def _log_of_table(
@@ -226,15 +218,6 @@ def _covariances(table: TextTable, names: Mapping[str, str], units: Mapping[str,
             covariances[:, axis, axis] = stddev**2
     covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
     return covariances
-
-
-def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
-    check_columns(columns, QUANTITIES, layout, path)
-    missing = [quantity for quantity in AXES if quantity not in columns]
-    if missing or not {"timestamp", "image_name"} & columns.keys():
-        message = "columns do not name all of x, y, z and one of timestamp and image_name"
-        raise InputError(message, path)
-    return {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
 
 
 def _is_tum(head: str) -> bool:

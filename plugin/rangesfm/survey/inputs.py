@@ -23,7 +23,7 @@ from rangesfm.positions.position_formats import read_positions
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.positions.true_positions import read_true_positions
 from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
-from rangesfm.ranging.anchors.anchor_file import AnchorList, read_anchor_list
+from rangesfm.ranging.anchors.anchor_file import read_anchor_list
 from rangesfm.ranging.anchors.anchor_ids import ids_in_log
 from rangesfm.ranging.anchors.site import Site, local_site, site_of
 from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
@@ -117,20 +117,27 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     """
     survey.require_metres()
     _check_rigs_are_metric(survey)
-    file, listed = survey.anchors, None
+    file = survey.anchors
+    listed, anchor_notes = tuple[Anchor, ...](), tuple[str, ...]()
     if file.path is not None:
-        listed = read_anchor_list(file.path, columns=file.columns, unit=file.unit)
+        listed, anchor_notes = read_anchor_list(file.path, columns=file.columns, unit=file.unit)
     tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
     if survey.ranges.path is None:
         log = RangeLog.from_arrays([], [], image_name=[])
     else:
-        log = read_log(survey.ranges, _ids(listed), tag_ids)
-        if listed is not None and (named := _named_as_in_log(listed, log, survey.anchors.path)) is not None:
-            listed, log = named, read_log(survey.ranges, _ids(named), tag_ids)
+        ids = [anchor.anchor_id for anchor in listed]
+        log = read_log(survey.ranges, ids, tag_ids)
+        if (found := ids_in_log(ids, log.anchor_ids)) is not None:  # only one rule leads to these
+            id_of, rule = found
+            listed = tuple(replace(one, anchor_id=id_of.get(one.anchor_id, one.anchor_id)) for one in listed)
+            same = ", ".join(f"{there} is {here}" for there, here in id_of.items())
+            note = f"{_name(file.path)}: its anchors are named otherwise than in the log and are taken so: {same}"
+            anchor_notes = (*anchor_notes, f"{note} ({rule})")
+            log = read_log(survey.ranges, [anchor.anchor_id for anchor in listed], tag_ids)
         log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
         _check_camera_is_heard(log)
     tag_in_cam_m = _lever_arms_of_log(log, survey)
-    anchors = _anchors_of_log(log) if listed is None else listed.anchors
+    anchors = listed or _anchors_of_log(log)
     _check_anchors_known(log, anchors, survey)
     frame = survey.anchors.frame or default_anchor_frame(anchors)
     site, anchors = local_site(anchors, frame, survey.anchors.crs, survey.anchors.path)
@@ -155,8 +162,8 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     assumed = (
         *log.notes,
         *_kinds_of_ranges(log),
-        *(["the anchor positions are those in the log"] if listed is None and is_placed else ()),
-        *(() if listed is None else listed.notes),
+        *(["the anchor positions are those in the log"] if not listed and is_placed else ()),
+        *anchor_notes,
         *positions.notes,
         *tape.notes,
         *(() if reference is None else reference.notes),
@@ -164,22 +171,6 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     )
     log = log.in_time_order()
     return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions, imu)
-
-
-def _ids(listed: AnchorList | None) -> list[str]:
-    return [anchor.anchor_id for anchor in listed.anchors] if listed is not None else []
-
-
-def _named_as_in_log(listed: AnchorList, log: RangeLog, path: Path | None) -> AnchorList | None:
-    """Return the anchors with the ids of the log, if only one rule leads to these, with a note; else None."""
-    found = ids_in_log(_ids(listed), log.anchor_ids)
-    if found is None:
-        return None
-    id_of, rule = found
-    anchors = tuple(replace(one, anchor_id=id_of.get(one.anchor_id, one.anchor_id)) for one in listed.anchors)
-    same = ", ".join(f"{there} is {here}" for there, here in id_of.items())
-    note = f"{_name(path)}: its anchors are named otherwise than in the log and are taken so: {same} ({rule})"
-    return AnchorList(anchors, (*listed.notes, note))
 
 
 def _surveyed_positions(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +13,21 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.contents import AnyPath
-from rangesfm.files.text_tables import FOUND, NO_NAMES, TextTable, is_plain_table, read_head, read_table
+from rangesfm.files.text_tables import NO_NAMES, TextTable, is_plain_table, read_head
 from rangesfm.options import TIME_S
 from rangesfm.ranging.readers.columns import read_timestamps
 from rangesfm.ranging.readers.guess import Guess, find_time, is_range, is_rising, named_photos
-from rangesfm.ranging.readers.layout import Layout, find_layout
-from rangesfm.ranging.readers.lists import Choice, UnclearListError, check_columns, columns_flag, read_list
+from rangesfm.ranging.readers.layout import Layout
+from rangesfm.ranging.readers.lists import (
+    Choice,
+    ListRows,
+    UnclearListError,
+    columns_by_user,
+    columns_flag,
+    layout_of_list,
+    read_canonical_rows,
+    read_rows,
+)
 from rangesfm.ranging.readers.times import SECONDS_PER_UNIT
 
 QUANTITIES = ("image_name", "timestamp", "date", "nanoseconds")
@@ -64,28 +73,24 @@ def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] = NO_NAMES, uni
         InputError: a cell is not a time or a name. The error gives the line.
     """
     path = Path(path)
-    head = read_head(path)
-    if not head.strip():
-        raise InputError(f"the file is empty, {_EXPECTED}", path)
-    if not columns and unit is None and is_canonical_photo_list(head):
-        table = read_table(path, [*_CANONICAL.values()], separator=FOUND)
-        times_s = table.numbers("timestamp_s", bounds=TIME_S)
-        return _photo_list(table, _CANONICAL, times_s, "s", ())
-    layout = find_layout(path)
-    if layout is None:
-        raise InputError(f"no table of photos and times, {_EXPECTED}", path)
-    taken = _columns_by_user(columns, layout, path) if columns else find_photo_columns(path, layout)
+    if not columns and unit is None and is_canonical_photo_list(read_head(path)):
+        rows = read_canonical_rows(path, _CANONICAL, [*_CANONICAL.values()])
+        return _photo_list(rows, rows.table.numbers("timestamp_s", bounds=TIME_S), "s")
+    layout = layout_of_list(path, "photos and times", _EXPECTED)
+    needed = ("image_name", "timestamp")
+    taken = columns_by_user(columns, QUANTITIES, needed, layout, path) if columns else find_photo_columns(path, layout)
     if taken is None:
         found = printable(", ".join(layout.units))
         raise InputError(f"no columns with photos and times; found {found}; {_EXPECTED}", path)
-    table, notes = read_list(layout, taken)
+    rows, notes = read_rows(path, layout, taken, of=()), list[str]()
 
     def ask(units: Sequence[str], why: str) -> InputError:
         choices = [Choice(f"if they are {one}", ("--image_times_unit", one)) for one in units]
         return UnclearListError("photo times", path, layout, [f"the times have {why}"], choices)
 
-    times_s, unit = read_timestamps(table, taken, layout.units, unit, notes, ask, slowest_s=_SLOWEST_S)
-    return _photo_list(table, taken, times_s, unit, tuple(f"{path.name}: {note}" for note in notes))
+    times_s, unit = read_timestamps(rows.table, taken, layout.units, unit, notes, ask, slowest_s=_SLOWEST_S)
+    more = tuple(f"{path.name}: {note}" for note in notes)
+    return _photo_list(replace(rows, notes=(*rows.notes, *more)), times_s, unit)
 
 
 def is_canonical_photo_list(head: str) -> bool:
@@ -124,20 +129,12 @@ def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     raise UnclearListError("photo times", path, layout, doubts, choices)
 
 
-def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
-    check_columns(columns, QUANTITIES, layout, path)
-    if not {"image_name", "timestamp"} <= columns.keys():
-        raise InputError("columns do not name both image_name and timestamp", path)
-    return {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
-
-
-def _photo_list(
-    table: TextTable, columns: Mapping[str, str], times_s: Array, unit: str, notes: tuple[str, ...]
-) -> PhotoList:
+def _photo_list(rows: ListRows, times_s: Array, unit: str) -> PhotoList:
+    table = rows.table
     if not len(table):
         raise InputError("no rows below the header, expected one per photo", table.path)
-    places = [len(found[1]) if (found := _DECIMALS.search(text)) else 0 for text in table.text(columns["timestamp"])]
+    places = [len(found[1]) if (found := _DECIMALS.search(text)) else 0 for text in rows.text("timestamp")]
     resolution_s = SECONDS_PER_UNIT[unit] * 10.0 ** -np.array(places, np.float64)
-    if "nanoseconds" in columns:
+    if "nanoseconds" in rows.columns:
         resolution_s[:] = SECONDS_PER_UNIT["ns"]
-    return PhotoList(table, columns, table.text(columns["image_name"]), times_s, resolution_s, notes)
+    return PhotoList(table, rows.columns, rows.text("image_name"), times_s, resolution_s, rows.notes)

@@ -183,35 +183,35 @@ def test_a_column_holds_what_all_words_of_its_name_can_mean(words: str, quantity
 def test_columns_of_another_table_are_told_with_those_that_are_not_used(tmp_path: Path) -> None:
     path = table(tmp_path, "Point,E [cm],N [cm],H [cm],Code/A,150,250,350,q/B,1,2,3,r")
     found = read_anchor_list(path)
-    np.testing.assert_allclose(known(found.anchors[0].position_m), [1.5, 2.5, 3.5])
-    assert found.notes == (
+    np.testing.assert_allclose(known(found[0][0].position_m), [1.5, 2.5, 3.5])
+    assert found[1] == (
         "points.csv: columns taken: anchor_id = Point, x = E [cm], y = N [cm], z = H [cm]; not used: Code",
         "points.csv: coordinates are in cm",
     )
-    assert [str(anchor) for anchor in read_anchors(path)] == [str(anchor) for anchor in found.anchors]
+    assert [str(anchor) for anchor in read_anchors(path)] == [str(anchor) for anchor in found[0]]
 
 
 def test_nothing_is_told_about_a_canonical_file(tmp_path: Path) -> None:
-    assert read_anchor_list(table(tmp_path, HEADER + ROWS)).notes == ()
+    assert read_anchor_list(table(tmp_path, HEADER + ROWS))[1] == ()
 
 
 def test_a_table_without_names_is_taken_as_x_y_z_and_that_is_told_unless_columns_are_given(tmp_path: Path) -> None:
     path = table(tmp_path, ROWS[1:])
     found = read_anchor_list(path)
-    np.testing.assert_array_equal(known(found.anchors[1].position_m), [4.5, 5.5, 6.5])
-    assert found.notes[-1] == "points.csv: the table has no names: its numbers are taken as x, y, z"
+    np.testing.assert_array_equal(known(found[0][1].position_m), [4.5, 5.5, 6.5])
+    assert found[1][-1] == "points.csv: the table has no names: its numbers are taken as x, y, z"
     typed = read_anchor_list(path, columns={"z": "2", "x": "3", "y": "4", "anchor_id": "1"})
-    np.testing.assert_array_equal(known(typed.anchors[1].position_m), [5.5, 6.5, 4.5])
-    assert typed.notes == ("points.csv: columns taken: anchor_id = 1, x = 3, y = 4, z = 2",)
+    np.testing.assert_array_equal(known(typed[0][1].position_m), [5.5, 6.5, 4.5])
+    assert typed[1] == ("points.csv: columns taken: anchor_id = 1, x = 3, y = 4, z = 2",)
 
 
 def test_a_unit_or_columns_that_are_given_count_in_a_canonical_file_too(tmp_path: Path) -> None:
     path = table(tmp_path, HEADER + ROWS)
     in_feet = read_anchor_list(path, unit="ft")
-    np.testing.assert_allclose(known(in_feet.anchors[0].position_m), np.array([1.5, 2.5, 3.5]) * 0.3048)
-    assert in_feet.notes[-1] == "points.csv: coordinates are in ft"
+    np.testing.assert_allclose(known(in_feet[0][0].position_m), np.array([1.5, 2.5, 3.5]) * 0.3048)
+    assert in_feet[1][-1] == "points.csv: coordinates are in ft"
     swapped = read_anchor_list(path, columns={"anchor_id": "anchor_id", "x": "y_m", "y": "x_m", "z": "z_m"})
-    np.testing.assert_array_equal(known(swapped.anchors[0].position_m), [2.5, 1.5, 3.5])
+    np.testing.assert_array_equal(known(swapped[0][0].position_m), [2.5, 1.5, 3.5])
 
 
 @pytest.mark.parametrize(
@@ -235,14 +235,14 @@ def test_lengths_are_in_their_own_unit_or_else_in_that_of_the_coordinates(
 
 def test_all_units_of_the_coordinates_are_told_but_metres(tmp_path: Path) -> None:
     found = read_anchor_list(table(tmp_path, "Point,X [mm],Y [cm],Z [m]/A,1000,200,3"))
-    np.testing.assert_allclose(known(found.anchors[0].position_m), [1, 2, 3])
-    assert found.notes[-1] == "points.csv: coordinates are in cm and mm"
+    np.testing.assert_allclose(known(found[0][0].position_m), [1, 2, 3])
+    assert found[1][-1] == "points.csv: coordinates are in cm and mm"
 
 
 def test_files_without_a_table_of_anchors_and_columns_that_miss_some_are_refused(tmp_path: Path) -> None:
     expected = "expected a table with anchor_id,x_m,y_m,z_m"
     assert refusal(table(tmp_path, "/ /", "none.csv")).args[0].endswith(f"none.csv: the file is empty, {expected}")
-    assert f"no table, {expected}" in str(refusal(table(tmp_path, "# nothing")))
+    assert f"no table of anchors, {expected}" in str(refusal(table(tmp_path, "# nothing")))
     assert f"no columns of anchors; found a, b; {expected}" in str(refusal(table(tmp_path, "a,b/1,2/3,4")))
     path = table(tmp_path, "Point,X,Y,Z" + ROWS)
     with pytest.raises(InputError, match="columns do not name y, z, expected anchor_id, x, y and z"):
@@ -458,8 +458,8 @@ def test_lists_of_total_stations_begin_with_their_station(
     if separator == " ":
         text = text.replace(" ", "_").replace("\n;", "\n-;")
     found = read_anchor_list(table(tmp_path, "Site: hall 4/" + text.replace(";", separator)))
-    np.testing.assert_array_equal([known(anchor.position_m) for anchor in found.anchors], places)
-    assert [anchor.anchor_id for anchor in found.anchors] == [row.partition(";")[0] for row in rows[-2:]]
+    np.testing.assert_array_equal([known(anchor.position_m) for anchor in found[0]], places)
+    assert [anchor.anchor_id for anchor in found[0]] == [row.partition(";")[0] for row in rows[-2:]]
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "utf-16"])

@@ -3,75 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.contents import AnyPath
-from rangesfm.files.text_tables import (
-    FOUND,
-    TextTable,
-    is_plain_table,
-    read_head,
-    read_table,
-    repeated,
-    write_user_table,
-)
-from rangesfm.option_model import Bounds
+from rangesfm.files.text_tables import is_plain_table, read_head, repeated, write_user_table
 from rangesfm.options import BIAS_M, COORDINATE_M, STDDEV_OR_EXACT_M
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.guess import MAX_NUM_IDS, by_id_rather_than_index, is_named_time, is_range
-from rangesfm.ranging.readers.layout import MISSING, ColumnSample, Layout, find_layout
+from rangesfm.ranging.readers.layout import ColumnSample, Layout, find_layout
 from rangesfm.ranging.readers.lists import (
+    AXES,
     Choice,
+    ListRows,
     UnclearListError,
-    check_columns,
+    columns_by_user,
     columns_flag,
-    read_list,
+    layout_of_list,
+    read_canonical_rows,
+    read_rows,
     ways_to_complete,
 )
-from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
+from rangesfm.ranging.readers.units import named_length_unit
 
 WHAT = "anchors"
 QUANTITIES = ("anchor_id", "x", "y", "z", "position_stddev", "range_bias", "range_bias_stddev")
-_AXES = ("x", "y", "z")
 _CANONICAL = {
     quantity: quantity if quantity == "anchor_id" else f"{quantity}_m" for quantity in QUANTITIES
 }  # names in the canonical CSV
-_REQUIRED = tuple(_CANONICAL[quantity] for quantity in ("anchor_id", *_AXES))
-_OPTIONAL = tuple(name for name in _CANONICAL.values() if name not in _REQUIRED)
+_REQUIRED = tuple(_CANONICAL[quantity] for quantity in ("anchor_id", *AXES))
 _ALIASES = {"": "anchor_id", "id": "anchor_id", "Anchor_ID": "anchor_id", "x": "x_m", "y": "y_m", "z": "z_m"}
 _EXPECTED = f"expected a table with {','.join(_REQUIRED)}"
+_BY_ORDER = "the table has no names: its numbers are taken as x, y, z"
 _GEOGRAPHIC = "EPSG:4979"
 # Coordinates beyond this, metres, are not local but those of a surveyed grid.
 LOCAL_M = 500.0
-
-
-@dataclass(frozen=True)
-class AnchorList:
-    """Content of an anchor file.
-
-    Attributes:
-        anchors: in the order of the file.
-        notes: lines for the user about how the file was read.
-    """
-
-    anchors: tuple[Anchor, ...]
-    notes: tuple[str, ...] = ()
 
 
 def read_anchors(
     path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None
 ) -> tuple[Anchor, ...]:
     """Read the anchors in a file; see ``read_anchor_list``."""
-    return read_anchor_list(path, columns=columns, unit=unit).anchors
+    return read_anchor_list(path, columns=columns, unit=unit)[0]
 
 
-def read_anchor_list(path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None) -> AnchorList:
+def read_anchor_list(
+    path: AnyPath, *, columns: Mapping[str, str] | None = None, unit: str | None = None
+) -> tuple[tuple[Anchor, ...], tuple[str, ...]]:
     """Read ``anchor_id,x_m,y_m,z_m[,position_stddev_m,range_bias_m,range_bias_stddev_m]``, or another table of points.
 
     Coordinates are empty for an anchor of unknown position. The optional cells may be empty as well. In other tables,
@@ -84,32 +65,28 @@ def read_anchor_list(path: AnyPath, *, columns: Mapping[str, str] | None = None,
             recognized.
         unit: unit of the coordinates, "m", "cm", "mm" or "ft"; None: that in the names of the columns, else metres.
 
+    Returns:
+        The anchors in the order of the file, and lines for the user about how the file was read.
+
     Raises:
         UnclearListError: the columns are not known for sure; the advice says what to type.
         InputError: an anchor appears twice, a position is incomplete, or a cell is not a number. The error gives the
             line.
     """
     path = Path(path)
-    head = read_head(path)
-    if not head.strip():
-        raise InputError(f"the file is empty, {_EXPECTED}", path)
-    if not columns and unit is None and is_canonical_anchor_file(head):
-        table = read_table(path, _REQUIRED, _OPTIONAL, aliases=_ALIASES, separator=FOUND)
-        return AnchorList(_anchors(table, _CANONICAL, dict.fromkeys(QUANTITIES, "m"), ("",)))
-    layout = find_layout(path)
-    if layout is None:
-        raise InputError(f"no table, {_EXPECTED}", path)
-    taken = _columns_by_user(columns, layout, path) if columns else find_anchor_columns(path, layout)
+    if not columns and unit is None and is_canonical_anchor_file(read_head(path)):
+        return _anchors(read_canonical_rows(path, _CANONICAL, _REQUIRED, _ALIASES)), ()
+    layout = layout_of_list(path, WHAT, _EXPECTED)
+    needed = ("anchor_id", *AXES)
+    taken = columns_by_user(columns, QUANTITIES, needed, layout, path) if columns else find_anchor_columns(path, layout)
     if taken is None:
         if (unclear := like_anchors(path)) is not None:
             raise unclear
         found = printable(", ".join(layout.units))
         raise InputError(f"no columns of anchors; found {found}; {_EXPECTED}", path)
-    units, told = _units(layout, taken, unit)
-    table, notes = read_list(layout, taken)
-    by_order = [] if layout.has_names or columns else ["the table has no names: its numbers are taken as x, y, z"]
-    found_anchors = _anchors(table, taken, units, MISSING)
-    return AnchorList(found_anchors, tuple(f"{path.name}: {note}" for note in (*notes, *by_order, *told)))
+    rows = read_rows(path, layout, taken, unit)
+    by_order = () if layout.has_names or columns else (f"{path.name}: {_BY_ORDER}",)
+    return _anchors(rows), (*rows.notes, *by_order)
 
 
 def is_canonical_anchor_file(head: str) -> bool:
@@ -128,7 +105,7 @@ def write_anchors(anchors: Sequence[Anchor], path: AnyPath) -> None:
         place = 4 * [None] if anchor.position_m is None else [*anchor.position_m, anchor.position_stddev_m]
         bias = 2 * [None] if anchor.range_bias_stddev_m is None else [anchor.range_bias_m, anchor.range_bias_stddev_m]
         rows.append([anchor.anchor_id, *("" if number is None else f"{number:.4f}" for number in (*place, *bias))])
-    write_user_table(Path(path), [*_REQUIRED, *_OPTIONAL], rows)
+    write_user_table(Path(path), [*_CANONICAL.values()], rows)
 
 
 def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
@@ -138,7 +115,7 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
         UnclearListError: it may be one, but the columns are not known for sure.
     """
     found = _by_name(layout) if layout.has_names else _by_values(layout)
-    ids, axes = found["anchor_id"], {axis: found[axis] for axis in _AXES}
+    ids, axes = found["anchor_id"], {axis: found[axis] for axis in AXES}
     degrees = {} if axes["x"] and axes["y"] else _degrees(layout)
     is_about_anchors = not terms.ABOUT_ANCHORS.isdisjoint(terms.words_of(path.stem))
     is_named = layout.has_names and any((terms.ANCHOR | terms.POINT) & {*column.words} for column in ids)
@@ -167,7 +144,7 @@ def find_anchor_columns(path: Path, layout: Layout) -> dict[str, str] | None:
         return columns
     if not choices and not degrees:
         choices = [_choice(when, ways) for when, ways in ways_to_complete(columns, _candidates(layout, columns))]
-    unknown = {quantity: "NAME" for quantity in ("anchor_id", *_AXES) if quantity not in columns | degrees}
+    unknown = {quantity: "NAME" for quantity in ("anchor_id", *AXES) if quantity not in columns | degrees}
     choices = choices or [_choice("with the names of the columns", columns | degrees | unknown)]
     raise UnclearListError(WHAT, path, layout, doubts, choices)
 
@@ -180,9 +157,9 @@ def like_anchors(path: Path) -> UnclearListError | None:
     first, *others = layout.columns
     numbers = [column.name for column in others if column.kind == "numbers"]
     is_other = any(column.names_photos or is_range(column) or is_named_time(column) for column in layout.columns)
-    if is_other or first.num_distinct < len(first.cells) or not _may_be_id(first) or len(numbers) < len(_AXES):
+    if is_other or first.num_distinct < len(first.cells) or not _may_be_id(first) or len(numbers) < len(AXES):
         return None
-    ways = [dict(zip(_AXES, numbers[k : k + 3])) for k in range(len(numbers) - 2)]
+    ways = [dict(zip(AXES, numbers[k : k + 3])) for k in range(len(numbers) - 2)]
     choices = [
         _choice(f"if {', '.join(way.values())} are x, y, z of {first.name}", {"anchor_id": first.name, **way})
         for way in ways
@@ -198,9 +175,9 @@ def _choice(when: str, columns: Mapping[str, str], *flags: str) -> Choice:
 def _candidates(layout: Layout, columns: Mapping[str, str]) -> dict[str, list[str]]:
     """Return the columns that may hold each quantity that has none yet, by their values."""
     free = [column for column in layout.columns if column.name not in columns.values()]
-    may_be = {quantity: [one.name for one in free if one.kind == "numbers"] for quantity in _AXES}
+    may_be = {quantity: [one.name for one in free if one.kind == "numbers"] for quantity in AXES}
     may_be["anchor_id"] = [one.name for one in free if one.num_distinct == len(one.cells) and _may_be_id(one)]
-    return {quantity: may_be[quantity] for quantity in ("anchor_id", *_AXES) if quantity not in columns}
+    return {quantity: may_be[quantity] for quantity in ("anchor_id", *AXES) if quantity not in columns}
 
 
 def _may_be_id(column: ColumnSample) -> bool:
@@ -219,7 +196,7 @@ def _by_name(layout: Layout) -> dict[str, list[ColumnSample]]:
         quantity = _named_quantity({*column.words})
         (found[quantity] if quantity else others).append(column)
     found["anchor_id"] = by_id_rather_than_index(found["anchor_id"])
-    if not found["anchor_id"] and all(found[axis] for axis in _AXES):
+    if not found["anchor_id"] and all(found[axis] for axis in AXES):
         texts = [column for column in others if column.kind == "text" and column.num_distinct == len(column.cells)]
         nameless = [column for column in layout.columns[:1] if column.name == "column 1"]
         found["anchor_id"] = nameless or (texts if len(texts) == 1 else [])
@@ -235,7 +212,7 @@ def _named_quantity(words: set[str]) -> str | None:
             return "position_stddev"
         return "range_bias_stddev" if about & terms.STDDEV else "range_bias"
     own = about - terms.ANCHOR - terms.POINT
-    if axis := next((axis for axis in _AXES if own and own <= terms.COORDINATES[axis]), None):
+    if axis := next((axis for axis in AXES if own and own <= terms.COORDINATES[axis]), None):
         return axis
     return "anchor_id" if words and words <= terms.ANCHOR | terms.ID | terms.POINT else None
 
@@ -251,7 +228,7 @@ def _by_values(layout: Layout) -> dict[str, list[ColumnSample]]:
     is_short = len(first.cells) <= MAX_NUM_IDS and len(others) <= 4
     if is_id and is_short and len(numbers) == 3 and numbers == others[:3]:
         found["anchor_id"] = [first]
-        found |= {axis: [column] for axis, column in zip(_AXES, numbers)}
+        found |= {axis: [column] for axis, column in zip(AXES, numbers)}
     return found
 
 
@@ -288,7 +265,7 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
     swapped = {**columns, "x": y, "y": x}
     east_first, north_first = _choice("if x is east and y is north", columns), _choice("if x is north", swapped)
     if not layout.has_names:
-        largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in _AXES), default=0.0)
+        largest = max((float(np.abs(by_name[columns[axis]].numbers).max(initial=0.0)) for axis in AXES), default=0.0)
         # In a surveyed grid, north often comes before east.
         if largest > LOCAL_M or len(order) > 4:
             first = _choice("if the numbers are x, y, z or east, north, height", columns)
@@ -296,64 +273,32 @@ def _doubts_about_axes(layout: Layout, columns: Mapping[str, str]) -> Iterator[t
             yield "a table without names, in which either east or north may come first", [first, second]
     elif order.index(y) < order.index(x) and {"x", "y"} == {*by_name[x].words, *by_name[y].words} - terms.LENGTH_UNIT:
         yield f"{y} comes before {x}, as where surveyors call north x", [north_first, east_first]
-    units = {axis: named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in _AXES}
+    units = {axis: named_length_unit(f"{columns[axis]} {by_name[columns[axis]].unit}") for axis in AXES}
     if None in units.values() and {*units.values()} - {None, "m"}:
         told = sorted({unit for unit in units.values() if unit})
         choices = [_choice(f"if all are in {unit}", columns, "--anchor_unit", unit) for unit in told]
         yield f"some of the coordinates are in {' and '.join(told)}, others have no unit", choices
 
 
-def _columns_by_user(columns: Mapping[str, str], layout: Layout, path: Path) -> dict[str, str]:
-    check_columns(columns, QUANTITIES, layout, path)
-    if missing := [quantity for quantity in ("anchor_id", *_AXES) if quantity not in columns]:
-        raise InputError(f"columns do not name {', '.join(missing)}, expected anchor_id, x, y and z", path)
-    return {quantity: columns[quantity] for quantity in QUANTITIES if quantity in columns}
-
-
-def _units(layout: Layout, columns: Mapping[str, str], unit: str | None) -> tuple[dict[str, str], list[str]]:
-    """Return the unit of each quantity, with a line for the user if it is not metres."""
-    by_name = {column.name: column.unit for column in layout.columns}
-    named = {quantity: named_length_unit(f"{name} {by_name[name]}") for quantity, name in columns.items()}
-    units = {quantity: (unit if quantity in _AXES else None) or own or "m" for quantity, own in named.items()}
-    units |= {quantity: units["x"] for quantity in QUANTITIES[4:] if quantity in columns and named[quantity] is None}
-    others = sorted({units[axis] for axis in _AXES} - {"m"})
-    return units, [f"coordinates are in {' and '.join(others)}"] if others else []
-
-
-def _anchors(
-    table: TextTable, names: Mapping[str, str], units: Mapping[str, str], missing: Sequence[str]
-) -> tuple[Anchor, ...]:
-    """Return the anchors of a table.
-
-    Args:
-        table: the rows.
-        names: name of the column of each quantity.
-        units: unit of each quantity.
-        missing: texts of a cell that counts as empty.
-    """
+def _anchors(rows: ListRows) -> tuple[Anchor, ...]:
+    table = rows.table
     if not len(table):
         raise InputError("names no anchor, expected one per line", table.path)
-    anchor_ids = table.text(names["anchor_id"])
+    anchor_ids = rows.text("anchor_id")
     if again := repeated(anchor_ids):
         row, first = again
         message = f"anchor {anchor_ids[row]} is in line {table.line[first]} already, expected each once"
         raise InputError(message, table.path, int(table.line[row]))
-
-    def lengths_m(quantity: str, empty: float, bounds: Bounds) -> Array:
-        name, expected = names.get(quantity, ""), f"{bounds}, or nothing"
-        if name not in table:
-            return np.full(len(table), empty)
-        per_metre = UNITS_PER_METRE[units[quantity]]
-        expected += "" if per_metre == 1 else f" (here in {units[quantity]})"
-        metres = table.numbers(name, empty=np.nan, missing=missing, expected=expected) / per_metre
-        table.refuse(~(np.isnan(metres) | bounds.hold(metres)), name, expected)
-        return np.where(np.isnan(metres), empty, metres)
-
-    positions = np.column_stack([lengths_m(axis, np.nan, COORDINATE_M) for axis in _AXES])
-    _refuse_incomplete(table, names, positions)
-    position_stddevs = lengths_m("position_stddev", 0.0, STDDEV_OR_EXACT_M)
-    biases = lengths_m("range_bias", 0.0, BIAS_M)
-    bias_stddevs = lengths_m("range_bias_stddev", np.nan, STDDEV_OR_EXACT_M)
+    positions = np.column_stack([rows.metres(axis, COORDINATE_M, np.nan) for axis in AXES])
+    unknown = np.isnan(positions)
+    incomplete = unknown.any(axis=1) & ~unknown.all(axis=1)
+    if np.any(incomplete):
+        row = int(np.argmax(incomplete))
+        axis = AXES[int(np.argmax(unknown[row]))]
+        raise table.error(row, rows.columns[axis], "all three coordinates or none")
+    position_stddevs = rows.metres("position_stddev", STDDEV_OR_EXACT_M, 0.0)
+    biases = rows.metres("range_bias", BIAS_M, 0.0)
+    bias_stddevs = rows.metres("range_bias_stddev", STDDEV_OR_EXACT_M, np.nan)
     return tuple(
         Anchor(
             anchor_id=anchor_id,
@@ -364,13 +309,3 @@ def _anchors(
         )
         for row, anchor_id in enumerate(anchor_ids)
     )
-
-
-def _refuse_incomplete(table: TextTable, names: Mapping[str, str], positions: Array) -> None:
-    """Check that the positions (n, 3) are NaN, unknown, in all three coordinates or in none."""
-    unknown = np.isnan(positions)
-    incomplete = unknown.any(axis=1) & ~unknown.all(axis=1)
-    if np.any(incomplete):
-        row = int(np.argmax(incomplete))
-        axis = _AXES[int(np.argmax(unknown[row]))]
-        raise table.error(row, names[axis], "all three coordinates or none")

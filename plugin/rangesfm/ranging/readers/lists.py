@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
-from rangesfm.errors import InputError, printable
-from rangesfm.files.text_tables import TextTable
-from rangesfm.ranging.readers.guess import described
-from rangesfm.ranging.readers.layout import ColumnSample, Layout
+import numpy as np
 
+from rangesfm.arrays import Array
+from rangesfm.errors import InputError, printable
+from rangesfm.files.text_tables import FOUND, NO_NAMES, TextTable, read_head, read_table
+from rangesfm.option_model import Bounds
+from rangesfm.ranging.readers.guess import described
+from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
+from rangesfm.ranging.readers.units import UNITS_PER_METRE, named_length_unit
+
+AXES = ("x", "y", "z")
 _MAX_NUM_WAYS = 6  # ways to read a list that are offered
 
 
@@ -94,11 +100,25 @@ def ways_to_complete(
         yield f"if {' and '.join(f'{name} is {quantity}' for quantity, name in more.items())}", {**columns, **more}
 
 
-def check_columns(given: Mapping[str, str], quantities: Collection[str], layout: Layout, path: Path) -> None:
-    """Check columns that the user named.
+def layout_of_list(path: Path, what: str, expected: str) -> Layout:
+    """Return the layout of the table in a file; ``what`` and ``expected`` are words for the InputError without one."""
+    layout = find_layout(path)
+    if layout is None:
+        found = f"no table of {what}" if read_head(path).strip() else "the file is empty"
+        raise InputError(f"{found}, {expected}", path)
+    return layout
+
+
+def columns_by_user(
+    given: Mapping[str, str], quantities: Sequence[str], required: Sequence[str], layout: Layout, path: Path
+) -> dict[str, str]:
+    """Return the columns that the user named, in the order of the quantities.
+
+    Args:
+        required: quantities that must be among them, such as "x", or "timestamp or image_name" of which one must be.
 
     Raises:
-        InputError: a quantity is unknown, or the table has no such column.
+        InputError: a quantity is unknown or missing, or the table has no such column.
     """
     for quantity, name in given.items():
         if quantity not in quantities:
@@ -106,29 +126,99 @@ def check_columns(given: Mapping[str, str], quantities: Collection[str], layout:
             raise InputError(message, path)
         if name not in layout.units:
             raise InputError(f"no column {printable(name)}; found {printable(', '.join(layout.units))}", path)
+    if missing := [those for those in required if given.keys().isdisjoint(those.split(" or "))]:
+        expected = f"{', '.join(required[:-1])} and {required[-1]}"
+        raise InputError(f"columns do not name {', '.join(missing)}, expected {expected}", path)
+    return {quantity: given[quantity] for quantity in quantities if quantity in given}
 
 
-def read_list(layout: Layout, columns: Mapping[str, str]) -> tuple[TextTable, list[str]]:
-    """Read the rows of a list, with lines for the user about what was taken.
+@dataclass(frozen=True)
+class ListRows:
+    """The rows of a list.
+
+    Attributes:
+        table: the rows. columns: name of the column of each quantity that the list has. units: their units of length.
+        missing: texts of a cell, in small letters, that counts as empty.
+        notes: lines for the user about how the file was read; empty for a canonical CSV.
+    """
+
+    table: TextTable
+    columns: Mapping[str, str]
+    units: Mapping[str, str]
+    missing: Sequence[str]
+    notes: tuple[str, ...] = ()
+
+    def text(self, quantity: str, empty: str | None = None) -> list[str]:
+        """Return the cells of a quantity; ``empty`` replaces those that are empty or missing, and None refuses them."""
+        if quantity not in self.columns and empty is not None:
+            return [empty] * len(self.table)
+        return self.table.text(self.columns[quantity], empty=empty)
+
+    def metres(self, quantity: str, bounds: Bounds, empty: float | None = None) -> Array:
+        """Return lengths (n,) in metres; else as for ``text``."""
+        if quantity not in self.columns and empty is not None:
+            return np.full(len(self.table), empty)
+        name, unit = self.columns[quantity], self.units[quantity]
+        expected = str(bounds) + ", or nothing" * (empty is not None) + f" (here in {unit})" * (unit != "m")
+        filled = None if empty is None else np.nan
+        values = self.table.numbers(name, empty=filled, missing=self.missing, expected=expected)
+        values = values / UNITS_PER_METRE[unit]
+        self.table.refuse(~(np.isnan(values) | bounds.hold(values)), name, expected)
+        return np.where(np.isnan(values), np.nan if empty is None else empty, values)
+
+
+def read_canonical_rows(
+    path: Path, names: Mapping[str, str], required: Sequence[str], aliases: Mapping[str, str] = NO_NAMES
+) -> ListRows:
+    """Read a canonical CSV, whose lengths are in metres.
 
     Args:
-        layout: layout of the file.
+        names: name of the column of each quantity. required: names of those that it must have.
+        aliases: as for ``read_table``.
+
+    Raises:
+        InputError: as ``read_table``.
+    """
+    optional = [name for name in names.values() if name not in required]
+    table = read_table(path, required, optional, aliases=aliases, separator=FOUND)
+    columns = {quantity: name for quantity, name in names.items() if name in table}
+    return ListRows(table, columns, dict.fromkeys(columns, "m"), ("",))
+
+
+def length_units(
+    layout: Layout, columns: Mapping[str, str], unit: str | None = None, of: Sequence[str] = AXES
+) -> tuple[dict[str, str], list[str]]:
+    """Return the unit of each quantity, with a line for the user if it is not metres.
+
+    Args:
         columns: name of the column of each quantity.
+        unit: of the quantities ``of``; None: that in the names of their columns or their cells, else metres. A quantity
+            without a unit of its own has that of the first of these.
+    """
+    named = {quantity: named_length_unit(f"{name} {layout.units[name]}") for quantity, name in columns.items()}
+    units = {quantity: unit or named[quantity] or "m" for quantity in of}
+    others = sorted({*units.values()} - {"m"})
+    notes = [f"{'distances' if of[0] == 'distance' else 'coordinates'} are in {' and '.join(others)}"] if others else []
+    usual = units[of[0]] if of else "m"
+    return {quantity: units.get(quantity) or own or usual for quantity, own in named.items()}, notes
+
+
+def read_rows(
+    path: Path, layout: Layout, columns: Mapping[str, str], unit: str | None = None, of: Sequence[str] = AXES
+) -> ListRows:
+    """Read the rows of a list of any layout; arguments as for ``length_units``.
 
     Raises:
         InputError: a line is not a row of the table.
     """
     table, notes = layout.read(every_row=True)
     # The layout leaves commas in a table with commas as they are, because such a cell may be a list of numbers.
-    cured = {column.name: column.cured() for column in column_samples(layout, columns.values()) if column.cure is None}
-    cells = {name: [*map(one.cure, table.text(name, empty=""))] for name, one in cured.items() if one.cure}
+    uncured = [column for column in layout.columns if column.name in columns.values() and column.cure is None]
+    cured = {column.name: column.cured().cure for column in uncured}
+    cells = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cured.items() if cure}
     taken = ", ".join(f"{quantity} = {name}" for quantity, name in columns.items())
     unused = [name for name in layout.units if name not in columns.values()]
     notes.insert(0, f"columns taken: {taken}" + (f"; not used: {printable(', '.join(unused))}" if unused else ""))
-    return replace(table, cells={**table.cells, **cells}), notes
-
-
-def column_samples(layout: Layout, names: Iterable[str]) -> list[ColumnSample]:
-    """Return the columns with these names, in the order of the file."""
-    wanted = {*names}
-    return [column for column in layout.columns if column.name in wanted]
+    units, more = length_units(layout, columns, unit, of)
+    told = tuple(f"{path.name}: {note}" for note in (*notes, *more))
+    return ListRows(replace(table, cells={**table.cells, **cells}), columns, units, MISSING, told)
