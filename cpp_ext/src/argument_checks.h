@@ -70,6 +70,24 @@ inline Eigen::Vector3d FiniteVector3(const std::string& name, const Array& array
   return FiniteVector(name, array);
 }
 
+// Returns a matrix from an array (rows, columns), of which Eigen::Dynamic stands for any number.
+inline Eigen::MatrixXd FiniteMatrix(const std::string& name, const Array& array, Eigen::Index rows,
+                                    Eigen::Index columns) {
+  const auto is_right = [&array](int axis, Eigen::Index size) {
+    return size == Eigen::Dynamic || array.shape(axis) == size;
+  };
+  if (array.ndim() != 2 || !is_right(0, rows) || !is_right(1, columns)) {
+    const auto number = [](Eigen::Index size) {
+      return size == Eigen::Dynamic ? "any number of" : std::to_string(size);
+    };
+    FailOnShape(name, array, number(rows) + " rows of " + number(columns) + " numbers");
+  }
+  using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+  Eigen::MatrixXd matrix = Eigen::Map<const RowMajor>(array.data(), array.shape(0), array.shape(1));
+  CheckEach(name, matrix.reshaped(), Finite);
+  return matrix;
+}
+
 // Returns the vector scaled to length 1.
 inline Eigen::Vector3d Direction3(const std::string& name, const Array& array) {
   const Eigen::Vector3d vector = FiniteVector3(name, array);
@@ -106,17 +124,6 @@ inline Eigen::Matrix3Xd Vector3ForEachRange(const std::string& name, const Array
   }
   CheckEach(name, columns.reshaped(), Finite);
   return columns;
-}
-
-// Returns a row (k,) for each of n ranges, from an array (n, k).
-inline Eigen::MatrixXd RowForEachRange(const std::string& name, const Array& array, Eigen::Index num_ranges) {
-  if (array.ndim() != 2 || array.shape(0) != num_ranges) {
-    FailOnShape(name, array, "a row for each of " + std::to_string(num_ranges) + " ranges");
-  }
-  using RowMajor = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
-  Eigen::MatrixXd rows = Eigen::Map<const RowMajor>(array.data(), num_ranges, array.shape(1));
-  CheckEach(name, rows.reshaped(), Finite);
-  return rows;
 }
 
 // Returns three columns for each of n matrices (n, 3, 3).

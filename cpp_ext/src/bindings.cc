@@ -23,6 +23,7 @@
 #include "rangesfm/direction_cost.h"
 #include "rangesfm/distance_cost.h"
 #include "rangesfm/elimination_order.h"
+#include "rangesfm/inertial_cost.h"
 #include "rangesfm/joint_prior_cost.h"
 #include "rangesfm/position_cost.h"
 #include "rangesfm/range_cost.h"
@@ -51,7 +52,8 @@ MeasuredRanges Measured(const Array& range_m, const Array& stddev_m, const Array
   const Eigen::Index num_ranges = range_m.size();
   return {ForEachRange("range_m", range_m, num_ranges, Positive),
           ForEachRange("stddev_m", stddev_m, num_ranges, Positive), ForEachRange("share", share, num_ranges, Positive),
-          loadings_m ? RowForEachRange("loadings_m", *loadings_m, num_ranges) : Eigen::MatrixXd(num_ranges, 0)};
+          loadings_m ? FiniteMatrix("loadings_m", *loadings_m, num_ranges, Eigen::Dynamic)
+                     : Eigen::MatrixXd(num_ranges, 0)};
 }
 
 RangeModel Model(const OptionalArray& tag_in_cam_m, std::optional<double> short_range_length_m, double loss_scale,
@@ -239,29 +241,79 @@ ceres::CostFunction* MakeDirectionCost(const Array& direction_in_world, const Ar
                            Direction3("direction_in_cam", direction_in_cam), Positive("stddev_rad", stddev_rad));
 }
 
-constexpr auto kJointPriorCostDoc = R"(Make the cost of a prior on n numbers that are correlated.
+constexpr auto kInertialCostDoc = R"(Make the cost of what an inertial sensor measured between two keyframes.
 
-The n residuals are ``whitening (x - mean)``. Parameter blocks: each number (1,). An example are the range biases of
-anchors, which have the tag's bias in common.
+Its motion is summed up in its own frame at the first keyframe (preintegration: Forster et al., "On-manifold
+preintegration for real-time visual-inertial odometry", 2017, with scale errors and clock besides the biases). With M =
+rig_from_imu Exp(mounting[:3]), a = mounting[3:], R the rotations from world to rig, p = R^T (a - t), g the gravity, and
+turn, speed and shift corrected to the numbers of the sensor by ``by_sensor``, to first order, the nine errors are
+
+``log(turn^T M^T R_before R_after^T M)``, ``M^T R_before (v_after - v_before - g dt) - speed``,
+``M^T R_before (p_after - p_before - v_before dt - g dt^2 / 2) - shift``.
+
+The squared length of the nine residuals is the robust loss of the length of ``whitening errors`` times the share.
+Metres, seconds and radians throughout. Parameter blocks: rig_from_world before and after (7,) as [qx qy qz qw tx ty
+tz]; velocities of the sensor in the world, before and after (3,); gravity in the world (3,), which points down; biases
+(6,) of gyroscope and accelerometer; shares (6,) by which their axes read too much; by how much later than assumed the
+sensor measured (1,); mounting (6,), a rotation vector of the sensor in its own frame and its place in the rig.
 
 Args:
-    mean: (n,) prior mean, in the blocks' unit.
-    whitening: (n, n) matrix such that ``whitening^T whitening`` is the inverse of the numbers' covariance.
+    interval_s: time between the keyframes, positive.
+    turn: (3, 3) rotation from the sensor's frame at the end into that at the start.
+    speed: (3,) change of the velocity without gravity. shift: (3,) the same of the place, beyond that of the velocity.
+    at: (13,) biases, shares and clock at which they were summed up.
+    by_sensor: (9, 13) derivatives of turn (as a rotation vector at its end), speed and shift by these.
+    whitening: (9, 9) matrix such that ``whitening^T whitening`` is the inverse of the errors' covariance.
+    rig_from_imu: (3, 3) rotation.
+    share: factor of the loss, positive.
+    loss_scale: scale of Geman and McClure's loss (see ``range_cost``) in standard deviations, positive; infinity means
+        least squares.
+
+Raises:
+    ValueError: see ``range_cost``.
+)";
+
+ceres::CostFunction* MakeInertialCost(double interval_s, const Array& turn, const Array& speed, const Array& shift,
+                                      const Array& at, const Array& by_sensor, const Array& whitening,
+                                      const Array& rig_from_imu, double share, double loss_scale) {
+  constexpr int kErrors = InertialMotion::kNumErrors;
+  constexpr int kOfSensor = InertialMotion::kNumOfSensor;
+  if (at.size() != kOfSensor) {
+    FailOnShape("at", at, std::to_string(kOfSensor) + " numbers");
+  }
+  InertialMotion motion = {Positive("interval_s", interval_s),
+                           FiniteMatrix("turn", turn, 3, 3),
+                           FiniteVector3("speed", speed),
+                           FiniteVector3("shift", shift),
+                           FiniteVector("at", at),
+                           FiniteMatrix("by_sensor", by_sensor, kErrors, kOfSensor),
+                           FiniteMatrix("whitening", whitening, kErrors, kErrors)};
+  return new InertialCost(std::move(motion), FiniteMatrix("rig_from_imu", rig_from_imu, 3, 3), Positive("share", share),
+                          Loss(loss_scale, true));
+}
+
+constexpr auto kJointPriorCostDoc = R"(Make the cost of a prior on numbers that are correlated.
+
+The r residuals are ``whitening (x - mean)``, with x the numbers of all blocks one after the other. Parameter blocks: m
+of the same size s. Examples are the range biases of anchors, which have the tag's bias in common, and a bias that
+walks from one block to the next.
+
+Args:
+    mean: (m, s) prior mean of each block, in its unit; (m,) of blocks of one number.
+    whitening: (r, m s) matrix such that ``whitening^T whitening`` is the information on the numbers.
 
 Raises:
     ValueError: see ``range_cost``.
 )";
 
 ceres::CostFunction* MakeJointPriorCost(const Array& mean, const Array& whitening) {
-  const Eigen::VectorXd means = FiniteVector("mean", mean);
-  const Eigen::Index size = means.size();
-  if (whitening.ndim() != 2 || whitening.shape(0) != size || whitening.shape(1) != size) {
-    FailOnShape("whitening", whitening, std::to_string(size) + " rows and columns");
+  if (mean.ndim() == 0 || mean.ndim() > 2 || mean.size() == 0) {
+    FailOnShape("mean", mean, "a number or a row for each of one block or more");
   }
-  // The array is in C order, so that Eigen's columns are its rows.
-  const Eigen::MatrixXd matrix = Eigen::Map<const Eigen::MatrixXd>(whitening.data(), size, size).transpose();
-  CheckEach("whitening", matrix.reshaped(), Finite);
-  return new JointPriorCost(means, matrix);
+  const Eigen::VectorXd means = Eigen::Map<const Eigen::VectorXd>(mean.data(), mean.size());
+  CheckEach("mean", means, Finite);
+  return new JointPriorCost(mean.ndim() == 2 ? static_cast<int>(mean.shape(1)) : 1, means,
+                            FiniteMatrix("whitening", whitening, Eigen::Dynamic, means.size()));
 }
 
 ceres::CostFunction* MakeZeroTieCost(int size_a, int size_b) {
@@ -303,6 +355,9 @@ PYBIND11_MODULE(_cpp, m) {
         arg("loss_scale") = kLeastSquares);
   m.def("direction_cost", &rangesfm::MakeDirectionCost, kOwn, rangesfm::kDirectionCostDoc, py::kw_only(),
         arg("direction_in_world"), arg("direction_in_cam"), arg("stddev_rad"));
+  m.def("inertial_cost", &rangesfm::MakeInertialCost, kOwn, rangesfm::kInertialCostDoc, py::kw_only(),
+        arg("interval_s"), arg("turn"), arg("speed"), arg("shift"), arg("at"), arg("by_sensor"), arg("whitening"),
+        arg("rig_from_imu"), arg("share") = 1.0, arg("loss_scale") = kLeastSquares);
   m.def("joint_prior_cost", &rangesfm::MakeJointPriorCost, kOwn, rangesfm::kJointPriorCostDoc, py::kw_only(),
         arg("mean"), arg("whitening"));
   m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, kOwn, "See elimination_order.h.", py::kw_only(), arg("size_a"),

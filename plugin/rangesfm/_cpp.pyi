@@ -23,6 +23,19 @@ def distance_cost(
     has_bias: bool = False,
     loss_scale: typing.SupportsFloat | typing.SupportsIndex = ...,
 ) -> pyceres.CostFunction: ...
+def inertial_cost(
+    *,
+    interval_s: typing.SupportsFloat | typing.SupportsIndex,
+    turn: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    speed: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    shift: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    at: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    by_sensor: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    whitening: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    rig_from_imu: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
+    share: typing.SupportsFloat | typing.SupportsIndex = 1.0,
+    loss_scale: typing.SupportsFloat | typing.SupportsIndex = ...,
+) -> pyceres.CostFunction: ...
 def interpolated_range_cost(
     *,
     range_m: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],

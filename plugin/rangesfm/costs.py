@@ -1,4 +1,4 @@
-"""Range, distance and position residuals alone, for users who write their own bundle adjustment.
+"""Range, distance, position and inertial residuals alone, for users who write their own bundle adjustment.
 
 ``examples/own_problem.py`` shows how. Each function describes its parameter blocks, units and errors. A cost is a
 ``pyceres.CostFunction``. Importing this module raises ``SolverError`` where the compiled part does not fit the
@@ -13,6 +13,7 @@ from rangesfm.ceres import (
     add_residual_block,
     direction_cost,
     distance_cost,
+    inertial_cost,
     interpolated_range_cost,
     joint_prior_cost,
     keep_from_elimination,
@@ -28,6 +29,7 @@ __all__ = [
     "add_residual_block",
     "direction_cost",
     "distance_cost",
+    "inertial_cost",
     "interpolated_range_cost",
     "joint_prior_cost",
     "keep_from_elimination",

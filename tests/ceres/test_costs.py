@@ -17,6 +17,7 @@ from rangesfm.ceres import (
     add_residual_block,
     direction_cost,
     distance_cost,
+    inertial_cost,
     interpolated_range_cost,
     joint_prior_cost,
     range_cost,
@@ -133,6 +134,30 @@ COSTS: dict[str, Callable[[np.random.Generator], tuple[pyceres.CostFunction, lis
     "joint_prior": lambda rng: (
         joint_prior_cost(mean=rng.normal(0, 1, 4), whitening=rng.normal(0, 1, (4, 4))),
         [rng.normal(0, 1, 1) for _ in range(4)],
+    ),
+    "joint prior of large blocks": lambda rng: (
+        joint_prior_cost(mean=rng.normal(0, 1, (2, 3)), whitening=rng.normal(0, 1, (4, 6))),
+        [rng.normal(0, 1, 3) for _ in range(2)],
+    ),
+    "inertial": lambda rng: (
+        inertial_cost(
+            interval_s=0.8,
+            turn=Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
+            speed=rng.normal(0, 1, 3),
+            shift=rng.normal(0, 1, 3),
+            at=rng.normal(0, 0.1, 13),
+            by_sensor=rng.normal(0, 1, (9, 13)),
+            whitening=rng.normal(0, 1, (9, 9)),
+            rig_from_imu=Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
+            loss_scale=5.0,
+        ),
+        [
+            *(random_pose(rng, 1.0) for _ in range(2)),
+            *(
+                rng.normal(0, size, num)
+                for num, size in ((3, 1), (3, 1), (3, 10), (6, 0.1), (6, 0.1), (1, 0.1), (6, 0.3))
+            ),
+        ],
     ),
     "zero_tie": lambda rng: (zero_tie_cost(size_a=3, size_b=1), [rng.normal(0, 1, 3), rng.normal(0, 1, 1)]),
 }
@@ -285,10 +310,12 @@ def test_priors_and_ties_of_impossible_shape_are_refused() -> None:
         direction_cost(direction_in_world=[0, 0, 1], direction_in_cam=[0, 0, 0], stddev_rad=0.1)
     with pytest.raises(ValueError, match="more than 0"):
         direction_cost(direction_in_world=[0, 0, 1], direction_in_cam=[0, 0, 1], stddev_rad=0.0)
-    with pytest.raises(ValueError, match="2 rows and columns"):
+    with pytest.raises(ValueError, match="rows of 2 numbers"):
         joint_prior_cost(mean=[1.0, 2.0], whitening=np.eye(3))
     with pytest.raises(ValueError, match="whitening is nan"):
         joint_prior_cost(mean=[1.0], whitening=[[np.nan]])
+    with pytest.raises(ValueError, match="mean has 0 dimensions"):
+        joint_prior_cost(mean=1.0, whitening=[[1.0]])
     with pytest.raises(ValueError, match="size_b"):
         zero_tie_cost(size_a=3, size_b=0)
     with pytest.raises(ValueError, match="at least the block's size"):

@@ -56,7 +56,7 @@ class PositionCost final : public ceres::CostFunction {
       const Eigen::Index first_row = 3 * static_cast<Eigen::Index>(i);
       const Eigen::Matrix3d whitening = known_.whitening.middleCols<3>(first_row);
       const Eigen::Vector3d off = whitening * (place.TagInWorld(i) - known_.position.col(i));
-      const Scaled scaled = MakeRobust(off);
+      const RobustLoss::OfVector scaled = loss_.ForLength(off.norm());
       Eigen::Map<Eigen::Vector3d>{residuals + first_row} = root_share_[i] * scaled.factor * off;
       if (jacobians == nullptr) {
         continue;
@@ -86,25 +86,6 @@ class PositionCost final : public ceres::CostFunction {
  private:
   static constexpr int kPoseSize = 7;
   static constexpr int kNone = -1;
-  // For a shorter vector, the robust residuals equal those of least squares to the last digit.
-  static constexpr double kTiny = 1e-8;
-
-  // The robust residuals of a vector r are factor * r, with the derivative factor * I + along * r r^T. With the robust
-  // value v and slope v' of the length n of r: factor = v / n, along = (v' - v / n) / n^2.
-  struct Scaled {
-    double factor;
-    double along;
-  };
-
-  Scaled MakeRobust(const Eigen::Vector3d& off) const {
-    const double length = off.norm();
-    if (length < kTiny) {
-      return {1.0, 0.0};
-    }
-    const RobustLoss::Robust robust = loss_(length);
-    const double factor = robust.value / length;
-    return {factor, (robust.slope - factor) / (length * length)};
-  }
 
   const Place place_;
   const KnownPositions known_;

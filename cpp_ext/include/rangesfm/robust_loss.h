@@ -20,6 +20,12 @@ class RobustLoss {
     double slope;  // derivative of the value with respect to the residual
   };
 
+  // The robust residuals of a vector r are factor * r, with the derivative factor * I + along * r r^T.
+  struct OfVector {
+    double factor;
+    double along;
+  };
+
   RobustLoss() = default;
   RobustLoss(double scale, bool is_bounded) : inv_scale_(1.0 / scale), is_bounded_(is_bounded) {}
 
@@ -37,9 +43,21 @@ class RobustLoss {
     return {residual * g, 1.0 / ((1.0 + x) * g)};
   }
 
+  // Makes the length n of a vector robust. With its robust value v and slope v': factor = v / n, along = (v' - v / n) /
+  // n^2.
+  OfVector ForLength(double length) const {
+    if (length < kTinyLength) {
+      return {1.0, 0.0};
+    }
+    const Robust robust = (*this)(length);
+    const double factor = robust.value / length;
+    return {factor, (robust.slope - factor) / (length * length)};
+  }
+
  private:
   // For smaller x, value and slope equal those of least squares to the last digit.
   static constexpr double kTiny = 1e-17;
+  static constexpr double kTinyLength = 1e-8;
 
   double inv_scale_ = 0.0;
   bool is_bounded_ = false;

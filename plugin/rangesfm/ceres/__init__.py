@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from rangesfm._cpp import (
         direction_cost,
         distance_cost,
+        inertial_cost,
         interpolated_range_cost,
         joint_prior_cost,
         position_cost,
@@ -54,6 +55,7 @@ __all__ = [
     "check_compatibility",
     "direction_cost",
     "distance_cost",
+    "inertial_cost",
     "interpolated_range_cost",
     "joint_prior_cost",
     "keep_from_elimination",

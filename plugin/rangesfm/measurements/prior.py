@@ -20,7 +20,7 @@ class Prior(Measurements):
 
     Attributes:
         names: of the blocks. mean: (m, size).
-        root_information: (m, m) inverse root of the covariance of one number of each; all numbers of a block are alike.
+        root_information: (r, m size) root of the information on their numbers, those of the first block first.
     """
 
     kind: ClassVar[str] = "prior"
@@ -30,17 +30,16 @@ class Prior(Measurements):
     root_information: Array
 
     @classmethod
-    def of_one(cls, name: Block, mean: Array, stddev: float) -> Prior:
-        """Return the prior of one block, all of whose numbers have this standard deviation."""
-        return cls((name,), mean[None], np.array([[1 / stddev]]))
+    def of_one(cls, name: Block, mean: Array, stddev: float | Array) -> Prior:
+        """Return the prior of one block, whose numbers are independent and have these standard deviations."""
+        return cls((name,), mean[None], np.diag(1 / np.broadcast_to(stddev, mean.shape)))
 
     def is_prior_of(self, blocks: frozenset[Block]) -> bool:
         return blocks.issuperset(self.names)
 
     @property
     def weights(self) -> Weights:
-        root = np.asarray(np.kron(self.root_information, np.eye(self.mean.shape[1])), dtype=np.float64)
-        return Weights(root[None], np.ones(1), LEAST_SQUARES)
+        return Weights(self.root_information[None], np.ones(1), LEAST_SQUARES)
 
     def linearize(self, state: MapState) -> Linearization:
         num, size = self.mean.shape
@@ -65,12 +64,6 @@ class Prior(Measurements):
         if not all(are_there):
             missing = [name for name, is_there in zip(self.names, are_there, strict=True) if not is_there]
             raise ValueError(f"a joint prior of {self.names}, but nothing else depends on {missing}")
-        if len(own) == 1:
-            stddev = 1 / (self.root_information[0, 0] * adjustment.pixel_stddev)
-            ceres.add_normal_prior(adjustment.adjuster, own[0], self.mean[0], stddev)
-        else:
-            cost = ceres.joint_prior_cost(
-                mean=self.mean[:, 0], whitening=adjustment.pixel_stddev * self.root_information
-            )
-            ceres.add_residual_block(adjustment.adjuster, cost, None, own)
+        cost = ceres.joint_prior_cost(mean=self.mean, whitening=adjustment.pixel_stddev * self.root_information)
+        ceres.add_residual_block(adjustment.adjuster, cost, None, own)
         return np.arange(first, problem.num_residuals())

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
+from rangesfm.ceres import inertial_cost
 from rangesfm.geometry.poses import Poses
 from rangesfm.measurements.imu.motion import MotionErrors, Mounting
 from rangesfm.measurements.imu.preintegration import NUM_OF_SENSOR, Preintegrated, preintegrate
 
 Array = npt.NDArray[np.float64]
 
+GRAVITY_M_S2 = 9.8
 DENSITIES = np.array([2e-3, 2e-2])
 SENSOR = np.concatenate([[0.02, -0.01, 0.03], [0.2, -0.1, 0.3], [0.01, -0.02, 0.01], [0.03, 0.02, -0.03], [0.004]])
 PHOTO_S = np.array([0.3, 0.55, 1.2, 2.0])
@@ -46,16 +50,14 @@ def test_derivatives_by_the_sensors_numbers_are_those_of_the_sums() -> None:
         np.testing.assert_allclose(found.by_sensor[:, :, k], slope, atol=1e-6 if k < NUM_OF_SENSOR - 1 else 5e-3)
 
 
-def test_sums_derivatives_and_covariance_are_gtsams() -> None:
-    gtsam = pytest.importorskip("gtsam", reason="it has no wheel for this Python")
-    (time_s, gyro, accel), finer = signal(), 40
-    found = preintegrate(time_s, gyro, accel, PHOTO_S)
-    params = gtsam.PreintegrationParams.MakeSharedU(9.8)
+def gtsams_sums(gtsam: Any, finer: int = 40) -> Iterator[Any]:
+    """Yield GTSAM's sums of the intervals between the photos, with more steps than the log."""
+    time_s, gyro, accel = signal()
+    params = gtsam.PreintegrationParams.MakeSharedU(GRAVITY_M_S2)
     params.setGyroscopeCovariance(np.eye(3) * DENSITIES[0] ** 2)
     params.setAccelerometerCovariance(np.eye(3) * DENSITIES[1] ** 2)
     params.setIntegrationCovariance(np.eye(3) * 1e-20)
-    order = [*range(3), *range(6, 9), *range(3, 6)]  # GTSAM has the position before the velocity
-    for k, (start, end) in enumerate(pairwise(PHOTO_S.tolist())):
+    for start, end in pairwise(PHOTO_S.tolist()):
         sums = gtsam.PreintegratedImuMeasurements(params, gtsam.imuBias.ConstantBias())
         ends = np.array([start, *time_s[(time_s > start) & (time_s < end)], end])
         fine = np.interp(np.arange(finer * (len(ends) - 1) + 1) / finer, np.arange(len(ends)), ends)
@@ -63,6 +65,14 @@ def test_sums_derivatives_and_covariance_are_gtsams() -> None:
         for at, step in zip(middle, np.diff(fine), strict=True):
             rate, force = ([np.interp(at, time_s, axis) for axis in values.T] for values in (gyro, accel))
             sums.integrateMeasurement(np.array(force), np.array(rate), step)
+        yield sums
+
+
+def test_sums_derivatives_and_covariance_are_gtsams() -> None:
+    gtsam = pytest.importorskip("gtsam", reason="it has no wheel for this Python")
+    found = preintegrate(*signal(), PHOTO_S)
+    order = [*range(3), *range(6, 9), *range(3, 6)]  # GTSAM has the position before the velocity
+    for k, sums in enumerate(gtsams_sums(gtsam)):
         np.testing.assert_allclose(found.turn[k], sums.deltaRij().matrix(), atol=2e-5)
         np.testing.assert_allclose(found.speed[k], sums.deltaVij(), atol=2e-3)
         np.testing.assert_allclose(found.shift[k], sums.deltaPij(), atol=1e-3)
@@ -76,6 +86,38 @@ def test_sums_derivatives_and_covariance_are_gtsams() -> None:
         turned = Rotation.from_matrix(states[1].attitude().matrix().T @ states[0].attitude().matrix()).as_rotvec()
         moved = [states[0].velocity() - states[1].velocity(), states[0].position() - states[1].position()]
         np.testing.assert_allclose(found.by_sensor[k, :, :6] @ biases, np.concatenate([turned, *moved]), atol=1e-5)
+
+
+def test_what_a_state_costs_is_what_it_costs_in_gtsam() -> None:
+    gtsam = pytest.importorskip("gtsam", reason="it has no wheel for this Python")
+    found, rng = preintegrate(*signal(), PHOTO_S), np.random.default_rng(5)
+    whitening = np.linalg.inv(np.linalg.cholesky(found.covariance(DENSITIES)))
+    for k, sums in enumerate(gtsams_sums(gtsam)):
+        cost = inertial_cost(
+            interval_s=found.interval_s[k], turn=found.turn[k], speed=found.speed[k], shift=found.shift[k],
+            at=found.at[k], by_sensor=found.by_sensor[k], whitening=whitening[k], rig_from_imu=np.eye(3),
+        )  # fmt: skip
+        factor = gtsam.ImuFactor(0, 1, 2, 3, 4, sums)
+        for _ in range(20):
+            pose = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(0, 2, 3)), rng.normal(0, 3, 3))
+            before = gtsam.NavState(pose, rng.normal(0, 1, 3))
+            biases = rng.normal(0, 0.003, 6)
+            bias = gtsam.imuBias.ConstantBias(biases[3:], biases[:3])
+            after = sums.predict(before, bias).retract(rng.normal(0, 0.02, 9))
+            ends = [(end.pose(), end.velocity()) for end in (before, after)]
+            expected = factor.evaluateError(*ends[0], *ends[1], bias)
+            expected = 0.5 * expected @ np.linalg.solve(sums.residualCovariance(), expected)
+            blocks = [colmaps(end) for end, _ in ends] + [velocity for _, velocity in ends]
+            gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
+            residuals = cost.evaluate(*blocks, gravity, biases, np.zeros(6), np.zeros(1), np.zeros(6))[0]
+            assert 0.5 * np.sum(np.square(residuals)) == pytest.approx(expected, rel=0.05)
+
+
+def colmaps(pose: Any) -> Array:
+    """Return the block rig_from_world of a pose of GTSAM."""
+    rig_from_world = pose.inverse()
+    quaternion = Rotation.from_matrix(rig_from_world.rotation().matrix()).as_quat()
+    return np.concatenate([quaternion, rig_from_world.translation()])
 
 
 def test_an_interval_counts_by_what_its_gap_hides_and_is_left_out_where_its_turn_is_lost() -> None:
