@@ -7,7 +7,6 @@ from tests.cli.screen import Clock
 from tests.result_document import result_document
 
 from rangesfm.batch.batch_state import BatchState, SurveyRow, exit_status_of, figures_of, format_rows
-from rangesfm.errors import Failure
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.settings import Survey
 
@@ -22,22 +21,6 @@ def batch_state(clock: Clock) -> BatchState:
     return BatchState([(name, Survey()) for name in "abcd"], clock=clock)
 
 
-def test_an_attempt_begins_anew_where_a_worker_was_killed(batch_state: BatchState, clock: Clock) -> None:
-    batch_state.tell(0, {"began_on": "one"})
-    batch_state.tell(0, {"stage": "mapping"})
-    batch_state.tell(0, {"num_done": 3, "num_total": 9})
-    row = batch_state.rows[0]
-    assert (row.stage, row.num_done, row.num_total) == ("mapping", 3, 9)
-    clock.now_s += 50
-    batch_state.tell(0, {"began_on": "two"})
-    assert (row.stage, row.num_done) == ("", None)
-    clock.now_s += 8
-    batch_state.end(0, "done", "", 0, verdict="good")
-    assert (row.status, row.num_attempts, row.host, row.seconds) == ("done", 2, "two", 8)
-    batch_state.tell(0, {"began_on": "late"})  # from a worker that was thought to be lost
-    assert (row.status, row.num_attempts, row.host) == ("done", 2, "two")
-
-
 def test_time_left_is_that_of_those_that_are_done(batch_state: BatchState, clock: Clock) -> None:
     for index in (0, 1):
         batch_state.tell(index, {"began_on": "here"})
@@ -49,20 +32,6 @@ def test_time_left_is_that_of_those_that_are_done(batch_state: BatchState, clock
     assert batch_state.seconds_left() == pytest.approx((30 + 0 + 30) / 2)
     clock.now_s += 20
     assert batch_state.seconds_left() == pytest.approx((30 + 0 + 10) / 2)
-
-
-def test_whatever_is_not_over_when_it_is_interrupted_says_so(batch_state: BatchState) -> None:
-    batch_state.tell(0, {"began_on": "here"})
-    batch_state.end(1, "done", "", 0)
-    batch_state.end_all("interrupted", "interrupted")
-    assert batch_state.is_over
-    assert [row.status for row in batch_state.rows] == ["interrupted", "done", "interrupted", "interrupted"]
-
-
-def test_a_file_that_could_not_be_read_is_over_from_the_start() -> None:
-    batch_state = BatchState([("x.toml", Failure("x.toml: no such file", 2))])
-    assert batch_state.is_over
-    assert exit_status_of(batch_state.rows) == 2
 
 
 @pytest.mark.parametrize(

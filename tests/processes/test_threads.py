@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import inspect
 import os
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,11 +15,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import rangesfm
 from rangesfm.processes.threads import (
-    at_most,
-    both,
     num_threads,
     settle_num_threads,
-    side_by_side,
     with_one_blas_thread,
 )
 
@@ -36,45 +31,6 @@ COMPUTES_NOTHING = {
     *("reconstruct", "rescale", "select_keyframes", "tag_positions", "trajectory_from_reconstruction"),
     *("two_candidate", "write_report"),
 }
-
-
-@pytest.mark.parametrize("asked", ["1", "3"])
-def test_what_is_made_of_parts_comes_in_their_order(monkeypatch: pytest.MonkeyPatch, asked: str) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", asked)
-
-    def later_parts_are_done_first(part: int) -> int:
-        time.sleep(0.002 * (5 - part))
-        return part**2
-
-    assert side_by_side(later_parts_are_done_first, range(5)) == [0, 1, 4, 9, 16]
-    assert side_by_side(later_parts_are_done_first, []) == []
-
-
-def test_an_error_in_a_part_is_raised() -> None:
-    with pytest.raises(ZeroDivisionError):
-        side_by_side(lambda part: 1 / part, [1, 0])
-
-
-@pytest.mark.parametrize("asked", ["1", "2"])
-def test_both_of_two_are_done_and_where_both_fail_the_first_is_heard(
-    monkeypatch: pytest.MonkeyPatch, asked: str
-) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", asked)
-    assert both(lambda: 1, lambda: "two") == (1, "two")
-    with pytest.raises(ZeroDivisionError):
-        both(lambda: 1 / 0, lambda: [][1])
-    with pytest.raises(IndexError):
-        both(lambda: 1, lambda: [][1])
-
-
-def test_two_wait_for_each_other_only_where_there_are_threads_for_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
-    monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    met = threading.Barrier(2, timeout=10)
-    both(met.wait, met.wait)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    here = threading.get_ident()
-    assert both(threading.get_ident, threading.get_ident) == (here, here)
 
 
 @pytest.mark.parametrize(
@@ -109,24 +65,6 @@ def test_what_is_no_number_of_threads_is_refused(given: str, rangesfm_process: C
         done = rangesfm_process("scale", cwd=Path.cwd(), status=2)
     said = f"rangesfm: error: the environment's OMP_NUM_THREADS is '{given}', expected a number of threads\n"
     assert done.stderr == said
-
-
-def test_no_more_threads_than_are_allowed_inside_a_block_however_they_are_nested(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 8)
-    monkeypatch.setenv("OMP_NUM_THREADS", "6")
-    with at_most(4):
-        assert num_threads() == 4
-        with at_most(-1), at_most(9):
-            assert num_threads() == 4
-        with at_most(1):
-            here = threading.get_ident()
-            assert both(threading.get_ident, threading.get_ident) == (here, here)
-        assert num_threads() == 4
-    with pytest.raises(ZeroDivisionError), at_most(2):
-        1 / 0  # noqa: B018
-    assert num_threads() == 6
 
 
 @pytest.fixture

@@ -41,15 +41,6 @@ class TestWithAnchors:
         assert log.tag_index.tolist() == [0, 0, -1, 0]
         assert log.peer_index.tolist() == [-1, -1, 0, 1]
 
-    def test_roles_can_be_told_anew(self) -> None:
-        pairs = (("t", "A"), ("A", "B"), ("u", "t"), ("B", "u"))
-        once = log_of(*pairs).with_anchors({"B", "u"})
-        again = once.with_anchors({"t", "u"}).with_anchors({"A", "B"})
-        direct = log_of(*pairs).with_anchors({"A", "B"})
-        assert (again.anchor_ids, again.tag_ids) == (direct.anchor_ids, direct.tag_ids)
-        assert again.kind.tolist() == direct.kind.tolist()
-        assert [set(ends) for ends in ends_of(again)] == [set(pair) for pair in pairs]
-
     def test_ids_are_in_the_order_that_people_count_in_whatever_the_logs(self) -> None:
         ids = ("A1", "A02", "A2", "A10", "A10b", "B", "a", "\u00e9")
         for order in (ids, ids[::-1]):
@@ -66,11 +57,6 @@ class TestPeerRanges:
         assert [set(ids) for ids in ranges.end_ids] == [{"A", "B"}, {"B", "C"}]
         assert [tuple(log.anchor_ids[k] for k in ends) for ends in ranges.ends] == list(ranges.end_ids)
 
-    def test_ranges_between_tags_are_had_with_both_ends(self) -> None:
-        log = log_of(("t", "A"), ("t", "u")).with_anchors({"A"})
-        assert log.peer_ranges(RangeKind.TAG_TAG).end_ids == (("t", "u"),)
-        assert len(log.peer_ranges(RangeKind.ANCHOR_ANCHOR).rows) == 0
-
     def test_subset_forgets_nodes_without_ranges_and_keeps_kinds(self) -> None:
         log = log_of(("t", "A"), ("B", "C"), ("t", "u"), ("v", "A")).with_anchors({"A", "B", "C"})
         part = log.subset(np.array([1, 2]))
@@ -78,17 +64,8 @@ class TestPeerRanges:
         assert (set(part.anchor_ids), part.tag_ids) == ({"B", "C"}, ("t", "u"))
         assert part.range_m.tolist() == [2.0, 3.0]
 
-    def test_range_with_one_end_is_refused(self) -> None:
-        log = log_of(("t", "A"))
-        with pytest.raises(ValueError, match="two ends"):
-            RangeLog(**{**vars(log), "tag_index": np.array([-1])})
-
 
 class TestRoles:
-    def test_sides_decide_where_nothing_else_is_known(self) -> None:
-        log = log_of(("t", "A"), ("u", "A"))
-        assert tell_roles(log, EndpointRoles.TAG_AND_ANCHOR) is log
-
     def test_known_anchors_tell_ranges_between_two_of_a_kind(self) -> None:
         log = log_of(("t", "A"), ("u", "A"), ("A", "B"), ("t", "u"), ("B", "t"))
         for roles in (EndpointRoles.TAG_AND_ANCHOR, EndpointRoles.ASKER_AND_ASKED):
@@ -131,12 +108,6 @@ class TestRoles:
         assert (part.tag_ids, part.anchor_ids) == (("0", "1"), ("0", "1"))
         assert (part.tag_index.tolist(), part.anchor_index.tolist()) == ([0, 1], [1, 0])
         assert part.kind.tolist() == [0, 0]
-
-    def test_id_known_as_both_is_that_of_two_nodes(self) -> None:
-        log = log_of(("1", "2"), ("1", "3"))
-        assert (
-            tell_roles(log, EndpointRoles.TAG_AND_ANCHOR, known_anchor_ids={"1", "2", "3"}, known_tag_ids={"1"}) is log
-        )
 
     def test_nodes_that_are_numbered_by_side_are_never_confused(self) -> None:
         log = log_of(("0", "1"), ("1", "2"))

@@ -49,11 +49,6 @@ def test_duplicates_and_times_out_of_order_are_counted() -> None:
     assert summary.num_out_of_order == 2
 
 
-def test_same_range_of_another_tag_is_no_duplicate() -> None:
-    log = RangeLog.from_arrays(["a", "a"], [1, 1], timestamp_s=[0, 0], tag_id=["x", "y"])
-    assert summarize_ranges(log).num_duplicates == 0
-
-
 def test_ranges_between_two_of_a_kind_are_told_apart_from_those_of_the_camera() -> None:
     log = RangeLog.from_arrays(
         ["a", "b", "b", "a", "u"], [1, 2, 3, 5, 9], timestamp_s=range(5), tag_id=["t", "t", "a", "b", "t"]
@@ -77,11 +72,6 @@ def test_step_of_rounded_ranges_is_found(step_m: float) -> None:
     assert find_quantization_m(rounded.astype(np.float32).astype(np.float64)) == step_m
     rounded[17] += step_m / 3
     assert find_quantization_m(rounded) != step_m
-
-
-def test_few_or_fine_ranges_are_not_suspected() -> None:
-    assert find_quantization_m(np.full(5, 1.5)) is None
-    assert find_quantization_m(np.random.default_rng(1).uniform(1, 90, 500)) is None
 
 
 # Noise, estimated from the log alone
@@ -118,19 +108,10 @@ def test_noise_is_that_of_most_ranges_in_spite_of_outliers_gaps_and_order() -> N
     assert estimate_noise_m(time[order], noisy[order]) == pytest.approx(0.05, rel=0.25)
 
 
-def test_ranges_at_one_and_the_same_time_have_a_noise_too() -> None:
-    noisy = 5 + np.random.default_rng(2).normal(0, 0.05, 3000)
-    assert estimate_noise_m(np.zeros(3000), noisy) == pytest.approx(0.05, rel=0.1)
-
-
 def test_noise_is_not_less_than_that_of_rounding() -> None:
     log = RangeLog.from_arrays(["a"] * 100, [1.5] * 100, timestamp_s=np.arange(100))
     (anchor,) = summarize_ranges(log).anchors
     assert anchor.noise_stddev_m == pytest.approx(0.1 / np.sqrt(12))
-
-
-def test_too_few_ranges_have_no_noise() -> None:
-    assert estimate_noise_m(np.arange(21.0), np.arange(21.0)) is None
 
 
 @given(

@@ -16,9 +16,9 @@ from tests.known import known
 from tests.known_errors import known_errors, predicted_by_model
 from tests.scale.robust_scale import metric_from_sfm_by_robust_weights
 from tests.simulated.model import synthetic_model
+from tests.simulated.outliers import spoilt
 from tests.simulated.path import loop_path, sequence_path
 from tests.simulated.ranges import simulate_ranges_at
-from tests.studies.scale_breakdown import spoilt
 
 from rangesfm import ceres
 from rangesfm.colmap.transform import rescale

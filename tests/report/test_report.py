@@ -20,7 +20,6 @@ from rangesfm.cli import main
 from rangesfm.errors import InputError
 from rangesfm.report import write_report
 from rangesfm.report.content import Content
-from rangesfm.report.figures_ranges import residuals_over_time
 from rangesfm.report.scene import scene_of, thumbnails, view_of
 from rangesfm.result.result_folder import read_result_folder
 
@@ -320,14 +319,6 @@ def test_the_policy_allows_the_pages_own_script_and_no_other(make_result: MakeRe
     assert html.count("<script") == 3  # the other scripts hold data
 
 
-def test_a_doubtful_place_has_its_reason_also_if_the_scale_has_the_same(make_result: MakeResult) -> None:
-    reason = "anchor A3 stands elsewhere"
-    changes = {"place": doubtful_place(reason, [0.0, 0.0, 0.0]), "scale": {"verdict": "doubtful", "reasons": [reason]}}
-    texts = page_of(make_result(num_keyframes=5, num_ranges_per_anchor=5, changes=changes)).texts
-    begin = texts.index("Place: doubtful")
-    assert "For the same reasons as the scale." in texts[begin : begin + 30]
-
-
 def test_notes_on_how_the_inputs_were_read_are_no_warnings(make_result: MakeResult) -> None:
     note, warning = "uwb.csv: columns taken: range = d", "no ranges to anchor A9"
     texts = page_of(make_result(changes={"notes": [note], "warnings": [warning]})).texts
@@ -345,16 +336,6 @@ def test_the_page_may_have_another_title_and_author_than_the_run_was_given(make_
     before_appendix = set(texts[: texts.index("Appendix")])  # which has the settings of the run
     assert {"North wing", "E. Muster"} <= before_appendix
     assert not {"Hall", "A. Other"} & before_appendix
-
-
-def test_the_used_dots_of_a_figure_of_residuals_are_of_one_map(make_result: MakeResult) -> None:
-    """Dots of two maps, one over the other, had the grey of the rejected ones."""
-    content = Content(read_result_folder(make_result(num_keyframes=20, num_ranges_per_anchor=20)))
-    figure = residuals_over_time(content)
-    assert figure is not None
-    for panel in figure.panels:
-        dots = {one.name: one.color for one in panel.series if one.kind == "dots"}
-        assert dots == {"used": "after", "rejected": "red"}
 
 
 def test_names_cannot_inject_markup(make_result: MakeResult) -> None:
@@ -400,15 +381,6 @@ def test_a_picture_tells_found_mistakes_from_those_not_found_and_those_that_noth
     beyond = [mark["x"] > 1.0 for mark in evidence["marks"]]
     assert beyond == [True, False, False]
     assert [mark["x"] for mark in could_hide["marks"]] == [0.42, 20.0, 0.42]
-
-
-def test_a_warning_that_is_a_reason_of_the_verdict_is_shown_once(make_result: MakeResult) -> None:
-    reason, other = "eight anchors agree within 1.5 %", "the clocks were set during the survey"
-    page = page_of(make_result(changes={"warnings": [reason, other]}))
-    assert [text for text in page.texts if "agree within 1.5 %" in text or "clocks were set" in text] == [
-        f"E{reason[1:]}.",
-        f"T{other[1:]}.",
-    ]
 
 
 def test_the_same_result_gives_the_same_page(make_result: MakeResult) -> None:
@@ -468,12 +440,6 @@ def test_a_long_log_makes_no_long_page(make_result: MakeResult) -> None:
     assert any("One range in 6 is drawn" in text for text in page_of(folder).texts)
 
 
-def test_anchors_that_coincide_in_a_view_share_their_label(make_result: MakeResult) -> None:
-    plan, _ = figures_in(make_result(num_keyframes=20, num_ranges_per_anchor=10))["trajectory"]
-    texts = [row.get("label") for layer in plan["spec"]["layer"] for row in layer["data"].get("values", [])]
-    assert {"1, 2", "3, 4", "5, 6", "7, 8"} <= set(texts)
-
-
 def test_a_folder_that_is_not_a_result_is_refused_and_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no result\.json"):
         write_report(tmp_path)
@@ -519,11 +485,6 @@ def test_each_range_begins_at_its_own_tag(make_result: MakeResult) -> None:
     scene = scene_of(content)
     assert scene is not None
     assert sorted(view_of(scene)["ranges"]["tags_in_cam_m"]) == sorted(arms.values())
-
-
-def test_mistakes_are_listed_by_what_became_of_the_search_for_them(make_result: MakeResult) -> None:
-    texts = page_of(make_result()).texts
-    assert {"found", "not found", "would not be found"} <= set(texts)
 
 
 def test_a_name_from_a_file_fetches_nothing_from_outside_the_folder(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -19,7 +18,6 @@ from tests.outputs import names_in, paths_below, unfinished
 from tests.vision.matches import content_of
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.files.records import write_json
 from rangesfm.options import CameraOptions, MapperOptions
 from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 
@@ -162,12 +160,6 @@ def test_options_that_colmap_does_not_have_are_refused_before_anything_is_writte
     assert not (tmp_path / "out").exists()
 
 
-def test_an_output_folder_that_cannot_be_made_is_named(room: Room, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="file/out: cannot write to this output folder"):
-        reconstruct(room.folder, room.names, tmp_path / "file" / "out", camera=room.camera, mapper=MAPPER)
-
-
 def test_sequential_matching_pairs_neighbours_in_time_whatever_their_names(
     room: Room, tmp_path: Path, listener: Listener
 ) -> None:
@@ -250,13 +242,6 @@ class TestEarlierRun:
         assert (photos / names[0]).stat().st_size == before.st_size
         reconstruct(photos, names, output, camera=room.camera, mapper=MAPPER, progress=listener)
         assert listener.stages == ["features", "matching", "mapping"]
-
-    def test_of_unchanged_photos_does_not_read_them_again(
-        self, room: Room, output: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr("rangesfm.files.contents.sha256_of", pytest.fail)
-        summary = reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER)
-        assert summary.seconds == {}
 
     def test_killed_while_it_paired_photos_in_time_order_can_be_matched_otherwise(
         self, room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -374,15 +359,6 @@ class TestOtherPhotos:
         # All photos need no database, because their models are there.
         assert reconstruct(room.folder, room.names, output, camera=room.camera, mapper=MAPPER).num_registered == 6
         assert (output / name).read_bytes() == changed
-
-    def test_are_reconstructed_where_a_hash_of_the_record_is_a_list(self, room: Room, output: Path) -> None:
-        record = json.loads((output / "reconstruct.json").read_text())
-        photos, database = record["notes"]["photos"], record["notes"]["database"]
-        photos |= {name: [state, ["a list"]] for name, (state, _) in photos.items()}
-        database["photos"] = {name: ["a list"] for name in database["photos"]}
-        write_json(record, output / "reconstruct.json")
-        summary = reconstruct(room.folder, room.names[:4], output, camera=room.camera, mapper=MAPPER)
-        assert summary.num_registered == 4
 
     def test_are_reconstructed_though_colmap_has_looked_at_the_database(self, room: Room, output: Path) -> None:
         with pycolmap.Database.open(output / "database.db") as database:  # this updates a counter in the file's header

@@ -7,15 +7,11 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import chi2
 from tests.simulated.path import loop_path
-from tests.studies import anchor_initialization
 
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import PathShape
 from rangesfm.ranging.anchors.trilateration import (
-    AnchorPlacement,
     Trilateration,
     TrilaterationOptions,
-    _refuse_uncertain,
     trilaterate,
     trilaterate_anchors,
 )
@@ -96,12 +92,6 @@ class TestOutliers:
         assert np.all(found.weights[is_outlier[order]] < 0.1)
         assert found.noise_stddev_m == pytest.approx(0.05, rel=0.4)
 
-    def test_the_answer_is_the_same_every_time(self) -> None:
-        ranges = distances(flight()) + noise(100)
-        first, second = (trilaterate(flight(), ranges) for _ in range(2))
-        np.testing.assert_array_equal(first.position_m, second.position_m)
-        np.testing.assert_array_equal(first.covariance_m2, second.covariance_m2)
-
 
 class TestPositionsInAPlane:
     def test_give_both_places(self) -> None:
@@ -109,11 +99,6 @@ class TestPositionsInAPlane:
         assert found.mirror_position_m is not None
         np.testing.assert_allclose(sorted([found.position_m[2], found.mirror_position_m[2]]), [-1.5, 3.5], atol=0.1)
         np.testing.assert_allclose(found.mirror_position_m[:2], ANCHOR_M[:2], atol=0.1)
-
-    def test_put_no_anchor_into_a_file_that_may_be_at_either(self) -> None:
-        either, one = (trilaterate(path, distances(path) + noise(100, 0.02)) for path in (flat(), flight()))
-        assert AnchorPlacement("A", 100, either, None).anchor.position_m is None
-        np.testing.assert_array_equal(AnchorPlacement("A", 100, one, None).anchor.position_m, one.position_m)
 
     @pytest.mark.parametrize(("toward", "height"), [((0, 0, 1), 3.5), ((0, 0, -1), -1.5)])
     def test_give_the_one_that_is_asked_for(self, toward: tuple[float, float, float], height: float) -> None:
@@ -298,15 +283,6 @@ def test_three_good_ranges_in_ten_decide(given: bool, limit_m: float) -> None:
     assert np.median(errors_over_seeds(np.repeat([0.02, 0.5], [30, 70]), given=given)) < limit_m
 
 
-@pytest.mark.parametrize("options", [TrilaterationOptions(), KNOWN_BIAS], ids=["defaults", "bias known"])
-def test_study_in_small_finds_every_anchor_among_15_percent_outliers(options: TrilaterationOptions) -> None:
-    summary = anchor_initialization.estimate(0.15, 12, options)
-    assert summary.num_refused == 0
-    assert np.median(summary.error_m) < 0.10
-    assert np.max(summary.error_m) < 0.30
-    assert np.mean(summary.squares) < chi2.ppf(1 - 5e-4, 3 * 12) / 12
-
-
 class TestErrorCurve:
     def test_short_ranges_weigh_in_full_once_their_error_was_learnt(self) -> None:
         positions = 0.2 * flight()
@@ -327,16 +303,6 @@ class TestErrorCurve:
             for stddev in (0.01, 1.0)
         )
         assert np.linalg.norm(doubted.position_m - ANCHOR_M) < 0.5 * np.linalg.norm(equal.position_m - ANCHOR_M)
-
-    def test_a_log_brings_what_its_curve_left_uncertain(self) -> None:
-        ranges = distances(flight()) + noise(100, 0.05)
-        shared = np.full(100, 0.2)
-        log = RangeLog.from_arrays(["A"] * 100, ranges, timestamp_s=np.arange(100.0), shared_stddev_m=shared)
-        (placement,) = trilaterate_anchors(log, flight())
-        alone = trilaterate(flight(), ranges, shared_stddev_m=shared, timestamp_s=np.arange(100.0))
-        assert placement.found is not None
-        np.testing.assert_allclose(placement.found.position_m, alone.position_m, atol=1e-9)
-        np.testing.assert_allclose(placement.found.covariance_m2, alone.covariance_m2, atol=1e-9)
 
 
 class TestRounding:
@@ -364,21 +330,3 @@ class TestRounding:
         ranges = distances(line, np.array([1.0, away_m, 3.0])) + noise(100, 0.02, seed)
         with pytest.raises(GeometryError, match="on a line, and the anchor may be anywhere on a circle"):
             trilaterate(line, ranges, options=KNOWN_BIAS)
-
-
-class TestRefusalByTheCovariance:
-    AXES = np.eye(3)
-
-    def said(self, stddevs_m: list[float], extents_m: list[float], turn: Array = AXES, limit_m: float = 1.0) -> str:
-        covariance = np.zeros((4, 4))
-        covariance[:3, :3] = turn @ np.diag(np.square(stddevs_m)) @ turn.T
-        shape = PathShape(np.zeros(3), np.eye(3), np.array(extents_m))
-        with pytest.raises(GeometryError) as caught:
-            _refuse_uncertain(covariance, shape, TrilaterationOptions(max_position_stddev_m=limit_m))
-        return str(caught.value)
-
-    @pytest.mark.parametrize(("width_m", "is_line"), [(0.119, True), (0.121, False)])
-    def test_names_a_path_that_is_nearly_straight(self, width_m: float, is_line: bool) -> None:
-        said = self.said([0.1, 500.0, 0.3], [4.0, width_m, 0.0])
-        assert ("lie on a line, and the anchor may be anywhere on a circle around that line" in said) == is_line
-        assert said.endswith("(stddev 1e+02 m along 0.00, 1.00, 0.00)")

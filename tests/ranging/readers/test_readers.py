@@ -326,45 +326,6 @@ def test_any_cells_under_a_good_header_are_a_log_or_an_input_error(
                 assert len(read_ranges(path, **options)) > 0  # type: ignore[arg-type]
 
 
-HEADERS = (
-    "time_s,range,from_id,to_id",
-    "timestamp,range,from_id,to_id",
-    "t,ID_Tag,ID_Anchor,range",
-    "image_name,anchor_id,range_m,tag_id",
-)
-
-
-@any_bytes_in_one_folder
-@given(
-    rows=st.lists(st.lists(cells, min_size=3, max_size=5), max_size=5),
-    header=st.sampled_from(HEADERS),
-    known=st.sets(st.sampled_from(["1", "a", "0"])),
-)
-def test_any_cells_under_the_header_of_a_preset_are_a_log_or_an_input_error(
-    tmp_path: Path, rows: list[list[str]], header: str, known: set[str]
-) -> None:
-    path = write(tmp_path, (header + "\n" + "\n".join(",".join(row) for row in rows)).encode())
-    with contextlib.suppress(InputError):
-        assert len(read_ranges(path, anchor_ids=known)) > 0
-
-
-@any_bytes_in_one_folder
-@given(rows=st.lists(st.lists(cells, min_size=4, max_size=9), max_size=4), num=st.sampled_from([4, 6]))
-def test_any_time_stamps_are_a_log_or_an_input_error(tmp_path: Path, rows: list[list[str]], num: int) -> None:
-    header = ",".join(["t", "node", *("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")[:num]])
-    path = write(tmp_path, (header + "\n" + "\n".join(",".join(row) for row in rows)).encode())
-    with contextlib.suppress(InputError):
-        assert len(read_ranges(path, columns={"timestamp": "t", "anchor_id": "node"})) > 0
-
-
-@any_bytes_in_one_folder
-@given(rows=st.lists(st.lists(cells, max_size=5), max_size=5))
-def test_any_cells_of_inrols_text_are_a_log_or_an_input_error(tmp_path: Path, rows: list[list[str]]) -> None:
-    path = write(tmp_path, ("# index timestamp anchor_id r\n" + "\n".join(" ".join(row) for row in rows)).encode())
-    with contextlib.suppress(InputError):
-        assert len(read_ranges(path)) > 0
-
-
 @any_bytes_in_one_folder
 @given(
     good=st.integers(0, 6),
