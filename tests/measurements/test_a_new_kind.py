@@ -68,7 +68,6 @@ class Steps(KindOnMap):
             by_pose=by_pose.reshape(num, -1),
             components=(Component(STEPS, noise_m2),),
             alone_m2=noise_m2,
-            working_m2=noise_m2,
             is_used=np.ones(num, dtype=bool),
         )
 

@@ -1,4 +1,4 @@
-"""The scale estimate by the robust weights alone, from which it is moved half-way to that by the best weights."""
+"""The scale estimate by the robust weights alone, from which it is moved to that by the best weights."""
 
 from __future__ import annotations
 

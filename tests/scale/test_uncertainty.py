@@ -26,7 +26,7 @@ Array = npt.NDArray[np.float64]
 
 WITHOUT_BIASES = RangeModelOptions(range_bias_stddev_m=0.0, common_bias_stddev_m=0.0)
 FAR_ANCHORS_M = {"A": (9.0, 2.0, 2.5), "B": (-9.0, 1.0, 0.4), "C": (0.5, 9.0, 3.0), "D": (1.0, -9.0, 0.2)}
-IN_TIME = ("white", "time", "place", "view", "reweighting")
+IN_TIME = ("white", "time", "place", "view")
 
 
 @dataclass(frozen=True)
@@ -135,23 +135,6 @@ def test_a_map_that_bends_is_not_known_as_well_as_one_that_does_not(make_survey:
     assert stddevs[1]["bending"] > 5 * stddevs[0]["bending"]
     assert wrong.uncertainty.half_width_95 > 1.5 * true.uncertainty.half_width_95
     assert abs(bent.relative_error(wrong)) < wrong.uncertainty.half_width_95
-
-
-def test_best_weights_that_disagree_by_more_than_chance_are_followed_no_further(make_survey: MakeSurvey) -> None:
-    found = make_survey(radio=Radio(range_stddev_m=0.05)).scale("first_camera", "ABCDE")
-    assert found.errors.learned is not None
-    assert found.on_map is not None
-    learnt = found.on_map.problem
-    for share in (1.0, 1e-3):
-        told = replace(learnt, sizes={name: share * size for name, size in learnt.sizes.items()})
-        known = told.posterior(is_fitted=True)
-        stated = known.uncertainty.components
-        by_robust, _ = told.linear.with_weights(told.working_m2, told.noise.covariance_m2)
-        best = np.array([stated[name] for name in stated if name != "reweighting"])
-        chance = np.sqrt(by_robust[0, 0] - np.sum(best**2))
-        assert stated["reweighting"] == abs(known.step[0]) <= 0.5 * chance * (1 + 1e-9)
-    # With a covariance a millionth as large, the difference exceeds chance, and is limited to it.
-    assert stated["reweighting"] == pytest.approx(0.5 * chance)
 
 
 def test_what_the_clocks_leave_open_is_part_of_scale_and_place(make_survey: MakeSurvey) -> None:

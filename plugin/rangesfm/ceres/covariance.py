@@ -280,7 +280,12 @@ def _solved(
     """Return the equations, perhaps with loose poses held, their inverse, the spread, and the blocks' covariances."""
     equations, inverse = _held_if_loose(equations, _joint_inverse)
     spread = _Spread.of(equations, errors)
-    return equations, inverse, spread, inverse.diagonal_blocks(spread)
+    blocks = inverse.diagonal_blocks(spread)
+    if any(np.any(np.diag(block) < 0) for block in blocks):  # a pose is so loose that rounding leaves no digit of it
+        equations = equations.with_loose_poses_held()
+        inverse, spread = _joint_inverse(equations), _Spread.of(equations, errors)
+        blocks = inverse.diagonal_blocks(spread)
+    return equations, inverse, spread, blocks
 
 
 def _held_if_loose(

@@ -27,11 +27,9 @@ from rangesfm.inference.linear_map import regular
 from rangesfm.inference.posterior import Posterior
 from rangesfm.options import ScaleOptions
 from rangesfm.ranging.range_observations import status_by_weight
-from rangesfm.scale.binned_ranges import bias_covariance
-from rangesfm.scale.range_equation import RangeState, state_after
+from rangesfm.scale.range_equation import RangeState
 from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.scale.scale_problem import ScaleProblem
 from rangesfm.scale.scale_verdict import doubts_of_ranges, judge, remarks_on_anchors
 
 # Number of Gauss-Newton steps after which the bins are kept: with bins and outliers chosen anew each time, a map may
@@ -120,9 +118,8 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
     problem = linearized(on_map).with_learnt_errors()
     if not drifts(problem):
         return estimate
-    known = _known(problem, posed, estimate.uncertainty.formal)
-    uncertainty, covariance = known.uncertainty, known.covariance
-    state = state_after((problem.columns,), on_map.state, known.step)
+    known = Posterior.best(problem, problem.errors, estimate.uncertainty.formal)
+    uncertainty, state = known.uncertainty, on_map.state
     fit = replace(solution.fit, state=state, weights=problem.bins.robust_weight)
     bent = replace(solution, fit=fit)
     doubts, remarks = doubts_of_ranges(posed, bent, uncertainty, {}), remarks_on_anchors(bent, estimate.anchors)
@@ -136,19 +133,11 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
         replace(judged, reasons=(*judged.reasons, drift)),
         metric_from_sfm=state.metric_from_model @ posed.first_camera_from_sfm,
         uncertainty=uncertainty,
-        placement=problem.columns.placement(covariance),
+        placement=known.placement,
         observations=replace(estimate.observations, status=status),
         errors=replace(estimate.errors, stddev_m=stddev_m),
         anchors=tuple(replace(anchor, position_m=at) for anchor, at in positions),
     )
-
-
-def _known(problem: Linearized, posed: ScaleProblem, formal: float) -> Posterior:
-    """Return the uncertainty of a path at the estimate with the best weights, compared with simple weights."""
-    simple_m2 = problem.errors.only("white", *BENDS).covariance_m2 + bias_covariance(problem.bins, posed.ranges)
-    by_others, _ = problem.with_weights(simple_m2, problem.errors.covariance_m2)
-    robust_step = problem.solved(simple_m2).step
-    return Posterior.between(problem, problem.errors, formal, by_others, robust_step, is_at_best=True)
 
 
 def _bent_once(problem: Linearized) -> RangesOnMap:

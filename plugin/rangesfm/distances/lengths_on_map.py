@@ -47,6 +47,5 @@ def lengths_on_map(
         by_pose=by_pose.reshape(num, -1),
         components=(Component("tape", tape_m2), Component("marks", marks_m2)),
         alone_m2=np.diag(lengths.stddev_m**2) + marks_m2,
-        working_m2=tape_m2 + marks_m2,
         is_used=is_used,
     )

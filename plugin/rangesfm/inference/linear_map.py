@@ -77,15 +77,6 @@ class LinearMap:
         """Return the solution for residuals with this (c, c) covariance."""
         return Solved(covariance_m2, self.design, self.residual_m, self.prior_design, self.prior_residual)
 
-    def with_weights(self, assumed_m2: Array, covariance_m2: Array) -> tuple[Array, Array]:
-        """Return the (p, p) covariance of the estimate with the weights for other errors, and its (p, c) gains.
-
-        Args:
-            assumed_m2: (c, c) covariance from which the weights come. covariance_m2: (c, c) covariance of the errors.
-        """
-        of_bins, of_priors = self.solved(assumed_m2).gains
-        return np.asarray(of_bins @ covariance_m2 @ of_bins.T + of_priors @ of_priors.T), of_bins
-
 
 @dataclass(frozen=True)
 class EstimatedMistake:

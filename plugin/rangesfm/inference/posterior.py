@@ -16,15 +16,13 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from rangesfm.arrays import Array, Mask
 from rangesfm.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
 from rangesfm.inference.bending import BENDS, Bending, MapBending
-from rangesfm.inference.linear_map import Columns, EstimatedMistake, LinearMap, Solved, regular
+from rangesfm.inference.linear_map import Columns, EstimatedMistake, LinearMap, regular
 from rangesfm.inference.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
 
 MAX_NUM_OBSERVATIONS = 450
 """Largest number of observations of a map: learning their errors takes some twenty inversions of their covariance."""
 GIVEN = "given"
 """Effect of priors; not a component of the noise."""
-REWEIGHTING = "reweighting"
-"""Effect of the choice between the best and the robust weights; not a component of the noise."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +36,7 @@ class Observations:
         by_pose: (c, 6 n) derivatives by the poses of the path: turns in their own frames, and shifts in the frame and
             in the unit in which ``MapBending`` has the path.
         components: of their errors, without the bending of the map.
-        alone_m2: (c, c) covariance as if each single one erred independently. working_m2: that which the robust
-            weights assume.
+        alone_m2: (c, c) covariance as if each single one erred independently.
         is_used: (c,) whether they take part in the estimate; the others are only tested or predicted.
         prior_residual, prior_design: (r,), (r, p) of priors on the unknowns, in standard deviations.
     """
@@ -51,7 +48,6 @@ class Observations:
     by_pose: Array
     components: tuple[Component, ...]
     alone_m2: Array
-    working_m2: Array
     is_used: Mask
     prior_residual: Array = field(default_factory=lambda: np.zeros(0))
     prior_design: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -115,15 +111,13 @@ class Posterior:
         uncertainty: of the scale.
         columns: the p unknowns. covariance: (p, p) of these.
         step: (p,) from the state at which the map is to the estimate, to which everything else refers.
-        best_step: (p,) to the estimate with the best weights.
-        gains: (c,) change of the scale's logarithm, with the best weights, per metre of each observation that is used.
+        gains: (c,) change of the scale's logarithm per metre of each observation that is used.
     """
 
     uncertainty: ScaleUncertainty
     columns: Columns
     covariance: Array
     step: Array
-    best_step: Array
     gains: Array
 
     @property
@@ -138,59 +132,19 @@ class Posterior:
         return self.placement
 
     @classmethod
-    def of(cls, best: Solved, noise: Noise, formal: float, columns: Columns, step: Array, half: Array) -> Posterior:
-        """Return the posterior at the middle between two estimates, each of which is ``half`` (p,) away.
+    def best(cls, linear: LinearMap, noise: Noise, formal: float) -> Posterior:
+        """Return the posterior with the best weights for the errors (Gauss and Markov).
 
         Args:
-            step: (p,) to that middle.
+            formal: relative standard deviation of the scale, as if all observations erred independently.
         """
+        best = linear.solved(noise.covariance_m2)
         of_observations, of_priors = best.gains
         components = noise.effects(of_observations[0])
         if (given := float(np.linalg.norm(of_priors[0]))) > 0:
             components[GIVEN] = given
-        components[REWEIGHTING] = abs(float(half[0]))
-        covariance = best.covariance + np.outer(half, half)
         uncertainty = ScaleUncertainty(formal, components)
-        return cls(uncertainty, columns, covariance, step, best.step, of_observations[0])
-
-    @classmethod
-    def between(
-        cls,
-        linear: LinearMap,
-        noise: Noise,
-        formal: float,
-        by_robust: Array,
-        robust_step: Array | None = None,
-        *,
-        is_at_best: bool = False,
-    ) -> Posterior:
-        """Combine the estimate with the best weights for the errors and the robust estimate.
-
-        Best weights (Gauss-Markov) are only as good as the model of the errors, which real radios do not always follow.
-        Robust weights depend less on the model. The truth is taken to be equally likely at either estimate: the map is
-        best placed half-way between them, and its interval is wider by as much. The variance of the difference is the
-        difference of the variances (Hausman, "Specification tests in econometrics", 1978). A difference of the scale of
-        more than one standard deviation is evidence against the model, so only one standard deviation of it is used.
-
-        Args:
-            formal: relative standard deviation of the scale, as if all observations erred independently.
-            by_robust: (p, p) covariance of the unknowns with the robust weights.
-            robust_step: (p,) to the robust estimate; None: the map is there.
-            is_at_best: whether the map is at the estimate with the best weights. A part of the way to the robust one is
-                then gone from there, and else from the robust one.
-        """
-        best = linear.solved(noise.covariance_m2)
-        robust = np.zeros(len(best.step)) if robust_step is None else robust_step
-        change = -robust if is_at_best else best.step - robust
-        chance = chance_differences(by_robust, best.covariance)[0]
-        # The whole step is shortened, because a shorter one of the scale alone would not fit the anchors' places.
-        half = min(1.0, chance / max(abs(float(change[0])), 1e-300)) * change / 2
-        return cls.of(best, noise, formal, linear.columns, -half if is_at_best else robust + half, half)
-
-
-def chance_differences(by_others: Array, by_best: Array) -> Array:
-    """Return the (p,) standard deviations of the difference of two estimates with these covariances (p, p)."""
-    return np.sqrt(np.maximum(np.diag(by_others - by_best), 0.0))
+        return cls(uncertainty, linear.columns, best.covariance, best.step, of_observations[0])
 
 
 @dataclass(frozen=True)
@@ -202,7 +156,7 @@ class JointProblem:
         rows: of each kind, by its name.
         components: of the errors. sizes: of these, by name.
         bending: of the map, in all observations.
-        alone_m2, working_m2, is_used: as of ``Observations``.
+        alone_m2, is_used: as of ``Observations``.
     """
 
     linear: LinearMap
@@ -211,7 +165,6 @@ class JointProblem:
     sizes: Mapping[str, float]
     bending: Bending
     alone_m2: Array
-    working_m2: Array
     is_used: Mask
 
     @cached_property
@@ -290,53 +243,18 @@ class JointProblem:
         linear, noise = self.among(rows)
         return linear.solved(noise.covariance_m2).mistake(-columns[rows])
 
-    def posterior(self, *, is_fitted: bool, is_refined: bool = False, formal: float | None = None) -> Posterior:
+    def posterior(self, *, is_refined: bool = False, formal: float | None = None) -> Posterior:
         """Return what all observations say of the map.
 
         Args:
-            is_fitted: whether the map is where the robust weights of all observations have it.
-            is_refined: whether the photos let it bend in that fit.
-            formal: as of ``Posterior.between``; None: it is computed.
+            is_refined: whether the photos let the map bend in its fit.
+            formal: as of ``Posterior.best``; None: it is computed.
         """
-        used = self.is_used
-        at = np.ix_(used, used)
-        linear, noise = self.among(used)
-        bent_m2 = self.bending.formal_m2[at] if is_refined else np.zeros((used.sum(),) * 2)
+        at, (linear, noise) = np.ix_(self.is_used, self.is_used), self.among(self.is_used)
         if formal is None:
-            formal = float(np.sqrt(linear.solved(self.alone_m2[at] + bent_m2).covariance[0, 0]))
-        working_m2 = bent_m2 + (self.working_m2 if is_fitted else self.balanced_m2)[at]
-        by_robust, _ = linear.with_weights(working_m2, noise.covariance_m2)
-        robust_step = None if is_fitted else linear.solved(working_m2).step
-        return Posterior.between(linear, noise, formal, by_robust, robust_step)
-
-    def expected_posterior(self) -> Posterior:
-        """Return what the observations are expected to say, before anything is measured."""
-        used = self.is_used
-        at, (linear, noise) = np.ix_(used, used), self.among(used)
-        formal = float(np.sqrt(linear.solved(self.alone_m2[at]).covariance[0, 0]))
-        by_robust, _ = linear.with_weights(self.balanced_m2[at] + noise.only(*BENDS).covariance_m2, noise.covariance_m2)
-        best = linear.solved(noise.covariance_m2)
-        # The estimates with different weights will differ by about one standard deviation.
-        half = chance_differences(by_robust, best.covariance) / 2
-        return Posterior.of(best, noise, formal, linear.columns, np.zeros(len(half)), half)
-
-    @property
-    def balanced_m2(self) -> Array:
-        """(c, c) covariance that robust weights assume where no kind says more of the scale than its errors allow.
-
-        The weights of single observations do not know how much of their errors they share, which is more in one kind
-        than in another.
-        """
-        kinds = [of_kind for of_kind in self.rows.values() if self.is_used[of_kind].any()]
-        balanced = self.working_m2.copy()
-        for of_kind in kinds if len(kinds) > 1 else ():
-            rows = np.zeros(len(self.is_used), dtype=bool)
-            rows[of_kind] = self.is_used[of_kind]
-            at, (linear, noise) = np.ix_(rows, rows), self.among(rows)
-            claimed = float(linear.solved(self.working_m2[at]).covariance[0, 0])
-            by_errors, _ = linear.with_weights(self.working_m2[at], noise.covariance_m2)
-            balanced[of_kind, of_kind] *= max(float(by_errors[0, 0]) / claimed, 1.0)
-        return balanced
+            alone_m2 = self.alone_m2 + self.bending.formal_m2 if is_refined else self.alone_m2
+            formal = float(np.sqrt(linear.solved(alone_m2[at]).covariance[0, 0]))
+        return Posterior.best(linear, noise, formal)
 
     def predicted_m2(self, kind: str, covariance: Array) -> Array:
         """Return the (c, c) covariance of the errors of unused functions of the map, after all that is observed.
@@ -383,7 +301,6 @@ def joined(observations: Sequence[Observations], bending: MapBending) -> JointPr
         usual_sizes(components),
         bent,
         np.asarray(block_diag(*(each.alone_m2 for each in observations))),
-        np.asarray(block_diag(*(each.working_m2 for each in observations))),
         np.concatenate([each.is_used for each in observations]),
     )
 

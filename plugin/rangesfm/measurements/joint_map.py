@@ -49,8 +49,6 @@ class KindOnMap(ABC):
 
     kind: ClassVar[str]
     """Name of the kind."""
-    is_in_fit: ClassVar[bool] = False
-    """Whether the fit of a map that may bend knows them; the map is moved as a whole to what others say."""
 
     @property
     def words(self) -> str:
@@ -114,7 +112,7 @@ class KindOnMap(ABC):
 
     def posterior(self, problem: JointProblem) -> Posterior:
         """Return what they say of the map alone, given the problem of them alone about the placement."""
-        return problem.posterior(is_fitted=False)
+        return problem.posterior()
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield faults that make an interval doubtful which rests on them first of all."""
@@ -217,7 +215,7 @@ class JointMap:
     def without(self, kind: str, name: str) -> JointMap:
         """Return the map at rest without one component of the errors of a kind."""
         problem = self.problem.without(kind, name)
-        return replace(self, problem=problem, posterior=problem.posterior(is_fitted=True, is_refined=True))
+        return replace(self, problem=problem, posterior=problem.posterior(is_refined=True))
 
     def moved(self) -> tuple[KindOnMap, ...]:
         """Return the kinds on the map that was moved to its estimate."""
@@ -288,9 +286,9 @@ def join_kinds(
     found, used = observations(kinds, placed), [each for each in kinds if each.is_used]
     problem = joined(found, bending).learnt()
     if is_at_rest:
-        known = problem.posterior(is_fitted=all(each.is_in_fit for each in used), is_refined=True)
+        known = problem.posterior(is_refined=True)
     else:
-        known = used[0].posterior(problem) if len(used) == 1 else problem.posterior(is_fitted=False)
+        known = used[0].posterior(problem) if len(used) == 1 else problem.posterior()
     observed = {each.kind: each for each in found}
     return JointMap(tuple(kinds), path, placed, bending, is_at_rest, observed, problem, known)
 

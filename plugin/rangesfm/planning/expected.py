@@ -37,7 +37,7 @@ from rangesfm.ranging.errors.learned import LearnedErrors
 from rangesfm.ranging.errors.noise import START_STDDEV_M
 from rangesfm.ranging.range_observations import RangeObservations
 from rangesfm.scale.anchor_plane import mirrored_map
-from rangesfm.scale.binned_ranges import RANGES, BinnedRanges, bias_covariance, binned_ranges
+from rangesfm.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import antenna_positions, fit_at
 from rangesfm.scale.scale_by_positions import doubts_of_positions, planned_positions, refuse_open_turn
@@ -105,7 +105,7 @@ class Expected:
         """Return that a run will refuse the survey, and know nothing of its map."""
         none, is_placed = np.zeros(0, dtype=np.int64), planned.anchor_frame == "site"
         columns, open_ = Columns(0, 1 if is_placed else -1, none, none, 7), OPEN**4 * np.eye(7)
-        known = Posterior(ScaleUncertainty(np.inf, {}), columns, open_, np.zeros(7), np.zeros(7), np.zeros(0))
+        known = Posterior(ScaleUncertainty(np.inf, {}), columns, open_, np.zeros(7), np.zeros(0))
         open_m = np.full(len(planned.trajectory), np.inf)
         return cls(replace(planned, photos=None), None, None, known, None, open_m, 0, (), refusal)
 
@@ -251,16 +251,14 @@ def _positions(
         return None, None, notes
     try:
         found = planned_positions(known, planned.trajectory, planned.lasting_s, max_num)
-        expected = noise_of_sizes(found.components, usual_sizes(found.components), len(found.is_used))
-        observed = replace(found, working_m2=expected.only(*_NOISE).covariance_m2)
-        alone = the_map.solved([observed])[1]
+        alone = the_map.solved([found])[1]
         assert alone.placement is not None, "known positions place the map"
         refuse_open_turn(alone.placement)
     except GeometryError as error:
         if not planned.anchors:
             raise GeometryError(f"the scale is not determined: {error}") from None
         return None, None, (*notes, f"the known positions are not used: {error}")
-    return observed, PlacementPrior.of(planned.site_from_first_camera, np.zeros(3), alone.placement), notes
+    return found, PlacementPrior.of(planned.site_from_first_camera, np.zeros(3), alone.placement), notes
 
 
 def _ranges(planned: PlannedSurvey, placement: PlacementPrior | None, max_num_bins: int) -> RangesAtTruth:
@@ -274,8 +272,7 @@ def _ranges(planned: PlannedSurvey, placement: PlacementPrior | None, max_num_bi
     found = binned_ranges(posed, solution, max_num_bins=max_num_bins, noise_m=START_STDDEV_M)
     sizes = _given_or_usual(found.components, planned.component_stddevs)
     alone = noise_of_sizes(found.components, sizes, len(found.is_used)).only(*_NOISE).covariance_m2
-    working = alone + bias_covariance(found.bins, posed.ranges)
-    return RangesAtTruth(posed, solution, replace(found, alone_m2=alone, working_m2=working))
+    return RangesAtTruth(posed, solution, replace(found, alone_m2=alone))
 
 
 def _given_or_usual(components: Sequence[Component], given: Mapping[str, float]) -> dict[str, float]:
@@ -304,7 +301,7 @@ class _BendingMap:
         problem = joined([*observed, self._keyframes(observed)], self.bending)
         num_first = len(observed[0].residual_m)
         problem = replace(problem, sizes=self._sizes(problem.components, num_first))
-        known = problem.expected_posterior()
+        known = problem.posterior()
         variances = np.diag(problem.predicted_m2(_KEYFRAMES, known.covariance))
         stddevs_m = np.sqrt(np.maximum(variances.reshape(-1, 3).sum(axis=1), 0.0))
         of_all = np.interp(np.arange(len(self.planned.trajectory)), self._some, stddevs_m)
@@ -335,6 +332,6 @@ class _BendingMap:
         motions = similarity_motions(path.centers[some] - path.centers[0]).reshape(-1, 7)
         none = np.zeros((num, num))
         return Observations(
-            _KEYFRAMES, columns, motions[:, : columns.num], np.zeros(num), by_pose.reshape(num, -1), (), none, none,
+            _KEYFRAMES, columns, motions[:, : columns.num], np.zeros(num), by_pose.reshape(num, -1), (), none,
             np.zeros(num, dtype=bool),
         )  # fmt: skip

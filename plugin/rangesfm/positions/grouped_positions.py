@@ -85,7 +85,6 @@ def grouped_positions(
         by_pose=by_pose,
         components=_with_frame(components, known, site_from_model, grouping, design, used),
         alone_m2=weighed,
-        working_m2=weighed,
         is_used=used,
         grouping=grouping,
     )

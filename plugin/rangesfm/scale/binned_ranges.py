@@ -43,7 +43,6 @@ class BinnedRanges(Observations):
 def binned_ranges(
     posed: ScaleProblem,
     solution: Solution,
-    shared_m: Array | None = None,
     max_num_bins: int = MAX_NUM_OBSERVATIONS,
     noise_m: float | None = None,
 ) -> BinnedRanges:
@@ -53,7 +52,6 @@ def binned_ranges(
     here.
 
     Args:
-        shared_m: (n, k) errors of the ranges that a refinement took for shared ones, as ``shared_errors_m``.
         max_num_bins: fewer bins are coarser and take less time.
         noise_m: standard deviation of single ranges; None: that of the solution.
     """
@@ -62,8 +60,6 @@ def binned_ranges(
     only_map = replace(given, bias_stddev_m=np.zeros(given.num_anchors), stddev_m=np.ones(len(given.range_m)))
     columns, bins = columns_of([only_map])[0], _bins(posed, solution, max_num_bins)
     robust = solution.fit.weights / errors.stddev_m**2
-    alone, weighed = (np.diag(1 / np.maximum(bins.total(each), 1e-12)) for each in (robust, errors.worth * robust))
-    shared = np.zeros((len(bins), 0)) if shared_m is None else bins.mean(shared_m)
     gradient, on_path = range_gradient(posed.ranges, state), posed.observations.on_path(posed.rows)
     slopes = by_poses(gradient, state.metric_from_model, posed.model_from_cam, given.tag_from_center, on_path)
     components = radio_components(
@@ -76,8 +72,7 @@ def binned_ranges(
         residual_m=bins.mean(predicted_ranges(given, unbiased) - given.range_m),
         by_pose=bins.by_pose(slopes, len(posed.trajectory)),
         components=widened(components, solution.noise_stddev_m if noise_m is None else noise_m),
-        alone_m2=alone,
-        working_m2=weighed + bias_covariance(bins, given) + shared @ shared.T,
+        alone_m2=np.diag(1 / np.maximum(bins.total(robust), 1e-12)),
         is_used=np.ones(len(bins), dtype=bool),
         bins=bins,
         prior_residual=prior_residuals(only_map, columns, state),
@@ -124,14 +119,6 @@ def _bins(posed: ScaleProblem, solution: Solution, max_num: int) -> RangeBins:
         solution.fit.weights,
         noisiness(problem.anchor_index, solution.fit.residuals_m, problem.num_anchors),
         max_num,
-    )
-
-
-def bias_covariance(bins: RangeBins, given: RangeProblem) -> Array:
-    """Return the (c, c) covariance of bins by the priors of the anchors' biases."""
-    index = bins.anchor_index
-    return np.asarray(
-        given.bias_stddev_m[index] ** 2 * (index[:, None] == index) + given.common_bias_stddev_m**2, dtype=np.float64
     )
 
 

@@ -209,7 +209,7 @@ class _RangeStart:
             why_open = (f"the map gets metres, but no place in the site: {error}",)
             problem = scale_problem(*posing, place_is_open=True, site=self.site)
             solution = solution_from(problem, error.in_first_camera)
-        return RangeScale(problem, solution, path, 1.0, self.bending, np.zeros((len(problem.rows), 0))), why_open
+        return RangeScale(problem, solution, path, 1.0, self.bending), why_open
 
 
 def _paper_table(solution: Solution) -> TwoCandidate | None:

@@ -61,7 +61,6 @@ class LengthScale(KindOnMap):
 
     kind = LENGTHS
     words, remedy = "measured lengths", "measure a length again"
-    is_in_fit = True
 
     def observed(
         self, placed: Similarity, *, in_site: bool = False, max_num: int = MAX_NUM_OBSERVATIONS

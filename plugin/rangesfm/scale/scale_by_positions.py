@@ -107,7 +107,6 @@ class PositionScale(KindOnMap):
 
     kind = POSITIONS
     words, remedy = "known positions", "look at the units of both"
-    is_in_fit = True
 
     @property
     def start(self) -> Similarity:
@@ -268,7 +267,7 @@ def scale_by_positions(
         learnt = worst
     fit, observed, problem = learnt
     is_at_rest = refined is not None
-    posterior = problem.posterior(is_fitted=True, is_refined=is_at_rest)
+    posterior = problem.posterior(is_refined=is_at_rest)
     alone = JointMap((), path, fit.similarity, bending, is_at_rest, {POSITIONS: observed}, problem, posterior)
     refuse_open_turn(posterior.place)
     return PositionScale(fit, used & ~fit.used, threshold, alone, _inflation(learnt))
@@ -291,9 +290,9 @@ def _inflation(learnt: _Learnt) -> float:
     fit, observed, problem = learnt
     used = problem.is_used
     linear, noise = problem.among(used)
-    _, by_robust = linear.with_weights(problem.working_m2[np.ix_(used, used)], noise.covariance_m2)
+    as_independent, _ = linear.solved(problem.alone_m2[np.ix_(used, used)]).gains
     is_antenna = np.asarray(abs(observed.grouping) @ np.repeat(~fit.known.is_mark, 3) > 0)[used]
-    effects = noise.effects(np.where(is_antenna, by_robust[0], 0.0))
+    effects = noise.effects(np.where(is_antenna, as_independent[0], 0.0))
     of_parts = {name: size for name, size in effects.items() if name.startswith(POSITIONS)}
     alone = of_parts.get(POSITIONS, 0.0)
     return float(np.linalg.norm([*of_parts.values()])) / alone if alone > 0 else 1.0

@@ -34,7 +34,6 @@ class RangeScale(KindOnMap):
     Attributes:
         posed: the scale problem. solution: the state of the map, with its errors.
         path: of the map. unit: of it in the units of the problem, which has the same path. bending: of the map.
-        shared_m: (k, j) errors of the ranges that a refinement took for shared ones, as ``shared_errors_m``.
         per_anchor: scale from each anchor alone, by id. anchors: estimates. They are judged with the scale.
     """
 
@@ -43,13 +42,11 @@ class RangeScale(KindOnMap):
     path: Trajectory
     unit: float
     bending: MapBending
-    shared_m: Array
     per_anchor: Mapping[str, float] = field(default_factory=dict)
     anchors: tuple[AnchorEstimate, ...] = ()
 
     kind = words = RANGES
     remedy = "calibrate the radio (rangesfm ranges calibrate)"
-    is_in_fit = True
 
     @property
     def places_map(self) -> bool:
@@ -61,7 +58,7 @@ class RangeScale(KindOnMap):
     ) -> BinnedRanges:
         """Linearise the ranges about their solution, which is at the placement."""
         del placed, in_site
-        return binned_ranges(self.posed, self.solution, self.shared_m, max_num)
+        return binned_ranges(self.posed, self.solution, max_num)
 
     @property
     def metric_from_model(self) -> Similarity:
@@ -109,7 +106,7 @@ class RangeScale(KindOnMap):
 
     def posterior(self, problem: JointProblem) -> Posterior:
         """Return what they say of the map, which is where their robust weights have it."""
-        return problem.posterior(is_fitted=True, formal=self.solution.fit.log_scale_stddev)
+        return problem.posterior(formal=self.solution.fit.log_scale_stddev)
 
     def moved(self, known: Posterior) -> RangeScale:
         """Return the ranges on the map at the estimate of a posterior, with the same robust weights."""
@@ -151,7 +148,6 @@ def ranges_on_refined_map(
     biases_m: Array,
     errors: RangeErrors,
     off_m: Array,
-    shared_m: Array,
     bending: MapBending,
 ) -> RangeScale:
     """Transfer the ranges of a scale estimate to the map that it became.
@@ -162,7 +158,6 @@ def ranges_on_refined_map(
         tags_m, centers_m: (k, 3) positions of tag and camera at each of the k ranges.
         anchors_m: (m, 3). biases_m: (m,). errors: of the k ranges, as weighted.
         off_m: (k,) by how much the map takes them to be too long because of shared errors.
-        shared_m: as of ``RangeScale``.
     """
     unit, trajectory = 1 / scale, trajectory_m.transformed(1 / scale, np.eye(3), np.zeros(3))
     placed = Similarity(scale, first_camera_from(trajectory).rotation.T, trajectory_m.centers[0])
@@ -179,13 +174,13 @@ def ranges_on_refined_map(
     robust = errors.robust_weights(predicted_ranges(problem, state) + off_m - problem.range_m)
     solution = Solution(by_errors, fit_at(by_errors, state, robust), errors, float(np.median(errors.stddev_m)))
     posed = replace(start.posed, ranges=problem, trajectory=trajectory)
-    return RangeScale(posed, solution, trajectory_m, unit, bending, shared_m, anchors=start.anchors)
+    return RangeScale(posed, solution, trajectory_m, unit, bending, anchors=start.anchors)
 
 
 def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarity) -> PlacementPrior | None:
     """Return what the first other kind that places the map says of the place of the first camera's frame.
 
-    The problem of the ranges is solved and tested with it, by the best weights for that kind's errors.
+    The problem of the ranges is solved and tested with it.
 
     Args:
         first_camera_from_model: with the unit of the problem.
@@ -193,7 +188,7 @@ def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarit
     for each in others:
         if each.places_map and each.is_used:
             known = each.alone.posterior
-            best = moved_similarity(each.alone.placed, known.columns.map_step(known.best_step), each.alone.path)
+            best = moved_similarity(each.alone.placed, known.columns.map_step(known.step), each.alone.path)
             return PlacementPrior.of(best @ first_camera_from_model.inverse(), np.zeros(3), known.place)
     return None
 

@@ -17,16 +17,13 @@ def scale_sensitivity(solution: Solution, posed: ScaleProblem, by_bins: Array, b
     """Return the changes of the scale in percent, to first order.
 
     Args:
-        by_bins: (c,) change of the scale's logarithm, with the best weights, per metre that each bin is longer.
+        by_bins: (c,) change of the scale's logarithm per metre that each bin is longer.
         bins: of the problem's ranges.
     """
-    problem, fit, state = solution.problem, solution.fit, solution.fit.state
-    # Relative change of the scale with the robust weights per metre by which each range is longer.
-    robust = fit.gradients @ fit.covariance[0] / problem.stddev_m
+    problem, state = solution.problem, solution.fit.state
 
     def percent(range_error_m: Array) -> float:
-        # The scale is half-way between that with the robust weights and that with the best weights.
-        return 50 * float(robust @ range_error_m + by_bins @ bins.mean(range_error_m))
+        return 100 * float(by_bins @ bins.mean(range_error_m))
 
     distance, centimetre = predicted_ranges(problem, state), 0.01
     world_from_cam = state.metric_from_model.rotation @ posed.model_from_cam

@@ -522,7 +522,6 @@ def _ranges_at_rest(
         np.array([anchor.range_bias_m for anchor in anchors]),
         ranges.errors,
         ranges.shared_m(rest.state)[ranges.rows],
-        metric.estimate.shared_errors_m[start.posed.rows],
         bending,
     )
 

@@ -212,13 +212,12 @@ def population(without: str | None = None) -> dict[str, tuple[float, float]]:
 
 COMPONENTS = components(population())
 
-OtherError = Literal["learnt_curve", "given", "reweighting", "clocks", "places", "wandering", "bursts"]
+OtherError = Literal["learnt_curve", "given", "clocks", "places", "wandering", "bursts"]
 """Names of errors that are no components to be learnt; the checker of types finds one without a description."""
 
 _OTHERS: Mapping[OtherError, str] = {
     "learnt_curve": "what the calibration of the radio leaves open",
     "given": "given values: anchors' positions, lengths and others",
-    "reweighting": "choice of the ranges' weights",
     "clocks": "time offset between the clocks",
     "places": "positions of the camera at and between the photos",
     "wandering": "slow wandering of the ranges, as hands and bodies move",
