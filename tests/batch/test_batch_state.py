@@ -42,7 +42,8 @@ def test_the_batch_ends_with_the_largest_of_the_statuses(statuses: tuple[int, ..
 
 
 def test_the_table_of_the_terminal_says_why_below() -> None:
-    done = SurveyRow("a.toml", "done", "short", 0, verdict="doubtful", scale=0.5, num_photos=3)
+    done = SurveyRow("a.toml", "done", "short", 0)
+    done.figures = {**done.figures, "verdict": "doubtful", "scale": 0.5, "num_photos": 3}
     failed = SurveyRow("b.toml", "failed", "no such file", 2)
     lines = format_rows([done, failed]).split("\n")
     assert lines[1].split() == ["a.toml", "doubtful", "0.5", "3", "-", "-", "-", "-"]
@@ -65,4 +66,4 @@ def test_figures_are_those_of_the_result() -> None:
     )
     figures = figures_of(ResultSummary.model_validate(result))
     assert list(figures.values()) == ["good", 0.7, 0.02, "site", 14, 10, 8, 0.08, None, 0.1, 1]
-    assert list(SurveyRow("", **figures).cells())[-11:] == list(figures)
+    assert list(SurveyRow("", figures=figures).cells())[-11:] == list(figures)

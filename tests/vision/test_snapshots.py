@@ -18,7 +18,7 @@ from rangesfm.progress import SILENT, Progress
 from rangesfm.vision import snapshots as snapshots_module
 from rangesfm.vision.incremental_mapping import UnfinishedMapping, size_of
 from rangesfm.vision.reconstruct import reconstruct
-from rangesfm.vision.snapshots import Snapshots
+from rangesfm.vision.snapshots import snapshots
 
 if TYPE_CHECKING:
     from tests.vision.conftest import Listener, Room
@@ -142,10 +142,10 @@ def test_a_mapping_that_is_killed_loses_seconds(
     model = pycolmap.Reconstruction(undisturbed.output / "sparse" / "0")
     mapping = UnfinishedMapping((), model, size_of(model))
     (tmp_path / "scratch").mkdir()
-    snapshots = Snapshots(tmp_path / "kept", tmp_path / "scratch", min_model_size=10)
+    keep = snapshots(tmp_path / "kept", tmp_path / "scratch", min_model_size=10)
     names: list[str] = []
     for now_s in range(60):
-        snapshots.add_photo(mapping)
+        keep(mapping)
         assert not os.listdir(tmp_path / "scratch")
         kept = os.listdir(tmp_path / "kept") if (tmp_path / "kept").exists() else []
         assert len(kept) <= 1

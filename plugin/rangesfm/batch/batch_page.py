@@ -66,19 +66,22 @@ def _tiles(batch_state: BatchState) -> list[tuple[str, str, str]]:
 
 
 def _row(row: SurveyRow, folder: Path) -> list[str]:
-    within = None if row.scale_stddev is None else NORMAL_95 * row.scale_stddev
+    figures = row.figures
+    within = None if figures["scale_stddev"] is None else NORMAL_95 * figures["scale_stddev"]
     decimals = decimals_for(within, default=5)
-    scale = fixed(row.scale, decimals)
+    scale = fixed(figures["scale"], decimals)
     return [
         _name(row, folder),
-        Markup("{} {}").format(report_page.light(_light(row)), row.verdict or row.status),
+        Markup("{} {}").format(report_page.light(_light(row)), figures["verdict"] or row.status),
         scale if within is None else f"{scale} ± {fixed(within, decimals)}",
-        count(row.num_photos),
-        f"{count(row.num_ranges_used)} of {count(row.num_ranges)}" if row.num_ranges is not None else plain(None),
-        fixed(row.range_rms_m, 3, "m"),
-        fixed(row.reprojection_rms_px, 2, "px"),
-        fixed(row.rmse_m, 3, "m"),
-        count(row.num_warnings),
+        count(figures["num_photos"]),
+        f"{count(figures['num_ranges_used'])} of {count(figures['num_ranges'])}"
+        if figures["num_ranges"] is not None
+        else plain(None),
+        fixed(figures["range_rms_m"], 3, "m"),
+        fixed(figures["reprojection_rms_px"], 2, "px"),
+        fixed(figures["rmse_m"], 3, "m"),
+        count(figures["num_warnings"]),
         count(row.num_attempts),
         duration(row.seconds),
     ]
@@ -95,5 +98,5 @@ def _name(row: SurveyRow, folder: Path) -> str:
 
 def _light(row: SurveyRow) -> str:
     if row.status == "done":
-        return "green" if row.verdict == "good" else "amber"
+        return "green" if row.figures["verdict"] == "good" else "amber"
     return "red" if row.status == "failed" else "off"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from rangesfm.batch.jobs import Job
@@ -15,12 +15,16 @@ from rangesfm.result.summary import ResultSummary
 
 Status = Literal["waiting", "running", "done", "failed", "interrupted"]
 STATUSES: tuple[Status, ...] = get_args(Status)
-_NOT_IN_TABLE = ("stage", "num_done", "num_total", "began_s")
+_FIGURES = (
+    *("verdict", "scale", "scale_stddev", "frame", "num_photos", "num_ranges", "num_ranges_used", "range_rms_m"),
+    *("reprojection_rms_px", "rmse_m", "num_warnings"),
+)
+_NOT_IN_TABLE = ("figures", "stage", "num_done", "num_total", "began_s")
 
 
 @dataclass
 class SurveyRow:
-    """One row of the batch's table, with the results from ``result.json``; and how far the present attempt has come.
+    """One row of the batch's table; and how far the present attempt has come.
 
     Attributes:
         survey: the survey file.
@@ -30,8 +34,7 @@ class SurveyRow:
         seconds: duration of the last attempt.
         host: machine of the last attempt.
         output_path: empty if the survey file cannot be read.
-        scale_stddev: the empirical one, which is never less than the formal one.
-        rmse_m: ``ComparisonRow.rmse_m`` of the final map, where there is a reference.
+        figures: from ``result.json`` (``figures_of``); each None until there is one.
         stage: that it is in. num_done, num_total: items of the stage, where it counts them.
         began_s: start of the present attempt on the clock of the batch, seconds.
     """
@@ -44,17 +47,7 @@ class SurveyRow:
     seconds: float | None = None
     host: str = ""
     output_path: str = ""
-    verdict: str | None = None
-    scale: float | None = None
-    scale_stddev: float | None = None
-    frame: str | None = None
-    num_photos: int | None = None
-    num_ranges: int | None = None
-    num_ranges_used: int | None = None
-    range_rms_m: float | None = None
-    reprojection_rms_px: float | None = None
-    rmse_m: float | None = None
-    num_warnings: int | None = None
+    figures: Mapping[str, Any] = field(default_factory=lambda: dict.fromkeys(_FIGURES))
     stage: str = ""
     num_done: int | None = None
     num_total: int | None = None
@@ -66,25 +59,24 @@ class SurveyRow:
 
     def cells(self) -> dict[str, Any]:
         """Return the plain values of the row, by column."""
-        return {name: value for name, value in vars(self).items() if name not in _NOT_IN_TABLE}
+        return {name: value for name, value in vars(self).items() if name not in _NOT_IN_TABLE} | dict(self.figures)
 
 
 def figures_of(summary: ResultSummary) -> dict[str, Any]:
-    """Return the fields of a SurveyRow that come from ``result.json``."""
+    """Return the figures of a survey from ``result.json``.
+
+    The stddev of the scale is the empirical one, which is never less than the formal one. The RMSE is that of the final
+    map, where there is a reference.
+    """
     scale, ranges = summary.scale, summary.ranges
-    return {
-        "verdict": scale.verdict,
-        "scale": scale.value,
-        "scale_stddev": scale.stddev_empirical,
-        "frame": summary.frame,
-        "num_photos": summary.map.num_photos,
-        "num_ranges": ranges.num,
-        "num_ranges_used": ranges.num_used,
-        "range_rms_m": ranges.rms_m,
-        "reprojection_rms_px": None if summary.refine is None else summary.refine.reprojection_rms_px,
-        "rmse_m": summary.comparison[-1].rmse_m if summary.comparison else None,
-        "num_warnings": len(summary.warnings),
-    }
+    values = (
+        *(scale.verdict, scale.value, scale.stddev_empirical, summary.frame, summary.map.num_photos),
+        *(ranges.num, ranges.num_used, ranges.rms_m),
+        None if summary.refine is None else summary.refine.reprojection_rms_px,
+        summary.comparison[-1].rmse_m if summary.comparison else None,
+        len(summary.warnings),
+    )
+    return dict(zip(_FIGURES, values, strict=True))
 
 
 def exit_status_of(rows: Iterable[SurveyRow]) -> int:
@@ -98,12 +90,12 @@ def format_rows(rows: Sequence[SurveyRow]) -> str:
     cells = [
         (
             row.survey,
-            row.verdict or row.status,
-            text_or_dash(row.scale, ".6g"),
-            text_or_dash(row.num_photos, "d"),
-            text_or_dash(row.num_ranges_used, "d"),
-            text_or_dash(row.range_rms_m, ".3f"),
-            text_or_dash(row.rmse_m, ".4f"),
+            row.figures["verdict"] or row.status,
+            text_or_dash(row.figures["scale"], ".6g"),
+            text_or_dash(row.figures["num_photos"], "d"),
+            text_or_dash(row.figures["num_ranges_used"], "d"),
+            text_or_dash(row.figures["range_rms_m"], ".3f"),
+            text_or_dash(row.figures["rmse_m"], ".4f"),
             text_or_dash(row.seconds, ".1f"),
         )
         for row in rows
@@ -189,8 +181,7 @@ class BatchState:
         row = self.rows[index]
         row.seconds = None if row.began_s is None else self.seconds_running(row)
         row.status, row.reason, row.exit_status, row.began_s = status, reason, exit_status, None
-        for name, value in figures.items():
-            setattr(row, name, value)
+        row.figures = {**row.figures, **figures}
 
     def end_all(self, status: Status, reason: str, exit_status: int | None = None) -> None:
         """End all surveys that are not over with this status."""

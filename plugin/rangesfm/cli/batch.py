@@ -169,7 +169,7 @@ def _stage(row: SurveyRow) -> str:
 
 def _ended(row: SurveyRow) -> str:
     seconds = "" if row.seconds is None else f" after {format_duration(row.seconds)}"
-    what = (row.exit_status == 0 and row.verdict) or row.status
+    what = (row.exit_status == 0 and row.figures["verdict"]) or row.status
     reason = f": {row.reason}" if row.reason and row.reason != what else ""
     return f"{row.survey}: {what}{seconds}{reason}"
 

@@ -10,6 +10,7 @@ import signal
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import pycolmap
 
@@ -27,41 +28,14 @@ from rangesfm.vision.incremental_mapping import UnfinishedMapping, adjust_whole,
 from rangesfm.vision.own_process import WholePipelineOptions, map_at_once, run_program
 from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.rigs import Rigs
-from rangesfm.vision.snapshots import Snapshots, newest_snapshot
+from rangesfm.vision.snapshots import newest_snapshot, snapshots
 from rangesfm.vision.steps import DATABASE_NAME, MODELS_NAME, Workspace
 
 _MAX_LINE = 200
 
 
-@dataclass(frozen=True)
-class ExternalMapper:
-    """A mapper that is a program of its own.
-
-    Attributes:
-        words: the program and its arguments, in which {images} stands for the folder of the photos.
-    """
-
-    words: tuple[str, ...]
-
-    @classmethod
-    def from_command(cls, command: str) -> ExternalMapper:
-        """Return the mapper of a command line.
-
-        Raises:
-            InputError: there is no such program.
-        """
-        try:
-            words = shlex.split(command)
-        except ValueError as error:
-            raise InputError(f"[mapper] command is not a command line ({error}): {shown(command)}") from error
-        program = words[0] if words else ""
-        is_anywhere = Path(program).name == program or Path(program).is_absolute()
-        if (found := shutil.which(program)) is None or not is_anywhere:
-            expected = "expected a program on the PATH, or the absolute path of one"
-            raise InputError(f"[mapper] command begins with {shown(program)}, {expected}")
-        return cls((found, *words[1:]))
-
-
+ExternalMapper: TypeAlias = tuple[str, ...]
+"""A program that maps, and its arguments, in which {images} stands for the folder of the photos."""
 PipelineOptions = pycolmap.IncrementalPipelineOptions | WholePipelineOptions | ExternalMapper
 
 
@@ -86,7 +60,7 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
         InputError: a key or value that COLMAP does not have, or there is no such external mapper.
     """
     if mapper.command is not None:
-        return ExternalMapper.from_command(mapper.command)
+        return _external_mapper(mapper.command)
     options: pycolmap.IncrementalPipelineOptions | WholePipelineOptions
     # Several threads search for an initial pair until one of them has found some pair, and Ceres adds up what they
     # compute in the order in which they finish: every run gives another map.
@@ -109,6 +83,19 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
     return options
 
 
+def _external_mapper(command: str) -> ExternalMapper:
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise InputError(f"[mapper] command is not a command line ({error}): {shown(command)}") from error
+    program = words[0] if words else ""
+    is_anywhere = Path(program).name == program or Path(program).is_absolute()
+    if (found := shutil.which(program)) is None or not is_anywhere:
+        expected = "expected a program on the PATH, or the absolute path of one"
+        raise InputError(f"[mapper] command begins with {shown(program)}, {expected}")
+    return (found, *words[1:])
+
+
 def _set_seed(options: pycolmap.IncrementalPipelineOptions, seed: int) -> None:
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
 
@@ -122,7 +109,7 @@ def mapping_options(
     because with rigs held fixed COLMAP 4.2's global positioning gives a senseless map, even from perfect matches.
     """
     growing = pipeline_options(camera, mapper, seed)
-    if isinstance(growing, pycolmap.GlobalPipelineOptions | ExternalMapper):
+    if isinstance(growing, pycolmap.GlobalPipelineOptions | tuple):
         return MappingOptions(growing, None)
     options = growing
     if isinstance(options, pycolmap.HierarchicalPipelineOptions):
@@ -190,12 +177,12 @@ def _map_incrementally(
         num_registered = _num_registered(begun)
         space.progress.message(f"mapping: continues from {num_registered} photos of an earlier run")
     with scratch_folder(space.folder / "mapping") as folder:
-        snapshots = Snapshots(space.snapshots, folder, options.min_model_size)
+        keep = snapshots(space.snapshots, folder, options.min_model_size)
 
         def add_photo(mapping: UnfinishedMapping) -> None:
             nonlocal num_registered
             num_registered = _num_registered(mapping)
-            snapshots.add_photo(mapping)
+            keep(mapping)
 
         return run_in_background(
             lambda token: incremental_mapping(
@@ -226,7 +213,7 @@ def _map_in_child(
     space.progress.message("mapping: this mapper shows no progress, and starts anew after an interruption")
     with scratch_folder(space.folder / "mapping") as folder:
         database_path = Path(shutil.copyfile(space.database, folder / DATABASE_NAME))
-        if isinstance(mapper, ExternalMapper):
+        if isinstance(mapper, tuple):
             return _map_by_program(space, folder, image_path, mapper, log_folder / "external_mapper")
         # It does not notice a cancellation, so that Ctrl-C ends its process.
         run_child(partial(map_at_once, database_path, image_path, mapper, log_folder))
@@ -241,8 +228,8 @@ def _map_by_program(
     Raises:
         ReconstructionError: it failed, wrote no model, or a model of other photos.
     """
-    words = [word.replace("{images}", str(image_path.resolve())) for word in mapper.words]
-    name = f"the external mapper {Path(mapper.words[0]).name}"
+    words = [word.replace("{images}", str(image_path.resolve())) for word in mapper]
+    name = f"the external mapper {Path(mapper[0]).name}"
     status = run_child(partial(run_program, words, folder, dict(os.environ), log))
     if status:
         how = f"status {status}" if status > 0 else signal.Signals(-status).name

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from rangesfm.colmap.model_files import read_model
@@ -20,42 +21,34 @@ _INTERVAL_OVER_DURATION = 20.0
 _SIZE_NAME = "size_at_adjustment.json"
 
 
-class Snapshots:
-    """Keeper of the newest snapshot of a mapping.
+def snapshots(path: Path, scratch: Path, min_model_size: int) -> Callable[[UnfinishedMapping], None]:
+    """Return a function that takes a snapshot if one is due; it is called when COLMAP has added a photo.
 
     Args:
         path: folder of the newest snapshot, made with the first snapshot.
         scratch: folder on the same disk, where a snapshot is written before it is moved to ``path``.
         min_model_size: a further model with fewer photos than that may not be kept by COLMAP, and has no snapshot.
     """
+    newest_ms, next_s = 0, time.monotonic() + _MIN_INTERVAL_S
 
-    def __init__(self, path: Path, scratch: Path, min_model_size: int):
-        self._path = path
-        self._scratch = scratch
-        self._min_model_size = min_model_size
-        self._newest_ms = 0
-        self._next_s = time.monotonic() + _MIN_INTERVAL_S
-
-    def add_photo(self, mapping: UnfinishedMapping) -> None:
-        """Take a snapshot if one is due; to be called when COLMAP has added a photo to the growing model."""
+    def keep(mapping: UnfinishedMapping) -> None:
+        nonlocal newest_ms, next_s
         begin_s = time.monotonic()
-        if begin_s < self._next_s or (mapping.finished and mapping.growing.num_reg_frames() < self._min_model_size):
+        if begin_s < next_s or (mapping.finished and mapping.growing.num_reg_frames() < min_model_size):
             return
-        # Two snapshots within a millisecond must not have the same name.
-        self._newest_ms = max(time.time_ns() // 1_000_000, self._newest_ms + 1)
-        _keep(_write(mapping, self._scratch / f"{self._newest_ms:013d}"), self._path)
+        # The name is the time, as COLMAP's are. Two snapshots within a millisecond must not have the same one.
+        newest_ms = max(time.time_ns() // 1_000_000, newest_ms + 1)
+        folder = scratch / f"{newest_ms:013d}"
+        folder.mkdir()
+        write_json([*mapping.size_at_adjustment], folder / _SIZE_NAME)
+        for number, model in enumerate(mapping.models):
+            (folder / str(number)).mkdir()
+            model.write_binary(folder / str(number))
+        _keep(folder, path)
         end_s = time.monotonic()
-        self._next_s = end_s + max(_MIN_INTERVAL_S, _INTERVAL_OVER_DURATION * (end_s - begin_s))
+        next_s = end_s + max(_MIN_INTERVAL_S, _INTERVAL_OVER_DURATION * (end_s - begin_s))
 
-
-def _write(mapping: UnfinishedMapping, folder: Path) -> Path:
-    """Write the models into a new folder, named by the time in milliseconds as COLMAP does; return the folder."""
-    folder.mkdir()
-    write_json([*mapping.size_at_adjustment], folder / _SIZE_NAME)
-    for number, model in enumerate(mapping.models):
-        (folder / str(number)).mkdir()
-        model.write_binary(folder / str(number))
-    return folder
+    return keep
 
 
 def newest_snapshot(path: Path) -> UnfinishedMapping | None:
