@@ -13,7 +13,7 @@ from rangesfm.geometry.poses import model_poses
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.measurements.kind import MapState
-from rangesfm.measurements.table import ranges_of_map
+from rangesfm.measurements.radio import ranges_of_map
 from rangesfm.options import RangeModelOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.range_errors import RangeErrors

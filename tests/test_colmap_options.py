@@ -21,7 +21,8 @@ import rangesfm
 from rangesfm.ceres.bundle_adjustment import bundle_adjustment
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.loops.resection import resection_options
-from rangesfm.options import CameraOptions, MapperOptions, RefineOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.features import feature_options

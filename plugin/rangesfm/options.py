@@ -15,7 +15,6 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from rangesfm.errors import OptionError
-from rangesfm.mapper_options import MapperOptions as MapperOptions
 from rangesfm.option_model import Bounds, KeyMeta, Options
 
 DEFAULT_FORMATS = ("tum", "ply")

@@ -41,7 +41,8 @@ import pycolmap
 from tests.vision.matches import content_of
 
 from rangesfm.colmap.colmap_log import colmap_log
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.database import clear_matches
 from rangesfm.vision.image_times import list_images

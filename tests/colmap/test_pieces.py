@@ -1,4 +1,4 @@
-"""Parts of a model that share hardly any points are found, and a model that its points hold together has none."""
+"""Points that photos see, and parts of a model that share hardly any points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import sequence_path
 from tests.simulated.pieces import leave_across, points_across
 
-from rangesfm.colmap.pieces import MIN_NUM_SHARED, frames_of_largest_part, loose_pieces
+from rangesfm.colmap.pieces import MIN_NUM_SHARED, frames_of_largest_part, loose_pieces, overlaps_in, seen_in
 
 NUM_PHOTOS = 30
 SECOND = tuple(f"frame_{k:05d}.jpg" for k in range(19, NUM_PHOTOS + 1))
@@ -74,3 +74,28 @@ def test_the_largest_part_of_a_map_of_few_points_is_the_whole_map(model: pycolma
         model.delete_point3D(point_id)
     np.testing.assert_array_equal(frames_of_largest_part(model), np.arange(1, NUM_PHOTOS + 1))
     assert len(frames_of_largest_part(pycolmap.Reconstruction())) == 0
+
+
+def test_photos_overlap_by_the_points_they_have_in_common(model: pycolmap.Reconstruction) -> None:
+    points = [{point.point3D_id for point in model.image(i).get_observation_points2D()} for i in model.reg_image_ids()]
+    common = [[len(a & b) for b in points] for a in points]
+    np.testing.assert_array_equal(overlaps_in(model).toarray(), common)
+    assert np.count_nonzero(common) < len(points) ** 2
+
+
+def test_each_photo_sees_its_observations_where_they_are(model: pycolmap.Reconstruction) -> None:
+    for image in model.images.values():
+        ids, xy = seen_in(image)
+        points = image.get_observation_points2D()
+        np.testing.assert_array_equal(ids, [point.point3D_id for point in points])
+        np.testing.assert_array_equal(xy, [point.xy for point in points])
+
+
+def test_a_photo_that_sees_nothing_overlaps_with_none(model: pycolmap.Reconstruction) -> None:
+    blind = min(model.reg_image_ids())
+    for index in model.image(blind).get_observation_point2D_idxs():
+        model.delete_observation(blind, index)
+    ids, xy = seen_in(model.image(blind))
+    assert ids.shape == (0,)
+    assert xy.shape == (0, 2)
+    assert not overlaps_in(model)[[list(model.reg_image_ids()).index(blind)]].count_nonzero()

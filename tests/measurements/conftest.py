@@ -28,8 +28,8 @@ from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.measurements.positions import AntennaPositions
 from rangesfm.measurements.prior import Prior
+from rangesfm.measurements.radio import ranges_of_map
 from rangesfm.measurements.ranges import Ranges
-from rangesfm.measurements.table import ranges_of_map
 from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import associate

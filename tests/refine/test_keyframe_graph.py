@@ -24,7 +24,7 @@ from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.prior import Prior
-from rangesfm.measurements.table import ranges_of_map
+from rangesfm.measurements.radio import ranges_of_map
 from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.association import associate

@@ -17,7 +17,7 @@ from rangesfm.geometry.poses import Poses
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.measurements.kind import LEAST_SQUARES, MapState
-from rangesfm.measurements.table import ranges_of_map
+from rangesfm.measurements.radio import ranges_of_map
 from rangesfm.options import RefineOptions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.point_fit import PointProblem

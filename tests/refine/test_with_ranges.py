@@ -26,8 +26,7 @@ from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.distances.locate_lengths import locate_distances
 from rangesfm.distances.tape import Marker, Tape, TapedDistance
 from rangesfm.errors import InputError, SolverError
-from rangesfm.estimation.refine_summary import RefineSummary
-from rangesfm.estimation.with_ranges import refine_with_ranges
+from rangesfm.estimation.with_ranges import RefineSummary, refine_with_ranges
 from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points, rmse
 from rangesfm.geometry.trajectory import Trajectory, pose_of, trajectory_from_reconstruction

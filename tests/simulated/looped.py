@@ -34,7 +34,9 @@ from rangesfm.loops.loop_finder import LoopFinder
 from rangesfm.loops.merge import merge_tracks
 from rangesfm.loops.resection import Loop
 from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
-from rangesfm.measurements.table import Measured, ranges_of_map
+from rangesfm.measurements.radio import RadioLog, ranges_of_map
+from rangesfm.measurements.ranges import Ranges
+from rangesfm.measurements.source import Measured
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.association import associate
@@ -181,11 +183,11 @@ class ScaledMap:
         return cls(survey, rescale(sfm, estimate.metric_from_sfm), trajectory, estimate)
 
     @property
-    def measured(self) -> Measured:
+    def ranges(self) -> Ranges:
         estimate = self.estimate
         # The simulated ranges have no errors but noise.
         errors = replace(estimate.errors, learned=None)
-        ranges = ranges_of_map(
+        return ranges_of_map(
             self.trajectory,
             estimate.observations,
             estimate.metric_from_sfm,
@@ -194,13 +196,12 @@ class ScaledMap:
             errors,
             RefineOptions(),
         )
-        return Measured(ranges)
 
-    def problem(self, model: pycolmap.Reconstruction, measured: Measured, *, is_refined: bool) -> MapProblem:
+    def problem(self, model: pycolmap.Reconstruction, ranges: Ranges, *, is_refined: bool) -> MapProblem:
         """Return the problem of a copy of a map in metres."""
         return map_problem(
             pycolmap.Reconstruction(model),
-            measured,
+            Measured((RadioLog(ranges),)),
             self.trajectory,
             camera=CameraOptions(refine_intrinsics=False),
             options=RefineOptions(),
@@ -212,7 +213,7 @@ class ScaledMap:
     def refined(self, start: pycolmap.Reconstruction | None = None) -> MapAtRest:
         """Refine the scaled map, or another map in metres."""
         model = self.scaled if start is None else start
-        return refine(self.problem(model, self.measured, is_refined=start is not None), {})
+        return refine(self.problem(model, self.ranges, is_refined=start is not None), {})
 
     def error_m(self, model: pycolmap.Reconstruction) -> float:
         """Return the root mean square error of the keyframes, without alignment."""
@@ -257,9 +258,8 @@ class SimulatedMap:
         path = self.database_path
         path.unlink(missing_ok=True)
         write_matches(path, self.model, self.looped.neighbours | self.matches_of(sorted(tried.closed)))
-        scaled, measured = self.scaled, self.scaled.measured
-        at = replace(measured, ranges=measured.ranges.at_blocks(self.at_rest.state.blocks))
-        problem = scaled.problem(self.model, at, is_refined=True)
+        ranges = self.scaled.ranges.at_blocks(self.at_rest.state.blocks)
+        problem = self.scaled.problem(self.model, ranges, is_refined=True)
         rest = refine_with_loops(
             problem,
             problem.like(self.at_rest.problem),

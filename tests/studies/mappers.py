@@ -34,7 +34,8 @@ from tests.studies.simulated_database import write_database
 
 from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.geometry.reference import Reference, read_reference, write_reference
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.ranging.readers import write_ranges_csv
 from rangesfm.vision.mapping import map_photos, mapping_options, read_mapped_models

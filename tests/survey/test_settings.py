@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
-from rangesfm.options import MapperOptions, OutputOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import OutputOptions
 from rangesfm.ranging.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import input_paths, read_survey, survey_from_tables

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 from rangesfm.errors import InputError, OptionError
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.photo_files import Photos, usable_photos
 from rangesfm.vision.reconstruct import reconstruct

@@ -9,7 +9,8 @@ import pytest
 from tests.installed import with_gpus
 
 from rangesfm.errors import OptionError
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.features import feature_options
 from rangesfm.vision.mapping import pipeline_options

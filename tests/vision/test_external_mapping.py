@@ -18,7 +18,7 @@ import pytest
 from tests.outputs import unfinished
 
 from rangesfm.errors import InputError, OptionError, ReconstructionError
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import SILENT, Progress
 from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 

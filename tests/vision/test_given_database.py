@@ -16,7 +16,8 @@ from tests.vision.matches import content_of
 
 from rangesfm.errors import InputError
 from rangesfm.files.contents import sha256_of
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 
 if TYPE_CHECKING:

@@ -17,7 +17,8 @@ from tests.simulated.path import loop_path
 from tests.studies.simulated_database import write_database
 
 from rangesfm.geometry.similarity import align_points, rmse
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.vision.incremental_mapping import UnfinishedMapping, adjust_whole, incremental_mapping
 from rangesfm.vision.mapping import pipeline_options
 

@@ -15,7 +15,7 @@ import pytest
 from tests.outputs import names_in, unfinished
 
 import rangesfm
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.vision.database import num_photos_with_features
 from rangesfm.vision.reconstruct import reconstruct
 

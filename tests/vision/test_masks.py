@@ -13,7 +13,8 @@ from PIL import Image
 
 from rangesfm.errors import InputError, OptionError
 from rangesfm.files.atomic import sole_writer
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.progress import SILENT
 from rangesfm.vision.photo_matching import photo_matching
 from rangesfm.vision.rigs import NO_RIGS

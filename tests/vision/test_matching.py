@@ -13,7 +13,7 @@ from tests.vision.matches import content_of
 
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.errors import ReconstructionError
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision import matching
 from rangesfm.vision.camera import cameras_of_photos

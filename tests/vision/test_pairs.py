@@ -10,7 +10,8 @@ from PIL import Image
 from tests.outputs import unfinished
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.vision.pairs import pairing_options, pairs_to_match, read_pairs
 from rangesfm.vision.photo_files import Photos
 from rangesfm.vision.reconstruct import reconstruct

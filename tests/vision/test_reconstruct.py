@@ -18,7 +18,8 @@ from tests.outputs import names_in, paths_below, unfinished
 from tests.vision.matches import content_of
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 
 if TYPE_CHECKING:

@@ -20,7 +20,8 @@ from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
 from rangesfm.inference.bending import WalkBending
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.scale.scale_by_lengths import lengths_between_points
 from rangesfm.vision.given_database import opened
 from rangesfm.vision.image_times import read_image_times_csv

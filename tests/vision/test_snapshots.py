@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from tests.outputs import names_in, unfinished
 
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import SILENT, Progress
 from rangesfm.vision import snapshots as snapshots_module
 from rangesfm.vision.incremental_mapping import UnfinishedMapping, size_of

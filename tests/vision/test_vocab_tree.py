@@ -12,7 +12,7 @@ import pycolmap
 import pytest
 
 from rangesfm.errors import InputError, OptionError
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.database import create_database

@@ -15,7 +15,7 @@ import pytest
 from tests.outputs import unfinished
 
 from rangesfm.errors import InputError, ReconstructionError
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.vision.reconstruct import ReconstructionSummary, reconstruct
 
 if TYPE_CHECKING:

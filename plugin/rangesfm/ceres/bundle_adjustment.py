@@ -17,7 +17,7 @@ from rangesfm import ceres
 from rangesfm.arrays import Array
 from rangesfm.ceres.linear_solver import dense_is_faster, inverse_is_affordable, max_num_images_direct
 from rangesfm.colmap.passthrough import apply_options
-from rangesfm.colmap.point_observations import overlaps_in
+from rangesfm.colmap.pieces import overlaps_in
 from rangesfm.errors import SolverError
 from rangesfm.geometry.numerics import NEGLIGIBLE_STDDEVS, ROUNDING
 from rangesfm.geometry.poses import model_poses

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.colmap.point_observations import seen_in
+from rangesfm.colmap.pieces import seen_in
 
 # COLMAP keeps no observation with a larger error, in pixels (IncrementalPipelineOptions.filter_max_reproj_error).
 _MAX_ERROR_PX = 4.0

@@ -18,7 +18,8 @@ from rangesfm.comparison.model_ranges import ModelRanges, ranges_of_result
 from rangesfm.comparison.same_photos import Length, carried_by, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto, text_or_dash
 from rangesfm.distances.locate_lengths import locate_distances
-from rangesfm.distances.tape import Tape, markers_of_photos
+from rangesfm.distances.tape import Tape
+from rangesfm.distances.tape_file import markers_of_photos
 from rangesfm.errors import InputError
 from rangesfm.files.text_tables import align_rows
 from rangesfm.geometry.reference import Reference

@@ -15,7 +15,7 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
-from rangesfm.estimation.refine_summary import RefineSummary
+from rangesfm.estimation.with_ranges import RefineSummary
 from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.geometry.similarity import path_shape, similarity_motions
 from rangesfm.geometry.trajectory import Trajectory

@@ -1,4 +1,4 @@
-"""Measured lengths in a model: the ends of taped lengths, and lengths between anchors by radio or by survey."""
+"""Measured lengths in a model: the ends of taped lengths, and lengths between anchors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,8 @@ from rangesfm.distances.tape import CONTROL, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.noise import shared_stddev
 from rangesfm.ranging.range_gradient import RangeGradient
-from rangesfm.ranging.range_log import RangeKind, RangeLog
 
-# Standard deviation of the median of normally distributed values over that of their mean: sqrt(pi / 2).
-_MEDIAN_OVER_MEAN = 1.2533
 # Smallest standard deviation of a length between anchors, because lengths are weighted by its inverse.
 _MIN_STDDEV_M = 1e-3
 # Names of printed tags' corners, as ``find_tags`` gives them.
@@ -222,35 +218,6 @@ def _what_is_wrong(taped: TapedDistance, points: Collection[str], anchor_ids: Co
         if name not in points and name not in anchor_ids:
             return f"an end is {name!r}, expected a photo that is in the model, a marker or an anchor of the log"
     return f"from {taped.ends[0]!r} to {taped.ends[1]!r}: expected two anchors, or two ends that are not anchors"
-
-
-def distances_by_radio(
-    log: RangeLog, noise_m: float, bias_m: Array, bias_stddev_m: Array, common_bias_stddev_m: float
-) -> LocatedDistances:
-    """Return one length for each pair of anchors that ranged: the median of their ranges in both directions.
-
-    All ranges of a pair share the error from the same delays and reflections, so that many are hardly better than one.
-    A bias belongs to an anchor's ranges with the tag. Ranges between two anchors get the mean of their two biases.
-
-    Args:
-        noise_m: standard deviation of a range for which the log gives none.
-        bias_m, bias_stddev_m: (num_anchors,) known bias of each anchor's ranges, and its standard deviation.
-        common_bias_stddev_m: standard deviation of the bias that all ranges between anchors share.
-    """
-    ranges = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
-    range_m, given = log.range_m[ranges.rows], log.range_stddev_m[ranges.rows]
-    pairs, index = np.unique(np.sort(ranges.ends, axis=1), axis=0, return_inverse=True)
-    index = index.reshape(-1)
-    count = np.bincount(index, minlength=len(pairs))
-    noise = np.where(np.isfinite(given), given, noise_m)
-    medians = np.array([np.median(range_m[index == k]) for k in range(len(pairs))])
-    mean_square = np.bincount(index, noise**2, len(pairs)) / count
-    shared = np.bincount(index, shared_stddev(log)[ranges.rows], len(pairs)) / count
-    first, second = pairs.reshape(-1, 2).T
-    variance = _MEDIAN_OVER_MEAN**2 * mean_square / count + shared**2 + common_bias_stddev_m**2
-    variance += bias_stddev_m[first] ** 2 + bias_stddev_m[second] ** 2
-    corrected_m = medians - (bias_m[first] + bias_m[second]) / 2
-    return LocatedDistances.of(corrected_m, np.sqrt(variance), anchor_pair=pairs.reshape(-1, 2))
 
 
 def surveyed_distances(anchors: Sequence[Anchor]) -> tuple[TapedDistance, ...]:

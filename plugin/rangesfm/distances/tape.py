@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rangesfm.arrays import Array
-from rangesfm.files.photo_names import photos_meant
 
 CONTROL, CHECK = "control", "check"
 # Kind of a length that contradicts the map and was rejected.
@@ -95,13 +94,3 @@ class Tape:
         """Return the tape with the lengths of these indices marked as left out."""
         distances = (replace(taped, kind=LEFT_OUT) if k in rows else taped for k, taped in enumerate(self.distances))
         return replace(self, distances=tuple(distances))
-
-
-def markers_of_photos(markers: Mapping[str, Marker], photos: Collection[str]) -> dict[str, Marker]:
-    """Return markers with the names of their photos as these are, by ``photos_meant``."""
-    listed = [*dict.fromkeys(name for marker in markers.values() for name in marker.image_names)]
-    meant = dict(zip(listed, photos_meant(listed, photos), strict=True))
-    return {
-        name: replace(marker, image_names=tuple(meant[photo] for photo in marker.image_names))
-        for name, marker in markers.items()
-    }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from rangesfm.distances.measured_lists import LENGTHS, MARKS
 from rangesfm.distances.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import InputError
 from rangesfm.files.contents import AnyPath
+from rangesfm.files.photo_names import photos_meant
 from rangesfm.files.text_tables import repeated
 from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
 from rangesfm.ranging.readers.lists import ListRows
@@ -72,3 +75,13 @@ def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[st
             raise listed.table.error(rows[again[0]], listed.columns["image_name"], "each photo once for this marker")
         markers[name] = Marker(seen_in, pixels[rows], tuple(listed.table.line[rows].tolist()), stddev_px)
     return markers
+
+
+def markers_of_photos(markers: Mapping[str, Marker], photos: Collection[str]) -> dict[str, Marker]:
+    """Return markers with the names of their photos as these are, by ``photos_meant``."""
+    listed = [*dict.fromkeys(name for marker in markers.values() for name in marker.image_names)]
+    meant = dict(zip(listed, photos_meant(listed, photos), strict=True))
+    return {
+        name: replace(marker, image_names=tuple(meant[photo] for photo in marker.image_names))
+        for name, marker in markers.items()
+    }

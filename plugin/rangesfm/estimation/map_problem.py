@@ -19,7 +19,7 @@ from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.poses import model_poses
 from rangesfm.geometry.trajectory import Trajectory, pose_of
 from rangesfm.measurements.kind import Block, MapState, Measurements
-from rangesfm.measurements.table import Measured
+from rangesfm.measurements.source import Measured
 from rangesfm.options import CameraOptions, RefineOptions
 
 
@@ -173,8 +173,7 @@ def map_problem(
         num_threads,
         is_refined,
     )
-    kinds = measured.kinds(model_poses(metric, problem.frame_ids), metric, problem.frame_ids, trajectory)
-    return replace(problem, kinds=kinds)
+    return replace(problem, kinds=measured.kinds(metric, problem.frame_ids, trajectory, options))
 
 
 @dataclass(frozen=True)

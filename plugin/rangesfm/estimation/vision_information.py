@@ -17,7 +17,7 @@ import pycolmap
 from scipy import sparse
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.colmap.point_observations import seen_in
+from rangesfm.colmap.pieces import seen_in
 from rangesfm.errors import SolverError
 from rangesfm.geometry.numerics import ROUNDING
 from rangesfm.geometry.poses import Poses, relative_poses

@@ -1,27 +1,32 @@
-"""Bundle adjustment by COLMAP with ranges, which fixes the scale and removes drift: the stage as one function."""
+"""Bundle adjustment by COLMAP with ranges, which fixes the scale and removes drift, as one function, with a summary."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.arrays import Array
+from rangesfm.arrays import Array, Indices
+from rangesfm.ceres.covariance import JointCovariance
 from rangesfm.distances.tape import Tape
 from rangesfm.estimation.map_problem import map_problem
-from rangesfm.estimation.refine_summary import RefineSummary, summarize
-from rangesfm.estimation.refinement import joint_errors, refine
+from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.measurements.table import Measured, TapedLengths, Upwards, ranges_of_map
+from rangesfm.measurements.gravity import Upwards
+from rangesfm.measurements.lengths import TapedLengths
+from rangesfm.measurements.radio import RadioLog, ranges_of, ranges_of_map
+from rangesfm.measurements.ranges import CLOCK, SHORT, Ranges, anchors_at
+from rangesfm.measurements.source import Measured
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.processes.threads import at_most, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.range_observations import RangeObservations
+from rangesfm.ranging.errors.range_errors import Misfit, RangeErrors, misfits
+from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
 
 
 @with_one_blas_thread
@@ -78,7 +83,7 @@ def refine_with_ranges(
     if shared_errors_m is not None:
         ranges = replace(ranges, shared_errors_m=shared_errors_m)
     upwards = () if first_pose_is_fixed or gravity is None else (Upwards(gravity),)
-    measured = Measured(ranges, (TapedLengths(tape or Tape()), *upwards))
+    measured = Measured((RadioLog(ranges), TapedLengths(tape or Tape()), *upwards))
     with at_most(num_threads):
         problem = map_problem(
             metric,
@@ -93,3 +98,143 @@ def refine_with_ranges(
         rest = refine(problem, measured.markers)
         covariance = joint_errors(rest, 1.0) if options.covariance else None
     return metric, summarize(rest, ranges, covariance, 1.0)
+
+
+@dataclass(frozen=True)
+class RefineSummary:
+    """Result of the refinement.
+
+    Attributes:
+        num_iterations: of the solver on the full problem, successful and unsuccessful.
+        num_graph_steps: of the solver on the keyframe graph before.
+        bend_m: root mean square bending of the map in the keyframe graph, beyond any similarity.
+        initial_cost, final_cost: half the sum of squares, in pixels at unit weight: at the start with the weights at
+            that time, and at the end.
+        reprojection_rms_px: root mean square length of the final reprojection errors.
+        pixel_stddev: standard deviation of a feature's coordinate, from the residuals before.
+        errors: of all n ranges of the log, as weighted at the end.
+        seconds: time of the solver.
+        converged: whether the keyframes came to rest.
+        message: of the solver.
+        misfits: reasons why the ranges fit worse than their noise suggests; empty if they do not.
+        anchors: refined positions and biases, with standard deviations if there is a covariance.
+        tags_in_cam_m: (num_tags, 3) lever arms, as given or estimated.
+        time_shift_s: how much later than assumed the ranges were taken; None if not estimated.
+        short_range_error_m: amplitude of the excess of short ranges, which decays with a length of 1 m; None if not
+            estimated.
+        covariance: of poses, anchors and scale; None if not asked for, if the model is too large, or if ranges and
+            photos leave something undetermined.
+        bending_factor: learnt bending over the bending that the photos' residuals suggest; 1 if unknown.
+        observations: with status by the final weight of each range.
+        predicted_m: (n,) ranges predicted by the refined model; NaN without a place.
+        weights: (n,) robust weights in [0, 1]; NaN without a place.
+    """
+
+    num_iterations: int
+    num_graph_steps: int
+    bend_m: float
+    initial_cost: float
+    final_cost: float
+    reprojection_rms_px: float
+    pixel_stddev: float
+    errors: RangeErrors
+    seconds: float
+    converged: bool
+    message: str
+    misfits: tuple[Misfit, ...]
+    anchors: tuple[AnchorEstimate, ...]
+    tags_in_cam_m: Array
+    time_shift_s: float | None
+    short_range_error_m: float | None
+    covariance: JointCovariance | None
+    bending_factor: float
+    observations: RangeObservations
+    predicted_m: Array
+    weights: Array
+
+    def moved(self, change: Similarity, anchors_m: Array, rows: Indices, longer_m: Array) -> RefineSummary:
+        """Return the summary of the same map moved as a whole.
+
+        Args:
+            change: from the world of this map to that of the moved one. anchors_m: (m, 3) positions of anchors there.
+            rows: (k,) ranges that took part. longer_m: (k,) by how much longer they are there.
+        """
+        predicted_m, weights, status = self.predicted_m.copy(), self.weights.copy(), self.observations.status.copy()
+        predicted_m[rows] += longer_m
+        weights[rows] = self.errors.subset(rows).robust_weights((predicted_m - self.observations.log.range_m)[rows])
+        status[rows] = status_by_weight(weights[rows])
+        mirrors_m = [
+            None if each.mirror_position_m is None else change.apply(each.mirror_position_m) for each in self.anchors
+        ]
+        places = zip(self.anchors, anchors_m, mirrors_m, strict=True)
+        return replace(
+            self,
+            anchors=tuple(replace(a, position_m=at_m, mirror_position_m=mirror_m) for a, at_m, mirror_m in places),
+            observations=replace(self.observations, status=status),
+            predicted_m=predicted_m,
+            weights=weights,
+        )
+
+    def __repr__(self) -> str:
+        """Return what the refinement did on one line."""
+        ended = "converged" if self.converged else "not converged"
+        return f"<refinement of {self.num_iterations} iterations, {ended}, {self.reprojection_rms_px:.2f} px>"
+
+
+def summarize(
+    rest: MapAtRest, given: Ranges, covariance: JointCovariance | None, bending_factor: float
+) -> RefineSummary:
+    """Summarise a refinement.
+
+    Args:
+        rest: the map at rest. given: the ranges before, which may be none.
+        covariance, bending_factor: as in the summary.
+    """
+    ranges = ranges_of(rest.problem.kinds, given)
+    state, solutions = rest.state, rest.solutions
+    if not len(ranges.rows):
+        state = replace(state, blocks={**ranges.blocks, **state.blocks})
+    observations, rows, errors = ranges.observations, ranges.rows, ranges.errors
+    log = observations.log
+    predicted_m = ranges.predicted_m(state)
+    residuals_m, weights, status = predicted_m - log.range_m, np.full(len(log), np.nan), observations.status.copy()
+    weights[rows] = errors.robust_weights(residuals_m[rows])
+    status[rows] = status_by_weight(weights[rows])
+    times = observations.before + observations.fraction if log.timestamp_s is None else log.timestamp_s
+    return RefineSummary(
+        num_iterations=sum(solution.num_iterations for solution in solutions),
+        num_graph_steps=rest.num_graph_steps,
+        bend_m=rest.bend_m,
+        initial_cost=solutions[0].initial_cost,
+        final_cost=solutions[-1].final_cost,
+        reprojection_rms_px=rest.reprojection_rms_px,
+        pixel_stddev=rest.pixel_stddev,
+        errors=errors.spread(rows, len(log)),
+        seconds=sum(solution.seconds for solution in solutions),
+        converged=rest.converged,
+        message=solutions[-1].message,
+        misfits=misfits(errors, residuals_m[rows], times[rows]),
+        anchors=_with_stddevs(anchors_at(ranges.anchors, state.blocks), covariance),
+        tags_in_cam_m=ranges.arms_m(state),
+        time_shift_s=ranges.estimated(state, CLOCK),
+        short_range_error_m=ranges.estimated(state, SHORT),
+        covariance=covariance,
+        bending_factor=bending_factor,
+        observations=replace(observations, status=status),
+        predicted_m=predicted_m,
+        weights=weights,
+    )
+
+
+def _with_stddevs(
+    anchors: tuple[AnchorEstimate, ...], covariance: JointCovariance | None
+) -> tuple[AnchorEstimate, ...]:
+    if covariance is None:
+        return anchors
+    variances = np.trace(covariance.anchors, axis1=1, axis2=2) / 3
+    # Rounding leaves a negative variance where the joint equations hardly determine an anchor: then it is not known.
+    variances[variances < 0] = np.nan
+    return tuple(
+        replace(anchor, position_stddev_m=float(np.sqrt(variance))) if np.isfinite(anchor.position_m).all() else anchor
+        for anchor, variance in zip(anchors, variances, strict=True)
+    )

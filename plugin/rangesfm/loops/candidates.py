@@ -11,7 +11,7 @@ import pycolmap
 from scipy.spatial import KDTree
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.colmap.point_observations import seen_in
+from rangesfm.colmap.pieces import seen_in
 from rangesfm.geometry.rotations import cross_matrices
 from rangesfm.loops.relative_errors import RelativeErrors
 

@@ -10,8 +10,7 @@ from itertools import compress
 import pycolmap
 
 from rangesfm.arrays import Indices
-from rangesfm.colmap.pieces import MIN_NUM_SHARED
-from rangesfm.colmap.point_observations import overlaps_in
+from rangesfm.colmap.pieces import MIN_NUM_SHARED, overlaps_in
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.trajectory import Trajectory

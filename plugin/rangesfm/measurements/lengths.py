@@ -13,6 +13,7 @@ from rangesfm import ceres
 from rangesfm.arrays import Array, Indices
 from rangesfm.ceres.bundle_adjustment import BundleAdjustment
 from rangesfm.distances.markers import images_by_name, variance_along
+from rangesfm.distances.tape import Marker, Tape
 from rangesfm.geometry.robust_statistics import RobustLoss
 from rangesfm.geometry.trajectory import pose_of
 from rangesfm.measurements.kind import (
@@ -26,6 +27,7 @@ from rangesfm.measurements.kind import (
 )
 from rangesfm.measurements.points import NamedPoints, linearized
 from rangesfm.measurements.prior import Prior
+from rangesfm.measurements.source import MapToFit, Source
 
 BETWEEN_ANCHORS: Block = ("bias", "between anchors")
 _TINY_M = 1e-9
@@ -164,3 +166,28 @@ def _of_rig(metric: pycolmap.Reconstruction, image: pycolmap.Image, origin: Arra
 
 def _origin(name: str) -> Block:
     return "rig origin", name
+
+
+@dataclass(frozen=True)
+class TapedLengths(Source):
+    """Lengths that were taped, between what the photos show or between anchors, of which the control ones take part."""
+
+    tape: Tape
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks of the lengths' ends."""
+        ends = {name for taped in self.tape.control().distances for name in taped.ends}
+        return {name: marker for name, marker in self.tape.markers.items() if name in ends}
+
+    def measurements(self, at: MapToFit) -> Iterator[Measurements]:
+        """Yield the lengths whose ends are in the map, if there are any."""
+        taped = [each for each in self.tape.control().distances if all(name in at.points for name in each.ends)]
+        if taped:
+            yield Lengths(
+                tuple(each.ends for each in taped),
+                at.points,
+                np.array([each.distance_m for each in taped]),
+                np.array([each.stddev_m for each in taped]),
+                {},
+            )

@@ -181,8 +181,3 @@ class AntennaPositions(Measurements):
 
     def log_likelihood(self, residual: Array) -> float:
         return -residual.size * float(np.log(max(self._shown(residual, 0.0), 1e-300)))
-
-
-def antenna_at(state: MapState) -> tuple[Array, float] | None:
-    """Return the antenna's lever arm (3,) in a state, and how much later it was there than assumed; None without."""
-    return (state.blocks[ARM], float(state.blocks[CLOCK][0])) if ARM in state.blocks else None

@@ -25,8 +25,8 @@ from rangesfm.inference.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, Estima
 from rangesfm.inference.mistakes import MistakeTests
 from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, JointProblem, ScaleByKind, ScaleUncertainty, joined
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap
+from rangesfm.measurements.site_positions import UsedPositions
 from rangesfm.measurements.source import Source
-from rangesfm.measurements.table import UsedPositions
 from rangesfm.positions.grouped_positions import (
     POSITIONS,
     GroupedPositions,

@@ -16,9 +16,10 @@ from rangesfm.geometry.trajectory import Trajectory, first_camera_from, moved_si
 from rangesfm.inference.bending import MapBending
 from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Posterior, ScaleUncertainty
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, join_kinds
+from rangesfm.measurements.kind import MapState
+from rangesfm.measurements.ranges import Ranges, anchors_at
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.errors.learned import LearnedErrors
-from rangesfm.ranging.errors.range_errors import RangeErrors
 from rangesfm.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved
 from rangesfm.scale.placement_prior import PlacementPrior
 from rangesfm.scale.range_equation import RangeProblem, RangeState, fit_at, predicted_ranges, solve
@@ -112,6 +113,46 @@ class RangeScale(KindOnMap):
         """Return the ranges on the map at the estimate of a posterior, with the same robust weights."""
         return replace(self, solution=moved(self.solution, known))
 
+    def on_refined_map(
+        self,
+        path: Trajectory,
+        scale: float,
+        ranges: Ranges,
+        at: MapState,
+        others: Sequence[KindOnMap],
+        bending: MapBending,
+    ) -> RangeScale:
+        """Return the ranges on the map that the scaled one became, as a scale problem in the unit of the latter.
+
+        Args:
+            path: of the refined map, in the metric world. scale: its metres per unit of the unscaled model.
+            ranges: as weighted in the refined map. at: its state.
+            others: measurements of other kinds on it. bending: of it.
+        """
+        unit, trajectory = 1 / scale, path.transformed(1 / scale, np.eye(3), np.zeros(3))
+        placed = Similarity(scale, first_camera_from(trajectory).rotation.T, path.centers[0])
+        tags_m, centers_m = ranges.antennas_m(at)
+        problem = replace(
+            self.posed.ranges,
+            centers=placed.inverse().apply(centers_m),
+            tag_from_center=(tags_m - centers_m) @ placed.rotation,
+            distances=with_lengths(self.posed.ranges.distances, others, scale),
+            # The model's frame is that of the first camera, in the unit of the unscaled model.
+            placement=placement_by(others, replace(IDENTITY, scale=unit) @ first_camera_from(path)),
+        )
+        anchors = anchors_at(ranges.anchors, at.blocks)
+        state = RangeState(
+            placed,
+            np.array([anchor.position_m for anchor in anchors]),
+            np.array([anchor.range_bias_m for anchor in anchors]),
+        )
+        by_errors, errors = weighted(problem, ranges.errors), ranges.errors
+        off_m = predicted_ranges(problem, state) + ranges.shared_m(at)[ranges.rows] - problem.range_m
+        fit = fit_at(by_errors, state, errors.robust_weights(off_m))
+        solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
+        posed = replace(self.posed, ranges=problem, trajectory=trajectory)
+        return RangeScale(posed, solution, path, unit, bending, anchors=self.anchors)
+
     def learnt(self, on_map: JointMap) -> LearnedErrors:
         """Return the errors of the ranges as learnt on a map, with those of the map."""
         observed = on_map.observed[RANGES]
@@ -135,46 +176,6 @@ class RangeScale(KindOnMap):
             others = [unknown if each is self else each for each in on_map.kinds]
             unplaced = on_map.rejoined(others, unknown.placed).posterior.uncertainty
             yield from remarks_on_places(on_map.posterior.uncertainty, unplaced)
-
-
-def ranges_on_refined_map(
-    start: RangeScale,
-    others: Sequence[KindOnMap],
-    trajectory_m: Trajectory,
-    scale: float,
-    tags_m: Array,
-    centers_m: Array,
-    anchors_m: Array,
-    biases_m: Array,
-    errors: RangeErrors,
-    off_m: Array,
-    bending: MapBending,
-) -> RangeScale:
-    """Transfer the ranges of a scale estimate to the map that it became.
-
-    Args:
-        start: the ranges on the unscaled map. others: measurements of other kinds on the refined map.
-        trajectory_m: of the refined map, in the metric world. scale: its metres per unit of the unscaled model.
-        tags_m, centers_m: (k, 3) positions of tag and camera at each of the k ranges.
-        anchors_m: (m, 3). biases_m: (m,). errors: of the k ranges, as weighted.
-        off_m: (k,) by how much the map takes them to be too long because of shared errors.
-    """
-    unit, trajectory = 1 / scale, trajectory_m.transformed(1 / scale, np.eye(3), np.zeros(3))
-    placed = Similarity(scale, first_camera_from(trajectory).rotation.T, trajectory_m.centers[0])
-    problem = replace(
-        start.posed.ranges,
-        centers=placed.inverse().apply(centers_m),
-        tag_from_center=(tags_m - centers_m) @ placed.rotation,
-        distances=with_lengths(start.posed.ranges.distances, others, scale),
-        # The model's frame is that of the first camera, in the unit of the unscaled model.
-        placement=placement_by(others, replace(IDENTITY, scale=unit) @ first_camera_from(trajectory_m)),
-    )
-    state = RangeState(placed, anchors_m, biases_m)
-    by_errors = weighted(problem, errors)
-    robust = errors.robust_weights(predicted_ranges(problem, state) + off_m - problem.range_m)
-    solution = Solution(by_errors, fit_at(by_errors, state, robust), errors, float(np.median(errors.stddev_m)))
-    posed = replace(start.posed, ranges=problem, trajectory=trajectory)
-    return RangeScale(posed, solution, trajectory_m, unit, bending, anchors=start.anchors)
 
 
 def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarity) -> PlacementPrior | None:

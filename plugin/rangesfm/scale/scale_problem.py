@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.distances.locate_lengths import LocatedDistances, distances_by_radio, surveyed_distances
+from rangesfm.distances.locate_lengths import LocatedDistances, surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of
 from rangesfm.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory, first_camera_from
+from rangesfm.measurements.radio import lengths_by_radio
 from rangesfm.options import RangeModelOptions
 from rangesfm.ranging.anchors.anchor import Anchor
 from rangesfm.ranging.anchors.site import Site
@@ -151,7 +152,8 @@ def scale_problem(
     if anchor_frame == "site" and not known.any():
         measured += _between_surveyed(in_log, given & heard)
     noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
-    measured.append(distances_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m))
+    pairs, length_m, stddev_m = lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m)
+    measured.append(LocatedDistances.of(length_m, stddev_m, anchor_pair=pairs))
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], trajectory),

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.distances.tape import Marker, Tape, markers_of_photos
-from rangesfm.distances.tape_file import read_tape
+from rangesfm.distances.tape import Marker, Tape
+from rangesfm.distances.tape_file import markers_of_photos, read_tape
 from rangesfm.errors import InputError
 from rangesfm.files.folders import natural_order
 from rangesfm.geometry.reference import Reference

@@ -10,13 +10,20 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.distances.lengths_on_map import LENGTHS
 from rangesfm.distances.locate_lengths import locate_distances
+from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
+from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.inference.bending import MapBending
-from rangesfm.measurements.joint_map import KindOnMap, find_kind
+from rangesfm.measurements.gravity import Upwards
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, find_kind
 from rangesfm.measurements.kind import Block
+from rangesfm.measurements.lengths import TapedLengths
+from rangesfm.measurements.positions import ARM, CLOCK
+from rangesfm.measurements.source import Source
 from rangesfm.positions.grouped_positions import POSITIONS
+from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.scale.scale_by_lengths import LengthScale, lengths_between_points
 from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.survey.inputs import RangingInputs
@@ -42,7 +49,7 @@ class MapOfPhotos:
 
 
 def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
-    surveyed = inputs.positions
+    surveyed = _with_antenna_at(inputs.positions, at.blocks)
     known = surveyed.located(at.model, at.path)
     if known is None or known.is_check.all():
         return None
@@ -55,6 +62,15 @@ def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
         metres_per_unit=at.metres_per_unit,
     )
     return replace(found, surveyed=surveyed)
+
+
+def _with_antenna_at(surveyed: SurveyedPositions, blocks: Mapping[Block, Array]) -> SurveyedPositions:
+    """Return all positions with the antenna's lever arm and time offset as a refinement has estimated them."""
+    track = surveyed.antenna
+    if track is None or ARM not in blocks:
+        return surveyed
+    offset_s = None if track.offset_s is None else track.offset_s + float(blocks[CLOCK][0])
+    return replace(surveyed, antenna=replace(track, offset_s=offset_s, antenna_in_cam_m=blocks[ARM]))
 
 
 def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
@@ -91,3 +107,14 @@ def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[KindOnMa
             continue
         found += [] if located is None else [located]
     return tuple(found), tuple(remarks)
+
+
+def sources_in_map(tape: Tape, on_map: JointMap | None, gravity: Gravity | None) -> tuple[Source, ...]:
+    """Return the measurements besides ranges for the fit of a map that may bend.
+
+    Args:
+        tape: lengths of all kinds. on_map: what is measured in the map as one piece; None where nothing is known.
+        gravity: the upward direction in the first camera; None where the map has no place in the site.
+    """
+    of_kinds = () if on_map is None else (source for kind in on_map.kinds for source in kind.sources(on_map))
+    return (TapedLengths(tape), *of_kinds, *(() if gravity is None else (Upwards(gravity),)))

@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from rangesfm.errors import InputError, OptionError
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.option_model import Key, Options, PathRole
 from rangesfm.options import (
     AnchorOptions,
@@ -21,7 +22,6 @@ from rangesfm.options import (
     ExportOptions,
     ImageOptions,
     ImuOptions,
-    MapperOptions,
     MarkerOptions,
     OutputOptions,
     PointOptions,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rangesfm.errors import OptionError
 from rangesfm.installed_versions import OTHER_BUILDS, num_gpus
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 
 
 def uses_gpu(mapper: MapperOptions) -> bool:

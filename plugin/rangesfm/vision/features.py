@@ -9,7 +9,7 @@ import pycolmap
 
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import OptionError, ReconstructionError
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.processes.supervision import run_child
 from rangesfm.progress import Progress
 from rangesfm.vision.database import num_photos_with_features

@@ -19,7 +19,8 @@ from rangesfm.colmap.model_files import read_model, write_binary_model
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError, ReconstructionError, shown
 from rangesfm.files.atomic import new_folder, scratch_folder
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.processes.supervision import run_child
 from rangesfm.vision.background import run_in_background
 from rangesfm.vision.database import num_matching_pairs

@@ -16,7 +16,7 @@ import pycolmap
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import ReconstructionError
 from rangesfm.files.atomic import scratch_folder
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.processes.supervision import run_children
 from rangesfm.progress import Progress
 from rangesfm.vision.background import run_in_background

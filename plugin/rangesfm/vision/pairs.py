@@ -12,7 +12,7 @@ import pycolmap
 from rangesfm.colmap.passthrough import apply_options
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.files.text_tables import read_text
-from rangesfm.options import MapperOptions
+from rangesfm.mapper_options import MapperOptions
 from rangesfm.vision.database import named_by_place
 from rangesfm.vision.photo_files import Photos
 

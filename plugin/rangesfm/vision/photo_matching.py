@@ -12,7 +12,8 @@ from typing import Any
 import pycolmap
 
 from rangesfm.files.atomic import new_file
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.vision.camera import PhotoCameras, cameras_of_photos, check_camera
 from rangesfm.vision.database import (
     clear_matches,

@@ -12,7 +12,8 @@ import pycolmap
 from rangesfm.errors import InputError, ReconstructionError
 from rangesfm.files.atomic import scratch_folder, sole_writer
 from rangesfm.files.contents import AnyPath
-from rangesfm.options import CameraOptions, MapperOptions
+from rangesfm.mapper_options import MapperOptions
+from rangesfm.options import CameraOptions
 from rangesfm.progress import SILENT, Progress
 from rangesfm.vision.loop_database import forget_loops
 from rangesfm.vision.mapping import MappingOptions, map_photos, mapping_options, pipeline_options, read_mapped_models

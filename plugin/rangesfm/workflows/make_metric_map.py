@@ -29,9 +29,9 @@ from rangesfm.distances.locate_lengths import surveyed_distances
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model, by_photos
-from rangesfm.estimation.refine_summary import summarize
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
 from rangesfm.estimation.vision_information import LoopPoses
+from rangesfm.estimation.with_ranges import summarize
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.geometry.poses import model_poses
@@ -41,20 +41,14 @@ from rangesfm.inference.bending import MapBending, WalkBending
 from rangesfm.inference.mistakes import MistakeTests
 from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS
 from rangesfm.join.join_models import ModelVerdict, join_models
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, find_kind, join_kinds, tested_kinds
+from rangesfm.measurements.joint_map import Doubt, JointMap, find_kind, join_kinds, tested_kinds
 from rangesfm.measurements.kind import MapState
-from rangesfm.measurements.table import (
-    Measured,
-    TapedLengths,
-    Upwards,
-    anchors_at,
-    antenna_at,
-    ranges_of,
-    ranges_of_map,
-)
+from rangesfm.measurements.radio import RadioLog, ranges_of, ranges_of_map
+from rangesfm.measurements.ranges import Ranges
+from rangesfm.measurements.source import Measured
 from rangesfm.positions.clock import POSITIONS
-from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.processes.threads import at_most
+from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.clock.offset import TimeOffset
 from rangesfm.ranging.clock.time_offset import REMEDY
 from rangesfm.ranging.errors.components import CLOCKS
@@ -62,10 +56,10 @@ from rangesfm.result.result_folder import is_refined_model
 from rangesfm.scale.binned_ranges import RANGES
 from rangesfm.scale.scale_by_lengths import LengthScale
 from rangesfm.scale.scale_by_positions import PositionScale
-from rangesfm.scale.scale_by_ranges import RangeScale, ranges_on_refined_map
+from rangesfm.scale.scale_by_ranges import RangeScale
 from rangesfm.scale.scale_estimate import ScaleEstimate
 from rangesfm.scale.scale_verdict import NOTHING_KNOWN, refuse_unknown
-from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map
+from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, sources_in_map
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.workflows.close_loops import RefinedMap, close_loops_of_survey
@@ -170,15 +164,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
         estimate = replace(estimate, anchors=sides.of(estimate.anchors))
     rivals = _by_rivals(run, path, estimate)
     scaled = rescale(path.sfm, estimate.metric_from_sfm)
-    ranges = ranges_of_map(
-        path.trajectory,
-        estimate.observations,
-        estimate.metric_from_sfm,
-        inputs.tag_in_cam_m,
-        estimate.anchors,
-        estimate.errors,
-        survey.refine,
-    )
+    ranges = _ranges(run, path.trajectory, estimate, estimate.anchors)
     predicted = ranges.predicted_m(MapState(model_poses(scaled, path.trajectory.frame_ids), ranges.blocks))
     weights = estimate.errors.robust_weights(predicted - inputs.log.range_m)
     offset_s = offset.value_s if offset is not None else survey.ranges.time_offset_s
@@ -323,7 +309,7 @@ def refine_map(run: SurveyRun, metric: MetricResult) -> RefinedMap:
     measured = _measured(run, metric)
     with at_most(run.survey.mapper.num_threads):
         problem = _problem(run, metric, measured, metric.scaled, is_refined=is_refined_model(run.survey.images.model))
-        return _finished(run, metric, measured, refine(problem, measured.markers))
+        return _finished(run, metric, refine(problem, measured.markers))
 
 
 def refine_closed_map(
@@ -344,7 +330,7 @@ def refine_closed_map(
         problem = _problem(run, metric, measured, metric.final, is_refined=True)
         known = problem.like(refined.at_rest.problem)
         rest = refine_with_loops(problem, known, measured.markers, loops, merge_tracks)
-        return _finished(run, metric, measured, rest)
+        return _finished(run, metric, rest)
 
 
 def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
@@ -357,25 +343,30 @@ def _with_open_clock(run: SurveyRun, metric: MetricResult) -> SurveyRun:
 
 def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
     """Return all that was measured of a scaled map."""
-    estimate, inputs, options = metric.estimate, run.inputs, run.survey.refine
-    tape = metric.tape
+    estimate, inputs, tape = metric.estimate, run.inputs, metric.tape
     if inputs.anchor_frame == "site" and estimate.frame != "site":
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
-    ranges = ranges_of_map(
-        metric.trajectory,
+    gravity = gravity_of(run.survey.scale.up_in_first_camera) if estimate.frame == "site" else None
+    return Measured((RadioLog(_given_ranges(run, metric)), *sources_in_map(tape, estimate.on_map, gravity)))
+
+
+def _given_ranges(run: SurveyRun, metric: MetricResult) -> Ranges:
+    """Return the ranges of a scaled map, with the errors that all other measurements may correct."""
+    estimate = metric.estimate
+    ranges = _ranges(run, metric.trajectory, estimate, metric.anchors)
+    return replace(ranges, shared_errors_m=estimate.shared_errors_m)
+
+
+def _ranges(run: SurveyRun, path: Trajectory, estimate: ScaleEstimate, anchors: Sequence[AnchorEstimate]) -> Ranges:
+    return ranges_of_map(
+        path,
         estimate.observations,
         estimate.metric_from_sfm,
-        inputs.tag_in_cam_m,
-        metric.anchors,
+        run.inputs.tag_in_cam_m,
+        anchors,
         estimate.errors,
-        options,
-    )
-    gravity, on_map = gravity_of(run.survey.scale.up_in_first_camera), estimate.on_map
-    of_kinds = () if on_map is None else (source for kind in on_map.kinds for source in kind.sources(on_map))
-    upwards = () if gravity is None or estimate.frame != "site" else (Upwards(gravity),)
-    return Measured(
-        replace(ranges, shared_errors_m=estimate.shared_errors_m), (TapedLengths(tape), *of_kinds, *upwards)
+        run.survey.refine,
     )
 
 
@@ -395,10 +386,10 @@ def _problem(
     )
 
 
-def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> RefinedMap:
+def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> RefinedMap:
     """Learn the errors at a map at rest, and return it as a result with its covariance."""
     survey, estimate = run.survey, metric.estimate
-    at, factor = _measured_at_rest(run, metric, measured, rest), 1.0
+    at, factor = _measured_at_rest(run, metric, rest), 1.0
     if at is not None:
         if survey.refine.time_offset_stddev_s and at.find(RangeScale) is not None:
             at = at.without(RANGES, CLOCKS)
@@ -415,7 +406,7 @@ def _finished(run: SurveyRun, metric: MetricResult, measured: Measured, rest: Ma
             )
     refined = rest.problem.metric
     refined.update_point_3d_errors()
-    summary = summarize(rest, measured.ranges, covariance, factor)
+    summary = summarize(rest, _given_ranges(run, metric), covariance, factor)
     broken = why_broken(metric.scaled, refined, metric.trajectory, estimate, summary, survey.refine.range_loss_scale)
     if broken and not point_errors(metric.scaled).fit:
         raise SolverError(
@@ -456,16 +447,6 @@ def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, refined
     return replace(refined, metric=replace(metric, estimate=estimate, refinement=refinement))
 
 
-def _surveyed_at_rest(surveyed: SurveyedPositions, rest: MapAtRest) -> SurveyedPositions:
-    """Return all positions with the antenna's lever arm and time offset as a map at rest has them."""
-    track, found = surveyed.antenna, antenna_at(rest.state)
-    if track is None or found is None:
-        return surveyed
-    arm_m, later_s = found
-    offset_s = None if track.offset_s is None else track.offset_s + later_s
-    return replace(surveyed, antenna=replace(track, offset_s=offset_s, antenna_in_cam_m=arm_m))
-
-
 def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) -> MapBending:
     """Return the bending of a refined map; ``metres_per_unit``: of the model to which the measurements refer."""
     if rest.equations is not None:
@@ -478,7 +459,7 @@ def _bending_at_rest(rest: MapAtRest, path: Trajectory, metres_per_unit: float) 
     return WalkBending(in_first_camera(path, metres_per_unit))
 
 
-def _measured_at_rest(run: SurveyRun, metric: MetricResult, measured: Measured, rest: MapAtRest) -> JointMap | None:
+def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> JointMap | None:
     """Return a map at rest with all that is measured in it; None where nothing is known of the scale's error."""
     start, model = metric.estimate.on_map, rest.problem.metric
     if start is None:
@@ -487,43 +468,13 @@ def _measured_at_rest(run: SurveyRun, metric: MetricResult, measured: Measured, 
     is_firm = np.isin(path.frame_ids, rest.firm_ids)
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
     bending = _bending_at_rest(rest, path, scale)
-    inputs = replace(run.inputs, tape=metric.tape, positions=_surveyed_at_rest(metric.positions, rest))
+    inputs = replace(run.inputs, tape=metric.tape, positions=metric.positions)
     others, _ = kinds_in_map(inputs, MapOfPhotos(model, path, bending, scale, rest.state.blocks, start.kinds))
-    others = tested_kinds(others, IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True) if others else ()
-    ranges = start.find(RangeScale)
-    of_ranges = (
-        () if ranges is None else (_ranges_at_rest(ranges, metric, measured, rest, path, scale, bending, others),)
-    )
-    return replace(join_kinds((*of_ranges, *others), path, IDENTITY, bending, is_at_rest=True), metres_per_unit=scale)
-
-
-def _ranges_at_rest(
-    start: RangeScale,
-    metric: MetricResult,
-    measured: Measured,
-    rest: MapAtRest,
-    path: Trajectory,
-    scale: float,
-    bending: MapBending,
-    others: Sequence[KindOnMap],
-) -> RangeScale:
-    """Return the ranges on a map at rest, as a scale problem in the unit of the unscaled model."""
-    ranges = ranges_of(rest.problem.kinds, measured.ranges)
-    tags_m, centers_m = ranges.antennas_m(rest.state)
-    anchors = anchors_at(ranges.anchors, rest.state.blocks)
-    return ranges_on_refined_map(
-        start,
-        others,
-        path,
-        scale,
-        tags_m,
-        centers_m,
-        np.array([anchor.position_m for anchor in anchors]),
-        np.array([anchor.range_bias_m for anchor in anchors]),
-        ranges.errors,
-        ranges.shared_m(rest.state)[ranges.rows],
-        bending,
-    )
+    kinds = tested_kinds(others, IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True) if others else ()
+    if (before := start.find(RangeScale)) is not None:
+        ranges = ranges_of(rest.problem.kinds, _given_ranges(run, metric))
+        kinds = (before.on_refined_map(path, scale, ranges, rest.state, kinds, bending), *kinds)
+    return replace(join_kinds(kinds, path, IDENTITY, bending, is_at_rest=True), metres_per_unit=scale)
 
 
 def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt]) -> MetricResult:

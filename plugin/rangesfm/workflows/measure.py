@@ -10,8 +10,8 @@ import numpy as np
 
 from rangesfm.distances.map_points import MapPoints
 from rangesfm.distances.measured_lists import PAIRS
-from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker, markers_of_photos
-from rangesfm.distances.tape_file import read_markers
+from rangesfm.distances.tape import FOUND_STDDEV_PX, Marker
+from rangesfm.distances.tape_file import markers_of_photos, read_markers
 from rangesfm.errors import InputError, number_text
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.text_tables import align_rows, write_table

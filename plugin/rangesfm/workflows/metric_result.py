@@ -16,7 +16,7 @@ from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.finished_map import Place
 from rangesfm.diagnostics.linearized import RangesOnMap
 from rangesfm.distances.tape import Tape
-from rangesfm.estimation.refine_summary import RefineSummary
+from rangesfm.estimation.with_ranges import RefineSummary
 from rangesfm.geometry.map_errors import MapErrors
 from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory

@@ -23,10 +23,11 @@ from rangesfm.ranging.errors.noise import (
     InlierNoise,
     correlation_inflation,
     inlier_noise,
+    place_labels,
     shared_stddev,
+    shares_by_residuals,
     stretch_labels,
 )
-from rangesfm.ranging.errors.place import place_labels, shares_by_residuals
 from rangesfm.ranging.range_observations import RangeObservations
 
 _Errors = TypeVar("_Errors")
