@@ -305,9 +305,9 @@ def _joint_inverse(equations: NormalEquations) -> _Inverse:
 
 
 def _factored(normal: Array | csr_array, columns: BlockColumns) -> NestedFactor:
-    is_last = np.array([kind not in ("pose", "point") for kind in columns.kinds], dtype=bool)
+    may_be_last = np.array([kind not in ("pose", "point") for kind in columns.kinds], dtype=bool)
     try:
-        found = factor(normal, columns.starts, is_last)
+        found = factor(normal, columns.starts, may_be_last)
     except SingularError as error:
         raise _not_determined(columns, error.column) from error
     worst = int(np.argmin(found.pivots))

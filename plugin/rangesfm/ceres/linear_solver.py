@@ -115,15 +115,15 @@ def _strip(rows: bsr_array, first: int, last: int) -> bsr_array:
     return bsr_array((rows.data[entries], rows.indices[entries], starts - starts[0]), shape=shape)
 
 
-def factor(normal: Array | csr_array, starts: Indices, is_last: Mask) -> NestedFactor:
+def factor(normal: Array | csr_array, starts: Indices, may_be_last: Mask) -> NestedFactor:
     """Factor normal equations; dense ones are overwritten, and sparse ones that are full enough are made dense.
 
     Args:
-        starts, is_last: as for ``NestedFactor``.
+        starts, may_be_last: as for ``NestedFactor``.
 
     Raises:
         SingularError: they are singular, by rounding or exactly.
     """
     if not isinstance(normal, np.ndarray) and _is_full(normal):
         normal = normal.toarray()
-    return NestedFactor(normal, starts, is_last)
+    return NestedFactor(normal, starts, may_be_last)

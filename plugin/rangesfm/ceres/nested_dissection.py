@@ -58,13 +58,14 @@ class Front:
     children: tuple[int, ...]
 
 
-def fronts_of(tied: csr_array, is_last: Mask) -> list[Front]:
+def fronts_of(tied: csr_array, may_be_last: Mask) -> list[Front]:
     """Return the fronts in the order of their elimination, each after its children.
 
     Args:
         tied: (n, n) symmetric; nonzero where two blocks are tied to each other.
-        is_last: (n,) blocks to be eliminated after all others, such as those that many others are tied to.
+        may_be_last: (n,) blocks to be eliminated after all others if more are tied to them than are in a part.
     """
+    is_last = may_be_last & (np.diff(tied.indptr) > _MAX_LEAF)
     first = np.flatnonzero(~is_last)
     parts = list(_dissected(csr_array(tied[first][:, first]), first))
     if is_last.any():
@@ -211,20 +212,20 @@ class NestedFactor:
 
     pivots: Array
 
-    def __init__(self, matrix: Array | csr_array, starts: Indices, is_last: Mask) -> None:
+    def __init__(self, matrix: Array | csr_array, starts: Indices, may_be_last: Mask) -> None:
         """Factor a matrix; a dense one is one front, and is overwritten.
 
         Args:
             matrix: (size, size). starts: (n + 1,) first column of each of n blocks, and the size.
-            is_last: (n,) as for ``fronts_of``.
+            may_be_last: (n,) as for ``fronts_of``.
 
         Raises:
             SingularError: the matrix is singular, by rounding or exactly.
         """
         if isinstance(matrix, np.ndarray):
-            fronts = [Front(np.arange(len(is_last)), np.zeros(0, dtype=np.int64), ())] if len(matrix) else []
+            fronts = [Front(np.arange(len(may_be_last)), np.zeros(0, dtype=np.int64), ())] if len(matrix) else []
         else:
-            fronts = fronts_of(_tied_blocks(matrix, starts), is_last)
+            fronts = fronts_of(_tied_blocks(matrix, starts), may_be_last)
         self._order = _columns_of([front.own for front in fronts], starts)
         place = np.argsort(self._order)
         sizes = np.diff(starts)

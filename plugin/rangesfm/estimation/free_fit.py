@@ -221,9 +221,10 @@ class _Layout:
 
     @property
     def parts(self) -> tuple[Indices, Mask]:
-        """Return the first free column of each pose, and of all else, and whether it is all else, which comes last."""
+        """Return the first free column of each pose and each block, and whether it is of a block."""
         num_of_poses = np.count_nonzero(self.free < 6 * self.num_poses)
-        ends = np.union1d(np.arange(0, num_of_poses + 1, 6), len(self.free))
+        of_blocks = np.searchsorted(self.free, [*self.first_of.values(), self.num])
+        ends = np.union1d(np.arange(0, num_of_poses + 1, 6), of_blocks)
         return ends, ends[1:] > num_of_poses
 
 
