@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -26,7 +26,7 @@ from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.progress import SilentProgress
 from rangesfm.vision.camera import cameras_of_photos
 from rangesfm.vision.features import feature_options
-from rangesfm.vision.mapping import mapping_options, pipeline_options
+from rangesfm.vision.mapping import WHILE_GROWING, mapping_options, pipeline_options
 from rangesfm.vision.matching import matching_options
 from rangesfm.vision.own_process import match_share
 from rangesfm.vision.photo_files import Photos
@@ -80,6 +80,7 @@ def test_a_vocabulary_tree_is_the_users(matching: str) -> None:
 
 
 SEEDS = {"random_seed": SEED, "mapper.random_seed": SEED, "triangulation.random_seed": SEED}
+GROWING = SEEDS | WHILE_GROWING
 AS_GIVEN = {
     "constant_cameras": {1},
     "ba_refine_focal_length": False,
@@ -116,7 +117,7 @@ def database_of(path: Path, *sizes: tuple[int, int]) -> Path:
 @pytest.mark.parametrize(
     ("method", "from_the_start", "as_given"),
     [
-        ("incremental", {"num_threads": 3} | SEEDS, AS_GIVEN),
+        ("incremental", {"num_threads": 3} | GROWING, AS_GIVEN),
         ("global", GLOBALLY, GLOBALLY_AS_GIVEN),
         ("hierarchical", of_clusters(SEEDS), of_clusters(AS_GIVEN)),
     ],
@@ -131,17 +132,20 @@ def test_models_are_mapped_as_colmap_maps_them(
     assert alone == from_the_start | {"num_threads": 1}
     kept = mapping_options(KNOWN_CAMERA.changed(refine_intrinsics=False), mapper, NO_RIGS, SEED, database)
     assert changes(kept.growing) == from_the_start | as_given
-    assert kept.whole is None
+    if method == "incremental":
+        assert changes(kept.whole) == {"num_threads": 3, "constant_cameras": {1}} | SEEDS
+    else:
+        assert kept.whole is None
 
 
-@pytest.mark.parametrize(("method", "named"), [("incremental", lambda changes: changes), ("hierarchical", of_clusters)])
-def test_a_calibration_holds_until_the_map_is_whole(
-    method: str, named: Callable[[dict[str, Any]], dict[str, Any]], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(
+    ("method", "growing"), [("incremental", GROWING | AS_GIVEN), ("hierarchical", of_clusters(SEEDS | AS_GIVEN))]
+)
+def test_a_calibration_holds_until_the_map_is_whole(method: str, growing: dict[str, Any], tmp_path: Path) -> None:
     mapper = MapperOptions(num_threads=3).changed(method=method)
     options = mapping_options(KNOWN_CAMERA, mapper, NO_RIGS, SEED, database_of(tmp_path / "database.db", (256, 192)))
     threads = {"num_threads": 1 if method == "hierarchical" else 3}
-    assert changes(options.growing) == threads | named(SEEDS | AS_GIVEN)
+    assert changes(options.growing) == threads | growing
     assert options.whole is not None
     assert changes(options.whole) == threads | SEEDS
 
@@ -153,20 +157,25 @@ def test_a_camera_that_is_guessed_beside_a_calibrated_one_is_refined_from_the_st
     database = database_of(tmp_path / "database.db", (256, 192), (256, 192), (300, 300))
     camera = KNOWN_CAMERA.changed(refine_intrinsics=refines)
     options = mapping_options(camera, MapperOptions(num_threads=3), NO_RIGS, SEED, database)
-    assert changes(options.growing) == {"num_threads": 3, "constant_cameras": {1, 2}} | SEEDS
-    assert (options.whole is None) == (refines is False)
-    if options.whole is not None:
-        assert changes(options.whole) == {"num_threads": 3} | SEEDS
+    held = {"constant_cameras": {1, 2}}
+    assert changes(options.growing) == {"num_threads": 3} | held | GROWING
+    assert changes(options.whole) == {"num_threads": 3} | SEEDS | (held if refines is False else {})
 
 
 @pytest.mark.parametrize("camera", [CameraOptions(), KNOWN_CAMERA.changed(refine_intrinsics=True)])
-def test_what_nobody_knows_is_refined_from_the_start_and_nothing_is_left_to_do(
-    camera: CameraOptions, tmp_path: Path
-) -> None:
+def test_what_nobody_knows_is_refined_from_the_start(camera: CameraOptions, tmp_path: Path) -> None:
     database = database_of(tmp_path / "database.db", (256, 192))
     options = mapping_options(camera, MapperOptions(num_threads=3), NO_RIGS, SEED, database)
-    assert options.whole is None
-    assert changes(options.growing) == {"num_threads": 3} | SEEDS
+    assert changes(options.growing) == {"num_threads": 3} | GROWING
+    assert changes(options.whole) == {"num_threads": 3} | SEEDS
+
+
+def test_how_a_map_grows_is_the_users_too(tmp_path: Path) -> None:
+    given = {"ba_global_frames_ratio": 1.2, "ba_global_max_refinements": 3}
+    mapper, database = MapperOptions(num_threads=3, pipeline=given), database_of(tmp_path / "database.db", (256, 192))
+    options = mapping_options(CameraOptions(), mapper, NO_RIGS, SEED, database)
+    assert changes(options.growing) == {"num_threads": 3} | GROWING | given
+    assert changes(options.whole) == {"num_threads": 3} | SEEDS | given
 
 
 def test_a_camera_is_guessed_as_colmap_guesses_it(monkeypatch: pytest.MonkeyPatch) -> None:

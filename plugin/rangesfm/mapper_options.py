@@ -52,7 +52,8 @@ class MapperOptions(Options, table="mapper"):
     """Passed through to pycolmap's FeatureMatchingOptions."""
     pipeline: dict[str, Any] = Field(default_factory=dict)
     """Passed through to the options of pycolmap's mapper: IncrementalPipelineOptions, GlobalPipelineOptions or
-    HierarchicalPipelineOptions."""
+    HierarchicalPipelineOptions. Unlike COLMAP, the incremental mapper adjusts all of a growing map only when it has
+    doubled, and once; when it is whole, it is adjusted to the end. ba_global_frames_ratio = 1.1 etc. change that."""
     close_loops: bool = True
     """Match photos of distant times that the refined map predicts to see the same, and refine again with these matches.
     Photos of different models that look alike are matched too. Without anything in metres (reconstruct), the unscaled

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from scipy import special
 from scipy.spatial.distance import pdist
-from scipy.stats import chi2
 
 from rangesfm import ceres
 from rangesfm.ceres.bundle_adjustment import bundle_adjustment, keyframe_centers
@@ -76,7 +76,7 @@ class LensFit:
         Args:
             bending_factor: that multiple.
         """
-        return bool(self.gain < bending_factor**2 * chi2.isf(RISK, self.num_params))
+        return bool(self.gain < bending_factor**2 * special.chdtri(self.num_params, RISK))
 
 
 def fit_lens(model: pycolmap.Reconstruction) -> LensFit | None:

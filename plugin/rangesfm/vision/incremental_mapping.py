@@ -16,8 +16,6 @@ from typing import TypeAlias
 
 import pycolmap
 
-from rangesfm.geometry.trajectory import pose_of
-
 # Rounds of lower demands on the initial pair, as in COLMAP.
 _NUM_RELAXATIONS = 2
 # The last adjustment ends when the cost decreases by less than this fraction, which is Ceres' default.
@@ -114,9 +112,9 @@ def incremental_mapping(
 class _WholeAdjustments:
     """Keeper of the size at which a growing model was last adjusted as a whole.
 
-    COLMAP does that each time the model has grown by a tenth since the last time. It begins to count at the size at
-    which it begins to map. So the first adjustment of a continued model is made due at the size at which it would have
-    been without the interruption.
+    COLMAP does that each time the model has grown by a given share since the last time. It begins to count at the size
+    at which it begins to map. So the first adjustment of a continued model is made due at the size at which it would
+    have been without the interruption.
 
     Args:
         options: of a pipeline, which reads them again after each photo.
@@ -126,38 +124,34 @@ class _WholeAdjustments:
         self._options = options
         self._ratios = options.ba_global_frames_ratio, options.ba_global_points_ratio
         self._steps = options.ba_global_frames_freq, options.ba_global_points_freq
-        self._poses: dict[int, bytes] = {}
+        self._counted_from: Size = (0, 0)
         self.size_at_last: Size = (0, 0)
 
     def begin(self, model: pycolmap.Reconstruction, size_at_last: Size) -> None:
         """Begin with a model, new or continued."""
-        self._poses, self.size_at_last = _poses(model), size_at_last
-        now, last = size_of(model), size_at_last
+        self.size_at_last = last = size_at_last
+        self._counted_from = now = size_of(model)
         if now == last:
-            self._count_as_usual()
+            self._count(self._ratios, self._steps)
             return
         of_frames, of_points = self._ratios
-        options = self._options
         # Half a frame less, so that rounding does not matter.
-        options.ba_global_frames_ratio = (math.ceil(of_frames * last[0]) - 0.5) / now[0]
-        options.ba_global_points_ratio = (math.ceil(of_points * last[1]) - 0.5) / now[1]
-        options.ba_global_frames_freq = self._steps[0] + last[0] - now[0]
-        options.ba_global_points_freq = self._steps[1] + last[1] - now[1]
+        ratios = (math.ceil(of_frames * last[0]) - 0.5) / now[0], (math.ceil(of_points * last[1]) - 0.5) / now[1]
+        self._count(ratios, (self._steps[0] + last[0] - now[0], self._steps[1] + last[1] - now[1]))
 
     def add_photo(self, model: pycolmap.Reconstruction) -> None:
-        """Note whether the model has been adjusted, which changes all poses."""
-        before, self._poses = self._poses, _poses(model)
-        if all(self._poses[id_] != pose for id_, pose in before.items() if id_ in self._poses):
-            self.size_at_last = size_of(model)
-            self._count_as_usual()
+        """Note whether the model has been adjusted, by COLMAP's rule."""
+        options, now = self._options, size_of(model)
+        ratios = options.ba_global_frames_ratio, options.ba_global_points_ratio
+        steps = options.ba_global_frames_freq, options.ba_global_points_freq
+        counts = zip(now, self._counted_from, ratios, steps, strict=True)
+        if any(num >= min(ratio * before, before + step) for num, before, ratio, step in counts):
+            self.size_at_last = self._counted_from = now
+            self._count(self._ratios, self._steps)
 
-    def _count_as_usual(self) -> None:
-        self._options.ba_global_frames_ratio, self._options.ba_global_points_ratio = self._ratios
-        self._options.ba_global_frames_freq, self._options.ba_global_points_freq = self._steps
-
-
-def _poses(model: pycolmap.Reconstruction) -> dict[int, bytes]:
-    return {id_: pose_of(model.frame(id_)).params.tobytes() for id_ in model.reg_frame_ids()}
+    def _count(self, ratios: tuple[float, float], steps: tuple[int, int]) -> None:
+        self._options.ba_global_frames_ratio, self._options.ba_global_points_ratio = ratios
+        self._options.ba_global_frames_freq, self._options.ba_global_points_freq = steps
 
 
 def adjust_whole(
@@ -176,19 +170,12 @@ def adjust_whole(
     solver = to_the_end.ceres.solver_options
     solver.function_tolerance, solver.gradient_tolerance = _WHOLE_FUNCTION_TOLERANCE, 0.0
     to_the_end.ceres.solver_options = solver
-    # The model and its tracks are adjusted in turns, until the tracks hardly change, as in COLMAP.
-    of_mapper, triangulation = options.get_mapper(), options.get_triangulation()
-    mapper.complete_and_merge_tracks(triangulation)
-    mapper.retriangulate(triangulation)
-    for _ in range(options.ba_global_max_refinements):
-        num_observations = model.compute_num_observations()
-        mapper.observation_manager.filter_observations_with_negative_depth()
-        mapper.adjust_global_bundle(of_mapper, to_the_end)
-        model.normalize()
-        num_changed = mapper.complete_and_merge_tracks(triangulation) + mapper.filter_points(of_mapper)
-        if num_changed < options.ba_global_max_refinement_change * num_observations:
-            break
+    of_mapper, rounds = options.get_mapper(), options.ba_global_max_refinements
+    mapper.iterative_global_refinement(
+        rounds, options.ba_global_max_refinement_change, of_mapper, to_the_end, options.get_triangulation()
+    )
     mapper.filter_frames(of_mapper)
+    pycolmap.align_reconstruction_to_orig_rig_scales(pipeline.database_cache.rigs, model)
     model.update_point_3d_errors()
     mapper.end_reconstruction(discard=False)
 

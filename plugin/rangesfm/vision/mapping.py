@@ -33,6 +33,19 @@ from rangesfm.vision.snapshots import newest_snapshot, snapshots
 from rangesfm.vision.steps import DATABASE_NAME, MODELS_NAME, Workspace
 
 _MAX_LINE = 200
+WHILE_GROWING: dict[str, float] = {
+    "ba_global_frames_ratio": 2.0,
+    "ba_global_points_ratio": 2.0,
+    "ba_global_max_refinements": 1,
+    "ba_global_function_tolerance": 1e-4,
+    "ba_local_max_refinements": 1,
+}
+"""How a model grows.
+
+COLMAP adjusts all of it each time that it has grown by a tenth, to the last digit and up to five times in a row, which
+takes most of the mapping's time. Its neighbours place a new photo well enough: all of it is adjusted to the end when it
+is whole.
+"""
 
 
 ExternalMapper: TypeAlias = tuple[str, ...]
@@ -46,8 +59,8 @@ class MappingOptions:
 
     Attributes:
         growing: options of the mapper.
-        whole: options of a last adjustment of each model, which frees intrinsics that the mapper held fixed; None where
-            it held none.
+        whole: options of a last adjustment of each model, which frees intrinsics that the mapper held fixed; None for a
+            mapper that takes all photos at once, where it held none.
     """
 
     growing: PipelineOptions
@@ -78,7 +91,7 @@ def pipeline_options(camera: CameraOptions, mapper: MapperOptions, seed: int) ->
         options = pycolmap.HierarchicalPipelineOptions(num_threads=1, num_workers=mapper.num_cores)
         _set_seed(options.incremental_options, seed)
     else:
-        options = pycolmap.IncrementalPipelineOptions(num_threads=num_threads)
+        options = pycolmap.IncrementalPipelineOptions(num_threads=num_threads, **WHILE_GROWING)
         _set_seed(options, seed)
     apply_options(options, mapper.pipeline, "mapper.pipeline")
     return options
@@ -130,12 +143,15 @@ def mapping_options(
     options.constant_cameras |= held["kept"]
     whole = copy.deepcopy(options)
     whole.num_threads = growing.num_threads
+    for key in WHILE_GROWING.keys() - mapper.pipeline.keys():
+        setattr(whole, key, getattr(pycolmap.IncrementalPipelineOptions(), key))
     options.constant_cameras |= held["refined last"]
     if options.constant_cameras >= set(cameras):
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         # Registration of a photo by its matches alone looks at these two options, not at constant_cameras.
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    return MappingOptions(growing, whole if held["refined last"] else None)
+    is_due = held["refined last"] or options is growing
+    return MappingOptions(growing, whole if is_due else None)
 
 
 def map_photos(space: Workspace, photos: Photos, options: MappingOptions, log_folder: Path) -> None:
