@@ -81,7 +81,7 @@ def test_what_is_up_is_seen_by_the_cameras(map_: MetricMap) -> None:
 
 def test_in_a_site_frame_z_is_up(map_: MetricMap) -> None:
     tilted = turned(map_, [0.3, 0.0, 0.0])
-    np.testing.assert_array_equal(up_in_world(tilted.trajectory, "auto", is_site=True), [0, 0, 1])
+    np.testing.assert_array_equal(up_in_world(tilted.trajectory, "auto", np.array([0.0, 0.0, 1.0])), [0, 0, 1])
     by_photos = up_in_world(tilted.trajectory, "cameras")
     np.testing.assert_array_equal(up_in_world(tilted.trajectory, "auto"), by_photos)
 

@@ -1,50 +1,106 @@
-"""A survey with the log of an inertial sensor: it is read, aligned with the photos of the map, and told."""
+"""A survey with the log of an inertial sensor, alone and beside ranges: what a user gets who has a phone."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pycolmap
-from scipy.spatial.transform import Rotation, RotationSpline
+import pytest
+from scipy.spatial.transform import Rotation
 from tests.conftest import Command
-from tests.simulated.files import write_rows
-from tests.simulated.inertial import CAM_FROM_IMU
-from tests.simulated.poses_alone import RANGES, write_poses_alone
+from tests.simulated.files import write_model, write_rows
+from tests.simulated.inertial import Motion, by_hand, imu_log, photos
+from tests.simulated.surveys import model_of_poses
 
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
 from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS
 
 OFFSET_S = 3.25
+METRES_PER_UNIT = 1 / 0.37
+ANCHORS_M = {"N": (2.6, 1.7, 0.4), "E": (-1.9, 2.1, 1.5), "S": (-2.4, -1.8, 0.5), "W": (2.1, -2.2, 1.3)}
+SENSOR = ("--imu", "imu.csv")
+RANGES = ("--ranges", "uwb.csv", "--ranges_time_offset", "0", "--tag_in_cam", "0,0,0")
 
 
-def write_imu(folder: Path, *, gyro_factor: float = 1.0) -> None:
-    """Write the log of a sensor that turns as the photos do, and measures nothing but gravity beside."""
-    model = pycolmap.Reconstruction(folder / "sparse" / "0")
-    times = {image.name: float(k) for k, image in enumerate(sorted(model.images.values(), key=lambda one: one.name))}
-    path = trajectory_from_reconstruction(model, times)
+def write_survey(folder: Path, motion: Motion, *, gyro_factor: float = 1.0) -> None:
+    """Write the path of the photos as a model, the sensor's log, and ranges of a radio at the camera."""
+    path = photos(motion, noise_rad=3e-4)
     assert path.timestamps_s is not None
-    turns = RotationSpline(path.timestamps_s, Rotation.from_matrix(path.world_from_cam @ CAM_FROM_IMU))
-    at_s = np.arange(0.0, len(path) - 1, 0.01)
-    forces = turns(at_s).inv().apply([0.0, 0.0, 9.81])
-    rows = np.column_stack([at_s - OFFSET_S, gyro_factor * turns(at_s, 1), forces]).tolist()
+    times = dict(zip(path.image_names, path.timestamps_s.tolist(), strict=True))
+    write_model(model_of_poses(path), folder / "sparse", times, folder / "images.csv")
+    log = imu_log(motion, offset_s=OFFSET_S)
+    rows = np.column_stack([log.timestamp_s, gyro_factor * log.gyro_rad_s, log.accel_m_s2]).tolist()
     write_rows(folder / "imu.csv", ",".join(CANONICAL_COLUMNS), rows)
+    rng, at_s = np.random.default_rng(2), np.arange(2.0, 59.0, 0.1)
+    names = np.resize(list(ANCHORS_M), len(at_s))
+    away = motion.places_m(at_s) - [ANCHORS_M[name] for name in names]
+    range_m = np.linalg.norm(away, axis=1) + rng.normal(0.0, 0.05, len(at_s))
+    measured = zip(at_s.tolist(), names.tolist(), range_m.tolist(), strict=True)
+    write_rows(folder / "uwb.csv", "timestamp_s,anchor_id,range_m", measured)
 
 
-def test_a_run_aligns_the_sensor_with_the_map(tmp_path: Path, rangesfm_command: Command) -> None:
-    survey = write_poses_alone(tmp_path)
-    write_imu(tmp_path)
-    rangesfm_command("scale", *survey.flags, *RANGES, "--imu", "imu.csv", "--output_path", "out", cwd=tmp_path)
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
-    (told,) = [line for line in result["notes"] if "inertial sensor" in line]
-    assert told.startswith("time offset of the inertial sensor: +3.25")
-    assert not [line for line in result["warnings"] if "imu.csv" in line]
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("with_sensor")
+    write_survey(folder, by_hand(2, axes=(3.0, 3.0, 3.0)))
+    return folder
+
+
+def scaled(folder: Path, out: Path, command: Command, *flags: str) -> dict[str, Any]:
+    read = ("--input_path", "sparse", "--images", "images.csv", "--no_report")
+    command("scale", *read, *flags, "--output_path", str(out), cwd=folder)
+    found: dict[str, Any] = json.loads((out / "result.json").read_text())
+    return found
+
+
+def half_width(result: dict[str, Any]) -> float:
+    low, high = result["scale"]["interval_95"]
+    return float(np.log(high / low) / 2)
+
+
+def test_photos_and_a_sensor_make_a_metric_and_level_map(
+    survey: Path, tmp_path: Path, rangesfm_command: Command
+) -> None:
+    result = scaled(survey, tmp_path / "out", rangesfm_command, *SENSOR)
+    assert (result["scale"]["verdict"], result["scale"]["method"]) == ("good", "imu")
+    low, high = result["scale"]["interval_95"]
+    assert low < METRES_PER_UNIT < high
+    assert half_width(result) < 0.03
+    imu = result["imu"]
+    assert imu["time_offset"]["value_s"] == pytest.approx(OFFSET_S, abs=0.005)
+    from_sfm = Rotation.from_quat(result["metric_from_sfm"]["rotation_xyzw"])
+    up = (from_sfm * Rotation.from_rotvec([0.3, -1.0, 2.0])).apply([0.0, 0.0, 1.0])  # as ``photos`` turned the world
+    down = np.array(imu["gravity_in_world"]) / np.linalg.norm(imu["gravity_in_world"])
+    assert np.degrees(np.arccos(-down @ up)) < 0.5
+    assert imu["up_stddev_deg"] < 0.5
+
+
+def test_beside_ranges_it_makes_the_interval_narrower(survey: Path, tmp_path: Path, rangesfm_command: Command) -> None:
+    alone, by_ranges, both = (
+        scaled(survey, tmp_path / str(k), rangesfm_command, *flags)
+        for k, flags in enumerate([SENSOR, RANGES, (*SENSOR, *RANGES)])
+    )
+    assert half_width(both) < min(half_width(by_ranges), half_width(alone))
+    low, high = both["scale"]["interval_95"]
+    assert low < METRES_PER_UNIT < high
+    assert {*both["scale"]["by_kind"]} == {"ranges", "imu"}
+    [against] = [test for test in both["tests"] if test["name"] == "imu against ranges"]
+    assert not against["rejected"]
+
+
+def test_a_motion_that_does_not_show_the_scale_is_named(tmp_path: Path, rangesfm_command: Command) -> None:
+    hand = by_hand(2, axes=(3.0, 3.0, 3.0))
+    write_survey(tmp_path, replace(hand, amplitudes_m=hand.amplitudes_m / 30))
+    scale = scaled(tmp_path, tmp_path / "out", rangesfm_command, *SENSOR)["scale"]
+    assert scale["verdict"] == "doubtful"
+    assert "the camera moved too evenly for the inertial sensor to show the scale" in scale["reasons"]
 
 
 def test_a_mistake_in_the_log_is_a_warning(tmp_path: Path, rangesfm_command: Command) -> None:
-    survey = write_poses_alone(tmp_path)
-    write_imu(tmp_path, gyro_factor=float(np.degrees(1)))
-    rangesfm_command("scale", *survey.flags, *RANGES, "--imu", "imu.csv", "--output_path", "out", cwd=tmp_path)
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    write_survey(tmp_path, by_hand(2, axes=(0.5, 0.5, 0.5)), gyro_factor=float(np.degrees(1)))
+    result = scaled(tmp_path, tmp_path / "out", rangesfm_command, *SENSOR)
     assert any("taken as degrees a second" in line for line in result["warnings"])
+    low, high = result["scale"]["interval_95"]
+    assert low < METRES_PER_UNIT < high

@@ -152,8 +152,9 @@ def _frame_note(options: ExportOptions, result_folder: Path) -> list[str]:
         return ["up is perpendicular to the ellipsoid, by the anchors' coordinates"]
     from rangesfm.result.result_folder import read_result_folder
 
-    if options.up == "auto" and read_result_folder(result_folder).summary.frame == "site":
-        return ["up is z of the site"]
+    summary = read_result_folder(result_folder).summary
+    if options.up == "auto" and summary.up is not None:
+        return ["up is z of the site" if summary.frame == "site" else "up is as it was measured"]
     photos = "the mean upward direction of the photos"
     source = {"cameras": photos, "auto": photos, "path": "perpendicular to the plane of the path"}
     return [f"up is {source.get(options.up, f'{options.up} in the frame of the result')}"]

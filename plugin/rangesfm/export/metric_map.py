@@ -21,6 +21,7 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.files.folders import stays_inside
 from rangesfm.geometry.georeference import Georeference, check_crs, georeference_of_anchor
+from rangesfm.geometry.gravity import UP_IN_SITE
 from rangesfm.geometry.similarity import Similarity, path_shape
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import ExportOptions
@@ -47,6 +48,7 @@ class MetricMap:
         metric_from_sfm: similarity from the world of the unscaled model to that of this model.
         relative_scale_stddev: relative stddev that the scale gives every length in the map; inf if unknown.
         is_site: whether the world of the model is the site frame of the anchors, where z is up by convention.
+        upward: (3,) unit vector in another world, as measured; None where it has to be taken from the photos.
         center_covariance_m2: covariance (3, 3) of each keyframe's projection centre by photo.
         offset_m: (3,) what was subtracted from all coordinates, to have the origin near the cameras.
     """
@@ -59,6 +61,7 @@ class MetricMap:
     images_path: Path | None = None
     database_path: Path | None = None
     is_site: bool = False
+    upward: Array | None = None
     georeference: Georeference | None = None
     center_covariance_m2: Mapping[str, Array] = field(default_factory=dict)
     offset_m: Array = field(default_factory=lambda: np.zeros(3))
@@ -66,6 +69,11 @@ class MetricMap:
     @cached_property
     def trajectory(self) -> Trajectory:
         return trajectory_from_reconstruction(self.reconstruction, self.timestamps_s)
+
+    @property
+    def known_up(self) -> Array | None:
+        """Return the upward unit vector (3,) in the world of the model; None if it is not known."""
+        return UP_IN_SITE if self.is_site else self.upward
 
     def georeference_for(self, need: str) -> Georeference:
         """Return the georeference.
@@ -129,7 +137,7 @@ def in_frame(map_: MetricMap, options: ExportOptions) -> MetricMap:
     if options.frame == "result":
         return map_
     if options.frame == "level":
-        vertical = up_in_world(map_.trajectory, options.up, is_site=map_.is_site)
+        vertical = up_in_world(map_.trajectory, options.up, map_.known_up)
         if map_.is_site:  # it is only tilted, not turned about z, because its heading is that of the site
             level = np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [vertical])[0].as_matrix())
         else:
@@ -163,6 +171,7 @@ def moved(map_: MetricMap, new_from_old: Similarity) -> MetricMap:
         anchors_m={name: new_from_old.apply(at) for name, at in map_.anchors_m.items()},
         metric_from_sfm=None if known is None else new_from_old @ known,
         georeference=georeference,
+        upward=None if map_.upward is None else new_from_old.rotation @ map_.upward,
         center_covariance_m2={name: turn @ of @ turn.T for name, of in covariance_m2.items()},
     )
 
@@ -179,7 +188,7 @@ def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
         georeference = georeference_of_anchor(
             anchor,
             options.origin_lat_lon_height,
-            up_in_world=up_in_world(map_.trajectory, options.up, is_site=map_.is_site),
+            up_in_world=up_in_world(map_.trajectory, options.up, map_.known_up),
             forward_in_world=map_.trajectory.world_from_cam[0][:, 2],
             heading_deg=options.heading_deg,
         )
@@ -189,15 +198,18 @@ def _georeferenced(map_: MetricMap, options: ExportOptions) -> MetricMap:
     return replace(map_, georeference=georeference)
 
 
-def up_in_world(trajectory: Trajectory, up: str, *, is_site: bool = False) -> Array:
+def up_in_world(trajectory: Trajectory, up: str, measured: Array | None = None) -> Array:
     """Return the upward unit vector (3,) by the rule ``up`` of ExportOptions.
+
+    Args:
+        measured: it, where it is known.
 
     Raises:
         InputError: the photos disagree, or do not say which side of the path's plane is up; the path is not in a plane;
             or ``up`` is not valid.
     """
-    if up == "auto" and is_site:
-        return np.array([0.0, 0.0, 1.0])
+    if up == "auto" and measured is not None:
+        return measured
     photos_up = -trajectory.world_from_cam[:, :, 1].mean(axis=0)
     if up in ("auto", "cameras"):
         if np.linalg.norm(photos_up) < _MIN_AGREEMENT:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array
+from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
@@ -84,6 +85,11 @@ class KindOnMap(ABC):
     def places_map(self) -> bool:
         """Whether they give the map its place in the site; the others give it metres in the first camera's frame."""
         return False
+
+    @property
+    def upward(self) -> Gravity | None:
+        """The upward direction in the first camera; None if they do not tell it."""
+        return None
 
     @property
     def is_used(self) -> bool:
@@ -304,6 +310,11 @@ def fit_kinds(kinds: Sequence[KindOnMap], path: Trajectory, placed: Similarity, 
             break
         placed = found.estimate
     return found
+
+
+def upward_by(kinds: Sequence[KindOnMap], given: Gravity | None) -> Gravity | None:
+    """Return the upward direction in the first camera as the first kind has it that tells it, or else as given."""
+    return next((upward for each in kinds if (upward := each.upward) is not None), given)
 
 
 def in_first_cameras_frame(path: Trajectory, scale: float) -> Similarity:

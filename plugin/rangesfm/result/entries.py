@@ -332,6 +332,38 @@ class PositionsEntry(Record):
     antenna_in_cam_m: Vector
 
 
+class ImuTimeOffsetEntry(Record):
+    """The time offset of an inertial sensor: image time = time of its log + ``value_s``."""
+
+    value_s: Number
+    stddev_s: Number
+
+
+class ImuEntry(Record):
+    """The inertial sensor, as far as the final map shows it.
+
+    Attributes:
+        num: samples in the log. num_used: between the photos.
+        rotation_imu_to_cam_xyzw: takes the sensor's axes to the camera's.
+        gravity_in_world: m/s^2, in the world of the metric models. up_stddev_deg: standard deviation of its direction.
+        accel_scale_factors: by how much the axes of the accelerometer read too much, 1: not at all.
+        accel_bias_m_s2, gyro_bias_rad_s: mean biases.
+        accel_noise, gyro_noise: densities of the white noise, m/s^2 and rad/s per root of Hz.
+    """
+
+    num: Count
+    num_used: Count
+    time_offset: ImuTimeOffsetEntry
+    rotation_imu_to_cam_xyzw: tuple[Number, Number, Number, Number]
+    gravity_in_world: Vector
+    up_stddev_deg: NumberOrNull
+    accel_scale_factors: Vector
+    accel_bias_m_s2: Vector
+    gyro_bias_rad_s: Vector
+    accel_noise: NumberOrNull
+    gyro_noise: NumberOrNull
+
+
 class DistanceRow(Record):
     """One measured length in metres: measured, in the map, and the difference map minus measurement."""
 

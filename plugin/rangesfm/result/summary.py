@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import numpy as np
+
 from rangesfm.arrays import Array
 from rangesfm.errors import number_text
 from rangesfm.files.records import NumberOrNull, Record, Text
@@ -68,6 +70,7 @@ class ResultSummary(Record):
     distances: tuple[entries.DistanceRow, ...]
     positions: entries.PositionsEntry | None = None
     points: entries.PointsEntry | None = None
+    imu: entries.ImuEntry | None = None
     comparison: tuple[entries.ComparisonRow, ...] = ()
     georeference: entries.GeoreferenceEntry | None
     versions: dict[Text, Text]
@@ -92,6 +95,9 @@ class ResultSummary(Record):
         """The upward unit vector (3,) of the map and its standard deviation (radians); None if unknown."""
         if self.frame == "site":
             return UP_IN_SITE, 0.0
+        if self.imu is not None and self.imu.up_stddev_deg is not None:
+            down = np.array(self.imu.gravity_in_world)
+            return -down / np.linalg.norm(down), np.deg2rad(self.imu.up_stddev_deg)
         gravity = gravity_of(self.settings.to_json().get("scale", {}).get("up_in_first_camera"))
         return None if gravity is None else (gravity.up_in_first_camera, gravity.stddev_rad)
 
@@ -139,6 +145,11 @@ class ResultSummary(Record):
             yield f"positions: {num} used, rms {rms} m{offset_of_positions}"
         if self.points is not None:
             yield from self.points.lines()
+        if self.imu is not None:
+            tilt = (
+                "" if self.imu.up_stddev_deg is None else f", level within {NORMAL_95 * self.imu.up_stddev_deg:.2f} deg"
+            )
+            yield f"inertial sensor: {self.imu.num_used} of {self.imu.num} samples used{tilt} (95 %)"
         if offset.estimated:
             within_s = None if offset.stddev_s is None else NORMAL_95 * offset.stddev_s
             value, within = _text(offset.value_s, "+.3f"), _text(within_s, ".3f")

@@ -13,7 +13,7 @@ from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, first_camera_from, in_first_camera
 from rangesfm.inference.bending import MapBending, WalkBending
 from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, ScaleUncertainty
-from rangesfm.measurements.joint_map import KindOnMap, fit_kinds, join_kinds, tested_kinds
+from rangesfm.measurements.joint_map import KindOnMap, fit_kinds, join_kinds, tested_kinds, upward_by
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.processes.threads import both, with_one_blas_thread
 from rangesfm.ranging.anchors.anchor import Anchor
@@ -161,7 +161,7 @@ class _RangeStart:
         judged_ranges = replace(ranges, per_anchor=per_anchor, anchors=found)
         on_map = replace(on_map, kinds=(judged_ranges, *others))
         judged, problem, solution = judge_map_of_kinds(on_map, options), ranges.posed, ranges.solution
-        gravity, remarks = gravity_of(options.up_in_first_camera), open_place
+        gravity, remarks = upward_by(others, gravity_of(options.up_in_first_camera)), open_place
         if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
             remarks = (*remarks, *levelled_places(gravity, self.anchors, found))
         learned = ranges.learnt(on_map)
@@ -197,7 +197,7 @@ class _RangeStart:
 
     def _solved(self, others: Sequence[KindOnMap]) -> tuple[RangeScale, tuple[str, ...]]:
         """Return the ranges at the best solution of their problem, and why the map's place is open, if it is."""
-        path, gravity = self.trajectory, gravity_of(self.options.up_in_first_camera)
+        path, gravity = self.trajectory, upward_by(others, gravity_of(self.options.up_in_first_camera))
         posing = (
             *(self.observations, path, self.anchors, self.anchor_frame, self.range_model),
             *(with_lengths(self.distances, others), gravity, placement_by(others, first_camera_from(path))),

@@ -17,6 +17,8 @@ from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.inference.bending import MapBending
 from rangesfm.measurements.gravity import Upwards
+from rangesfm.measurements.imu.inertial_fit import InertialProblem
+from rangesfm.measurements.imu.inertial_scale import IMU, InertialScale, scale_by_sensor
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, find_kind
 from rangesfm.measurements.kind import Block
 from rangesfm.measurements.lengths import TapedLengths
@@ -81,11 +83,20 @@ def _lengths(inputs: RangingInputs, at: MapOfPhotos) -> LengthScale | None:
     return lengths_between_points(found, at.path, at.bending, at.metres_per_unit, like, inputs.tape.distances)
 
 
+def _inertial(inputs: RangingInputs, at: MapOfPhotos) -> InertialScale | None:
+    if inputs.imu is None or inputs.imu.alignment is None:
+        return None
+    problem = InertialProblem.of_sensor(inputs.imu, inputs.imu.alignment, at.path)
+    return scale_by_sensor(problem, at.bending, at.metres_per_unit)
+
+
 KINDS: dict[str, Callable[[RangingInputs, MapOfPhotos], KindOnMap | None]] = {
     POSITIONS: _positions,
     LENGTHS: _lengths,
+    IMU: _inertial,
 }
 """How each kind is located in a map, by its name. Without ranges, the first that is used decides what is doubtful."""
+_WORDS = {POSITIONS: "known positions", LENGTHS: "known lengths", IMU: "readings of the inertial sensor"}
 
 
 def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[KindOnMap, ...], tuple[str, ...]]:
@@ -103,7 +114,7 @@ def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[KindOnMa
         except GeometryError as error:
             if at.before:
                 raise
-            remarks.append(f"the known {kind} are not used: {error}")
+            remarks.append(f"the {_WORDS[kind]} are not used: {error}")
             continue
         found += [] if located is None else [located]
     return tuple(found), tuple(remarks)

@@ -33,7 +33,7 @@ from rangesfm.options import (
     TagOptions,
 )
 
-METRIC_KEYS = ("ranges.path", "scale.distances", "markers.side_m", "points.path", "positions.path")
+METRIC_KEYS = ("ranges.path", "scale.distances", "markers.side_m", "points.path", "positions.path", "imu.path")
 """Keys of the measurements from which the map gets its metres."""
 
 
@@ -173,7 +173,8 @@ class Survey(BaseModel):
             raise InputError(
                 "no ranges and no lengths: give a radio's log (--ranges LOG), taped distances (--distances CSV), "
                 "control points (--points CSV), positions (--positions FILE), the size of printed tags "
-                "(--marker_side_m), or a rig with known poses (--rig_config_path JSON)"
+                "(--marker_side_m), the log of an inertial sensor (--imu LOG), or a rig with known poses "
+                "(--rig_config_path JSON)"
             )
 
     def to_dict(self) -> dict[str, Any]:

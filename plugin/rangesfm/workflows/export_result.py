@@ -122,6 +122,7 @@ def _read_map(result: ResultFolder, images_path: Path | None) -> MetricMap:
         images_path=images_path or result.images_path,
         database_path=result.path / DATABASE_NAME,
         is_site=summary.frame == "site",
+        upward=None if summary.up is None else summary.up[0],
         georeference=None if summary.georeference is None else summary.georeference.georeference,
         center_covariance_m2={} if covariances is None else covariances.by_photo_m2,
     )

@@ -41,7 +41,7 @@ from rangesfm.inference.bending import MapBending, WalkBending
 from rangesfm.inference.mistakes import MistakeTests
 from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS
 from rangesfm.join.join_models import ModelVerdict, join_models
-from rangesfm.measurements.joint_map import Doubt, JointMap, find_kind, join_kinds, tested_kinds
+from rangesfm.measurements.joint_map import Doubt, JointMap, find_kind, join_kinds, tested_kinds, upward_by
 from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.radio import RadioLog, ranges_of, ranges_of_map
 from rangesfm.measurements.ranges import Ranges
@@ -347,7 +347,8 @@ def _measured(run: SurveyRun, metric: MetricResult) -> Measured:
     if inputs.anchor_frame == "site" and estimate.frame != "site":
         # Too few anchors are surveyed to place the map in the site, but the distances between them are known.
         tape = tape.with_more(surveyed_distances(inputs.anchors))
-    gravity = gravity_of(run.survey.scale.up_in_first_camera) if estimate.frame == "site" else None
+    kinds = () if estimate.on_map is None else estimate.on_map.kinds
+    gravity = upward_by(kinds, gravity_of(run.survey.scale.up_in_first_camera)) if estimate.frame == "site" else None
     return Measured((RadioLog(_given_ranges(run, metric)), *sources_in_map(tape, estimate.on_map, gravity)))
 
 

@@ -22,7 +22,7 @@ from rangesfm.geometry.similarity import Similarity, align_points
 from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.join.join_models import ModelVerdict
 from rangesfm.loops.loop_closure import LoopClosure
-from rangesfm.measurements.joint_map import JointMap, KindOnMap
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, upward_by
 from rangesfm.positions.surveyed_positions import SurveyedPositions
 from rangesfm.ranging.anchors.anchor import AnchorEstimate
 from rangesfm.ranging.anchors.site import Site
@@ -159,6 +159,14 @@ class MetricResult:
             return {}
         index = np.searchsorted(found.frame_ids, self.trajectory.frame_ids)
         return dict(zip(self.trajectory.image_names, found.centers[index], strict=True))
+
+    @property
+    def upward(self) -> Array | None:
+        """Return the upward unit vector (3,) in the final map as it was measured; None if it was not."""
+        on_map = self.all_measured
+        if on_map is None or (gravity := upward_by(on_map.kinds, None)) is None:
+            return None
+        return np.asarray(on_map.estimate.rotation @ on_map.path.world_from_cam[0] @ gravity.up_in_first_camera)
 
     @property
     def map_errors(self) -> MapErrors | None:

@@ -145,6 +145,7 @@ def _write_models_and_tables(
         images_path=survey.images.path,
         database_path=survey.output.path / DATABASE_NAME,
         is_site=found.estimate.frame == "site",
+        upward=found.upward,
         georeference=georeference,
         center_covariance_m2=found.center_covariance_m2,
     )

@@ -18,7 +18,7 @@ from tests.sources.recorded import Message, write_bag
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS, is_imu_log, read_imu
-from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.measurements.imu.log import ImuLog, times_of_sampling
 
 LOG = imu_log(by_hand(), until_s=6.0)
 SINCE_1970_S = 1_790_000_000.0
@@ -347,3 +347,15 @@ def _text() -> bytes:
 
 
 TEXT = _text()
+
+
+def test_samples_that_arrive_late_were_taken_evenly_unless_some_are_lost() -> None:
+    taken_s = np.arange(4000) / 100.0
+    delays_s = np.random.default_rng(1).exponential(0.006, len(taken_s))
+    delays_s[2000:2050] += 0.3  # a transfer hangs
+    arrived_s = np.maximum.accumulate(taken_s + delays_s) + 1e-9 * np.arange(len(taken_s))
+    found_s = times_of_sampling(arrived_s)
+    assert found_s is not None
+    np.testing.assert_allclose(found_s - taken_s, (found_s - taken_s).mean(), atol=5e-4)
+    assert times_of_sampling(taken_s) is None
+    assert times_of_sampling(np.delete(arrived_s, range(1500, 1510))) is None

@@ -20,7 +20,7 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
 from rangesfm.files.bags import is_bag, messages_of, open_bag, stamp_s, type_name
 from rangesfm.files.text_tables import TextTable, header_names, read_head, read_text
-from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.measurements.imu.log import ImuLog, times_of_sampling
 from rangesfm.measurements.imu.signals import (
     ACCEL,
     GRAVITY,
@@ -419,6 +419,7 @@ def _joined(gyro: _Signal, accel: _Signal, path: Path, notes: list[str]) -> ImuL
     """
     for signal in (gyro, accel):
         _require_samples(signal, path)
+    gyro, accel = (_as_sampled(signal, notes) for signal in (gyro, accel))
     longest_s = max(0.1, 3 * float(np.median(np.diff(accel.times_s))))
     after = np.clip(np.searchsorted(accel.times_s, gyro.times_s), 1, len(accel.times_s) - 1)
     inside = (gyro.times_s >= accel.times_s[0]) & (gyro.times_s <= accel.times_s[-1])
@@ -435,6 +436,19 @@ def _joined(gyro: _Signal, accel: _Signal, path: Path, notes: list[str]) -> ImuL
         raise InputError(f"has a sample each {log.step_s:.2g} s, expected 50 a second or more", path)
     doubts = (f"{path.name}: {doubt}" for doubt in _doubts(log, gyro, accel))
     return replace(log, notes=tuple(notes), doubts=tuple(doubts))
+
+
+def _as_sampled(signal: _Signal, notes: list[str]) -> _Signal:
+    """Return a signal with the times at which it was sampled, with a note where the file has those of arrival."""
+    taken_s = times_of_sampling(signal.times_s)
+    if taken_s is None:
+        return signal
+    note = (
+        f"{signal.path.name}: the samples arrived up to {(signal.times_s - taken_s).max():.2g} s late; they were taken "
+        f"evenly, {1 / np.mean(np.diff(taken_s)):.2f} a second"
+    )
+    notes += [] if note in notes else [note]
+    return replace(signal, times_s=taken_s)
 
 
 def _require_samples(signal: _Signal, path: Path) -> None:

@@ -9,6 +9,46 @@ import numpy as np
 
 from rangesfm.arrays import Array
 
+# Times of arrival are those of an even clock and delays if in each stretch of so many samples ...
+_NUM_IN_STRETCH = 1000
+# ... the least late sample is late by less than this share of a step: after a lost one all are late by a whole step.
+_LATE = 0.25
+# Steps that differ more than this from their median, in steps, are not those of a sensor's own clock.
+_UNEVEN = 0.25
+
+
+def times_of_sampling(arrived_s: Array) -> Array | None:
+    """Return when the samples were taken if their times are those at which they arrived; None if they are not.
+
+    A sensor samples evenly, and nothing arrives before it is taken: the least late samples are on the lower convex hull
+    of the times over the samples' numbers. Source: Zhang, Liu and Xia, "Clock synchronization algorithms for network
+    measurements", 2002.
+
+    Args:
+        arrived_s: (k,) times, rising.
+    """
+    steps_s = np.diff(arrived_s)
+    step_s = float(np.median(steps_s))
+    if np.quantile(np.abs(steps_s - step_s), 0.75) <= _UNEVEN * step_s:
+        return None
+    hull: list[int] = []
+    for k, time_s in enumerate(arrived_s):
+        while len(hull) > 1 and (arrived_s[hull[-1]] - arrived_s[hull[-2]]) * (k - hull[-2]) >= (
+            time_s - arrived_s[hull[-2]]
+        ) * (hull[-1] - hull[-2]):
+            hull.pop()
+        hull.append(k)
+    # The first and the last sample are on the hull however late they are: there, the rest is extended.
+    edge = min(_NUM_IN_STRETCH, len(arrived_s)) // 10
+    inner = np.array([k for k in hull if edge <= k < len(arrived_s) - edge])
+    if len(inner) < 2:
+        return None
+    rate_s = (arrived_s[inner[-1]] - arrived_s[inner[0]]) / (inner[-1] - inner[0])
+    evenly_s = rate_s * np.arange(len(arrived_s))
+    taken_s = evenly_s + np.interp(np.arange(len(arrived_s)), inner, arrived_s[inner] - evenly_s[inner])
+    stretches = np.array_split(arrived_s - taken_s, max(len(arrived_s) // _NUM_IN_STRETCH, 1))
+    return taken_s if max(late.min() for late in stretches) < _LATE * step_s else None
+
 
 @dataclass(frozen=True)
 class ImuNoise:

@@ -1,0 +1,371 @@
+"""Scale, gravity and the sensor's own numbers by a log and the poses of photos (section 5 of ``model.md``).
+
+What is measured between two photos is a linear function of velocities, of few numbers that all intervals share, and of
+the poses. In stretches of neighbouring photos the velocities are eliminated exactly, and what is left is turned (QR)
+into as many numbers as are shared. These lose nothing of what the log says of the shared numbers where errors are as
+assumed there, and are linear combinations of all measurements where they are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.errors import GeometryError
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, UNDETERMINED
+from rangesfm.geometry.poses import Poses
+from rangesfm.geometry.robust_statistics import GEMAN_MCCLURE
+from rangesfm.geometry.rotations import logarithms
+from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.inference.linear_map import regular
+from rangesfm.measurements.imu.alignment import ImuAlignment
+from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.measurements.imu.motion import MotionErrors, Mounting
+from rangesfm.measurements.imu.preintegration import (
+    GYRO_BIAS,
+    GYRO_SCALE,
+    NUM_OF_SENSOR,
+    Preintegrated,
+    preintegrate,
+)
+from rangesfm.measurements.imu.sensor import InertialSensor
+from rangesfm.measurements.imu.sensor_prior import (
+    ARM_STDDEV_M,
+    GIVEN_ARM_STDDEV_M,
+    GRAVITY_M_S2,
+    GRAVITY_STDDEV,
+    SensorPrior,
+)
+
+SCALE, GRAVITY, SENSOR, TURN, ARM = slice(0, 1), slice(1, 4), slice(4, 17), slice(17, 20), slice(20, 23)
+"""What all intervals share: logarithm of the scale, gravity, the sensor's numbers, turn and place of the mounting."""
+NUM_SHARED = 23
+# Largest number of intervals in a stretch; the time for a stretch grows with its cube.
+_MAX_NUM_IN_STRETCH = 20
+
+Sizes = Mapping[str, float]
+"""Sizes of the errors that decide about weights, by name."""
+
+
+@dataclass(frozen=True)
+class InertialState:
+    """Values of all that a log depends on besides the map.
+
+    Attributes:
+        scale: metres per unit of the path. velocities_m_s: (n, 3). gravity_m_s2: (3,) in the path's world.
+        sensor: (13,). mounting: of the sensor.
+        weights: (n,) of the intervals after each photo, robust.
+    """
+
+    scale: float
+    velocities_m_s: Array
+    gravity_m_s2: Array
+    sensor: Array
+    mounting: Mounting
+    weights: Array
+
+    @property
+    def horizontal(self) -> Array:
+        """(3, 2) directions across gravity, by which it may turn."""
+        down = self.gravity_m_s2 / np.linalg.norm(self.gravity_m_s2)
+        return np.asarray(np.linalg.svd(down[None])[2][1:].T)
+
+
+@dataclass(frozen=True)
+class InertialProblem:
+    """A log between the photos of a path.
+
+    Attributes:
+        log: on the clock of the photos.
+        path: of the n photos, with times. mounting: of the sensor in the rig, as known before.
+        prior: what is known of the sensor's numbers, and of errors of clock and mounting.
+        time_offset_s: what was added to the times of the log as it was read.
+    """
+
+    log: ImuLog
+    path: Trajectory
+    mounting: Mounting
+    prior: SensorPrior
+    time_offset_s: float = 0.0
+
+    @classmethod
+    def of_sensor(cls, sensor: InertialSensor, found: ImuAlignment, path: Trajectory) -> InertialProblem:
+        """Return the log of a sensor that is aligned with the photos of a path."""
+        log = replace(found.log, timestamp_s=found.log.timestamp_s + found.time_offset_s)
+        turn_rad = float(np.sqrt(np.linalg.eigvalsh(found.rotation_covariance)[-1]))
+        prior = SensorPrior(
+            found.time_offset_stddev_s, turn_rad, ARM_STDDEV_M if sensor.imu_in_cam_m is None else GIVEN_ARM_STDDEV_M
+        )
+        arm = np.zeros(3) if sensor.imu_in_cam_m is None else sensor.imu_in_cam_m
+        noise = sensor.log.noise
+        prior = prior if noise is None else prior.with_given(noise)
+        return cls(log, path, Mounting(found.cam_from_imu, arm), prior, found.time_offset_s)
+
+    @property
+    def times_s(self) -> Array:
+        """(n,) times of the photos."""
+        assert self.path.timestamps_s is not None, "photos have times"
+        return self.path.timestamps_s
+
+    @property
+    def first_state(self) -> InertialState:
+        """A state from which the most likely one is found: in it, the mean specific force is against gravity."""
+        at = np.clip(np.searchsorted(self.log.timestamp_s, self.times_s), 0, len(self.log) - 1)
+        world_from_imu = self.path.world_from_cam @ self.mounting.rig_from_imu
+        force = np.einsum("nij,nj->ni", world_from_imu, self.log.accel_m_s2[at]).mean(axis=0)
+        gravity = -GRAVITY_M_S2 * force / np.linalg.norm(force)
+        velocities = np.zeros((len(self.path), 3))
+        return InertialState(1.0, velocities, gravity, np.zeros(NUM_OF_SENSOR), self.mounting, np.ones(len(self.path)))
+
+    def likeliest(self, state: InertialState, sizes: Sizes) -> InertialState:
+        """Return the most likely state for errors of these sizes, from another one.
+
+        Raises:
+            GeometryError: log and photos have no time in common, or do not tell the scale.
+        """
+        intervals = self.summed_up(state, sizes)
+        for step in range(MAX_NUM_ROUNDS):
+            before, (state, stddev) = state, self._improved(self.linearized(state, intervals), sizes)
+            if step and abs(np.log(state.scale / before.scale)) <= NEGLIGIBLE_STDDEVS * stddev:
+                break
+        return state
+
+    def summed_up(self, state: InertialState, sizes: Sizes) -> Preintegrated:
+        """Return the log summed up between the photos, about the sensor's numbers of a state.
+
+        Raises:
+            GeometryError: log and photos have no time in common.
+        """
+        densities = np.array([sizes["gyro_noise"], sizes["accel_noise"]])
+        log, times_s = self.log, self.times_s
+        found = preintegrate(log.timestamp_s, log.gyro_rad_s, log.accel_m_s2, times_s, state.sensor, densities)
+        if not len(found):
+            raise GeometryError("the log of the inertial sensor and the photos have no time in common")
+        return found
+
+    def linearized(self, state: InertialState, intervals: Preintegrated) -> LinearMotion:
+        """Return the errors of the intervals at a state, with their derivatives."""
+        metric = state.scale * (self.path.centers - self.path.centers[0])
+        poses, sensor = Poses(self.path.world_from_cam, metric), np.tile(state.sensor, (len(intervals), 1))
+        errors = MotionErrors.at(intervals, poses, state.velocities_m_s, state.gravity_m_s2, sensor, state.mounting)
+
+        def by_motion_of_photos(motion: Array, part: slice) -> Array:
+            ends = np.stack([motion[intervals.before], motion[intervals.after]], axis=1)
+            return np.asarray(np.einsum("kiaj,kaj->kia", errors.by_pose[:, :, :, part], ends))
+
+        by_scale = by_motion_of_photos(metric, slice(3, 6)).sum(axis=2, keepdims=True)
+        of_all = [by_scale, errors.by_gravity, errors.by_sensor, errors.by_turn, errors.by_arm]
+        late = by_motion_of_photos(self._motion(state), slice(0, 6))[:, :, :, None]
+        return LinearMotion(state, intervals, errors, np.concatenate(of_all, axis=2), late)
+
+    def _motion(self, state: InertialState) -> Array:
+        """Return the (n, 6) rates of the photos' poses: rad/s in the rig's own frame, and m/s of its origin."""
+        log = self.log
+        rates = np.column_stack([np.interp(self.times_s, log.timestamp_s, axis) for axis in log.gyro_rad_s.T])
+        in_rig = ((1 - state.sensor[GYRO_SCALE]) * rates - state.sensor[GYRO_BIAS]) @ state.mounting.rig_from_imu.T
+        arms = np.cross(in_rig, state.mounting.imu_in_rig_m)
+        return np.column_stack([in_rig, state.velocities_m_s - np.einsum("nij,nj->ni", self.path.world_from_cam, arms)])
+
+    def off_prior(self, state: InertialState) -> Array:
+        """Return the (23,) differences of the shared numbers from what was known of them; 0 where nothing was."""
+        off = np.zeros(NUM_SHARED)
+        off[SENSOR] = state.sensor
+        off[TURN] = logarithms((self.mounting.rig_from_imu.T @ state.mounting.rig_from_imu)[None])[0]
+        off[ARM] = state.mounting.imu_in_rig_m - self.mounting.imu_in_rig_m
+        return off
+
+    def _improved(self, motion: LinearMotion, sizes: Sizes) -> tuple[InertialState, float]:
+        """Return a better state, and the standard deviation of the scale's logarithm."""
+        state, stretches = motion.state, motion.stretches(sizes)
+        priors, off = self._priors(state)
+        design = np.vstack([*(each.combination @ each.shared for each in stretches), priors])
+        residual = np.concatenate([*(each.combination @ each.residual for each in stretches), off])
+        if np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < NUM_SHARED:
+            raise GeometryError("the inertial sensor does not tell the scale: too few of its intervals are known")
+        step = -np.linalg.lstsq(design, residual, rcond=None)[0]
+        velocities, weights = state.velocities_m_s.copy(), np.ones(len(self.path))
+        for each in stretches:
+            velocities[each.photos] = state.velocities_m_s[each.photos] + each.velocities(step)
+            weights[each.before] = each.weights(step)
+        growth = 1 + float(step[SCALE][0])  # the equations are linear in the scale itself, and not in its logarithm
+        if not growth > 0:
+            raise GeometryError("the inertial sensor does not tell the scale: by it the path would be inside out")
+        mounting, gravity = state.mounting.turned(step[TURN]), state.gravity_m_s2 + step[GRAVITY]
+        found = InertialState(
+            state.scale * growth,
+            velocities,
+            GRAVITY_M_S2 * gravity / np.linalg.norm(gravity),
+            state.sensor + step[SENSOR],
+            replace(mounting, imu_in_rig_m=mounting.imu_in_rig_m + step[ARM]),
+            weights,
+        )
+        return found, float(np.sqrt(np.linalg.inv(design.T @ design)[0, 0]))
+
+    def _priors(self, state: InertialState) -> tuple[Array, Array]:
+        """Return the (r, 23) derivatives and the (r,) residuals, in standard deviations, of what was known before."""
+        stddevs = np.full(NUM_SHARED, np.inf)
+        stddevs[SENSOR], stddevs[TURN], stddevs[ARM] = self.prior.of_sensor, self.prior.turn_rad, self.prior.arm_m
+        known = np.isfinite(stddevs) & (stddevs > 0)
+        length = np.zeros((1, NUM_SHARED))
+        length[0, GRAVITY] = state.gravity_m_s2 / GRAVITY_M_S2**2 / GRAVITY_STDDEV
+        off = self.off_prior(state)[known] / stddevs[known]
+        return np.vstack([np.diag(1 / stddevs)[known], length]), np.append(off, 0.0)
+
+
+@dataclass(frozen=True)
+class LinearMotion:
+    """The log summed up in k intervals between photos, linearised at a state.
+
+    Attributes:
+        state, intervals, errors: at which, of what, and predicted minus measured.
+        shared: (k, 9, 23) derivatives by what all intervals share.
+        late: (k, 9, 2, 1) by how much later than said the photos before and after were taken.
+    """
+
+    state: InertialState
+    intervals: Preintegrated
+    errors: MotionErrors
+    shared: Array
+    late: Array
+
+    def stretches(self, sizes: Sizes) -> list[Stretch]:
+        """Return all intervals in stretches of neighbours, given the sizes of the errors."""
+        num = len(self.intervals)
+        parts = np.array_split(np.arange(num), -(-num // _MAX_NUM_IN_STRETCH))
+        return [Stretch.of(rows, self, sizes) for rows in parts]
+
+    def combined(self, sizes: Sizes, max_num: int, *, keeps_direction: bool) -> Combinations:
+        """Return the few combinations of all errors that tell what all intervals share.
+
+        Args:
+            max_num: about the largest number of combinations; those that tell as much as all are never fewer.
+            keeps_direction: whether they depend on gravity's direction; otherwise what does is left out.
+        """
+        stretches, num = self.stretches(sizes), len(self.intervals)
+        by_direction = self.errors.by_gravity @ self.state.horizontal
+        parts = []
+        for group in np.array_split(np.arange(len(stretches)), min(max(max_num // NUM_SHARED, 1), len(stretches))):
+            of_group = [stretches[number] for number in group]
+            basis = np.linalg.qr(np.vstack([each.combination @ each.shared for each in of_group]))[0]
+            ends = np.cumsum([0, *(len(each.combination) for each in of_group)])
+            found = np.zeros((basis.shape[1], num, 9))
+            for each, first, last in zip(of_group, ends[:-1], ends[1:], strict=True):
+                found[:, each.rows] = (basis[first:last].T @ each.combination).reshape(-1, len(each.rows), 9)
+            parts.append(found)
+        coefficients = np.concatenate(parts)
+        if not keeps_direction:
+            seen = np.linalg.qr(np.tensordot(coefficients, by_direction, axes=2), mode="complete")[0]
+            coefficients = np.tensordot(seen[:, 2:].T, coefficients, axes=1)
+        return Combinations(coefficients, self)
+
+
+@dataclass(frozen=True)
+class Combinations:
+    """c linear combinations of the (k, 9) errors of intervals, which do not depend on velocities.
+
+    Attributes:
+        coefficients: (c, k, 9). motion: of the intervals.
+    """
+
+    coefficients: Array
+    motion: LinearMotion
+
+    def of(self, effects: Array) -> Array:
+        """Return (c, ...) combinations of (k, 9, ...) effects."""
+        return np.asarray(np.tensordot(self.coefficients, effects, axes=2))
+
+    def covariance(self, of_intervals: Array) -> Array:
+        """Return the (c, c) covariance for independent (k, 9, 9) covariances of intervals."""
+        spread = np.einsum("cki,kij->ckj", self.coefficients, of_intervals)
+        return np.asarray(np.tensordot(spread, self.coefficients, axes=([1, 2], [1, 2])))
+
+    def by_photos(self, effects: Array, num_photos: int) -> Array:
+        """Return the (c, n, m) combinations of effects (k, 9, 2, m) of the photos before and after."""
+        found = np.zeros((num_photos, len(self.coefficients), effects.shape[3]))
+        for side, photo in enumerate((self.motion.intervals.before, self.motion.intervals.after)):
+            np.add.at(found, photo, np.einsum("cki,kim->kcm", self.coefficients, effects[:, :, side]))
+        return np.swapaxes(found, 0, 1)
+
+    def walk(self, effects: Array, times_s: Array) -> Array:
+        """Return the (c, c) covariance of a random walk of 1 per root of a second, from the first interval on.
+
+        Args:
+            effects: (k, 9, 3) of the three numbers that walk. times_s: (k,) of the intervals.
+        """
+        each = np.einsum("cki,kia->kca", self.coefficients, effects)
+        later = np.cumsum(each[::-1], axis=0)[::-1][1:]  # a step moves all that comes after it
+        return np.asarray(np.einsum("kca,kda,k->cd", later, later, np.diff(times_s), optimize=True))
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Neighbouring intervals whose velocities are eliminated together.
+
+    Attributes:
+        rows: (m,) of the intervals. before: (m,) photos before each. photos: (q,) all of them.
+        residual: (9 m,). shared: (9 m, 23). lower: (9 m, 9 m) Cholesky factor of their covariance.
+        by_velocity: (9 m, 3 q).
+        combination: (r, 9 m) combinations that do not depend on velocities, with a covariance of 1.
+    """
+
+    rows: Indices
+    before: Indices
+    photos: Indices
+    residual: Array
+    shared: Array
+    lower: Array
+    by_velocity: Array
+    combination: Array
+
+    @classmethod
+    def of(cls, rows: Indices, motion: LinearMotion, sizes: Sizes) -> Stretch:
+        """Eliminate the velocities of some of the intervals, given the sizes of the errors."""
+        before, after, num = motion.intervals.before[rows], motion.intervals.after[rows], len(rows)
+        photos = np.unique([before, after])
+
+        def of_photos(values: Array) -> Array:
+            found = np.zeros((num, 9, len(photos), values.shape[3]))
+            for side, photo in enumerate((before, after)):
+                found[np.arange(num), :, np.searchsorted(photos, photo)] += values[:, :, side]
+            return found.reshape(9 * num, -1)
+
+        of_poses = np.repeat([sizes["pose_turns"], sizes["pose_places"]], 3)
+        noise = np.hstack(
+            [of_photos(motion.errors.by_pose[rows] * of_poses), of_photos(motion.late[rows] * sizes["photo_times"])]
+        )
+        total = noise @ noise.T
+        blocks = total.reshape(num, 9, num, 9)  # a view
+        densities = np.array([sizes["gyro_noise"], sizes["accel_noise"]])
+        of_intervals = motion.intervals.subset(rows).covariance(densities)
+        blocks[np.arange(num), :, np.arange(num)] += of_intervals / motion.state.weights[before][:, None, None]
+        lower = np.asarray(np.linalg.cholesky(regular(total)), dtype=np.float64)
+        by_velocity, own = of_photos(motion.errors.by_velocity[rows]), motion.shared[rows].reshape(9 * num, -1)
+        whitened = solve_triangular(lower, np.hstack([by_velocity, own]), lower=True)
+        basis = np.linalg.qr(whitened[:, : by_velocity.shape[1]])[0]
+        left = whitened[:, by_velocity.shape[1] :]
+        left = left / np.maximum(np.linalg.norm(left, axis=0), 1e-300)
+        turned, strengths, _ = np.linalg.svd(left - basis @ (basis.T @ left), full_matrices=False)
+        turned = turned[:, strengths > UNDETERMINED]
+        combination = solve_triangular(lower, turned, lower=True, trans=1).T
+        return cls(rows, before, photos, motion.errors.residual[rows].ravel(), own, lower, by_velocity, combination)
+
+    def _left(self, step: Array) -> Array:
+        return self.residual + self.shared @ step
+
+    def velocities(self, step: Array) -> Array:
+        """Return the (q, 3) most likely changes of the velocities after a step (23,) of the shared numbers."""
+        whitened = solve_triangular(self.lower, np.column_stack([self.by_velocity, self._left(step)]), lower=True)
+        basis, upper = np.linalg.qr(whitened[:, :-1])
+        return -np.asarray(solve_triangular(upper, basis.T @ whitened[:, -1])).reshape(-1, 3)
+
+    def weights(self, step: Array) -> Array:
+        """Return the (m,) robust weights of the intervals after a step."""
+        left = (self._left(step) + self.by_velocity @ self.velocities(step).ravel()).reshape(-1, 9)
+        covariance = self.lower @ self.lower.T
+        own = covariance.reshape(len(left), 9, len(left), 9)[np.arange(len(left)), :, np.arange(len(left))]
+        squared = np.einsum("ki,kij,kj->k", left, np.linalg.inv(own), left)
+        return GEMAN_MCCLURE.weights(np.sqrt(squared / max(float(np.median(squared)), 1e-300)))

@@ -1,0 +1,219 @@
+"""An inertial sensor on a map as a whole: its scale, the upward direction, and their errors (sections 4 to 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Array
+from rangesfm.geometry.gravity import Gravity
+from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS
+from rangesfm.geometry.similarity import Similarity
+from rangesfm.inference.bending import MapBending
+from rangesfm.inference.linear_map import Columns
+from rangesfm.inference.noise import Component
+from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, Observations, ScaleUncertainty, joined
+from rangesfm.measurements.imu.inertial_fit import (
+    ARM,
+    GRAVITY,
+    SCALE,
+    SENSOR,
+    TURN,
+    Combinations,
+    InertialProblem,
+    InertialState,
+    Sizes,
+)
+from rangesfm.measurements.imu.preintegration import (
+    ACCEL,
+    ACCEL_BIAS,
+    ACCEL_SCALE,
+    CLOCK,
+    GYRO,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    Preintegrated,
+)
+from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+
+IMU = "imu"
+# Observations from which the sizes of errors are learnt before there are other kinds.
+_NUM_OBSERVATIONS = MAX_NUM_OBSERVATIONS // 3
+# Relative change of the sizes of errors from which weights do not matter.
+_SAME_SIZE = 0.1
+
+
+@dataclass(frozen=True)
+class InertialScale(KindOnMap):
+    """A log on the path of a map, whose scale and upward direction it tells.
+
+    Attributes:
+        problem: the log on the path. bending: of the map.
+        metres_per_unit: units of the path in one unit of that which ``bending`` has.
+        state: the most likely one. sizes: of the errors with which it was found. intervals: the log summed up there.
+    """
+
+    problem: InertialProblem
+    bending: MapBending
+    metres_per_unit: float
+    state: InertialState
+    sizes: Sizes
+    intervals: Preintegrated
+
+    kind = IMU
+
+    @property
+    def words(self) -> str:
+        return "inertial sensor"
+
+    @property
+    def remedy(self) -> str:
+        return "measure a length, and look at what the notes say of the sensor's alignment"
+
+    @property
+    def start(self) -> Similarity:
+        """The placement by the log alone, in the first camera's frame."""
+        return in_first_cameras_frame(self.problem.path, self.state.scale)
+
+    @cached_property
+    def alone(self) -> JointMap:
+        """The map by the log alone."""
+        return fit_kinds((self,), self.problem.path, self.start, self.bending)
+
+    @cached_property
+    def upward(self) -> Gravity:
+        """The upward direction in the first camera, as exactly as the errors let the log and the map tell it."""
+        observed, combinations = self._observed(self.state.scale, keeps_direction=True)
+        across = combinations.of(combinations.motion.errors.by_gravity @ self.state.horizontal)
+        problem = replace(joined([observed], self.bending), sizes=self.alone.problem.sizes)
+        # The direction is that of the most likely state; how far off it may be is known as for a mistake in it.
+        stddev = float(np.linalg.norm(problem.mistake(across).stddevs)) / np.sqrt(2) / GRAVITY_M_S2
+        down = self.problem.path.world_from_cam[0].T @ self.state.gravity_m_s2
+        return Gravity(-down / np.linalg.norm(down), stddev)
+
+    def observed(self, placed: Similarity, *, in_site: bool, max_num: int) -> Observations:
+        """Linearise about the scale of a placement; what depends on gravity's direction is left out."""
+        del in_site
+        return self._observed(placed.scale, max_num)[0]
+
+    def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
+        """Yield that the motion does not show the scale."""
+        if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+            yield Doubt(
+                "the camera moved too evenly for the inertial sensor to show the scale",
+                "move it to and fro and turn it about all axes, for half a minute or longer",
+            )
+
+    def entry(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return what ``ImuEntry`` has."""
+        log, state, step_s = self.problem.log, self.state, self.problem.log.step_s
+        offset_s = self.problem.time_offset_s + float(state.sensor[CLOCK][0])
+        learnt = on_map.problem.sizes
+        found = {
+            "num": len(log),
+            "num_used": min(round(float(self.intervals.interval_s.sum()) / step_s), len(log)),
+            "time_offset": {"value_s": offset_s, "stddev_s": self.problem.prior.clock_s},
+            "rotation_imu_to_cam_xyzw": Rotation.from_matrix(state.mounting.rig_from_imu).as_quat(canonical=True),
+            "gravity_in_world": on_map.estimate.rotation @ state.gravity_m_s2,
+            "up_stddev_deg": np.degrees(self.upward.stddev_rad),
+            "accel_scale_factors": 1 / (1 - state.sensor[ACCEL_SCALE]),
+            "accel_bias_m_s2": state.sensor[ACCEL_BIAS],
+            "gyro_bias_rad_s": state.sensor[GYRO_BIAS],
+            "accel_noise": learnt["accel_noise"],
+            "gyro_noise": learnt["gyro_noise"],
+        }
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}
+
+    def _observed(
+        self, scale: float, max_num: int = _NUM_OBSERVATIONS, *, keeps_direction: bool = False
+    ) -> tuple[Observations, Combinations]:
+        """Return the observations at a scale, weighted by the sizes of the errors, and of what they are made."""
+        problem, state = self.problem, replace(self.state, scale=scale)
+        motion = problem.linearized(state, self.intervals)
+        made = motion.combined(self.sizes, max_num, keeps_direction=keeps_direction)
+        path, by_pose = problem.path, made.by_photos(motion.errors.by_pose, len(problem.path))
+        by_pose[:, :, 3:] = scale * self.metres_per_unit * by_pose[:, :, 3:] @ path.world_from_cam[0]
+        of_shared, nothing = made.of(motion.shared), np.zeros(0, dtype=np.int64)
+        components = tuple(self._components(made, by_pose, of_shared))
+        known = [each.alike for each in components if each.spread == 0]
+        assumed = [self.sizes[each.name] ** 2 * each.alike for each in components if each.name in self.sizes]
+        covariance = np.asarray(np.sum([*known, *assumed], axis=0))
+        found = Observations(
+            kind=IMU,
+            columns=Columns(0, -1, nothing, nothing, 1),
+            design=of_shared[:, SCALE],
+            # Constant errors of the sensor are about what was known of it before.
+            residual_m=made.of(motion.errors.residual) - of_shared @ problem.off_prior(state),
+            by_pose=by_pose.reshape(len(by_pose), -1),
+            components=components,
+            alone_m2=covariance,
+            is_used=np.ones(len(by_pose), dtype=bool),
+        )
+        return found, made
+
+    def _components(self, made: Combinations, by_pose: Array, of_shared: Array) -> Iterator[Component]:
+        """Yield the errors of observations, those of one standard deviation where it is learnt.
+
+        Args:
+            by_pose: (c, n, 6). of_shared: (c, 23) derivatives by what is shared.
+        """
+        motion, prior, num = made.motion, self.problem.prior, len(by_pose)
+        times_s = self.problem.times_s[motion.intervals.before]
+        for name, sensor, of_bias in (("gyro", GYRO, GYRO_BIAS), ("accel", ACCEL, ACCEL_BIAS)):
+            noise, walk = prior.noise[sensor], prior.walk[sensor]
+            white = made.covariance(motion.intervals.unit_covariance[sensor])
+            yield Component(f"{name}_noise", white, noise.median, noise.spread)
+            walked = made.walk(motion.errors.by_sensor[:, :, of_bias], times_s)
+            yield Component(f"{name}_bias_walk", walked, walk.median, walk.spread)
+        late = made.by_photos(motion.late, len(self.problem.path))[:, :, 0]
+        turns, places = (by_pose[:, :, part].reshape(num, -1) for part in (slice(0, 3), slice(3, 6)))
+        for name, by_noise, size in (
+            ("photo_times", late, PHOTO_TIMES),
+            ("pose_turns", turns, POSE_TURNS),
+            ("pose_places", places, POSE_PLACES),
+        ):
+            yield Component(name, by_noise @ by_noise.T, size.median, size.spread)
+        yield Component("log_gaps", made.covariance(motion.intervals.of_gaps))
+        of_sensor = of_shared[:, SENSOR]
+        down = of_shared[:, GRAVITY] @ motion.state.gravity_m_s2
+        for name, columns, stddev in (
+            ("gyro_bias", of_sensor[:, GYRO_BIAS], prior.gyro_bias_rad_s),
+            ("accel_bias", of_sensor[:, ACCEL_BIAS], prior.accel_bias_m_s2),
+            ("gyro_scale", of_sensor[:, GYRO_SCALE], prior.gyro_scale),
+            ("accel_scale", of_sensor[:, ACCEL_SCALE], prior.accel_scale),
+            ("imu_clock", of_sensor[:, CLOCK], prior.clock_s),
+            ("imu_turn", of_shared[:, TURN], prior.turn_rad),
+            ("imu_place", of_shared[:, ARM], prior.arm_m),
+            ("gravity", down[:, None], GRAVITY_STDDEV),
+        ):
+            yield Component(name, stddev**2 * columns @ columns.T)
+
+
+def scale_by_sensor(problem: InertialProblem, bending: MapBending, metres_per_unit: float = 1.0) -> InertialScale:
+    """Fit a log to the path of a map, with the sizes of the errors that it shows.
+
+    Args:
+        metres_per_unit: as of ``InertialScale``.
+
+    Raises:
+        GeometryError: log and photos have no time in common, or do not tell the scale.
+    """
+    gyro, accel = problem.prior.noise
+    sizes = {
+        "gyro_noise": gyro.median, "accel_noise": accel.median, "photo_times": PHOTO_TIMES.median,
+        "pose_turns": POSE_TURNS.median, "pose_places": POSE_PLACES.median,
+    }  # fmt: skip
+    state = problem.first_state
+    for _ in range(NUM_REWEIGHTINGS):
+        state = problem.likeliest(state, sizes)
+        found = InertialScale(problem, bending, metres_per_unit, state, sizes, problem.summed_up(state, sizes))
+        learnt = joined([found.observed(found.start, in_site=False, max_num=_NUM_OBSERVATIONS)], bending).learnt().sizes
+        before, sizes = sizes, {name: learnt[name] for name in sizes}
+        if max(abs(np.log(sizes[name] / before[name])) for name in sizes) < _SAME_SIZE:
+            break
+    return found

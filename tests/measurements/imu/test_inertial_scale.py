@@ -1,0 +1,75 @@
+"""The scale by an inertial sensor alone: it is near the truth within its interval, and open where the motion is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+from tests.simulated.inertial import CAM_FROM_IMU, Motion, by_hand, imu_log, photos
+
+from rangesfm.errors import GeometryError
+from rangesfm.inference.bending import WalkBending
+from rangesfm.measurements.imu.inertial_fit import InertialProblem
+from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
+from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.measurements.imu.motion import Mounting
+from rangesfm.measurements.imu.sensor_prior import SensorPrior
+
+Array = npt.NDArray[np.float64]
+METRES_PER_UNIT = 1 / 0.37
+PRIOR = SensorPrior(clock_s=0.005, turn_rad=0.01, arm_m=0.02)
+
+
+def posed(motion: Motion, accel_scale: Array, *, seed: int = 1) -> InertialProblem:
+    """Return a log with scale errors on the path of photos."""
+    log, path = imu_log(motion, seed=seed), photos(motion, noise_rad=3e-4)
+    log = ImuLog(log.timestamp_s, log.gyro_rad_s, (1 + accel_scale) * log.accel_m_s2)
+    return InertialProblem(log, path, Mounting(CAM_FROM_IMU, np.zeros(3)), PRIOR)
+
+
+def located(motion: Motion, accel_scale: Array, *, seed: int = 1) -> InertialScale:
+    """Return its scale."""
+    problem = posed(motion, accel_scale, seed=seed)
+    return scale_by_sensor(problem, WalkBending(problem.path))
+
+
+def test_a_log_gives_metres_whatever_the_scale_errors_of_its_axes() -> None:
+    errors = []
+    for seed in range(4):
+        scale_errors = np.random.default_rng(seed).normal(0, 0.03, 3)
+        found = located(by_hand(seed, axes=(3.0, 3.0, 3.0)), scale_errors, seed=seed).alone
+        off = np.log(found.scale.value / METRES_PER_UNIT)
+        assert found.uncertainty.half_width_95 < 0.03
+        errors.append(off / found.uncertainty.empirical)
+    assert np.abs(errors).max() < 3
+    assert np.sqrt(np.mean(np.square(errors))) < 2
+
+
+def test_the_interval_of_a_rover_that_hardly_turns_or_accelerates_is_wide() -> None:
+    hand = by_hand(0, axes=(0.0, 0.0, 1.0))
+    slow = replace(hand, frequencies_hz=hand.frequencies_hz / 10, amplitudes_rad=hand.amplitudes_rad / 10)
+    [doubt] = (kind := located(slow, np.zeros(3))).doubts(kind.alone.uncertainty)
+    assert kind.alone.uncertainty.half_width_95 > 0.04
+    assert "moved too evenly" in doubt.reason
+
+
+def test_the_upward_direction_is_known_to_less_than_half_a_degree() -> None:
+    errors = []
+    for seed in range(4):
+        found = located(by_hand(seed, axes=(3.0, 3.0, 3.0)), np.zeros(3), seed=seed)
+        # The simulated world is upright after it was turned by this rotation.
+        upright = Rotation.from_rotvec([0.3, -1.0, 2.0]).apply([0.0, 0.0, 1.0])
+        true = found.problem.path.world_from_cam[0].T @ upright
+        assert found.upward.stddev_rad < np.deg2rad(0.5)
+        errors.append(np.linalg.norm(found.upward.up_in_first_camera - true) / found.upward.stddev_rad)
+    assert np.max(errors) < 4
+
+
+def test_a_log_of_another_day_is_refused() -> None:
+    problem = posed(by_hand(), np.zeros(3))
+    later = replace(problem.log, timestamp_s=problem.log.timestamp_s + 86400.0)
+    with pytest.raises(GeometryError, match="no time in common"):
+        scale_by_sensor(replace(problem, log=later), WalkBending(problem.path))
