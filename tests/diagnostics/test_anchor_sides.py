@@ -46,7 +46,7 @@ def test_an_anchor_on_the_right_side_stays_there(crossed: MetricResult) -> None:
     sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
     assert not sides.has_crossed
     assert sides.mirrors_m == {"A1": None}
-    assert sides.of(crossed.anchors) == crossed.anchors
+    assert sides.applied_to(crossed.anchors) == crossed.anchors
 
 
 def test_sides_that_the_ranges_do_not_tell_apart_are_both_given() -> None:

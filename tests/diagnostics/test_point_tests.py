@@ -56,7 +56,7 @@ def marked(walked_survey: WalkedSurvey) -> Marked:
 
 def test_points_of_a_map_that_is_not_refined_are_as_far_off_as_it_is_bent() -> None:
     exact = MapPoint("M", np.zeros(3), MapPointErrors({}, np.zeros((3, 3))))
-    found = Placed(np.zeros((7, 7)), np.zeros(3), bent_by_m=0.3).of([exact])
+    found = Placed(np.zeros((7, 7)), np.zeros(3), bent_by_m=0.3).joint([exact])
     assert np.trace(found) == pytest.approx(0.3**2)
 
 

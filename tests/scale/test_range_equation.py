@@ -84,7 +84,7 @@ def test_prediction_is_the_hand_computed_one() -> None:
 @pytest.mark.parametrize("turn_rad", [0.0, 1e-5, 0.5, 2.5])
 def test_jacobians_are_finite_differences_in_every_column(rng: np.random.Generator, turn_rad: float) -> None:
     start = random_state(rng)
-    taped = LocatedDistances.of(
+    taped = LocatedDistances.control(
         np.array([3.0, 5.0, 4.0]),
         np.array([0.1, 0.2, 0.5]),
         model_length=np.array([2.0, np.nan, np.nan]),

@@ -175,7 +175,7 @@ class Refits:
         cost, state = min(starts, key=lambda each: each[0])
         return cost, replace(right, state=state)
 
-    def of(self, start: RangesOnMap) -> tuple[float, RangesOnMap]:
+    def fitted(self, start: RangesOnMap) -> tuple[float, RangesOnMap]:
         """Return the cost of the best fit of the thinned ranges, and the map at that fit."""
         fit = _roughly_solved(self._thinned(start), start.state)
         return fit.cost, replace(start, state=fit.state)

@@ -30,7 +30,7 @@ class AnchorSides:
     has_crossed: bool
     mirrors_m: Mapping[str, Array | None]
 
-    def of(self, anchors: Iterable[AnchorEstimate]) -> tuple[AnchorEstimate, ...]:
+    def applied_to(self, anchors: Iterable[AnchorEstimate]) -> tuple[AnchorEstimate, ...]:
         """Return estimates of anchors with the unknown ones on these sides."""
         at_m = dict(zip(self.on_map.anchor_ids, self.on_map.state.anchors_m, strict=True))
         return tuple(

@@ -228,7 +228,9 @@ def _with_usual_errors(on_map: RangesOnMap, bins: RangeBins, scatter_m: float) -
 
 
 def _usual_errors(components: Sequence[Component], bins: RangeBins, scatter_m: float) -> LearnedErrors:
-    return LearnedErrors.of(noise_of_sizes(components, usual_sizes(components) | {"white": scatter_m}, len(bins)), bins)
+    return LearnedErrors.from_noise(
+        noise_of_sizes(components, usual_sizes(components) | {"white": scatter_m}, len(bins)), bins
+    )
 
 
 def at_state(problem: Linearized, on_map: RangesOnMap) -> Linearized:

@@ -282,7 +282,7 @@ def _alternatives(problem: Linearized, before: float, tried: Sequence[Alternativ
         return
     refits = Refits(as_given(problem.on_map), problem.scatter_m)
     starts = sorted(((*refits.start(each.correction), each) for each in tried), key=lambda start: start[0])
-    fits = sorted(((*refits.of(start), each) for _, start, each in starts[:_NUM_FITTED]), key=lambda fit: fit[0])
+    fits = sorted(((*refits.fitted(start), each) for _, start, each in starts[:_NUM_FITTED]), key=lambda fit: fit[0])
     # Its squares do not decide: by the errors that last, an explanation with larger squares may be the likelier one.
     found = [(_likeliest_near(problem, refitted), each) for _, refitted, each in fits[:_NUM_TRIED]]
     if isinstance(problem.on_map.bending, WalkBending):

@@ -46,7 +46,7 @@ class Placed:
         by_map = similarity_motions(at_m - self.first_camera_m).reshape(-1, 7)
         return np.asarray(by_map @ self.covariance @ by_map.T)
 
-    def of(self, points: Sequence[MapPoint]) -> Array:
+    def joint(self, points: Sequence[MapPoint]) -> Array:
         """Return the (3 k, 3 k) covariance of points of a map that is not refined."""
         own = [point.errors.own_m2 + self.bent_by_m**2 / 3 * np.eye(3) for point in points]
         return np.asarray(block_diag(*own) + self.of_place(points))
@@ -79,7 +79,7 @@ def diagnose_points(
         return MistakeTests()
     finder = MapPoints(model, {}, points.markers, np.nan, points.markers_path or points.path)
     found = [finder.find_marker(of.name) for of in tested]
-    of_map = placed.of(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)
+    of_map = placed.joint(found) if errors is None else errors.joint([at.errors for at in found], scale_stddev)
     if errors is not None and placed.by_antenna:  # the errors of the refined map have none that last
         of_map = of_map + placed.of_place(found)
     own = np.repeat([of.stddev_m**2 for of in tested], 3)

@@ -56,7 +56,7 @@ class LocatedDistances:
     by_pose: csr_array
 
     @classmethod
-    def of(
+    def control(
         cls,
         distance_m: Array,
         stddev_m: Array,

@@ -227,7 +227,7 @@ class ComponentLikelihood:
 
     @cached_property
     def _half(self) -> _Half:
-        return _Half.of(self.of_components, self.known)
+        return _Half.packed(self.of_components, self.known)
 
     def _factored(self, logs: Array) -> tuple[float, Array]:
         """Return the log-determinant and the inverse (c, c) of the covariance."""
@@ -267,7 +267,7 @@ class _Half:
     known: Array
 
     @classmethod
-    def of(cls, components: Array, known: Array) -> _Half:
+    def packed(cls, components: Array, known: Array) -> _Half:
         num = len(known)
         places = np.flatnonzero(np.triu(np.ones((num, num))))
         # Rounding may leave a covariance singular, without this share of its trace on the diagonal.

@@ -46,7 +46,7 @@ class Views:
     size_px: Array
 
     @classmethod
-    def of(cls, model: pycolmap.Reconstruction, frame_ids: Indices) -> Views:
+    def in_model(cls, model: pycolmap.Reconstruction, frame_ids: Indices) -> Views:
         """Return the views of the photos of these frames that see any points."""
         place = {frame_id: k for k, frame_id in enumerate(frame_ids.tolist())}
         images = [model.image(image_id) for image_id in model.reg_image_ids()]

@@ -39,7 +39,7 @@ class LoopFinder:
     seed: int
 
     @classmethod
-    def of(
+    def in_refined_map(
         cls,
         model: pycolmap.Reconstruction,
         trajectory: Trajectory,
@@ -49,11 +49,11 @@ class LoopFinder:
     ) -> LoopFinder:
         """Return the finder of loops in a refined map; ``trajectory`` has its keyframes, also in another world."""
         path = trajectory.as_in(model)
-        return cls(model, path, RelativeErrors.of(errors, path.frame_ids, path.centers), pixel_stddev, seed)
+        return cls(model, path, RelativeErrors.of_keyframes(errors, path.frame_ids, path.centers), pixel_stddev, seed)
 
     @cached_property
     def views(self) -> Views:
-        return Views.of(self.model, self.path.frame_ids)
+        return Views.in_model(self.model, self.path.frame_ids)
 
     def propose(self, matched: Mapping[int, Set[int]], *, max_num: int) -> list[Pair]:
         """Return the pairs that are worth matching.

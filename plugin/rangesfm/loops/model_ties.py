@@ -52,7 +52,7 @@ def find_tie(
     """
     ways = [way for pair, matches in verified.items() for way in ((pair, matches), (pair[::-1], matches[:, ::-1]))]
     pairs = [
-        _MatchedPoints.of(first, second, pair, matches)
+        _MatchedPoints.in_photos(first, second, pair, matches)
         for pair, matches in ways
         if _has(first, pair[0]) and _has(second, pair[1])
     ]
@@ -88,7 +88,7 @@ class _MatchedPoints:
     pixels: Array
 
     @classmethod
-    def of(
+    def in_photos(
         cls, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, image_ids: Pair, matches: Indices
     ) -> _MatchedPoints:
         models = first, second

@@ -24,7 +24,7 @@ class RelativeErrors:
     frames: PartErrors
 
     @classmethod
-    def of(cls, errors: MapErrors, frame_ids: Indices, centers: Array) -> RelativeErrors:
+    def of_keyframes(cls, errors: MapErrors, frame_ids: Indices, centers: Array) -> RelativeErrors:
         """Return the errors of keyframes, given by the ids (n,) of their frames and their centres (n, 3)."""
         known = errors.parts["frame"]
         rows = [known.row_of[frame_id] for frame_id in frame_ids.tolist()]

@@ -237,7 +237,7 @@ def expect(
     if (taped := planned.taped_lengths) is not None:
         observed.append(lengths_on_map(taped, 1.0, path, np.ones(len(taped), dtype=bool)))
     problem, known, keyframe_stddevs_m = the_map.solved(observed)
-    learned = None if ranges is None else LearnedErrors.of(problem.noise_of(RANGES), ranges.observed.bins)
+    learned = None if ranges is None else LearnedErrors.from_noise(problem.noise_of(RANGES), ranges.observed.bins)
     num_positions = 0 if positions is None else int(np.count_nonzero(positions.is_used)) // 3
     return Expected(planned, vision, ranges, known, learned, keyframe_stddevs_m, num_positions, notes)
 
@@ -258,7 +258,7 @@ def _positions(
         if not planned.anchors:
             raise GeometryError(f"the scale is not determined: {error}") from None
         return None, None, (*notes, f"the known positions are not used: {error}")
-    return found, PlacementPrior.of(planned.site_from_first_camera, np.zeros(3), alone.placement), notes
+    return found, PlacementPrior.with_covariance(planned.site_from_first_camera, np.zeros(3), alone.placement), notes
 
 
 def _ranges(planned: PlannedSurvey, placement: PlacementPrior | None, max_num_bins: int) -> RangesAtTruth:

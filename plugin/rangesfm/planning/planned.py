@@ -199,7 +199,7 @@ class PlannedSurvey:
         lengths, stddevs = np.array(self.taped, dtype=np.float64).reshape(-1, 2).T
         # Between its ends the scale of the map varies.
         stddevs = np.hypot(stddevs, BENDING * lengths)
-        return LocatedDistances.of(lengths, stddevs, model_length=lengths) if self.taped else None
+        return LocatedDistances.control(lengths, stddevs, model_length=lengths) if self.taped else None
 
     def posed(self, observations: RangeObservations, placement: PlacementPrior | None = None) -> ScaleProblem:
         """Return the scale problem that a run will solve, with the input that it will have.

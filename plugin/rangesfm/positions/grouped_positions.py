@@ -46,48 +46,51 @@ class GroupedPositions(Observations):
     grouping: csr_array = field(kw_only=True)
 
 
-def grouped_positions(
-    known: KnownPositions,
-    site_from_model: Similarity,
-    path: Trajectory,
-    weights: Array,
-    stddev_m: Array,
-    is_used: Mask,
-    lasting_s: Sequence[float],
-    *,
-    metres_per_unit: float = 1.0,
-    max_num_groups: int = MAX_NUM_OBSERVATIONS // 3,
-) -> GroupedPositions:
-    """Group known positions, and linearise them about a similarity from the model of a path.
+@dataclass(frozen=True)
+class PositionFit:
+    """A robust fit of known positions to a map.
 
-    Args:
-        weights, stddev_m, is_used: (k,) robust weights, assumed standard deviations of a coordinate, and whether the
-            positions take part.
-        lasting_s: for how long errors of the antenna's positions last, seconds.
+    Attributes:
+        similarity: from the model of ``path`` to the site.
+        known: the k positions. used: (k,) those that take part. weights, stddev_m: (k,) robust weights, and standard
+            deviations of a coordinate that they assume.
+        lasting_s: for how long errors of an antenna's positions last.
         metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
-        max_num_groups: largest number of groups of an antenna's positions.
     """
-    grouping = _grouped_by_time(known, weights, max_num_groups)
-    takes_part = is_used & ((weights >= OUTLIER_BELOW) | known.is_mark)
-    used = np.asarray((abs(grouping) @ np.repeat(takes_part, 3)) > 0)
-    by_pose = groups_by_pose(known, site_from_model, path, grouping)
-    by_pose.reshape(len(by_pose), -1, 6)[:, :, 3:] *= metres_per_unit
-    design = grouping @ design_of_positions(known, site_from_model, path)
-    variances = np.repeat(stddev_m**2 / np.maximum(weights, OUTLIER_BELOW), 3)
-    weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
-    components = tuple(_components(known, site_from_model, grouping, stddev_m, lasting_s))
-    nothing = np.zeros(0, dtype=np.int64)
-    return GroupedPositions(
-        kind=POSITIONS,
-        columns=Columns(0, 1, nothing, nothing, 7),
-        design=design,
-        residual_m=grouping @ known.misclosures_m(site_from_model).ravel(),
-        by_pose=by_pose,
-        components=_with_frame(components, known, site_from_model, grouping, design, used),
-        alone_m2=weighed,
-        is_used=used,
-        grouping=grouping,
-    )
+
+    similarity: Similarity
+    known: KnownPositions
+    path: Trajectory
+    used: Mask
+    weights: Array
+    stddev_m: Array
+    lasting_s: tuple[float, ...]
+    metres_per_unit: float = 1.0
+
+    def at(self, similarity: Similarity, max_num: int = MAX_NUM_OBSERVATIONS) -> GroupedPositions:
+        """Return the observations about a similarity, of which an antenna has at most ``max_num``."""
+        known = self.known
+        grouping = _grouped_by_time(known, self.weights, max_num // 3)
+        takes_part = self.used & ((self.weights >= OUTLIER_BELOW) | known.is_mark)
+        used = np.asarray((abs(grouping) @ np.repeat(takes_part, 3)) > 0)
+        by_pose = groups_by_pose(known, similarity, self.path, grouping)
+        by_pose.reshape(len(by_pose), -1, 6)[:, :, 3:] *= self.metres_per_unit
+        design = grouping @ design_of_positions(known, similarity, self.path)
+        variances = np.repeat(self.stddev_m**2 / np.maximum(self.weights, OUTLIER_BELOW), 3)
+        weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
+        components = tuple(_components(known, similarity, grouping, self.stddev_m, self.lasting_s))
+        nothing = np.zeros(0, dtype=np.int64)
+        return GroupedPositions(
+            kind=POSITIONS,
+            columns=Columns(0, 1, nothing, nothing, 7),
+            design=design,
+            residual_m=grouping @ known.misclosures_m(similarity).ravel(),
+            by_pose=by_pose,
+            components=_with_frame(components, known, similarity, grouping, design, used),
+            alone_m2=weighed,
+            is_used=used,
+            grouping=grouping,
+        )
 
 
 def design_of_positions(known: KnownPositions, site_from_model: Similarity, path: Trajectory) -> Array:

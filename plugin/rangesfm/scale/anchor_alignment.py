@@ -101,7 +101,7 @@ class AnchorAlignment:
         return 0.5 * float(np.sum(CAUCHY.rho(self.squared)[0]))
 
     @classmethod
-    def of(cls, pairs: Mapping[str, _Pair], motion: Similarity) -> AnchorAlignment:
+    def by_motion(cls, pairs: Mapping[str, _Pair], motion: Similarity) -> AnchorAlignment:
         sides, squared, elsewhere_m = {}, [], {}
         for id_, pair in pairs.items():
             information = pair.information(motion)
@@ -157,7 +157,7 @@ def _distinct(pairs: Mapping[str, _Pair], path_m: Array) -> list[AnchorAlignment
     def are_same(first: AnchorAlignment, second: AnchorAlignment) -> bool:
         return rmse(first.target_from_source.apply(path_m) - second.target_from_source.apply(path_m)) <= tolerance
 
-    begun = best(AnchorAlignment.of(pairs, motion) for motion in _triple_motions(pairs.values()))
+    begun = best(AnchorAlignment.by_motion(pairs, motion) for motion in _triple_motions(pairs.values()))
     return best(_refined(pairs, fit) for fit in begun)
 
 
@@ -188,7 +188,7 @@ def _refined(pairs: Mapping[str, _Pair], fit: AnchorAlignment) -> AnchorAlignmen
         step = np.linalg.solve(normal, right)
         turn = Similarity(1.0, Rotation.from_rotvec(step[:3]).as_matrix(), np.zeros(3))
         shift = middle + step[3:] - turn.rotation @ middle
-        better = AnchorAlignment.of(pairs, replace(turn, translation=shift) @ fit.target_from_source)
+        better = AnchorAlignment.by_motion(pairs, replace(turn, translation=shift) @ fit.target_from_source)
         if not better.cost < fit.cost:
             break
         fit = better

@@ -27,7 +27,7 @@ class PlacementPrior:
     whitening: Array
 
     @classmethod
-    def of(cls, mean: Similarity, middle: Array, covariance: Array) -> PlacementPrior:
+    def with_covariance(cls, mean: Similarity, middle: Array, covariance: Array) -> PlacementPrior:
         """Return the prior with this (7, 7) covariance."""
         return cls(mean, middle, np.linalg.inv(np.linalg.cholesky(covariance)))
 

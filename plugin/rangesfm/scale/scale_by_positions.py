@@ -30,9 +30,9 @@ from rangesfm.measurements.source import Source
 from rangesfm.positions.grouped_positions import (
     POSITIONS,
     GroupedPositions,
+    PositionFit,
     at_point,
     design_of_positions,
-    grouped_positions,
     stddev_of,
 )
 from rangesfm.positions.known_positions import LASTING_S, MIN_NUM_POSITIONS, KnownPositions, LearntPositions
@@ -47,42 +47,6 @@ from rangesfm.scale.position_tests import tests_of_positions
 _MAX_NUM_TRIPLES = 300
 # Largest standard deviation of a turn of the map, radians, for which its effect is linear.
 _MAX_TURN_STDDEV = 0.3
-
-
-@dataclass(frozen=True)
-class PositionFit:
-    """A robust fit of known positions to a map.
-
-    Attributes:
-        similarity: from the model of ``path`` to the site.
-        known: the k positions. used: (k,) those that take part. weights, stddev_m: (k,) robust weights, and standard
-            deviations of a coordinate that they assume.
-        lasting_s: for how long errors of an antenna's positions last.
-        metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
-    """
-
-    similarity: Similarity
-    known: KnownPositions
-    path: Trajectory
-    used: Mask
-    weights: Array
-    stddev_m: Array
-    lasting_s: tuple[float, ...]
-    metres_per_unit: float = 1.0
-
-    def at(self, similarity: Similarity, max_num: int = MAX_NUM_OBSERVATIONS) -> GroupedPositions:
-        """Return the observations about a similarity, of which an antenna has at most ``max_num``."""
-        return grouped_positions(
-            self.known,
-            similarity,
-            self.path,
-            self.weights,
-            self.stddev_m,
-            self.used,
-            self.lasting_s,
-            metres_per_unit=self.metres_per_unit,
-            max_num_groups=max_num // 3,
-        )
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ class RangeScale(KindOnMap):
         """Return the errors of the ranges as learnt on a map, with those of the map."""
         observed = on_map.observed[RANGES]
         assert isinstance(observed, BinnedRanges), "ranges come in bins"
-        return LearnedErrors.of(on_map.problem.noise_of(RANGES), observed.bins)
+        return LearnedErrors.from_noise(on_map.problem.noise_of(RANGES), observed.bins)
 
     def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
         """Return these for the ranges in a bundle adjustment."""
@@ -190,7 +190,7 @@ def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarit
         if each.places_map and each.is_used:
             known = each.alone.posterior
             best = moved_similarity(each.alone.placed, known.columns.map_step(known.step), each.alone.path)
-            return PlacementPrior.of(best @ first_camera_from_model.inverse(), np.zeros(3), known.place)
+            return PlacementPrior.with_covariance(best @ first_camera_from_model.inverse(), np.zeros(3), known.place)
     return None
 
 
@@ -209,7 +209,7 @@ def with_lengths(
     for each in others:
         if each.is_used and not each.places_map:
             alone = each.alone.scale
-            length = LocatedDistances.of(unit * alone.value * one, unit * alone.stddev * one, model_length=one)
+            length = LocatedDistances.control(unit * alone.value * one, unit * alone.stddev * one, model_length=one)
             found = length if found is None else length.joined(found)
     return found
 

@@ -153,7 +153,7 @@ def scale_problem(
         measured += _between_surveyed(in_log, given & heard)
     noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
     pairs, length_m, stddev_m = lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m)
-    measured.append(LocatedDistances.of(length_m, stddev_m, anchor_pair=pairs))
+    measured.append(LocatedDistances.control(length_m, stddev_m, anchor_pair=pairs))
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
         centers=_centers_in_first_camera(observations.centers[rows], trajectory),
@@ -266,4 +266,4 @@ def _between_surveyed(anchors: Sequence[Anchor], given: Mask) -> list[LocatedDis
     pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
     lengths_m, stddevs_m = np.array([[pair.distance_m, pair.stddev_m] for pair in pairs]).reshape(-1, 2).T
     ends = np.array([[ids.index(end) for end in pair.ends] for pair in pairs])
-    return [LocatedDistances.of(lengths_m, stddevs_m, anchor_pair=ends)] if pairs else []
+    return [LocatedDistances.control(lengths_m, stddevs_m, anchor_pair=ends)] if pairs else []

@@ -161,7 +161,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     if not is_a_start and (on_map := _ranges_on_scaled(estimate, bending)) is not None:
         sides = likelier_sides(on_map)
         on_map, estimate = sides.on_map, estimate_by_bent(estimate, sides.on_map, survey.scale)
-        estimate = replace(estimate, anchors=sides.of(estimate.anchors))
+        estimate = replace(estimate, anchors=sides.applied_to(estimate.anchors))
     rivals = _by_rivals(run, path, estimate)
     scaled = rescale(path.sfm, estimate.metric_from_sfm)
     ranges = _ranges(run, path.trajectory, estimate, estimate.anchors)
@@ -440,11 +440,11 @@ def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, refined
     if at is None or metric.kept_refinement is None:
         return refined
     sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
-    estimate = replace(start.estimate, anchors=sides.of(start.estimate.anchors))
+    estimate = replace(start.estimate, anchors=sides.applied_to(start.estimate.anchors))
     if sides.has_crossed:
         again = refine_map(run, replace(start, estimate=estimate))
         return refined if again.metric.kept_refinement is None else again
-    refinement = replace(metric.kept_refinement, anchors=sides.of(metric.kept_refinement.anchors))
+    refinement = replace(metric.kept_refinement, anchors=sides.applied_to(metric.kept_refinement.anchors))
     return replace(refined, metric=replace(metric, estimate=estimate, refinement=refinement))
 
 

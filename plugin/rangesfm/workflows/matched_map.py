@@ -109,4 +109,4 @@ class MatchedMap(Generic[_Map]):
     def _finder(self) -> LoopFinder | None:
         if (errors := self.map.errors) is None:
             return None
-        return LoopFinder.of(self.map.model, self.map.trajectory, errors, self.map.pixel_stddev, self.seed)
+        return LoopFinder.in_refined_map(self.map.model, self.map.trajectory, errors, self.map.pixel_stddev, self.seed)

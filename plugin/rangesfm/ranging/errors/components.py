@@ -137,7 +137,7 @@ def _off_axis(bins: RangeBins) -> Array:
 def components(expected: Mapping[str, tuple[float, float]]) -> tuple[RadioComponent, ...]:
     """Return all components, given median and spread over radios by name."""
 
-    def of(
+    def component(
         name: str,
         words: str,
         correlation: Callable[[RangeBins], Array],
@@ -147,11 +147,11 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[RadioCompon
     ) -> RadioComponent:
         return RadioComponent(name, *expected[name], calibrated_median, is_of_anchor, correlation, words)
 
-    of_anchor = functools.partial(of, is_of_anchor=True)
+    of_anchor = functools.partial(component, is_of_anchor=True)
     return (
         of_anchor("white", "noise of single ranges", lambda c: np.diag(1 / c.worth)),
         of_anchor("time", "range errors that last for seconds", lambda c: _fading(c.time_s, LASTING_S) * _same_link(c)),
-        of(
+        component(
             "drift",
             "slow drift of the radio, the same to all anchors",
             lambda c: _fading(c.time_s, DRIFT_S) * _same(c.tag_index),
@@ -163,16 +163,18 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[RadioCompon
             lambda c: np.exp((c.in_cam @ c.in_cam.T - 1) / _LOBE) * _same_link(c),
         ),
         of_anchor("bias", "constant range error of each anchor", lambda c: _same(c.anchor_index)),
-        of("tag_bias", "constant range error of each tag", lambda c: _same(c.tag_index)),
-        of("common_bias", "constant error of all ranges", lambda c: np.ones((len(c), len(c))), calibrated_median=0.04),
-        of("short", "errors of short ranges", _short, calibrated_median=0.08),
-        of(
+        component("tag_bias", "constant range error of each tag", lambda c: _same(c.tag_index)),
+        component(
+            "common_bias", "constant error of all ranges", lambda c: np.ones((len(c), len(c))), calibrated_median=0.04
+        ),
+        component("short", "errors of short ranges", _short, calibrated_median=0.08),
+        component(
             "curve",
             "range errors that vary with the distance",
             lambda c: _smooth(_log_distance(c)),
             calibrated_median=0.02,
         ),
-        of(
+        component(
             "slope",
             "range errors proportional to the distance",
             lambda c: np.outer(c.distance_m, c.distance_m),
@@ -183,8 +185,10 @@ def components(expected: Mapping[str, tuple[float, float]]) -> tuple[RadioCompon
             "each anchor's antenna by direction",
             lambda c: _same(c.anchor_index) * _by_direction(c.from_anchor),
         ),
-        of("off_axis", "anchors' antennas seen from the side, all alike", _off_axis),
-        of("tag_antenna", "the tag's antenna by direction", lambda c: _same(c.tag_index) * _by_direction(c.in_cam)),
+        component("off_axis", "anchors' antennas seen from the side, all alike", _off_axis),
+        component(
+            "tag_antenna", "the tag's antenna by direction", lambda c: _same(c.tag_index) * _by_direction(c.in_cam)
+        ),
     )
 
 

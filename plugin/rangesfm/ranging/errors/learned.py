@@ -34,7 +34,7 @@ class LearnedErrors(Noise):
     unlikeliness: float = 0.0
 
     @classmethod
-    def of(cls, noise: Noise, bins: RangeBins) -> LearnedErrors:
+    def from_noise(cls, noise: Noise, bins: RangeBins) -> LearnedErrors:
         """Return the errors of bins."""
         return cls(noise.names, noise.stddevs, noise.covariances_m2, bins, bins.of_range)
 
@@ -117,5 +117,5 @@ def learn_errors(
     most = {each.name: most_unusual for each in given if each.name not in BENDS}
     sizes = learnt_sizes(given, off_m, design, prior_design, most, None if near is None else near.stddev_of_component)
     off = [np.log(sizes[each.name] / each.median) / each.spread for each in given if each.spread > 0]
-    learned = LearnedErrors.of(noise_of_sizes(given, sizes, len(bins)), bins)
+    learned = LearnedErrors.from_noise(noise_of_sizes(given, sizes, len(bins)), bins)
     return replace(learned, unlikeliness=float(np.sum(np.square(off))))
