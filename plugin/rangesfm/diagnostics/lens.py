@@ -42,6 +42,9 @@ _ORIGIN = {"fx": "f", "fy": "f", "k1": "k"}
 _MAX_NUM_ITERATIONS = 30
 # Relative decrease of the cost at which an adjustment ends.
 _FUNCTION_TOLERANCE = 1e-4
+# Trust region with which a free lens begins. Parameters of a rational distortion can hardly be told apart, so that
+# free steps fail; a chain of 600 photos still bends as it does in them.
+_TRUST_REGION_RADIUS = 1e6
 # Largest number of points between which lengths are compared.
 _MAX_NUM_POINTS = 300
 
@@ -156,7 +159,10 @@ def _adjust(model: pycolmap.Reconstruction, *, lens_is_free: bool) -> Any:
     """
     lens = dict.fromkeys(("refine_focal_length", "refine_extra_params", "refine_principal_point"), lens_is_free)
     # By this loss, wrong matches do not outweigh a lens.
-    ceres_options = {"loss_function_type": "SOFT_L1", "solver_options": {"function_tolerance": _FUNCTION_TOLERANCE}}
+    solver = {"function_tolerance": _FUNCTION_TOLERANCE}
+    if lens_is_free:
+        solver["initial_trust_region_radius"] = _TRUST_REGION_RADIUS
+    ceres_options = {"loss_function_type": "SOFT_L1", "solver_options": solver}
     options = RefineOptions(
         max_num_iterations=_MAX_NUM_ITERATIONS,
         bundle_adjustment={**lens, "refine_sensor_from_rig": False, "ceres": ceres_options},

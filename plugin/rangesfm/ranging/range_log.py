@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,7 +116,7 @@ class RangeLog:
         kind[self.anchor_index < 0] = RangeKind.TAG_TAG
         return kind
 
-    @property
+    @cached_property
     def own_order(self) -> Indices:
         """Rows (n,) sorted by anchor, time, tag and range.
 
