@@ -9,6 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.files.contents import AnyPath
 from rangesfm.files.folders import IMAGE_EXTENSIONS, natural_order, walk
 from rangesfm.files.photo_names import photos_meant
-from rangesfm.files.text_tables import TextTable
+from rangesfm.files.text_tables import NO_NAMES, TextTable
 from rangesfm.options import TIME_S
 from rangesfm.vision.photo_files import exif_tags
 from rangesfm.vision.photo_list import read_photo_list
@@ -27,6 +29,7 @@ from rangesfm.vision.photo_list import read_photo_list
 _FINEST_RESOLUTION_S = 1e-3
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL, _OFFSET_TIME_ORIGINAL = 0x9003, 0x9291, 0x9011
 _UNITS_PER_SECOND = (1, 10**3, 10**6, 10**9)
+_NO_FRAMES: Final[Mapping[str, Sequence[str]]] = MappingProxyType({})
 _MIN_DECIMALS = 3  # a number with fewer decimals, as in scan_1.2, is more likely a version than seconds
 
 
@@ -97,10 +100,10 @@ def find_image_times(
     folder: AnyPath,
     names: Sequence[str],
     csv_path: AnyPath | None = None,
-    frames: Mapping[str, Sequence[str]] | None = None,
+    frames: Mapping[str, Sequence[str]] = _NO_FRAMES,
     *,
     rate_hz: float | None = None,
-    columns: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] = NO_NAMES,
     unit: str | None = None,
 ) -> ImageTimes:
     """Find the times of the photos ``names`` in ``folder``.
@@ -144,9 +147,9 @@ def times_at_rate(names: Sequence[str], rate_hz: float) -> ImageTimes:
 def read_image_times_csv(
     path: AnyPath,
     names: Sequence[str] | None = None,
-    frames: Mapping[str, Sequence[str]] | None = None,
+    frames: Mapping[str, Sequence[str]] = _NO_FRAMES,
     *,
-    columns: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] = NO_NAMES,
     unit: str | None = None,
 ) -> ImageTimes:
     """Read ``image_name,timestamp_s``, or another table with names of photos and times.
@@ -164,11 +167,10 @@ def read_image_times_csv(
         InputError: with the line: a column is missing, a cell is not a time in seconds, a photo does not exist while
             one of ``names`` has no time, or a photo or a time appears twice.
     """
-    listed = read_photo_list(path, columns=columns or {}, unit=unit)
-    table, times = listed.table, listed.times_s
-    frames = frames or {}
+    rows, times, resolutions_s = read_photo_list(path, columns=columns, unit=unit)
+    table = rows.table
     frame_of = {photo: first for first, photos in frames.items() for photo in photos}
-    image_names = photos_meant(listed.image_names, {*(names or ()), *frame_of})
+    image_names = photos_meant(rows.text("image_name"), {*(names or ()), *frame_of})
     _refuse_repetitions(table, image_names, times.tolist(), frame_of)
     known, unknown = set(image_names), list[int]()
     if names is not None:
@@ -178,11 +180,11 @@ def read_image_times_csv(
         # If every photo has a time, the unknown names belong to photos that were removed. If one has none, an unknown
         # name is probably misspelt.
         if unknown and not all({name, *frames.get(name, ())} & timed for name in names):
-            column = listed.columns["image_name"]
+            column = rows.columns["image_name"]
             raise table.error(unknown[0], column, f"the name of a photo in the folder, like '{names[0]}'")
     stamps = {
         name: (time, resolution)
-        for name, time, resolution in zip(image_names, times.tolist(), listed.resolution_s.tolist(), strict=True)
+        for name, time, resolution in zip(image_names, times.tolist(), resolutions_s.tolist(), strict=True)
         if name in known
     }
     stamps = {name: stamp for name, stamp in stamps.items() if name not in frame_of} | {
@@ -193,7 +195,7 @@ def read_image_times_csv(
     if unknown:
         num = f"{len(unknown)} of the {len(image_names)}"
         notes.append(f"{num} names in {table.path.name} belong to no photo in the folder")
-    return replace(ordered, notes=(*notes, *ordered.notes), assumed=tuple(listed.notes))
+    return replace(ordered, notes=(*notes, *ordered.notes), assumed=rows.notes)
 
 
 def times_from_exif(folder: AnyPath, names: Sequence[str]) -> ImageTimes:

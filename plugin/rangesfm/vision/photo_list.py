@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, printable
 from rangesfm.files.contents import AnyPath
-from rangesfm.files.text_tables import NO_NAMES, TextTable, is_plain_table, read_head
+from rangesfm.files.text_tables import NO_NAMES, is_plain_table, read_head
 from rangesfm.options import TIME_S
 from rangesfm.ranging.readers.columns import read_timestamps
 from rangesfm.ranging.readers.guess import Guess, find_time, is_range, is_rising, named_photos
@@ -38,35 +38,19 @@ _SLOWEST_S = 120.0
 _DECIMALS = re.compile(r"(?:^[-+]?\d*|:\d\d)[.,](\d+)", re.ASCII)
 
 
-@dataclass(frozen=True)
-class PhotoList:
-    """Content of a table of photo times, n rows.
-
-    Attributes:
-        table: the rows, for messages.
-        columns: name of the column of each quantity.
-        image_names: n names as written.
-        times_s: (n,) seconds.
-        resolution_s: (n,) value of one unit in the last place of each time as written.
-        notes: lines for the user about how the file was read.
-    """
-
-    table: TextTable
-    columns: Mapping[str, str]
-    image_names: list[str]
-    times_s: Array
-    resolution_s: Array
-    notes: tuple[str, ...] = ()
-
-
-def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] = NO_NAMES, unit: str | None = None) -> PhotoList:
+def read_photo_list(
+    path: AnyPath, *, columns: Mapping[str, str] = NO_NAMES, unit: str | None = None
+) -> tuple[ListRows, Array, Array]:
     """Read ``image_name,timestamp_s``, or another table with names of photos and times.
 
     Args:
         path: the file; other columns are ignored.
-        columns: name of the column of each quantity (QUANTITIES), or its number in a table without names; None:
+        columns: name of the column of each quantity (QUANTITIES), or its number in a table without names; empty:
             recognized.
         unit: unit of the times as in [ranges] timestamp_unit; None: by the column's name or the values.
+
+    Returns:
+        The rows; their times (n,) in seconds; and the value (n,) of one unit in the last place of each time as written.
 
     Raises:
         UnclearListError: the columns or the unit are not known for sure; the advice says what to type.
@@ -75,7 +59,7 @@ def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] = NO_NAMES, uni
     path = Path(path)
     if not columns and unit is None and is_canonical_photo_list(read_head(path)):
         rows = read_canonical_rows(path, _CANONICAL, [*_CANONICAL.values()])
-        return _photo_list(rows, rows.table.numbers("timestamp_s", bounds=TIME_S), "s")
+        return _with_resolution(rows, rows.table.numbers("timestamp_s", bounds=TIME_S), "s")
     layout = layout_of_list(path, "photos and times", _EXPECTED)
     needed = ("image_name", "timestamp")
     taken = columns_by_user(columns, QUANTITIES, needed, layout, path) if columns else find_photo_columns(path, layout)
@@ -90,7 +74,7 @@ def read_photo_list(path: AnyPath, *, columns: Mapping[str, str] = NO_NAMES, uni
 
     times_s, unit = read_timestamps(rows.table, taken, layout.units, unit, notes, ask, slowest_s=_SLOWEST_S)
     more = tuple(f"{path.name}: {note}" for note in notes)
-    return _photo_list(replace(rows, notes=(*rows.notes, *more)), times_s, unit)
+    return _with_resolution(replace(rows, notes=(*rows.notes, *more)), times_s, unit)
 
 
 def is_canonical_photo_list(head: str) -> bool:
@@ -129,12 +113,11 @@ def find_photo_columns(path: Path, layout: Layout) -> dict[str, str] | None:
     raise UnclearListError("photo times", path, layout, doubts, choices)
 
 
-def _photo_list(rows: ListRows, times_s: Array, unit: str) -> PhotoList:
-    table = rows.table
-    if not len(table):
-        raise InputError("no rows below the header, expected one per photo", table.path)
+def _with_resolution(rows: ListRows, times_s: Array, unit: str) -> tuple[ListRows, Array, Array]:
+    if not len(rows.table):
+        raise InputError("no rows below the header, expected one per photo", rows.table.path)
     places = [len(found[1]) if (found := _DECIMALS.search(text)) else 0 for text in rows.text("timestamp")]
     resolution_s = SECONDS_PER_UNIT[unit] * 10.0 ** -np.array(places, np.float64)
     if "nanoseconds" in rows.columns:
         resolution_s[:] = SECONDS_PER_UNIT["ns"]
-    return PhotoList(table, rows.columns, rows.text("image_name"), times_s, resolution_s, rows.notes)
+    return rows, times_s, resolution_s

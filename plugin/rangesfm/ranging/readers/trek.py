@@ -8,9 +8,9 @@ milliseconds (in ``mr`` other numbers), and the ids of tag and anchor.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from rangesfm.ranging.range_log import RangeLog
 from rangesfm.ranging.readers.printed import LOST, numbered_lines
@@ -29,58 +29,43 @@ _NO_RANGE = (0, 0xFFFFFFFF)
 _BETWEEN_ANCHORS = {1: ("A0", "A1"), 2: ("A0", "A2"), 3: ("A1", "A2")}
 
 
-@dataclass(frozen=True)
-class _Report:
-    """One line, with the text in front of it; "" if another report is in front, as in JSON without line ends."""
+class _Report(NamedTuple):
+    """One line, by the groups of _LINE; the text in front of it is "" if another report is in front, as in JSON."""
 
     number: int
     prefix: str
-    kind: str
-    mask: int
-    ranges_mm: tuple[int, ...]
-    clock: str
-    tag: str
-
-
-def _reports(path: Path) -> Iterator[_Report | None]:
-    """Yield every line of a log; None for one that is damaged."""
-    for number, text in numbered_lines(path):
-        found = list(_LINE.finditer(text))
-        yield from [None] * (len(_BEGIN.findall(text)) - len(found))
-        for k, one in enumerate(found):
-            ranges_mm = tuple(int(digits, 16) for digits in one["ranges"].split())
-            prefix = "" if k else text[: one.start()]
-            yield _Report(number, prefix, one["kind"], int(one["mask"], 16), ranges_mm, one["clock"], one["tag"])
+    line: re.Match[str]
 
 
 def _read(path: Path, options: ReadOptions) -> RangeLog:
     refuse_options_of_tables(options, path)
-    all_reports = list(_reports(path))
-    whole = [report for report in all_reports if report is not None]
-    unused = "r" if any(report.kind == "c" for report in whole) else ""  # ``mr`` repeats the ranges of ``mc``
-    reports = [report for report in whole if report.kind != unused]
+    whole, num_damaged = list[_Report](), 0
+    for number, text in numbered_lines(path):
+        found = list(_LINE.finditer(text))
+        whole += [_Report(number, "" if k else text[: one.start()], one) for k, one in enumerate(found)]
+        num_damaged += max(0, len(_BEGIN.findall(text)) - len(found))
+    unused = "r" if any(report.line["kind"] == "c" for report in whole) else ""  # ``mr`` repeats the ranges of ``mc``
+    reports = [report for report in whole if report.line["kind"] != unused]
     seconds, notes = _times(reports, path, options)
-    is_masked = any(report.mask for report in reports)  # some firmware leaves the mask at 0
+    is_masked = any(int(report.line["mask"], 16) for report in reports)  # some firmware leaves the mask at 0
     readings = [
-        (report.kind, slot, _reading(report, slot, seconds(report), is_masked))
+        (report.line["kind"], slot, _reading(report, slot, int(digits, 16), seconds(report), is_masked))
         for report in reports
-        for slot in range(len(report.ranges_mm))
+        for slot, digits in enumerate(report.line["ranges"].split())
     ]
     # A place without any range belongs to no anchor.
     used = {(kind, slot) for kind, slot, reading in readings if reading.range_m > 0}
-    found = [reading for kind, slot, reading in readings if (kind, slot) in used]
-    found += [LOST] * (len(all_reports) - len(whole))
-    log = log_of_readings(found, path, options, _NAME, notes)
+    kept = [reading for kind, slot, reading in readings if (kind, slot) in used]
+    log = log_of_readings([*kept, *[LOST] * num_damaged], path, options, _NAME, notes)
     ends = {*log.tag_ids, *log.anchor_ids}
     return log.with_anchors({node for node in ends if node.startswith("A")})
 
 
-def _reading(report: _Report, slot: int, time_s: float, is_masked: bool) -> Reading:
+def _reading(report: _Report, slot: int, range_mm: int, time_s: float, is_masked: bool) -> Reading:
     """Return the range at a place in a line; it is 0 if there is none."""
-    range_mm = report.ranges_mm[slot]
-    is_valid = range_mm not in _NO_RANGE and (not is_masked or report.mask >> slot & 1)
-    tag_id, anchor_id = f"T{report.tag}", f"A{slot}"
-    if report.kind == "a":
+    is_valid = range_mm not in _NO_RANGE and (not is_masked or int(report.line["mask"], 16) >> slot & 1)
+    tag_id, anchor_id = f"T{report.line['tag']}", f"A{slot}"
+    if report.line["kind"] == "a":
         tag_id, anchor_id = _BETWEEN_ANCHORS.get(slot, ("", ""))
     return Reading(time_s, anchor_id, range_mm / 1000 * bool(is_valid and anchor_id), report.number, tag_id)
 
@@ -94,15 +79,15 @@ def _times(
     """
     host = HostClock(path, options)
     host_s = {host.find_seconds(report.prefix) for report in reports}
-    counts = {report.clock for report in reports if report.kind != "r"}
-    is_counted = len(counts) > 1 and all(report.kind != "r" for report in reports)
+    counts = {report.line["clock"] for report in reports if report.line["kind"] != "r"}
+    is_counted = len(counts) > 1 and all(report.line["kind"] != "r" for report in reports)
     if not is_counted or (len(host_s) > 1 and None not in host_s):
         clock = HostClock(path, options)
         return lambda report: clock.seconds(report.prefix, report.number), ()
     # Some firmware prints the count in decimals.
-    base = 16 if any(re.search("[a-fA-F]", report.clock) for report in reports) else 10
+    base = 16 if any(re.search("[a-fA-F]", report.line["clock"]) for report in reports) else 10
     note = "no time of the host in front of the lines: the time is the radio's count of milliseconds"
-    return lambda report: int(report.clock, base) / 1000, (note,)
+    return lambda report: int(report.line["clock"], base) / 1000, (note,)
 
 
 _NAME = "trek1000"
