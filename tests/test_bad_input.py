@@ -421,15 +421,6 @@ class TestPhotos:
         assert re.search(said, refusal("run", *self.flags, *flags))
         assert not (own_survey.folder / "out").exists()
 
-    @pytest.mark.usefixtures("photos")
-    def test_whose_mapper_key_does_not_exist(self, own_survey: WalkedSurvey, refusal: Refusal) -> None:
-        (own_survey.folder / "s.toml").write_text("[mapper.pipeline]\nmin_num_maches = 9\n")
-        said = refusal("run", "s.toml", *self.flags)
-        assert said == (
-            "s.toml:2: unknown key 'min_num_maches' in [mapper.pipeline]; the nearest known one is 'min_num_matches'"
-        )
-        assert not (own_survey.folder / "out").exists()
-
     @pytest.mark.parametrize("kind", ["unrelated", "black", "no pictures"])
     def test_that_do_not_reconstruct_are_status_4(
         self,

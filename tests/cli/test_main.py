@@ -173,12 +173,6 @@ def test_bad_usage_and_bad_input_are_one_line_and_status_2(
     assert said in error_line(capsys)
 
 
-def test_misspelt_survey_key_is_named_with_file_and_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "survey.toml").write_text('[ranges]\npth = "uwb.csv"\n')
-    assert main(["run", "survey.toml"]) == 2
-    assert "survey.toml:2: unknown key 'pth' in [ranges]; the nearest known one is 'path'" in error_line(capsys)
-
-
 def test_output_that_cannot_be_written_leaves_nothing_behind(folder: Path) -> None:
     (folder / "taken").mkdir()
     assert main(["ranges", "uwb.csv", "--output_path", "taken"]) == 2

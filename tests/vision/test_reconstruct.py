@@ -144,23 +144,6 @@ class TestCamera:
         assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("mapper", "message"),
-    [
-        (MapperOptions(features={"max_image": 9}), r"'max_image' in \[mapper.features\]; .* 'max_image_size'"),
-        (MapperOptions(matcher={"sift": {"max_ratio": "x"}}), r"\[mapper.matcher.sift\] max_ratio is 'x'"),
-        (MapperOptions(pairing={"overlap": 3}), r"'overlap' in \[mapper.pairing\]; .* known one is"),
-        (MapperOptions(pipeline={"min_num_matches": 0}), r"refuses a value, expected min_num_matches > 0"),
-    ],
-)
-def test_options_that_colmap_does_not_have_are_refused_before_anything_is_written(
-    room: Room, tmp_path: Path, mapper: MapperOptions, message: str
-) -> None:
-    with pytest.raises(InputError, match=message):
-        reconstruct(room.folder, room.names, tmp_path / "out", camera=room.camera, mapper=mapper)
-    assert not (tmp_path / "out").exists()
-
-
 def test_sequential_matching_pairs_neighbours_in_time_whatever_their_names(
     room: Room, tmp_path: Path, listener: Listener
 ) -> None:

@@ -152,34 +152,6 @@ ROWS = "/A,1.5,2.5,3.5/B,4.5,5.5,6.5"
 XYZ = {"anchor_id": "Point", "x": "X", "y": "Y", "z": "Z"}
 
 
-@pytest.mark.parametrize(
-    ("words", "quantity"),
-    [
-        ("x", "x"),
-        ("easting m", "x"),
-        ("y coordinate", "y"),
-        ("anchor h", "z"),
-        ("point north", "y"),
-        ("x y", None),
-        ("x id", None),
-        ("anchor", "anchor_id"),
-        ("point id", "anchor_id"),
-        ("number", "anchor_id"),
-        ("anchor time", None),
-        ("position", None),
-        ("range", None),
-        ("position sigma m", "position_stddev"),
-        ("range bias m", "range_bias"),
-        ("range bias stddev m", "range_bias_stddev"),
-        ("sigma x", None),
-        ("bias x", None),
-        ("", None),
-    ],
-)
-def test_a_column_holds_what_all_words_of_its_name_can_mean(words: str, quantity: str | None) -> None:
-    assert _named_quantity({*words.split()}) == quantity
-
-
 def test_columns_of_another_table_are_told_with_those_that_are_not_used(tmp_path: Path) -> None:
     path = table(tmp_path, "Point,E [cm],N [cm],H [cm],Code/A,150,250,350,q/B,1,2,3,r")
     found = read_anchor_list(path)
