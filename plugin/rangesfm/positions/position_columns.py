@@ -7,9 +7,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import islice, product
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -19,32 +17,16 @@ from rangesfm.ranging.anchors.site import WIDEST_DEG
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.guess import Guess, find_time, is_rising, named_photos
 from rangesfm.ranging.readers.layout import ColumnSample, Layout
-from rangesfm.ranging.readers.lists import Choice, UnclearListError, columns_flag
+from rangesfm.ranging.readers.lists import AXES, Choice, UnclearListError, columns_flag
 
-AXES = ("x", "y", "z")
 STDDEVS = tuple(f"stddev_{axis}" for axis in AXES)
 COVARIANCES = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 QUANTITIES = (
     *("timestamp", "date", "nanoseconds", "image_name", *AXES, "stddev", *STDDEVS, *COVARIANCES, "tag_id", "quality"),
 )
+_KEYS = {"timestamp", "image_name"}
 _MAX_NUM_WAYS = 4
 _QUATERNION_TOLERANCE = 1e-2
-
-
-@dataclass
-class _Found:
-    """Columns of a table of positions.
-
-    Attributes:
-        columns: name of the column of each quantity.
-        doubts: what is not sure. choices: the columns by each case in which they are right.
-        notes: lines for the user.
-    """
-
-    columns: dict[str, str]
-    doubts: list[str] = field(default_factory=list)
-    choices: dict[str, dict[str, str]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
 
 
 def find_position_columns(path: Path, layout: Layout) -> tuple[dict[str, str], list[str]]:
@@ -61,16 +43,16 @@ def find_position_columns(path: Path, layout: Layout) -> tuple[dict[str, str], l
         photos = photos or ([] if guess.columns else _labels(free))
     elif not photos and (rising := [column for column in free if column.kind == "times" or is_rising(column)]):
         guess.columns["timestamp"] = rising[0].name
-    columns = {"image_name": photos[0].name} if photos else dict(guess.columns)
-    free = [column for column in free if column.name not in columns.values()]
-    found = _Found(columns, notes=[] if photos else guess.notes)
-    (_axes_by_name if layout.has_names else _axes_by_values)(free, found)
-    if not {"timestamp", "image_name"} & columns.keys():
-        found.doubts.insert(0, "no column seems to be the time or the photo")
-    _add_errors(free, found.columns)
-    if found.doubts:
-        raise UnclearListError("positions", path, layout, found.doubts, [*_choices(free, found)])
-    return found.columns, found.notes
+    if photos:
+        guess.columns, guess.notes = {"image_name": photos[0].name}, []
+    free = [column for column in free if column.name not in guess.columns.values()]
+    axes = (_axes_by_name if layout.has_names else _axes_by_values)(free, guess)
+    if not _KEYS & guess.columns.keys():
+        guess.doubts.insert(0, "no column seems to be the time or the photo")
+    _add_errors(free, guess.columns)
+    if guess.doubts:
+        raise UnclearListError("positions", path, layout, guess.doubts, [*_choices(free, guess.columns, axes)])
+    return guess.columns, guess.notes
 
 
 def is_degrees(name: str, axis: str) -> bool:
@@ -88,7 +70,8 @@ def _labels(columns: Sequence[ColumnSample]) -> list[ColumnSample]:
     ][:1]
 
 
-def _axes_by_name(free: Sequence[ColumnSample], found: _Found) -> None:
+def _axes_by_name(free: Sequence[ColumnSample], found: Guess) -> dict[str, dict[str, str]]:
+    """Find x, y, z by their names; else return the columns that they may be, by the case in which they are."""
     numbers = [column for column in free if column.kind == "numbers"]
     of_axis = {axis: [column.name for column in numbers if _is_axis(column, axis)] for axis in AXES}
     groups = [*_triples(numbers)]
@@ -102,7 +85,8 @@ def _axes_by_name(free: Sequence[ColumnSample], found: _Found) -> None:
                 found.columns[axis] = those[0]
             else:
                 found.doubts.append(f"{'no column seems' if not those else 'several columns seem'} to be {axis}")
-        found.choices = {f"{', '.join(group.values())} are x, y, z": group for group in groups}
+        return {f"{', '.join(group.values())} are x, y, z": group for group in groups}
+    return {}
 
 
 def _is_axis(column: ColumnSample, axis: str) -> bool:
@@ -122,24 +106,24 @@ def _triples(columns: Sequence[ColumnSample]) -> Iterator[dict[str, str]]:
     yield from (group for group in groups.values() if len(group) == len(AXES))
 
 
-def _axes_by_values(free: Sequence[ColumnSample], found: _Found) -> None:
-    """Find x, y, z in a table without names: three numbers before a quaternion, or the only three."""
+def _axes_by_values(free: Sequence[ColumnSample], found: Guess) -> dict[str, dict[str, str]]:
+    """Do the same in a table without names: they are three numbers before a quaternion, or the only three."""
     numbers = [column for column in free if column.kind == "numbers"]
     before = [k for k in range(3, len(numbers) - 3) if _are_quaternions(numbers[k : k + 4])]
     places = numbers[before[0] - 3 : before[0]] if before else numbers
     may_be_ids = not before and any(all(map(str.isdigit, column.cells)) for column in places[:2])
     if len(places) != len(AXES) or may_be_ids:
         found.doubts.append("a table without names, of which any three numbers may be x, y, z")
-        return
+        return {}
     names = [column.name for column in places]
     east_first, north_first = (dict(zip(order, names)) for order in (AXES, ("y", "x", "z")))
     largest = max(float(np.abs(column.numbers).max(initial=0.0)) for column in places)
     if before or not (largest > LOCAL_M or _may_be_degrees(places)):
         found.columns |= east_first
         found.notes.append(f"the table has no names: columns {', '.join(names)} are taken as x, y, z")
-        return
+        return {}
     found.doubts.append("a table without names, in which either x (east, longitude) or y may come first")
-    found.choices = {
+    return {
         "the numbers are x, y, z or east, north, height or longitude, latitude, height": east_first,
         "they are north, east, height or latitude, longitude, height": north_first,
     }
@@ -172,17 +156,21 @@ def _add_errors(free: Sequence[ColumnSample], columns: dict[str, str]) -> None:
             columns.setdefault("quality", column.name)
 
 
-def _choices(free: Sequence[ColumnSample], found: _Found) -> Iterator[Choice]:
+def _choices(
+    free: Sequence[ColumnSample], columns: Mapping[str, str], axes: Mapping[str, dict[str, str]]
+) -> Iterator[Choice]:
     """Yield the ways to read the table, each with a whole command; one with NAME where values tell nothing."""
-    columns, ways = found.columns, [*product(_keys(free, found), _places(free, found))]
-    for (is_key, key), (are_axes, axes) in islice(ways, _MAX_NUM_WAYS):
-        taken = columns | key | axes
+    has_key, has_axes = bool(_KEYS & columns.keys()), columns.keys() >= {*AXES}
+    keys = {"": dict[str, str]()} if has_key else dict(_possible_keys(free))
+    places = axes or ({"": {}} if has_axes else dict(_possible_places(free)))
+    ways = [*product(keys.items(), places.items())]
+    for (is_key, key), (are_axes, place) in islice(ways, _MAX_NUM_WAYS):
+        taken = {**columns, **key, **place}
         if len({*taken.values()}) == len(taken):
             yield _choice(" and ".join(filter(None, (is_key, are_axes))), taken)
     if not ways:
-        known = {"timestamp", "image_name"} & columns.keys()
-        unknown = {key: "NAME" for key in (*(() if known else ("timestamp",)), *AXES) if key not in columns}
-        yield _choice("with the names of the columns", columns | unknown)
+        unknown = {key: "NAME" for key in (*(() if has_key else ("timestamp",)), *AXES) if key not in columns}
+        yield _choice("with the names of the columns", {**columns, **unknown})
 
 
 def _choice(when: str, columns: Mapping[str, str]) -> Choice:
@@ -190,11 +178,8 @@ def _choice(when: str, columns: Mapping[str, str]) -> Choice:
     return Choice(when if when.startswith("with") else f"if {when}", columns_flag("position_columns", ordered))
 
 
-def _keys(free: Sequence[ColumnSample], found: _Found) -> Iterator[tuple[str, dict[str, str]]]:
+def _possible_keys(free: Sequence[ColumnSample]) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield the columns that may be the time or the photo, after what they would be."""
-    if {"timestamp", "image_name"} & found.columns.keys():
-        yield "", {}
-        return
     for column in free:
         if column.kind == "text" and column.num_distinct == len(column.cells):
             yield f"{column.name} is the photo", {"image_name": column.name}
@@ -202,11 +187,8 @@ def _keys(free: Sequence[ColumnSample], found: _Found) -> Iterator[tuple[str, di
             yield f"{column.name} is the time", {"timestamp": column.name}
 
 
-def _places(free: Sequence[ColumnSample], found: _Found) -> Iterator[tuple[str, dict[str, str]]]:
+def _possible_places(free: Sequence[ColumnSample]) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield the columns that may be x, y and z, after what they would be."""
-    if found.choices or found.columns.keys() >= {*AXES}:
-        yield from found.choices.items() if found.choices else [("", {})]
-        return
-    numbers = [column for column in free if column.kind == "numbers"]
-    for names in zip(*(map(attrgetter("name"), numbers[k:]) for k in range(len(AXES)))):
+    numbers = [column.name for column in free if column.kind == "numbers"]
+    for names in zip(*(numbers[k:] for k in range(len(AXES)))):
         yield f"{', '.join(names)} are x, y, z", dict(zip(AXES, names))

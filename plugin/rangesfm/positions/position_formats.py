@@ -30,20 +30,13 @@ from rangesfm.geometry.reference import is_reference_file, is_tum_row, tum_table
 from rangesfm.option_model import Bounds
 from rangesfm.options import COORDINATE_M, STDDEV_M, TIME_S, PositionOptions
 from rangesfm.positions.pose_priors import is_database, read_pose_priors
-from rangesfm.positions.position_columns import (
-    AXES,
-    COVARIANCES,
-    QUANTITIES,
-    STDDEVS,
-    find_position_columns,
-    is_degrees,
-)
+from rangesfm.positions.position_columns import COVARIANCES, QUANTITIES, STDDEVS, find_position_columns, is_degrees
 from rangesfm.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line
 from rangesfm.ranging.anchors.site import WIDEST_DEG
 from rangesfm.ranging.readers import vocabulary as terms
 from rangesfm.ranging.readers.columns import read_timestamps
 from rangesfm.ranging.readers.layout import MISSING
-from rangesfm.ranging.readers.lists import Choice, UnclearListError, columns_by_user, layout_of_list, length_units
+from rangesfm.ranging.readers.lists import AXES, Choice, UnclearListError, columns_by_user, layout_of_list, length_units
 from rangesfm.ranging.readers.units import UNITS_PER_METRE
 
 _CANONICAL = {
