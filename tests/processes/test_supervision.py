@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -25,19 +23,20 @@ def run(
     code: str,
     listen: Callable[[dict[str, Any]], None] = lambda _: None,
     *,
-    given: bytes = b"given",
+    work: Callable[..., Any] = len,
     memory_limit_bytes: int = 1 << 40,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Ended:
     code = "import json, os, signal, sys, time\nsay = lambda **m: print(json.dumps(m), flush=True)\n" + code
-    command = [sys.executable, "-S", "-c", code]
-    return supervise(given, listen, memory_limit_bytes=memory_limit_bytes, is_stopped=is_stopped, command=command)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("rangesfm.processes.supervision._CHILD", code)
+        return supervise(work, listen, memory_limit_bytes=memory_limit_bytes, is_stopped=is_stopped)
 
 
 def test_messages_come_one_by_one_and_the_last_is_the_ending() -> None:
     heard: list[dict[str, Any]] = []
-    ended = run("say(given=sys.stdin.buffer.read(5).decode())\nsay(n=2)", heard.append)
-    assert heard == [{"given": "given"}, {"n": 2}]
+    ended = run("import pickle\nsay(given=str(pickle.load(sys.stdin.buffer)))\nsay(n=2)", heard.append)
+    assert heard == [{"given": str(len)}, {"n": 2}]
     assert ended == Ended({"n": 2}, None, 0, False, "")
 
 
@@ -66,7 +65,7 @@ def test_half_a_message_counts_for_nothing() -> None:
 
 
 def test_what_it_said_counts_also_if_it_died_before_it_heard() -> None:
-    ended = run("say(n=1)\nos.kill(os.getpid(), 9)", given=b"more than a pipe holds" * 100_000)
+    ended = run("say(n=1)\nos.kill(os.getpid(), 9)", work=partial(len, b"more than a pipe holds" * 100_000))
     assert (ended.last, ended.signal) == ({"n": 1}, signal.SIGKILL)
 
 
@@ -93,12 +92,12 @@ def test_a_child_imports_nothing_from_the_working_folder(tmp_path: Path, monkeyp
     sprung = set_traps(tmp_path)
     monkeypatch.chdir(tmp_path)
     works: list[Any] = [find_features, run_in_batch, partial(_draw, [])]
-    ended = [supervise(pickle.dumps(work)) for work in works]
+    ended = [supervise(work) for work in works]
     assert ["failed" in of.last for of in ended] == [True, True, False]  # they got far enough to say what is wrong
     assert not sprung()
 
 
 def test_a_child_imports_what_is_on_the_path_of_the_user(tmp_path: Path) -> None:
     (tmp_path / "of_the_user.py").write_text("def work(progress):\n    return 5\n")
-    work = pickle.dumps(partial(call_by_name, "of_the_user:work"))
+    work = partial(call_by_name, "of_the_user:work")
     assert supervise(work, environment={**os.environ, "PYTHONPATH": str(tmp_path)}).last == {"done": 5}

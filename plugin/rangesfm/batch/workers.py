@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import pickle
 import queue
 import signal
 import socket
@@ -242,10 +241,9 @@ def run_apart(
     tell({"began_on": socket.gethostname()})
     own = survey.mapper.num_threads  # the survey file may ask for fewer threads, but not for more
     survey = survey.changed({"mapper.num_threads": num_threads if own < 1 else min(own, num_threads)})
-    # By its name, because what runs a batch loads no estimator.
-    work = partial(call_by_name, "rangesfm.batch.survey_process:run_in_batch", survey, restart)
     ended = supervise(
-        pickle.dumps(work),
+        # By its name, because what runs a batch loads no estimator.
+        partial(call_by_name, "rangesfm.batch.survey_process:run_in_batch", survey, restart),
         tell,
         environment={**os.environ, "OMP_NUM_THREADS": str(num_threads), "OPENBLAS_NUM_THREADS": "1"},
         memory_limit_bytes=memory_limit_bytes,

@@ -7,7 +7,6 @@ noticed.
 from __future__ import annotations
 
 import base64
-import pickle
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, TypeAlias
@@ -28,7 +27,7 @@ def draw_pictures(drawings: Sequence[Drawing]) -> list[bytes]:
     Raises:
         SolverError: the engine fails, for example because it may not reserve the address space that it wants.
     """
-    ended = supervise(pickle.dumps(partial(_draw, drawings)))
+    ended = supervise(partial(_draw, drawings))
     if "done" not in ended.last:
         hint = " (it reserves 64 GB of address space; `ulimit -v` may allow less)" if ended.signal is not None else ""
         raise SolverError(f"the engine that draws pictures failed: {ended.how}{hint}")

@@ -21,7 +21,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
@@ -147,30 +147,28 @@ def call_by_name(name: str, *arguments: Any) -> Any:
 
 
 def supervise(
-    given: bytes,
+    work: Callable[[Progress], Any],
     listen: Callable[[dict[str, Any]], object] = lambda _: None,
     *,
     environment: Mapping[str, str] = os.environ,
     memory_limit_bytes: int = 0,
     is_stopped: Callable[[], bool] = lambda: False,
-    command: Sequence[str] | None = None,
 ) -> Ended:
     """Have a process call a function, and return how it ended.
 
     Args:
-        given: bytes for its standard input: the pickled function, which takes a ``Progress``.
+        work: function of a module, which returns plain values.
         listen: called with each message.
         environment: its environment variables.
         memory_limit_bytes: the process is killed if it takes more; 0: there is no limit.
         is_stopped: called several times a second; once it returns True, the process is interrupted.
-        command: another command line than that of a Python that calls the function.
     """
     lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     last: dict[str, Any] = {}
     needed_bytes, stopped_at = 0, math.inf
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
-            command or [sys.executable, "-c", _CHILD, str(os.getpid())],
+            [sys.executable, "-c", _CHILD, str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
@@ -182,7 +180,7 @@ def supervise(
         try:
             threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True).start()
             with suppress(BrokenPipeError):  # the process died; its messages so far still count
-                process.stdin.write(given)
+                process.stdin.write(pickle.dumps(work))
                 process.stdin.flush()
             while True:
                 if memory_limit_bytes and not needed_bytes and (used := _used_bytes(process)) > memory_limit_bytes:
@@ -263,14 +261,14 @@ def run_children(
     stop, num_done = threading.Event(), list[int]()
     pending: deque[Future[None]] = deque()
 
-    def run(place: int, work: bytes) -> None:
+    def run(place: int, work: Callable[[Progress], int]) -> None:
         def listen(message: dict[str, Any]) -> None:
             num_done[place] = message.get("num_done", num_done[place])
 
         if stop.is_set():
             return
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        ended = supervise(work, listen, environment=environment, is_stopped=stop.is_set)
+        ended = supervise(partial(_end_at_once, work), listen, environment=environment, is_stopped=stop.is_set)
         if "done" in ended.last:
             num_done[place] = ended.last["done"]
         elif not ended.stopped:
@@ -289,7 +287,7 @@ def run_children(
         try:
             for place, work in enumerate(works):
                 num_done.append(0)
-                pending.append(executor.submit(run, place, pickle.dumps(partial(_end_at_once, work))))
+                pending.append(executor.submit(run, place, work))
                 if len(pending) > num_at_once:
                     wait_for_first()
                     yield
