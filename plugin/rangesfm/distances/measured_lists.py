@@ -107,15 +107,6 @@ def _lengths_by_value(layout: Layout) -> dict[str, list[ColumnSample]] | None:
     return dict(zip(("from", "to", "distance", "stddev"), ([column] for column in layout.columns)))
 
 
-def _pairs_by_name(layout: Layout) -> dict[str, list[ColumnSample]]:
-    start, end = _ends(layout.columns)
-    return {"from": start, "to": end}
-
-
-def _pairs_by_value(layout: Layout) -> dict[str, list[ColumnSample]]:
-    return dict(zip(("from", "to"), ([column] for column in layout.columns)))
-
-
 def _marks_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
     of: dict[str, list[ColumnSample]] = {"marker": [], "image_name": [], "x": [], "y": []}
     for column in layout.columns:
@@ -124,15 +115,11 @@ def _marks_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
             of["image_name"].append(column)
         elif words and words <= terms.POINT | terms.MARK | terms.ID:
             of["marker"].append(column)
-        elif axis := next((axis for axis, those in terms.PIXEL_AXES.items() if _is_pixel(words, those)), None):
+        elif axis := next((a for a, those in terms.PIXEL_AXES.items() if set() < words - terms.PIXEL <= those), None):
             of[axis].append(column)
         elif words & terms.COORDINATES["z"]:
             return None  # a list of points in space
     return of
-
-
-def _is_pixel(words: set[str], axis: frozenset[str]) -> bool:
-    return bool(words - terms.PIXEL) and words - terms.PIXEL <= axis
 
 
 def _marks_by_value(layout: Layout) -> dict[str, list[ColumnSample]] | None:
@@ -153,7 +140,13 @@ LENGTHS = ListForm(
     _lengths_by_name,
     _lengths_by_value,
 )
-PAIRS = ListForm("pairs of points", _ENDS, {}, _pairs_by_name, _pairs_by_value)
+PAIRS = ListForm(
+    "pairs of points",
+    _ENDS,
+    {},
+    lambda layout: dict(zip(_ENDS, _ends(layout.columns))),
+    lambda layout: dict(zip(_ENDS, ([column] for column in layout.columns))),
+)
 MARKS = ListForm(
     "marks in photos",
     {"marker": "marker", "image_name": "image_name", "x": "x_px", "y": "y_px"},

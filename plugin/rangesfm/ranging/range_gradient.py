@@ -53,12 +53,3 @@ class RangeGradient:
         """Return the derivative (n, 3) by the lever arm, given the cameras' rotations (n, 3, 3)."""
         slopes: Array = np.einsum("nji,nj->ni", world_from_cam, self.by_tag)
         return slopes
-
-    def by_turn_of_cam(self, tag_in_cam_m: Array, world_from_cam: Array) -> Array:
-        """Return the derivative (n, 3) by a rotation vector of the camera in its own frame, about its centre.
-
-        Args:
-            tag_in_cam_m: (n, 3) lever arms.
-            world_from_cam: (n, 3, 3) rotations.
-        """
-        return np.cross(tag_in_cam_m, self.by_tag_in_cam(world_from_cam))
