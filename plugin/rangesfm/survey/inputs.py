@@ -117,25 +117,7 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     """
     survey.require_metres()
     _check_rigs_are_metric(survey)
-    file = survey.anchors
-    listed, anchor_notes = tuple[Anchor, ...](), tuple[str, ...]()
-    if file.path is not None:
-        listed, anchor_notes = read_anchor_list(file.path, columns=file.columns, unit=file.unit)
-    tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
-    if survey.ranges.path is None:
-        log = RangeLog.from_arrays([], [], image_name=[])
-    else:
-        ids = [anchor.anchor_id for anchor in listed]
-        log = read_log(survey.ranges, ids, tag_ids)
-        if (found := ids_in_log(ids, log.anchor_ids)) is not None:  # only one rule leads to these
-            id_of, rule = found
-            listed = tuple(replace(one, anchor_id=id_of.get(one.anchor_id, one.anchor_id)) for one in listed)
-            same = ", ".join(f"{there} is {here}" for there, here in id_of.items())
-            note = f"{_name(file.path)}: its anchors are named otherwise than in the log and are taken so: {same}"
-            anchor_notes = (*anchor_notes, f"{note} ({rule})")
-            log = read_log(survey.ranges, [anchor.anchor_id for anchor in listed], tag_ids)
-        log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
-        _check_camera_is_heard(log)
+    log, listed, anchor_notes = _read_radio(survey)
     tag_in_cam_m = _lever_arms_of_log(log, survey)
     anchors = listed or _anchors_of_log(log)
     _check_anchors_known(log, anchors, survey)
@@ -171,6 +153,30 @@ def read_ranging_inputs(survey: Survey) -> RangingInputs:
     )
     log = log.in_time_order()
     return RangingInputs(log, tag_in_cam_m, anchors, frame, site, tape, reference, notes, assumed, positions, imu)
+
+
+def _read_radio(survey: Survey) -> tuple[RangeLog, tuple[Anchor, ...], tuple[str, ...]]:
+    """Return the wanted ranges of the log, and the anchors in their file with notes on how that was read."""
+    file = survey.anchors
+    listed, anchor_notes = tuple[Anchor, ...](), tuple[str, ...]()
+    if file.path is not None:
+        listed, anchor_notes = read_anchor_list(file.path, columns=file.columns, unit=file.unit)
+    tag_ids = [*survey.tag.lever_arms_m, *([] if survey.tag.tag_id is None else [survey.tag.tag_id])]
+    if survey.ranges.path is None:
+        log = RangeLog.from_arrays([], [], image_name=[])
+    else:
+        ids = [anchor.anchor_id for anchor in listed]
+        log = read_log(survey.ranges, ids, tag_ids)
+        if (found := ids_in_log(ids, log.anchor_ids)) is not None:  # only one rule leads to these
+            id_of, rule = found
+            listed = tuple(replace(one, anchor_id=id_of.get(one.anchor_id, one.anchor_id)) for one in listed)
+            same = ", ".join(f"{there} is {here}" for there, here in id_of.items())
+            note = f"{_name(file.path)}: its anchors are named otherwise than in the log and are taken so: {same}"
+            anchor_notes = (*anchor_notes, f"{note} ({rule})")
+            log = read_log(survey.ranges, [anchor.anchor_id for anchor in listed], tag_ids)
+        log = _of_wanted_anchors(_of_wanted_tag(log, survey.tag.tag_id), survey.anchors.use)
+        _check_camera_is_heard(log)
+    return log, listed, anchor_notes
 
 
 def _surveyed_positions(
