@@ -2,6 +2,7 @@
 
 python -m tests.benchmarks.reconstruction PHOTOS[:EVERY_NTH] ... [--num_threads 2] [--num_rounds 3] [--seed 0]
     [--camera_model OPENCV --camera_params 377,432,...] [--only stages|matching|mapping]
+python -m tests.benchmarks.reconstruction SURVEY.toml ... [--base_path DATA_FOLDER] [--num_threads 2] [--num_rounds 3]
 
 PHOTOS are folders, for example ``DATA/room_env1/images:3 DATA/fountain/images plugin/rangesfm/demo/photos``. The photos
 of a folder are taken in the order of their names and matched sequentially. Each round measures both programs. Printed
@@ -18,6 +19,12 @@ The third table is about incremental mapping alone, from the same matches: by ra
 thread), and by rangesfm and pycolmap with ``--num_threads``. "Caller" are the processor seconds of the thread that
 calls the mapper: the wall-clock time on a machine without other load, if the other threads never keep it waiting. The
 last column gives how many different models the rounds have given.
+
+Of a survey, the way to its refined metric map (``rangesfm run``, without the report) is measured beside that of
+pycolmap's calls to an unscaled one, with neighbours matched by COLMAP's own options. ``--base_path`` is as for
+``rangesfm run``.
+
+A calibrated camera is held fixed by pycolmap's mapping, too. That is faster than its default.
 """
 
 from __future__ import annotations
@@ -43,7 +50,9 @@ from tests.vision.matches import content_of
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions
-from rangesfm.progress import SilentProgress
+from rangesfm.progress import Journal, SilentProgress
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_reader import read_survey
 from rangesfm.vision.database import clear_matches
 from rangesfm.vision.image_times import list_images
 from rangesfm.vision.incremental_mapping import incremental_mapping
@@ -51,6 +60,8 @@ from rangesfm.vision.mapping import pipeline_options
 from rangesfm.vision.matching import match_features, matching_options
 from rangesfm.vision.photo_files import usable_photos
 from rangesfm.vision.reconstruct import reconstruct
+from rangesfm.workflows.map_photos import find_keyframes
+from rangesfm.workflows.run import run_survey
 
 STAGES = ("features", "matching", "mapping")
 WAYS = ("rangesfm, reproducible", "rangesfm", "pycolmap")
@@ -104,6 +115,9 @@ def by_pycolmap(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     mapping = pycolmap.IncrementalPipelineOptions(num_threads=num, random_seed=seed)
+    if camera.params is not None:
+        mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
+        mapping.mapper.abs_pose_refine_focal_length = mapping.mapper.abs_pose_refine_extra_params = False
     calls = {
         "features": lambda: pycolmap.extract_features(
             database,
@@ -134,6 +148,30 @@ def by_rangesfm(
     reconstruct(photos, names, output, camera=camera, mapper=mapper, seed=seed, progress=stages)
     marks = [begin, *stages.marks[1:], Effort.so_far()]  # what comes before the features counts as part of them
     return [*(end - start for start, end in pairwise(marks)), marks[-1] - begin]
+
+
+def to_metric_map(survey: Survey, output: Path, num: int, seed: int) -> Effort:
+    """Run a survey from its photos to the refined metric map, without a report."""
+    values = {"output.path": output, "output.seed": seed, "mapper.num_threads": num, "report.enabled": False}
+    return effort_of(lambda: run_survey(survey.changed(values)))
+
+
+def compare_with_metric_map(survey: Survey, num: int, num_rounds: int, seed: int) -> None:
+    names, _ = find_keyframes(survey, Journal(SilentProgress()))
+    theirs, ours = [], []
+    for _ in range(num_rounds):
+        with tempfile.TemporaryDirectory() as scratch:
+            output = Path(scratch) / "pycolmap"
+            output.mkdir()
+            theirs.append(by_pycolmap(survey.photos_path, names, output, survey.camera, num, seed)[-1])
+            ours.append(to_metric_map(survey, Path(scratch) / "rangesfm", num, seed))
+    print(f"{len(names)} photos to a map{'clock':>12} {'processors':>11}   ({load()})")
+    for what, efforts in (("unscaled, by pycolmap", theirs), ("metric, by rangesfm", ours)):
+        clock_s, processor_s = median(e.clock_s for e in efforts), median(e.processor_s for e in efforts)
+        print(f"{what:24}{clock_s:8.1f}s {processor_s:10.1f}s")
+    clock = ratio([e.clock_s for e in ours], [e.clock_s for e in theirs])
+    processor = ratio([e.processor_s for e in ours], [e.processor_s for e in theirs])
+    print(f"ratio, clock {clock}, processors {processor}", flush=True)
 
 
 def match_anew(photos: Path, names: Sequence[str], database: Path, num_processes: int, seed: int) -> Effort:
@@ -258,7 +296,8 @@ def compare_processes(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photos", nargs="+", help="a folder, perhaps with :N for every Nth of its photos")
+    parser.add_argument("photos", nargs="+", help="a folder, perhaps with :N for every Nth of its photos; or a survey")
+    parser.add_argument("--base_path", help="of the surveys (default: their folders)")
     parser.add_argument("--num_threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--num_rounds", type=int, default=3)
     parser.add_argument("--camera_model")
@@ -269,6 +308,10 @@ def main() -> None:
     camera = CameraOptions(model=arguments.camera_model, params=arguments.camera_params)
     num, seed = arguments.num_threads, arguments.seed
     for given in arguments.photos:
+        if given.endswith(".toml"):
+            print(f"\n{given}:", flush=True)
+            compare_with_metric_map(read_survey(given, None, arguments.base_path), num, arguments.num_rounds, seed)
+            continue
         folder, _, every_nth = given.partition(":")
         photos = Path(folder)
         names = list_images(photos)[:: int(every_nth or 1)]
