@@ -14,7 +14,7 @@ from tests.simulated.path import loop_path
 from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.demo.simulated_radio import Radio, SimulatedRanges
-from rangesfm.distances.locate_lengths import LocatedDistances
+from rangesfm.distances.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.geometry.trajectory import Trajectory, in_first_camera
 from rangesfm.inference.bending import WalkBending
@@ -80,7 +80,8 @@ class Survey:
         self, frame: str, known: Collection[str] = (), log: RangeLog | None = None, **options: Any
     ) -> ScaleEstimate:
         """Run the scale stage on this survey's ranges, or on another log."""
-        anchors, others = self.anchors(frame, known), lengths_among(options.get("distances"), self.trajectory)
+        anchors, distances = self.anchors(frame, known), options.get("distances", NO_DISTANCES)
+        others = lengths_among(distances, self.trajectory)
         observations = self.observations(log)
         return initialize_scale(observations, self.trajectory, anchors, anchor_frame=frame, others=others, **options)
 
@@ -92,11 +93,9 @@ class Survey:
         return estimate.value / self.site_from_sfm.scale - 1
 
 
-def lengths_among(distances: LocatedDistances | None, path: Trajectory) -> list[LengthScale]:
+def lengths_among(distances: LocatedDistances, path: Trajectory) -> list[LengthScale]:
     """Return the lengths between points among measured distances, if there are any, for ``initialize_scale``."""
-    found = None
-    if distances is not None:
-        found = lengths_between_points(distances, path, WalkBending(in_first_camera(path)))
+    found = lengths_between_points(distances, path, WalkBending(in_first_camera(path)))
     return [] if found is None else [found]
 
 

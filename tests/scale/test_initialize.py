@@ -405,7 +405,7 @@ def test_control_distances_between_cameras_hold_a_scale_that_long_ranges_would_s
     assert held.value == pytest.approx(truth, rel=0.005)
     assert held.uncertainty.formal < 0.5 * alone.uncertainty.formal
     # The judged problem holds the scale no better than the lengths do in a map that bends.
-    lengths, posed = known(held.find(LengthScale)), known(known(held.find(RangeScale)).posed.ranges.distances)
+    lengths, posed = known(held.find(LengthScale)), known(held.find(RangeScale)).posed.ranges.distances
     assert posed.stddev_m[0] == pytest.approx(lengths.alone.scale.stddev)
 
 

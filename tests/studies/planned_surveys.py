@@ -142,7 +142,7 @@ def stddevs_of(planned: PlannedSurvey) -> dict[str, float]:
 
 def measured(
     planned: PlannedSurvey, seed: int
-) -> tuple[RangeObservations, Trajectory, tuple[Anchor, ...], LocatedDistances | None]:
+) -> tuple[RangeObservations, Trajectory, tuple[Anchor, ...], LocatedDistances]:
     """Simulate one such survey: all of its ranges, on a bent map, the anchors as told, and the taped lengths."""
     rng = np.random.default_rng(seed)
     stddevs, true = stddevs_of(planned), planned.trajectory
@@ -184,10 +184,8 @@ def _told(planned: PlannedSurvey, rng: np.random.Generator) -> tuple[Anchor, ...
     )
 
 
-def _taped(planned: PlannedSurvey, rng: np.random.Generator) -> LocatedDistances | None:
-    if not planned.taped:
-        return None
-    lengths, stddevs = np.array(planned.taped, dtype=np.float64).T
+def _taped(planned: PlannedSurvey, rng: np.random.Generator) -> LocatedDistances:
+    lengths, stddevs = np.array(planned.taped, dtype=np.float64).reshape(-1, 2).T
     found = lengths + stddevs * rng.standard_normal(len(lengths))
     bent = lengths * (1 + BENDING * rng.standard_normal(len(lengths)))
     return LocatedDistances.control(found, stddevs, model_length=bent / METRES_PER_UNIT)

@@ -130,6 +130,9 @@ class LocatedDistances:
         return jacobian
 
 
+NO_DISTANCES = LocatedDistances.control(np.zeros(0), np.zeros(0))
+
+
 def locate_distances(
     tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str], path: Trajectory | None = None
 ) -> LocatedDistances:

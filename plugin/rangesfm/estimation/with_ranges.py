@@ -41,9 +41,9 @@ def refine_with_ranges(
     tag_in_cam_m: npt.ArrayLike,
     first_pose_is_fixed: bool,
     gravity: Gravity | None = None,
-    camera: CameraOptions | None = None,
-    options: RefineOptions | None = None,
-    tape: Tape | None = None,
+    camera: CameraOptions = CameraOptions(),
+    options: RefineOptions = RefineOptions(),
+    tape: Tape = Tape(),
     shared_errors_m: Array | None = None,
     is_refined: bool = False,
     num_threads: int = -1,
@@ -77,19 +77,18 @@ def refine_with_ranges(
         InputError: an option passed through to COLMAP is unknown, a clock offset is to be estimated without times, or
             the end of a distance is not in the model.
     """
-    options = options or RefineOptions()
     metric = pycolmap.Reconstruction(reconstruction)
     ranges = ranges_of_map(trajectory, observations, metric_from_sfm, tag_in_cam_m, anchors, errors, options)
     if shared_errors_m is not None:
         ranges = replace(ranges, shared_errors_m=shared_errors_m)
     upwards = () if first_pose_is_fixed or gravity is None else (Upwards(gravity),)
-    measured = Measured((RadioLog(ranges), TapedLengths(tape or Tape()), *upwards))
+    measured = Measured((RadioLog(ranges), TapedLengths(tape), *upwards))
     with at_most(num_threads):
         problem = map_problem(
             metric,
             measured,
             trajectory,
-            camera=camera or CameraOptions(),
+            camera=camera,
             options=options,
             first_pose_is_fixed=first_pose_is_fixed,
             is_refined=is_refined,

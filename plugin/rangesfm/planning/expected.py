@@ -234,8 +234,8 @@ def expect(
     ranges = _ranges(planned, placement, max_num_bins) if planned.anchors else None
     observed: list[Observations] = [] if ranges is None else [ranges.observed]
     observed += [] if positions is None else [positions]
-    if (taped := planned.taped_lengths) is not None:
-        observed.append(lengths_on_map(taped, 1.0, path, np.ones(len(taped), dtype=bool)))
+    if planned.taped:
+        observed.append(lengths_on_map(planned.taped_lengths, 1.0, path, np.ones(len(planned.taped), dtype=bool)))
     problem, known, keyframe_stddevs_m = the_map.solved(observed)
     learned = None if ranges is None else LearnedErrors.from_noise(problem.noise_of(RANGES), ranges.observed.bins)
     num_positions = 0 if positions is None else int(np.count_nonzero(positions.is_used)) // 3

@@ -194,12 +194,12 @@ class PlannedSurvey:
         return joined_positions([marks, track]), notes
 
     @property
-    def taped_lengths(self) -> LocatedDistances | None:
-        """Lengths that will be taped, between places that are not known yet; None without any."""
+    def taped_lengths(self) -> LocatedDistances:
+        """Lengths that will be taped, between places that are not known yet."""
         lengths, stddevs = np.array(self.taped, dtype=np.float64).reshape(-1, 2).T
         # Between its ends the scale of the map varies.
         stddevs = np.hypot(stddevs, BENDING * lengths)
-        return LocatedDistances.control(lengths, stddevs, model_length=lengths) if self.taped else None
+        return LocatedDistances.control(lengths, stddevs, model_length=lengths)
 
     def posed(self, observations: RangeObservations, placement: PlacementPrior | None = None) -> ScaleProblem:
         """Return the scale problem that a run will solve, with the input that it will have.

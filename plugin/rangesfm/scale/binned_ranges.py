@@ -83,8 +83,7 @@ def binned_ranges(
 def without_others(problem: RangeProblem) -> RangeProblem:
     """Return the problem without lengths between points and known positions."""
     distances = problem.distances
-    between_anchors = None if distances is None else distances.subset(~distances.is_between_points)
-    return replace(problem, distances=between_anchors, placement=None)
+    return replace(problem, distances=distances.subset(~distances.is_between_points), placement=None)
 
 
 def _others_m2(posed: ScaleProblem, solution: Solution, bins: RangeBins) -> dict[OtherError, Array]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rangesfm.distances.locate_lengths import LocatedDistances
+from rangesfm.distances.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.errors import GeometryError
 from rangesfm.geometry.gravity import gravity_of
 from rangesfm.geometry.trajectory import Trajectory, first_camera_from, in_first_camera
@@ -41,12 +41,12 @@ def initialize_scale(
     anchors: Sequence[Anchor],
     *,
     anchor_frame: str,
-    options: ScaleOptions | None = None,
-    range_model: RangeModelOptions | None = None,
-    distances: LocatedDistances | None = None,
+    options: ScaleOptions = ScaleOptions(),
+    range_model: RangeModelOptions = RangeModelOptions(),
+    distances: LocatedDistances = NO_DISTANCES,
     others: Sequence[KindOnMap] = (),
     bending: MapBending | None = None,
-    site: Site | None = None,
+    site: Site = Site(),
     seed: int = 0,
 ) -> ScaleEstimate:
     """Estimate scale and frame of an unscaled path from ranges, from measurements of other kinds, or from all of them.
@@ -61,13 +61,12 @@ def initialize_scale(
         distances: measured ones, of which those between anchors are used beside ranges.
         others: measurements of other kinds on ``trajectory``, those first that decide what is doubtful.
         bending: how the map is bent; None: it drifts as a map of poses does.
-        site: frame of the anchors' positions; None: that in which they were given.
+        site: frame of the anchors' positions.
 
     Raises:
         InputError: an anchor of the log is not among ``anchors``.
         GeometryError: the scale is not determined.
     """
-    options, range_model = options or ScaleOptions(), range_model or RangeModelOptions()
     bending = bending or WalkBending(in_first_camera(trajectory))
     if not len(observations.log):
         return _without_ranges(observations, trajectory, others, bending, options, range_model)
@@ -131,9 +130,9 @@ class _RangeStart:
     anchor_frame: str
     options: ScaleOptions
     range_model: RangeModelOptions
-    distances: LocatedDistances | None
+    distances: LocatedDistances
     bending: MapBending
-    site: Site | None
+    site: Site
     seed: int
 
     def estimate(self, others: tuple[KindOnMap, ...], *, is_last: bool = False) -> ScaleEstimate:

@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.distances.locate_lengths import LocatedDistances
+from rangesfm.distances.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
@@ -64,7 +64,7 @@ class RangeProblem:
     bias_stddev_m: Array
     common_bias_stddev_m: float
     frame_is_free: bool
-    distances: LocatedDistances | None = None
+    distances: LocatedDistances = NO_DISTANCES
     gravity: Gravity | None = None
     placement: PlacementPrior | None = None
     share: Array | None = None
@@ -118,7 +118,7 @@ class RangeProblem:
             bias_mean_m=self.bias_mean_m[one],
             bias_stddev_m=self.bias_stddev_m[one],
             frame_is_free=False,
-            distances=None,
+            distances=NO_DISTANCES,
         )
 
 
@@ -403,9 +403,8 @@ def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) 
     anchors, biases = problem.uncertain
     off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
     off_bias = problem.bias_whitening @ (state.bias_m - problem.bias_mean_m)[biases]
-    priors = [off_anchor.ravel(), off_bias]
-    if problem.distances is not None:
-        priors.append(problem.distances.residuals(state.metric_from_model.scale, state.anchors_m))
+    of_distances = problem.distances.residuals(state.metric_from_model.scale, state.anchors_m)
+    priors = [off_anchor.ravel(), off_bias, of_distances]
     if problem.gravity is not None and columns.frame >= 0:
         priors.append(problem.gravity.residuals(state.metric_from_model.rotation))
     if problem.placement is not None and columns.frame >= 0:
@@ -427,9 +426,9 @@ def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, s
         for axis in range(3):
             jacobian[3 * row + axis, columns.anchor[k] + axis] = 1 / problem.anchor_stddev_m[k]
     jacobian[3 * len(anchors) :, columns.bias[biases]] = problem.bias_whitening
-    blocks, similarity = [jacobian], state.metric_from_model
-    if problem.distances is not None:
-        blocks.append(problem.distances.jacobian(similarity.scale, state.anchors_m, columns.anchor, columns.num))
+    similarity = state.metric_from_model
+    of_distances = problem.distances.jacobian(similarity.scale, state.anchors_m, columns.anchor, columns.num)
+    blocks = [jacobian, of_distances]
     if problem.gravity is not None and columns.frame >= 0:
         block = np.zeros((3, columns.num))
         turn = problem.gravity.jacobian(similarity.rotation, _left_of_step(start, state))

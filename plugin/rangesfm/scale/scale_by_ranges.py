@@ -194,9 +194,7 @@ def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarit
     return None
 
 
-def with_lengths(
-    distances: LocatedDistances | None, others: Sequence[KindOnMap], unit: float = 1.0
-) -> LocatedDistances | None:
+def with_lengths(distances: LocatedDistances, others: Sequence[KindOnMap], unit: float = 1.0) -> LocatedDistances:
     """Return distances between anchors with one length in the map for each other kind that gives its scale alone.
 
     With them the problem of the ranges is solved and tested.
@@ -204,13 +202,13 @@ def with_lengths(
     Args:
         unit: of the model to which the distances refer, in units of that of the other kinds.
     """
-    found = None if distances is None else distances.subset(~distances.is_between_points)
+    found = distances.subset(~distances.is_between_points)
     one = np.ones(1)
     for each in others:
         if each.is_used and not each.places_map:
             alone = each.alone.scale
             length = LocatedDistances.control(unit * alone.value * one, unit * alone.stddev * one, model_length=one)
-            found = length if found is None else length.joined(found)
+            found = length.joined(found)
     return found
 
 
@@ -220,7 +218,7 @@ def _solved(solution: Solution, problem: RangeProblem) -> Solution:
 
 
 def _ranges_alone(problem: RangeProblem) -> RangeProblem:
-    distances = None if problem.distances is None else problem.distances.subset(~problem.distances.is_between_points)
+    distances = problem.distances.subset(~problem.distances.is_between_points)
     if problem.placement is None:
         return replace(problem, distances=distances)
     is_placed = bool(np.isfinite(problem.anchor_stddev_m).any())

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.distances.locate_lengths import LocatedDistances, surveyed_distances
+from rangesfm.distances.locate_lengths import NO_DISTANCES, LocatedDistances, surveyed_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.geometry.gravity import Gravity
 from rangesfm.geometry.similarity import Similarity, path_shape, rounding_of
@@ -113,12 +113,12 @@ def scale_problem(
     anchors: Sequence[Anchor],
     anchor_frame: str,
     range_model: RangeModelOptions,
-    distances: LocatedDistances | None = None,
+    distances: LocatedDistances = NO_DISTANCES,
     gravity: Gravity | None = None,
     placement: PlacementPrior | None = None,
     *,
     place_is_open: bool = False,
-    site: Site | None = None,
+    site: Site = Site(),
 ) -> ScaleProblem:
     """Set up the range problem.
 
@@ -129,7 +129,7 @@ def scale_problem(
         placement: what known positions say of the map's place, for the first camera's frame; None without any.
         place_is_open: whether the map has more than one possible place in the site. Then only the distances between
             surveyed anchors are used, not their positions.
-        site: frame of the anchors' positions; None: that in which they were given.
+        site: frame of the anchors' positions.
 
     Raises:
         InputError: an anchor of the log is not among ``anchors``.
@@ -148,7 +148,7 @@ def scale_problem(
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     bias_m = np.array([a.range_bias_m for a in in_log])
     bias_stddev_m = np.array([_bias_stddev(a, range_model) for a in in_log])
-    measured = [] if distances is None else [distances]
+    measured = [distances]
     if anchor_frame == "site" and not known.any():
         measured += _between_surveyed(in_log, given & heard)
     noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
@@ -185,14 +185,14 @@ def scale_problem(
         tuple(notes),
         left_out,
         tuple(anchor.anchor_id for anchor in anchors),
-        site or Site(),
+        site,
     )
 
 
-def _control(distances: LocatedDistances, has_place: Mask) -> LocatedDistances | None:
-    """Return the distances to fit: no checks, and only between points or anchors in use; None if there are none."""
+def _control(distances: LocatedDistances, has_place: Mask) -> LocatedDistances:
+    """Return the distances to fit: no checks, and only between points or anchors in use."""
     takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1) & ~distances.is_check
-    return distances.subset(takes_part) if takes_part.any() else None
+    return distances.subset(takes_part)
 
 
 def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:

@@ -183,7 +183,7 @@ def _known_only(problem: RangeProblem) -> RangeProblem:
         part,
         anchor_stddev_m=np.where(known, problem.anchor_stddev_m, 0.0),
         bias_stddev_m=np.where(known, problem.bias_stddev_m, 0.0),
-        distances=None if distances is None else distances.subset(distances.is_between_points),
+        distances=distances.subset(distances.is_between_points),
     )
 
 
@@ -256,7 +256,7 @@ def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
         share=errors.share,
         bias_stddev_m=problem.bias_stddev_m / inflation,
         common_bias_stddev_m=problem.common_bias_stddev_m / inflation,
-        distances=None if distances is None else replace(distances, stddev_m=distances.stddev_m / inflation),
+        distances=replace(distances, stddev_m=distances.stddev_m / inflation),
         gravity=None if gravity is None else replace(gravity, stddev_rad=gravity.stddev_rad / inflation),
         placement=None if placement is None else replace(placement, whitening=placement.whitening * inflation),
     )

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.distances.locate_lengths import locate_distances
+from rangesfm.distances.locate_lengths import NO_DISTANCES, locate_distances
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.files.clock_times import span_text
 from rangesfm.files.photo_names import told_none, told_unknown
@@ -126,7 +126,7 @@ class SurveyRun:
         Raises:
             GeometryError: the scale is not determined.
         """
-        survey, inputs, distances = self.survey, self.inputs, None
+        survey, inputs, distances = self.survey, self.inputs, NO_DISTANCES
         bending = bending or WalkBending(in_first_camera(path.trajectory))
         others, remarks = kinds_in_map(inputs, MapOfPhotos(path.sfm, path.trajectory, bending))
         if not (others or len(inputs.log)):
