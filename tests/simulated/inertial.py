@@ -1,4 +1,4 @@
-"""A simulated inertial sensor on a camera that is carried by hand, and the photos that it took."""
+"""A simulated inertial sensor on a camera that a hand, a drone or a rover carries, and the photos that it took."""
 
 from __future__ import annotations
 
@@ -48,10 +48,60 @@ def by_hand(seed: int = 0, *, axes: tuple[float, float, float] = (1.0, 1.0, 1.0)
     )
 
 
+def by_drone(seed: int = 0) -> Motion:
+    """Return a flight of some tens of metres, with all headings and small tilts."""
+    rng = np.random.default_rng(seed)
+    frequencies_hz = rng.uniform(0.02, 0.3, 12)
+    turns = rng.normal(size=(3, 12)) * np.array([[0.05], [0.05], [0.2]]) / frequencies_hz**0.5
+    places = rng.normal(size=(3, 12)) * np.array([[0.1], [0.1], [0.03]]) / frequencies_hz
+    return Motion(turns, places, frequencies_hz, rng.uniform(0, 6.28, (3, 12)))
+
+
+def by_rover(seed: int = 0) -> Motion:
+    """Return a drive on level ground that hardly accelerates."""
+    rng = np.random.default_rng(seed)
+    frequencies_hz = rng.uniform(0.005, 0.04, 12)
+    turns = rng.normal(size=(3, 12)) * np.array([[0.001], [0.001], [0.1]]) / frequencies_hz**0.5
+    places = rng.normal(size=(3, 12)) * np.array([[0.003], [0.003], [0.0]]) / frequencies_hz
+    return Motion(turns, places, frequencies_hz, rng.uniform(0, 6.28, (3, 12)))
+
+
+@dataclass(frozen=True)
+class Grade:
+    """Errors of a sensor.
+
+    Attributes:
+        gyro_noise, accel_noise: white noise, rad/s and m/s^2 per root of Hz.
+        gyro_bias, accel_bias: standard deviations of the zeros, rad/s and m/s^2. gyro_walk, accel_walk: of their random
+            walks after a second.
+        scale: standard deviation of the scale factor of each axis of the accelerometer; a tenth of it of the gyroscope.
+    """
+
+    gyro_noise: float
+    accel_noise: float
+    gyro_bias: float
+    accel_bias: float
+    gyro_walk: float
+    accel_walk: float
+    scale: float = 0.03
+
+
+PHONE = Grade(2e-4, 3e-3, 0.015, 0.1, 1e-5, 5e-4)
+TACTICAL = Grade(1e-5, 2e-4, 1e-3, 0.02, 1e-6, 5e-5)
+CONSTANT = Grade(2e-4, 3e-3, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""The noise of a phone's sensor, and nothing else besides zeros that are always the same."""
+
+
 def imu_log(
-    motion: Motion, *, offset_s: float = 0.0, rate_hz: float = 100.0, until_s: float = 70.0, seed: int = 1
+    motion: Motion,
+    *,
+    offset_s: float = 0.0,
+    rate_hz: float = 100.0,
+    until_s: float = 70.0,
+    seed: int = 1,
+    grade: Grade = CONSTANT,
 ) -> ImuLog:
-    """Return the log of a sensor with the noise and the biases of a phone's.
+    """Return the log of a sensor.
 
     Args:
         offset_s: image time minus time of the log.
@@ -63,18 +113,40 @@ def imu_log(
     gyro = (motion.world_from_imu(times_s - h).inv() * motion.world_from_imu(times_s + h)).as_rotvec() / (2 * h)
     later, here, before = (motion.places_m(times_s + k * h) for k in (1, 0, -1))
     force = now.inv().apply((later - 2 * here + before) / h**2 + np.array([0.0, 0.0, GRAVITY_M_S2]))
-    gyro = gyro + rng.normal(size=gyro.shape) * 2e-3 + np.array([0.01, -0.02, 0.015])
-    force = force + rng.normal(size=force.shape) * 0.03 + np.array([0.05, 0.02, -0.08])
+    walked = rng.normal(size=(2, *gyro.shape)).cumsum(axis=1) / np.sqrt(rate_hz)
+    zeros, scales = rng.normal(size=(2, 2, 3))
+    gyro_zero = np.array([0.01, -0.02, 0.015]) if grade is CONSTANT else grade.gyro_bias * zeros[0]
+    accel_zero = np.array([0.05, 0.02, -0.08]) if grade is CONSTANT else grade.accel_bias * zeros[1]
+    noise = rng.normal(size=(2, *gyro.shape)) * np.sqrt(rate_hz)
+    gyro = (1 + 0.1 * grade.scale * scales[0]) * gyro + gyro_zero + grade.gyro_walk * walked[0]
+    force = (1 + grade.scale * scales[1]) * force + accel_zero + grade.accel_walk * walked[1]
+    gyro, force = gyro + grade.gyro_noise * noise[0], force + grade.accel_noise * noise[1]
     return ImuLog(times_s - offset_s, gyro, force, "imu.csv")
 
 
-def photos(motion: Motion, *, until_s: float = 60.0, every_s: float = 0.7, noise_rad: float = 1e-3) -> Trajectory:
-    """Return the path of the camera, in a world of its own and another unit."""
-    rng = np.random.default_rng(3)
+def photos(
+    motion: Motion,
+    *,
+    until_s: float = 60.0,
+    every_s: float = 0.7,
+    noise_rad: float = 1e-3,
+    bend: float = 0.0,
+    seed: int = 3,
+) -> Trajectory:
+    """Return the path of the camera, in a world of its own and another unit.
+
+    Args:
+        bend: how far the path is bent, as a share of its size.
+    """
+    rng = np.random.default_rng(seed)
     times_s = np.arange(2.0, until_s, every_s)
     errors = Rotation.from_rotvec(rng.normal(size=(len(times_s), 3)) * noise_rad)
     world = Rotation.from_rotvec([0.3, -1.0, 2.0])
     turns = world * motion.world_from_imu(times_s) * Rotation.from_matrix(CAM_FROM_IMU.T) * errors
     names = tuple(f"{k:04}.jpg" for k in range(len(times_s)))
-    centers = world.apply(motion.places_m(times_s)) * 0.37
+    places_m = motion.places_m(times_s)
+    knots_s = np.linspace(times_s[0], times_s[-1], 7)
+    bent = bend * np.linalg.norm(places_m.std(axis=0)) * rng.normal(size=(7, 3))
+    places_m = places_m + np.column_stack([np.interp(times_s, knots_s, axis) for axis in bent.T])
+    centers = world.apply(places_m) * 0.37
     return Trajectory(np.arange(len(times_s)), names, times_s, centers, turns.as_matrix())

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.conftest import Command
-from tests.simulated.files import write_model, write_rows
+from tests.simulated.files import write_anchors, write_model, write_rows
 from tests.simulated.inertial import Motion, by_hand, imu_log, photos
-from tests.simulated.surveys import model_of_poses
+from tests.simulated.surveys import Place, model_of_poses
 
 from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS
 
@@ -24,7 +24,9 @@ SENSOR = ("--imu", "imu.csv")
 RANGES = ("--ranges", "uwb.csv", "--ranges_time_offset", "0", "--tag_in_cam", "0,0,0")
 
 
-def write_survey(folder: Path, motion: Motion, *, gyro_factor: float = 1.0) -> None:
+def write_survey(
+    folder: Path, motion: Motion, *, gyro_factor: float = 1.0, anchors_m: dict[str, Place] = ANCHORS_M
+) -> None:
     """Write the path of the photos as a model, the sensor's log, and ranges of a radio at the camera."""
     path = photos(motion, noise_rad=3e-4)
     assert path.timestamps_s is not None
@@ -34,8 +36,9 @@ def write_survey(folder: Path, motion: Motion, *, gyro_factor: float = 1.0) -> N
     rows = np.column_stack([log.timestamp_s, gyro_factor * log.gyro_rad_s, log.accel_m_s2]).tolist()
     write_rows(folder / "imu.csv", ",".join(CANONICAL_COLUMNS), rows)
     rng, at_s = np.random.default_rng(2), np.arange(2.0, 59.0, 0.1)
-    names = np.resize(list(ANCHORS_M), len(at_s))
-    away = motion.places_m(at_s) - [ANCHORS_M[name] for name in names]
+    names = np.resize(list(anchors_m), len(at_s))
+    away = motion.places_m(at_s) - [anchors_m[name] for name in names]
+    write_anchors(folder / "anchors.csv", anchors_m)
     range_m = np.linalg.norm(away, axis=1) + rng.normal(0.0, 0.05, len(at_s))
     measured = zip(at_s.tolist(), names.tolist(), range_m.tolist(), strict=True)
     write_rows(folder / "uwb.csv", "timestamp_s,anchor_id,range_m", measured)
@@ -96,6 +99,21 @@ def test_a_motion_that_does_not_show_the_scale_is_named(tmp_path: Path, rangesfm
     scale = scaled(tmp_path, tmp_path / "out", rangesfm_command, *SENSOR)["scale"]
     assert scale["verdict"] == "doubtful"
     assert "the camera moved too evenly for the inertial sensor to show the scale" in scale["reasons"]
+
+
+def test_gravity_says_on_which_side_of_a_wall_with_anchors_a_path_in_a_plane_is(
+    tmp_path: Path, rangesfm_command: Command
+) -> None:
+    hand = by_hand(2, axes=(3.0, 3.0, 3.0))
+    on_wall = {"A": (-2.0, -2.0, -1.2), "B": (-2.0, 2.0, 0.5), "C": (-2.0, -1.5, 1.6), "D": (-2.0, 1.0, -0.9)}
+    flat = replace(hand, amplitudes_m=hand.amplitudes_m * [[1], [1], [0]])
+    write_survey(tmp_path, flat, anchors_m=on_wall)
+    sited = (*RANGES, "--anchors", "anchors.csv", "--anchor_frame", "site")
+    without = scaled(tmp_path, tmp_path / "without", rangesfm_command, *sited)
+    result = scaled(tmp_path, tmp_path / "out", rangesfm_command, *sited, *SENSOR)
+    assert (without["frame"], result["frame"]) == ("first_camera", "site")
+    up = -np.array(result["imu"]["gravity_in_world"]) / np.linalg.norm(result["imu"]["gravity_in_world"])
+    assert np.degrees(np.arccos(up[2])) < 1.0
 
 
 def test_a_mistake_in_the_log_is_a_warning(tmp_path: Path, rangesfm_command: Command) -> None:

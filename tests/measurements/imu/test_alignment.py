@@ -94,16 +94,22 @@ def test_a_mirrored_gyroscope_is_refused(wrong: Array) -> None:
 
 
 def test_axes_of_the_accelerometer_that_are_not_those_of_the_gyroscope_are_named() -> None:
-    found = align_imu(changed(accel=LOG.accel_m_s2[:, [1, 2, 0]]), PATH)
-    assert len(found.mistakes) == 1
-    assert "y, z, x of the gyroscope" in found.mistakes[0]
+    with pytest.raises(GeometryError, match="y, z, x of the gyroscope"):
+        align_imu(changed(accel=LOG.accel_m_s2[:, [1, 2, 0]]), PATH)
 
 
 def test_an_accelerometer_without_gravity_is_named() -> None:
     up = np.array([0.0, 0.0, 9.81])
     times_s = LOG.timestamp_s + OFFSET_S
-    found = align_imu(changed(accel=LOG.accel_m_s2 - MOTION.world_from_imu(times_s).inv().apply(up)), PATH)
-    assert ["with gravity in it" in line for line in found.mistakes] == [True]
+    with pytest.raises(GeometryError, match="with gravity in it"):
+        align_imu(changed(accel=LOG.accel_m_s2 - MOTION.world_from_imu(times_s).inv().apply(up)), PATH)
+
+
+def test_a_sensor_that_slips_is_named() -> None:
+    half, slip = len(LOG.timestamp_s) // 2, Rotation.from_euler("y", 20, degrees=True)
+    gyro, accel = (np.vstack([of[:half], slip.apply(of[half:])]) for of in (LOG.gyro_rad_s, LOG.accel_m_s2))
+    with pytest.raises(GeometryError, match=r"sits 20 deg otherwise .* fixed to the camera"):
+        align_imu(changed(gyro=gyro, accel=accel), PATH)
 
 
 def test_wrong_values_that_are_given_are_named_and_not_taken() -> None:

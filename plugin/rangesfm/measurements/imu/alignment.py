@@ -46,10 +46,14 @@ _MAX_OFFSET_STDDEV_S, _MAX_ROTATION_STDDEV = 0.1, float(np.radians(3.0))
 _FAR_OFF_SQUARED_3, _FAR_OFF_1 = 21.1, 3.9
 # What a protractor and the words "mounted upside down" leave open. A given rotation nearer than this is no mistake.
 _MOUNTED = float(np.radians(1.0))
+# A sensor that sits otherwise later by more than this has slipped; less is what lenses and maps may make of it.
+_SLIPPED = float(np.radians(3.0))
 _MEDIAN_OF_CHI3 = 1.538  # median length of three standard normal numbers
 _DEGREES = 180.0 / np.pi
 # Mean accelerations between photos scatter by so much of gravity if that is not in them; by a tenth in people's hands.
 _MOVED = 0.5
+# The zeros of a phone's accelerometer (0.5 m/s^2, see ``sensor_prior``) make them scatter by up to twice their share.
+_SENSORS_ERR = 0.1
 # Other axes are named if they make them scatter less by this factor, and chance does not.
 _CLEARLY = 1.25
 
@@ -186,7 +190,8 @@ def align_imu(
         )
     mistakes += _wrong_rotation(log, fit, cam_from_imu)
     mistakes += _wrong_offset(log, fit, time_offset_s, path.time_resolution_s)
-    mistakes += _wrong_axes(log, gyro, fit, path)
+    _require_fixed(log, gyro, fit, turns)
+    _require_same_axes(log, gyro, fit, path)
     return ImuAlignment(
         replace(log, gyro_rad_s=rates / factor),
         fit.offset_s,
@@ -393,22 +398,40 @@ def _wrong_offset(log: ImuLog, fit: _Fit, given_s: float | None, resolution_s: f
         )
 
 
-def _wrong_axes(log: ImuLog, gyro: GyroTurns, fit: _Fit, path: Trajectory) -> Iterator[str]:
-    """Yield a line if gravity stays where it is only with other axes of the accelerometer."""
+def _require_fixed(log: ImuLog, gyro: GyroTurns, fit: _Fit, turns: _PhotoTurns) -> None:
+    """Raise GeometryError if the sensor sits otherwise in the second half of the photos than in the first."""
+    is_first = np.arange(len(turns)) < len(turns) // 2
+    halves = [_refined(gyro, turns.take(part), fit) for part in (is_first, ~is_first)]
+    found = [half for half in halves if half is not None and half.is_determined]
+    if len(found) < 2:
+        return
+    turn = Rotation.from_matrix(found[1].cam_from_imu @ found[0].cam_from_imu.T).as_rotvec()
+    covariance = sum(half.covariance[1:4, 1:4] for half in found)
+    angle = float(np.linalg.norm(turn))
+    if angle > _SLIPPED and turn @ np.linalg.solve(covariance, turn) > _FAR_OFF_SQUARED_3:
+        raise GeometryError(
+            f"{log.name}: the sensor sits {np.degrees(angle):.0f} deg otherwise in the second half of the photos than "
+            "in the first: expected one that is fixed to the camera; leave out the part before or after it slipped"
+        )
+
+
+def _require_same_axes(log: ImuLog, gyro: GyroTurns, fit: _Fit, path: Trajectory) -> None:
+    """Raise GeometryError if gravity does not stay where it is, or only with other axes of the accelerometer."""
     means = _turned_means(log, gyro, fit, path)
     others = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3)) for signs in _SIGNS]
     # All signs reversed does not move gravity either: of both, the right-handed axes.
     scatters = [_scatter(means, other * np.linalg.det(other)) for other in others]
     scatter, least = _scatter(means, np.eye(3)), min(scatters)
-    if least < scatter / _CLEARLY and 1.5 * len(means) * np.log((scatter / least) ** 2) > _LIKELIER:
+    is_likelier = 1.5 * len(means) * np.log((scatter / least) ** 2) > _LIKELIER
+    if scatter > _SENSORS_ERR and least < scatter / _CLEARLY and is_likelier:
         best = others[scatters.index(least)]
         names = ", ".join(_name_of_axis(row) for row in best.T * np.linalg.det(best))
-        yield (
+        raise GeometryError(
             f"{log.name}: gravity moves as the camera turns, and stays where it is if x, y, z of the accelerometer are "
             f"{names} of the gyroscope (or all with the other sign): expected the same axes for both"
         )
-    elif scatter > _MOVED:
-        yield (
+    if scatter > _MOVED:
+        raise GeometryError(
             f"{log.name}: the acceleration, turned by the photos, scatters by {scatter:.0%} of its length: expected "
             "that of an accelerometer with gravity in it, fixed to the camera"
         )

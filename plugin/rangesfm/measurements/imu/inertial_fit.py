@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, UNDETERMINED
+from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS, UNDETERMINED
 from rangesfm.geometry.poses import Poses
 from rangesfm.geometry.robust_statistics import GEMAN_MCCLURE
 from rangesfm.geometry.rotations import logarithms
@@ -36,6 +36,7 @@ from rangesfm.measurements.imu.sensor import InertialSensor
 from rangesfm.measurements.imu.sensor_prior import (
     ARM_STDDEV_M,
     GIVEN_ARM_STDDEV_M,
+    GIVEN_TURN_STDDEV_RAD,
     GRAVITY_M_S2,
     GRAVITY_STDDEV,
     SensorPrior,
@@ -98,7 +99,9 @@ class InertialProblem:
         log = replace(found.log, timestamp_s=found.log.timestamp_s + found.time_offset_s)
         turn_rad = float(np.sqrt(np.linalg.eigvalsh(found.rotation_covariance)[-1]))
         prior = SensorPrior(
-            found.time_offset_stddev_s, turn_rad, ARM_STDDEV_M if sensor.imu_in_cam_m is None else GIVEN_ARM_STDDEV_M
+            max(found.time_offset_stddev_s, log.step_s / np.sqrt(12)),
+            turn_rad or GIVEN_TURN_STDDEV_RAD,
+            ARM_STDDEV_M if sensor.imu_in_cam_m is None else GIVEN_ARM_STDDEV_M,
         )
         arm = np.zeros(3) if sensor.imu_in_cam_m is None else sensor.imu_in_cam_m
         noise = sensor.log.noise
@@ -144,7 +147,9 @@ class InertialProblem:
         log, times_s = self.log, self.times_s
         found = preintegrate(log.timestamp_s, log.gyro_rad_s, log.accel_m_s2, times_s, state.sensor, densities)
         if not len(found):
-            raise GeometryError("the log of the inertial sensor and the photos have no time in common")
+            is_apart = times_s[-1] < log.timestamp_s[0] or times_s[0] > log.timestamp_s[-1]
+            why = "and the photos have no time in common" if is_apart else "does not tell how the photos turn"
+            raise GeometryError(f"the log of the inertial sensor {why}")
         return found
 
     def linearized(self, state: InertialState, intervals: Preintegrated) -> LinearMotion:
@@ -191,9 +196,17 @@ class InertialProblem:
         for each in stretches:
             velocities[each.photos] = state.velocities_m_s[each.photos] + each.velocities(step)
             weights[each.before] = each.weights(step)
+        stddev = float(np.sqrt(np.linalg.inv(design.T @ design)[0, 0]))
         growth = 1 + float(step[SCALE][0])  # the equations are linear in the scale itself, and not in its logarithm
+        if growth < -SIGNIFICANT_STDDEVS * stddev:
+            raise GeometryError(
+                f"{self.log.name}: by the accelerations the camera moved the other way than by the photos: have they "
+                "the other sign? at rest they point up, 9.8 m/s^2"
+            )
         if not growth > 0:
-            raise GeometryError("the inertial sensor does not tell the scale: by it the path would be inside out")
+            raise GeometryError(
+                "the inertial sensor does not tell the scale: the camera moved too evenly; move it to and fro"
+            )
         mounting, gravity = state.mounting.turned(step[TURN]), state.gravity_m_s2 + step[GRAVITY]
         found = InertialState(
             state.scale * growth,
@@ -203,13 +216,13 @@ class InertialProblem:
             replace(mounting, imu_in_rig_m=mounting.imu_in_rig_m + step[ARM]),
             weights,
         )
-        return found, float(np.sqrt(np.linalg.inv(design.T @ design)[0, 0]))
+        return found, stddev
 
     def _priors(self, state: InertialState) -> tuple[Array, Array]:
         """Return the (r, 23) derivatives and the (r,) residuals, in standard deviations, of what was known before."""
         stddevs = np.full(NUM_SHARED, np.inf)
         stddevs[SENSOR], stddevs[TURN], stddevs[ARM] = self.prior.of_sensor, self.prior.turn_rad, self.prior.arm_m
-        known = np.isfinite(stddevs) & (stddevs > 0)
+        known = np.isfinite(stddevs)
         length = np.zeros((1, NUM_SHARED))
         length[0, GRAVITY] = state.gravity_m_s2 / GRAVITY_M_S2**2 / GRAVITY_STDDEV
         off = self.off_prior(state)[known] / stddevs[known]

@@ -11,12 +11,20 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS
+from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
 from rangesfm.geometry.similarity import Similarity
 from rangesfm.inference.bending import MapBending
 from rangesfm.inference.linear_map import Columns
+from rangesfm.inference.mistakes import MistakeTests
 from rangesfm.inference.noise import Component
-from rangesfm.inference.posterior import MAX_NUM_OBSERVATIONS, Observations, ScaleUncertainty, joined
+from rangesfm.inference.posterior import (
+    MAX_NUM_OBSERVATIONS,
+    JointProblem,
+    Observations,
+    ScaleByKind,
+    ScaleUncertainty,
+    joined,
+)
 from rangesfm.measurements.imu.inertial_fit import (
     ARM,
     GRAVITY,
@@ -40,6 +48,7 @@ from rangesfm.measurements.imu.preintegration import (
 )
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.ranging.errors.components import component_words
 
 IMU = "imu"
 # Observations from which the sizes of errors are learnt before there are other kinds.
@@ -101,9 +110,26 @@ class InertialScale(KindOnMap):
         del in_site
         return self._observed(placed.scale, max_num)[0]
 
+    def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
+        """Return the tests of the scale against other kinds, and whether sensor and photos are of one motion."""
+        found = super().tests(on_map, by_kind)
+        return replace(found, reasons=(*found.reasons, *self._misfits(on_map.problem)))
+
+    def _misfits(self, problem: JointProblem) -> Iterator[str]:
+        """Yield what errs far more than such sensors and photos do."""
+        usual = {each.name: each for each in problem.components if each.spread > 0}
+        for name in self.sizes:
+            factor = problem.sizes[name] / usual[name].median
+            if np.log(factor) > SIGNIFICANT_STDDEVS * usual[name].spread:
+                [words] = component_words([name]).values()
+                yield (
+                    f"the {words} would be {factor:.0f} times the usual: do the accelerations belong to this motion? "
+                    "the sensor has to be fixed to the camera, with the axes of the gyroscope for the accelerometer"
+                )
+
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield that the motion does not show the scale."""
-        if uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+        if uncertainty.half_width_95 > DOUBTFUL_ABOVE and not any(self._misfits(self.alone.problem)):
             yield Doubt(
                 "the camera moved too evenly for the inertial sensor to show the scale",
                 "move it to and fro and turn it about all axes, for half a minute or longer",

@@ -60,6 +60,10 @@ ARM_STDDEV_M, GIVEN_ARM_STDDEV_M = 0.05, 0.01
 a phone), and as people measure it with a ruler."""
 
 
+GIVEN_TURN_STDDEV_RAD = float(np.radians(1.0))
+"""Standard deviation of a rotation that is given and that the turns of the photos do not show: a protractor's."""
+
+
 @dataclass(frozen=True)
 class SensorPrior:
     """Standard deviations of what is constant.
