@@ -52,7 +52,7 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def scaled(folder: Path, out: Path, command: Command, *flags: str) -> dict[str, Any]:
-    read = ("--input_path", "sparse", "--images", "images.csv", "--no_report")
+    read = ("--input_path", "sparse", "--images", "images.csv")
     command("scale", *read, *flags, "--output_path", str(out), cwd=folder)
     found: dict[str, Any] = json.loads((out / "result.json").read_text())
     return found
@@ -78,6 +78,7 @@ def test_photos_and_a_sensor_make_a_metric_and_level_map(
     down = np.array(imu["gravity_in_world"]) / np.linalg.norm(imu["gravity_in_world"])
     assert np.degrees(np.arccos(-down @ up)) < 0.5
     assert imu["up_stddev_deg"] < 0.5
+    assert "samples of an inertial sensor give it metres" in (tmp_path / "out" / "report.html").read_text("utf-8")
 
 
 def test_beside_ranges_it_makes_the_interval_narrower(survey: Path, tmp_path: Path, rangesfm_command: Command) -> None:

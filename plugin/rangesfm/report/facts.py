@@ -35,6 +35,9 @@ def _what(content: Content) -> str:
         surveyed = f"{num_surveyed} of them surveyed" if num_surveyed else "none of them surveyed"
         of_anchors = f"{len(summary.anchors)} radio anchors, {surveyed}"
         said.append(f"{count(ranges.num_used)} of {count(ranges.num)} ranges to {of_anchors}, give it metres.")
+    if summary.imu is not None:
+        num = count(summary.imu.num_used)
+        said.append(f"{num} samples of an inertial sensor give it metres, and say what is up.")
     if summary.distances:
         said.append(f"Measured lengths that fix its scale or check it: {len(summary.distances)}.")
     if summary.refine is None or not summary.refine.kept:
