@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
@@ -232,7 +232,9 @@ class RangeLog:
         """Return the log with some of its ranges; anchors and tags without ranges are dropped."""
         rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
         columns: dict[str, Any] = {
-            name: values[rows] for name, values in vars(self).items() if isinstance(values, np.ndarray)
+            name: values[rows]
+            for name in (each.name for each in fields(self))
+            if isinstance(values := getattr(self, name), np.ndarray)
         }
         if self.image_name is not None:
             columns["image_name"] = tuple(self.image_name[row] for row in rows)
