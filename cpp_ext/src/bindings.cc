@@ -253,13 +253,12 @@ turn, speed and shift corrected to the numbers of the sensor by ``by_sensor``, t
 
 The squared length of the nine residuals is the robust loss of the length of ``whitening errors`` times the share.
 Metres, seconds and radians throughout. Parameter blocks: rig_from_world before and after (7,) as [qx qy qz qw tx ty
-tz]; velocities of the sensor in the world, before and after (3,); a vector in the world (3,), of which only the direction counts, downwards; biases
+tz]; velocities of the sensor in the world, before and after (3,); gravity in the world (3,), which points down; biases
 (6,) of gyroscope and accelerometer; shares (6,) by which their axes read too much; by how much later than assumed the
 sensor measured (1,); mounting (6,), a rotation vector of the sensor in its own frame and its place in the rig.
 
 Args:
     interval_s: time between the keyframes, positive.
-    gravity_m_s2: length of g, positive.
     turn: (3, 3) rotation from the sensor's frame at the end into that at the start.
     speed: (3,) change of the velocity without gravity. shift: (3,) the same of the place, beyond that of the velocity.
     at: (13,) biases, shares and clock at which they were summed up.
@@ -274,17 +273,15 @@ Raises:
     ValueError: see ``range_cost``.
 )";
 
-ceres::CostFunction* MakeInertialCost(double interval_s, double gravity_m_s2, const Array& turn, const Array& speed,
-                                      const Array& shift, const Array& at, const Array& by_sensor,
-                                      const Array& whitening, const Array& rig_from_imu, double share,
-                                      double loss_scale) {
+ceres::CostFunction* MakeInertialCost(double interval_s, const Array& turn, const Array& speed, const Array& shift,
+                                      const Array& at, const Array& by_sensor, const Array& whitening,
+                                      const Array& rig_from_imu, double share, double loss_scale) {
   constexpr int kErrors = InertialMotion::kNumErrors;
   constexpr int kOfSensor = InertialMotion::kNumOfSensor;
   if (at.size() != kOfSensor) {
     FailOnShape("at", at, std::to_string(kOfSensor) + " numbers");
   }
   InertialMotion motion = {Positive("interval_s", interval_s),
-                           Positive("gravity_m_s2", gravity_m_s2),
                            FiniteMatrix("turn", turn, 3, 3),
                            FiniteVector3("speed", speed),
                            FiniteVector3("shift", shift),
@@ -359,8 +356,8 @@ PYBIND11_MODULE(_cpp, m) {
   m.def("direction_cost", &rangesfm::MakeDirectionCost, kOwn, rangesfm::kDirectionCostDoc, py::kw_only(),
         arg("direction_in_world"), arg("direction_in_cam"), arg("stddev_rad"));
   m.def("inertial_cost", &rangesfm::MakeInertialCost, kOwn, rangesfm::kInertialCostDoc, py::kw_only(),
-        arg("interval_s"), arg("gravity_m_s2"), arg("turn"), arg("speed"), arg("shift"), arg("at"), arg("by_sensor"),
-        arg("whitening"), arg("rig_from_imu"), arg("share") = 1.0, arg("loss_scale") = kLeastSquares);
+        arg("interval_s"), arg("turn"), arg("speed"), arg("shift"), arg("at"), arg("by_sensor"), arg("whitening"),
+        arg("rig_from_imu"), arg("share") = 1.0, arg("loss_scale") = kLeastSquares);
   m.def("joint_prior_cost", &rangesfm::MakeJointPriorCost, kOwn, rangesfm::kJointPriorCostDoc, py::kw_only(),
         arg("mean"), arg("whitening"));
   m.def("zero_tie_cost", &rangesfm::MakeZeroTieCost, kOwn, "See elimination_order.h.", py::kw_only(), arg("size_a"),

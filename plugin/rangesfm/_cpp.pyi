@@ -26,7 +26,6 @@ def distance_cost(
 def inertial_cost(
     *,
     interval_s: typing.SupportsFloat | typing.SupportsIndex,
-    gravity_m_s2: typing.SupportsFloat | typing.SupportsIndex,
     turn: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
     speed: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],
     shift: typing.Annotated[numpy.typing.ArrayLike, numpy.float64],

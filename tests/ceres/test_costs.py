@@ -142,7 +142,6 @@ COSTS: dict[str, Callable[[np.random.Generator], tuple[pyceres.CostFunction, lis
     "inertial": lambda rng: (
         inertial_cost(
             interval_s=0.8,
-            gravity_m_s2=9.8,
             turn=Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
             speed=rng.normal(0, 1, 3),
             shift=rng.normal(0, 1, 3),

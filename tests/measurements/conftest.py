@@ -22,6 +22,19 @@ from rangesfm.geometry.similarity import IDENTITY
 from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.measurements.control_points import ControlPoints
 from rangesfm.measurements.gravity import UpwardDirection
+from rangesfm.measurements.imu.inertial_motions import (
+    CLOCK,
+    GRAVITY,
+    MOUNTING,
+    SCALE_ERRORS,
+    GravityLength,
+    InertialMotions,
+    bias_block,
+    velocity_block,
+)
+from rangesfm.measurements.imu.motion import Mounting
+from rangesfm.measurements.imu.preintegration import preintegrate
+from rangesfm.measurements.imu.sensor_prior import SensorPrior
 from rangesfm.measurements.kind import LEAST_SQUARES, MapState, Measurements
 from rangesfm.measurements.lengths import Lengths
 from rangesfm.measurements.places import AntennaPlaces
@@ -36,7 +49,18 @@ from rangesfm.ranging.association import associate
 from rangesfm.ranging.range_log import RangeLog
 
 Array = npt.NDArray[np.float64]
-KINDS = ("range", "position", "length", "length by radio", "control point", "gravity", "prior")
+KINDS = (
+    "range",
+    "position",
+    "length",
+    "length by radio",
+    "control point",
+    "gravity",
+    "prior",
+    "inertial",
+    "bias walk",
+    "gravity length",
+)
 ARM_M = np.array([0.2, -0.3, 0.1])
 
 
@@ -74,7 +98,7 @@ def scene() -> Scene:
     poses = model_poses(made.reconstruction, path.frame_ids)
     markers = {f"M{k}": marker for k, marker in enumerate(_markers(made, 3))}
     points = NamedPoints.in_model(made.reconstruction, path.frame_ids, markers, ["A0", "A1", "A2"])
-    ranges = _ranges(path, rng)
+    ranges, motions = _ranges(path, rng), _motions(path, rng)
     kinds: dict[str, Measurements] = {
         "range": ranges,
         "position": _positions(path, rng),
@@ -93,6 +117,9 @@ def scene() -> Scene:
         "prior": Prior(
             (("bias", "A0"), ("bias", "A1"), ("bias", "A2")), rng.normal(0, 0.1, (3, 1)), rng.normal(0, 5, (3, 3))
         ),
+        "inertial": motions,
+        "bias walk": [*motions.priors()][-1],
+        "gravity length": GravityLength(),
     }  # fmt: skip
     blocks = {name: at + rng.normal(0, 0.1, at.shape) for kind in kinds.values() for name, at in kind.blocks.items()}
     return Scene(made.reconstruction, path, markers, kinds, MapState(poses, blocks))
@@ -144,6 +171,22 @@ def _positions(path: Trajectory, rng: np.random.Generator) -> AntennaPositions:
         tuple("abcdef"), places, path.centers[before] + rng.normal(0, 0.3, (6, 3)), roots, np.zeros(6), np.arange(6),
         ARM_M, 0.1, 0.1, LEAST_SQUARES, inflation=1.2,
     )  # fmt: skip
+
+
+def _motions(path: Trajectory, rng: np.random.Generator) -> InertialMotions:
+    """Return the motions of a sensor between photos, of which one is missing."""
+    assert path.timestamps_s is not None
+    log_s, num = np.linspace(-0.1, 6.1, 100), len(path)
+    intervals = preintegrate(log_s, rng.normal(0, 0.1, (100, 3)), rng.normal(0, 1, (100, 3)) + 9.8, path.timestamps_s)
+    intervals = intervals.subset(np.delete(np.arange(num - 1), 4))
+    start = {velocity_block(photo): rng.normal(0, 1, 3) for photo in range(num)}
+    start |= {bias_block(k): rng.normal(0, 0.1, 6) for k in range(3)}
+    start |= {GRAVITY: np.array([1.0, -9.0, 4.0]), SCALE_ERRORS: np.zeros(6), CLOCK: np.zeros(1), MOUNTING: np.zeros(6)}
+    stretch = np.arange(len(intervals)) * 3 // len(intervals)
+    roots, mounting = rng.normal(0, 3, (len(intervals), 9, 9)), Mounting(path.world_from_cam[5], ARM_M)
+    prior = SensorPrior(clock_s=0.01, turn_rad=0.02, arm_m=0.03)
+    walk = rng.uniform(0.01, 0.1, (2, 6))
+    return InertialMotions(intervals, roots, stretch, walk, mounting, prior, start, LEAST_SQUARES)
 
 
 def moved(poses: Poses, frame: int, step: Array) -> Poses:

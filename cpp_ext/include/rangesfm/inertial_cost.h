@@ -25,7 +25,6 @@ struct InertialMotion {
   using OfSensor = Eigen::Matrix<double, kNumOfSensor, 1>;
 
   double interval;
-  double gravity;  // its length
   Eigen::Matrix3d turn;
   Eigen::Vector3d speed;
   Eigen::Vector3d shift;
@@ -76,15 +75,13 @@ class InertialCost final : public ceres::CostFunction {
     const Pose after(parameters[kAfter]);
     const Eigen::Map<const Eigen::Vector3d> velocity_before(parameters[kVelocityBefore]);
     const Eigen::Map<const Eigen::Vector3d> velocity_after(parameters[kVelocityAfter]);
-    const Eigen::Map<const Eigen::Vector3d> downwards(parameters[kGravity]);
+    const Eigen::Map<const Eigen::Vector3d> gravity(parameters[kGravity]);
     const Eigen::Map<const Eigen::Vector3d> turn(parameters[kMounting]);
     const Eigen::Map<const Eigen::Vector3d> arm(parameters[kMounting] + 3);
     InertialMotion::OfSensor sensor;
     sensor << Eigen::Map<const Vector6>(parameters[kBiases]), Eigen::Map<const Vector6>(parameters[kScales]),
         *parameters[kClock];
 
-    const Eigen::Vector3d down = downwards.normalized();
-    const Eigen::Vector3d gravity = motion_.gravity * down;
     const double dt = motion_.interval;
     const Eigen::Matrix3d mounted = rig_from_imu_ * Exponential(turn);
     const Eigen::Matrix3d from_world = mounted.transpose() * before.rig_from_world;
@@ -125,9 +122,7 @@ class InertialCost final : public ceres::CostFunction {
     by_velocity.middleRows<3>(3) = from_world;
     Write<3>(kVelocityAfter, by_error * by_velocity, jacobians);
     Write<3>(kVelocityBefore, by_error * (dt * by_center - by_velocity), jacobians);
-    const Eigen::Matrix3d by_downwards =
-        motion_.gravity / downwards.norm() * (Eigen::Matrix3d::Identity() - down * down.transpose());
-    Write<3>(kGravity, by_error * (dt * dt / 2.0 * by_center - dt * by_velocity) * by_downwards, jacobians);
+    Write<3>(kGravity, by_error * (dt * dt / 2.0 * by_center - dt * by_velocity), jacobians);
     Eigen::Matrix<double, kNum, InertialMotion::kNumOfSensor> by_sensor = -motion_.by_sensor;
     by_sensor.topRows<3>() =
         (spread * off.transpose() * LeftJacobian(-change.head<3>()) * by_sensor.topRows<3>()).eval();

@@ -15,6 +15,8 @@ MIN_STDDEV_M = 1e-9
 """Smallest standard deviation, metres; what is divided by is at least as large."""
 # Relative difference of costs below which two fits are equal: rounding and the solver's tolerance.
 SAME_COST = 1e-6
+# Share of the degrees of freedom that is left, at least, where an estimate absorbs nearly all of the residuals.
+_LEAST_LEFT = 0.1
 
 
 def cost_of_deviation(num_stddevs: float) -> float:
@@ -72,6 +74,18 @@ GEMAN_MCCLURE = RobustLoss(3.46, is_bounded=True)
 def wider(bounded: RobustLoss) -> RobustLoss:
     """Return Cauchy's loss that corresponds to a bounded loss as CAUCHY does to GEMAN_MCCLURE."""
     return CAUCHY.scaled(bounded.width / GEMAN_MCCLURE.width)
+
+
+def factor_of_stddevs(scaled: Array, num_absorbed: float) -> float:
+    """Return the factor of standard deviations that (g, d) residuals show, by the median of the lengths of all g.
+
+    Args:
+        scaled: residuals in these standard deviations, independent. num_absorbed: degrees of freedom of the residuals
+            that an estimate has absorbed.
+    """
+    freedom = scaled.size / max(scaled.size - num_absorbed, _LEAST_LEFT * scaled.size)
+    expected = float(np.sqrt(special.chdtri(scaled.shape[1], 0.5)))
+    return float(np.sqrt(freedom) * np.median(np.linalg.norm(scaled, axis=1))) / expected
 
 
 def robust_stddev(residuals: npt.ArrayLike) -> float:

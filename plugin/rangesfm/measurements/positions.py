@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy import special
 from scipy.sparse import bsr_array, csr_array
 
 from rangesfm import ceres
 from rangesfm.arrays import Array, Indices, rows_by_key
 from rangesfm.ceres.bundle_adjustment import BundleAdjustment
-from rangesfm.geometry.robust_statistics import RobustLoss
+from rangesfm.geometry.robust_statistics import RobustLoss, factor_of_stddevs
 from rangesfm.measurements.kind import Block, ByBlock, LearntErrors, Linearization, MapState, Measurements, Weights
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.prior import Prior
@@ -22,10 +21,6 @@ from rangesfm.ranging.errors.noise import correlation_inflation
 
 ARM: Block = ("lever_arm", "positions")
 CLOCK: Block = ("clock", "positions")
-# Half of all vectors of three normally distributed numbers are shorter than this.
-_MEDIAN_LENGTH = float(np.sqrt(special.chdtri(3, 0.5)))
-# Share of the degrees of freedom that is left, at least, where a map absorbs nearly all of the positions.
-_LEAST_LEFT = 0.1
 
 
 @dataclass(frozen=True)
@@ -144,8 +139,7 @@ class AntennaPositions(Measurements):
     def _shown(self, residual: Array, num_absorbed: float) -> float:
         """Return the factor of the standard deviations that residuals show; arguments as for ``with_noise_of``."""
         scaled = np.einsum("gij,gj->gi", self.root_information, residual)
-        freedom = scaled.size / max(scaled.size - num_absorbed, _LEAST_LEFT * scaled.size)
-        return float(np.sqrt(freedom) * np.median(np.linalg.norm(scaled, axis=1))) / _MEDIAN_LENGTH
+        return factor_of_stddevs(scaled, num_absorbed)
 
     def change(self, other: AntennaPositions) -> float:
         mine, others = (of.inflation * np.maximum(of.factor, of.stated_share) for of in (self, other))

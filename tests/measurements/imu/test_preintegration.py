@@ -94,16 +94,9 @@ def test_what_a_state_costs_is_what_it_costs_in_gtsam() -> None:
     whitening = np.linalg.inv(np.linalg.cholesky(found.covariance(DENSITIES)))
     for k, sums in enumerate(gtsams_sums(gtsam)):
         cost = inertial_cost(
-            interval_s=found.interval_s[k],
-            gravity_m_s2=GRAVITY_M_S2,
-            turn=found.turn[k],
-            speed=found.speed[k],
-            shift=found.shift[k],
-            at=found.at[k],
-            by_sensor=found.by_sensor[k],
-            whitening=whitening[k],
-            rig_from_imu=np.eye(3),
-        )
+            interval_s=found.interval_s[k], turn=found.turn[k], speed=found.speed[k], shift=found.shift[k],
+            at=found.at[k], by_sensor=found.by_sensor[k], whitening=whitening[k], rig_from_imu=np.eye(3),
+        )  # fmt: skip
         factor = gtsam.ImuFactor(0, 1, 2, 3, 4, sums)
         for _ in range(20):
             pose = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(0, 2, 3)), rng.normal(0, 3, 3))

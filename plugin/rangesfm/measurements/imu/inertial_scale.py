@@ -36,6 +36,7 @@ from rangesfm.measurements.imu.inertial_fit import (
     InertialState,
     Sizes,
 )
+from rangesfm.measurements.imu.inertial_motions import InertialLog
 from rangesfm.measurements.imu.preintegration import (
     ACCEL,
     ACCEL_BIAS,
@@ -48,6 +49,7 @@ from rangesfm.measurements.imu.preintegration import (
 )
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.source import Source
 from rangesfm.ranging.errors.components import component_words
 
 IMU = "imu"
@@ -134,6 +136,19 @@ class InertialScale(KindOnMap):
                 "the camera moved too evenly for the inertial sensor to show the scale",
                 "move it to and fro and turn it about all axes, for half a minute or longer",
             )
+
+    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
+        """Return the log between the photos of the map, which may bend."""
+        state, placed, sizes = self.state, on_map.estimate, self.sizes
+        in_world = replace(
+            state,
+            velocities_m_s=state.velocities_m_s @ placed.rotation.T,
+            gravity_m_s2=placed.rotation @ state.gravity_m_s2,
+        )
+        late = sizes["photo_times"] * self.problem.linearized(state, self.intervals).late[..., 0]
+        densities = np.array([sizes["gyro_noise"], sizes["accel_noise"]])
+        covariance = self.intervals.covariance(densities) + late @ np.swapaxes(late, 1, 2)
+        return (InertialLog(self.problem, in_world, self.intervals, covariance),)
 
     def entry(self, on_map: JointMap) -> Mapping[str, object]:
         """Return what ``ImuEntry`` has."""
