@@ -4,31 +4,34 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 import pytest
 from tests.refine.conftest import bent, poses_and_rays
 from tests.simulated.inertial import CAM_FROM_IMU, Motion, by_hand, imu_log
 from tests.simulated.model import SyntheticModel, synthetic_model
 
+from rangesfm.colmap.transform import rescale
 from rangesfm.estimation.drift import carry_model
 from rangesfm.estimation.map_problem import map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine
 from rangesfm.geometry.poses import Poses
 from rangesfm.geometry.rotations import exponentials
 from rangesfm.geometry.similarity import IDENTITY, align_points, rmse
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.inference.bending import WalkBending
 from rangesfm.measurements.imu.inertial_fit import InertialProblem, InertialState
 from rangesfm.measurements.imu.inertial_motions import GRAVITY, SCALE_ERRORS, InertialLog
+from rangesfm.measurements.imu.inertial_scale import scale_by_sensor
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.motion import MotionErrors, Mounting
 from rangesfm.measurements.imu.preintegration import NUM_OF_SENSOR, Preintegrated, preintegrate
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, SensorPrior
-from rangesfm.measurements.source import Measured
+from rangesfm.measurements.source import Measured, Source
 from rangesfm.options import CameraOptions, RefineOptions
 
 Array = npt.NDArray[np.float64]
 MOUNTING = Mounting(CAM_FROM_IMU, np.zeros(3))
 PRIOR = SensorPrior(clock_s=0.005, turn_rad=0.01, arm_m=0.02)
-DENSITIES = np.array([2e-4, 3e-3])  # of ``imu_log``
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -51,15 +54,10 @@ def drift(made: SyntheticModel) -> tuple[Poses, Poses]:
     return true, drifted
 
 
-def refined(made: SyntheticModel, log: ImuLog, intervals: Preintegrated) -> MapAtRest:
-    """Refine a map with the motions of a sensor, from velocities of 0 and a gravity that is off by 2 degrees."""
-    path = trajectory_from_reconstruction(made.reconstruction, made.timestamps_s)
-    gravity = GRAVITY_M_S2 * exponentials(np.array([[0.03, -0.02, 0.0]]))[0] @ DOWN
-    state = InertialState(1.0, np.zeros((len(path), 3)), gravity, np.zeros(NUM_OF_SENSOR), MOUNTING, np.ones(len(path)))
-    source = InertialLog(InertialProblem(log, path, MOUNTING, PRIOR), state, intervals, intervals.covariance(DENSITIES))
+def refined(metric: pycolmap.Reconstruction, path: Trajectory, sources: tuple[Source, ...]) -> MapAtRest:
     problem = map_problem(
-        made.reconstruction,
-        Measured((source,)),
+        metric,
+        Measured(sources),
         path,
         camera=CameraOptions(refine_intrinsics=False),
         options=RefineOptions(),
@@ -83,7 +81,13 @@ def test_without_noise_a_map_is_what_it_was_before_it_drifted() -> None:
         "turn": found.turn @ exponentials(off[:, :3]), "speed": found.speed + off[:, 3:6],
         "shift": found.shift + off[:, 6:],
     }  # fmt: skip
-    rest = refined(made, log, Preintegrated(**{**vars(found), **exact}))
+    intervals = Preintegrated(**{**vars(found), **exact})
+    path = trajectory_from_reconstruction(made.reconstruction, made.timestamps_s)
+    gravity = GRAVITY_M_S2 * exponentials(np.array([[0.03, -0.02, 0.0]]))[0] @ DOWN
+    state = InertialState(1.0, np.zeros((num, 3)), gravity, np.zeros(NUM_OF_SENSOR), MOUNTING, np.ones(num))
+    covariance = intervals.covariance(np.array([2e-4, 3e-3]))
+    source = InertialLog(InertialProblem(log, path, MOUNTING, PRIOR), state, intervals, covariance)
+    rest = refined(made.reconstruction, path, (source,))
     assert rmse(drifted.centers - true.centers) > 0.1
     assert rest.converged
     np.testing.assert_allclose(rest.state.poses.centers, true.centers, atol=1e-6)
@@ -92,18 +96,21 @@ def test_without_noise_a_map_is_what_it_was_before_it_drifted() -> None:
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_drift_of_scale_and_tilt_is_gone_and_what_is_left_is_as_large_as_said(seed: int) -> None:
-    motion, num = by_hand(seed), 60
-    made, log = mapped(motion, num, seed, 0.5), imu_log(motion, seed=seed)
+    motion = by_hand(seed)
+    made, log = mapped(motion, 60, seed, 0.5), imu_log(motion, seed=seed)
     scale_errors = np.random.default_rng(seed).normal(0, 0.03, 3)
     log = ImuLog(log.timestamp_s, log.gyro_rad_s, (1 + scale_errors) * log.accel_m_s2)
-    times_s = np.array(list(made.timestamps_s.values()))
     true, drifted = drift(made)
-    rest = refined(made, log, preintegrate(log.timestamp_s, log.gyro_rad_s, log.accel_m_s2, times_s))
+    path = trajectory_from_reconstruction(made.reconstruction, made.timestamps_s)
+    sensor = scale_by_sensor(InertialProblem(log, path, MOUNTING, PRIOR), WalkBending(path))
+    placed = sensor.alone.estimate
+    rest = refined(rescale(made.reconstruction, placed), path, sensor.sources(sensor.alone))
     poses, errors = rest.state.poses, joint_errors(rest, 1.0)
     assert errors is not None
+    in_first = (true.centers - true.centers[0]) @ true.world_from_rig[0]
     said_m = float(np.sqrt(np.trace(errors.centers, axis1=1, axis2=2).mean()))
-    assert rmse(poses.centers - true.centers) < min(2 * said_m, 0.1 * rmse(drifted.centers - true.centers))
-    off = np.log(align_points(true.centers, poses.centers).scale)
+    assert rmse(poses.centers - in_first) < min(2 * said_m, 0.2 * rmse(placed.apply(drifted.centers) - in_first))
+    off = np.log(align_points(in_first, poses.centers).scale)
     assert errors.relative_scale_stddev < 0.004
     assert abs(off) < 3 * errors.relative_scale_stddev
     in_last, truly = (of.world_from_rig[-1].T @ at for of, at in ((poses, rest.state.blocks[GRAVITY]), (true, DOWN)))
