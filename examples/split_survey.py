@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 import rangesfm
+from rangesfm.sfm.image_times import ImageTimes, list_images
 from rangesfm.survey.settings import ROLE_OF_PATH
 from rangesfm.survey.survey_reader import parse_toml
-from rangesfm.vision.image_times import ImageTimes, list_images
 
 
 def main() -> None:

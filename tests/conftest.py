@@ -32,9 +32,9 @@ from rangesfm.cli import main
 from rangesfm.demo.simulated_radio import Radio, simulate_ranges
 from rangesfm.demo.survey import TIME_OFFSET_S as DEMO_TIME_OFFSET_S
 from rangesfm.demo.survey import DemoSurvey
-from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.ranging.readers import write_ranges_csv
+from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.util.geometry.reference import Reference, write_reference
+from rangesfm.util.geometry.similarity import Similarity
 
 Array = npt.NDArray[np.float64]
 Command = Callable[..., "subprocess.CompletedProcess[str]"]

@@ -9,15 +9,15 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.geometry.poses import model_poses
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.measurements.kind import MapState
-from rangesfm.measurements.radio import ranges_of_map
+from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
+from rangesfm.measurements.ranges.radio import ranges_of_map
+from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.options import RangeModelOptions, RefineOptions
-from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.range_errors import RangeErrors
-from rangesfm.ranging.range_observations import RangeObservations
+from rangesfm.util.geometry.poses import model_poses
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rangesfm.files.output_folder import PRIVATE_NAME
+from rangesfm.util.files.output_folder import PRIVATE_NAME
 
 
 def paths_in(folder: Path) -> list[Path]:

@@ -21,7 +21,7 @@ from tests.outputs import names_in, paths_below, unfinished
 from tests.result_document import result_document
 
 from rangesfm.cli import main
-from rangesfm.files.output_folder import LOCK_NAME
+from rangesfm.util.files.output_folder import LOCK_NAME
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey

@@ -18,19 +18,19 @@ from tests.simulated.model import synthetic_model
 from tests.simulated.path import loop_path
 
 import rangesfm
-from rangesfm.ceres.bundle_adjustment import bundle_adjustment
-from rangesfm.geometry.similarity import IDENTITY
-from rangesfm.loops.resection import resection_options
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions, RefineOptions
 from rangesfm.progress import SilentProgress
-from rangesfm.vision.camera import cameras_of_photos
-from rangesfm.vision.features import feature_options
-from rangesfm.vision.mapping import WHILE_GROWING, mapping_options, pipeline_options
-from rangesfm.vision.matching import matching_options
-from rangesfm.vision.own_process import match_share
-from rangesfm.vision.photo_files import Photos
-from rangesfm.vision.rigs import NO_RIGS
+from rangesfm.sfm.camera import cameras_of_photos
+from rangesfm.sfm.features import feature_options
+from rangesfm.sfm.loops.resection import resection_options
+from rangesfm.sfm.mapping import WHILE_GROWING, mapping_options, pipeline_options
+from rangesfm.sfm.matching import matching_options
+from rangesfm.sfm.own_process import match_share
+from rangesfm.sfm.photo_files import Photos
+from rangesfm.sfm.rigs import NO_RIGS
+from rangesfm.solver.bundle_adjustment import bundle_adjustment
+from rangesfm.util.geometry.similarity import IDENTITY
 
 SEED = 3
 ON_PROCESSOR = {"use_gpu": False} if pycolmap.has_cuda else {}  # COLMAP sets this itself where it has no CUDA

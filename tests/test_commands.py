@@ -26,12 +26,12 @@ from tests.simulated.ranges import simulate_ranges_at
 from rangesfm.colmap.model_files import read_model
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.demo.survey import ANCHORS_M, CAMERA_MODEL, TAG_IN_CAM_M
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.readers import read_ranges, write_ranges_csv
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.readers import read_ranges, write_ranges_csv
 from rangesfm.result.places import path_in
 from rangesfm.survey.settings import KEYS
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey

@@ -19,11 +19,11 @@ import pytest
 from PIL import Image
 from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
 
-from rangesfm.geometry.reference import read_reference
-from rangesfm.ranging.anchors.anchor_file import read_anchors
-from rangesfm.ranging.readers import read_ranges
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
+from rangesfm.measurements.ranges.readers import read_ranges
+from rangesfm.sfm.image_times import read_image_times_csv
 from rangesfm.survey.survey_reader import parse_toml, read_survey
-from rangesfm.vision.image_times import read_image_times_csv
+from rangesfm.util.geometry.reference import read_reference
 
 if TYPE_CHECKING:
     from tests.conftest import PhotoRun, WalkedSurvey

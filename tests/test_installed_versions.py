@@ -12,11 +12,11 @@ import pytest
 from tests.installed import with_installed
 
 import rangesfm
-from rangesfm import ceres
-from rangesfm.ceres import check_compatibility
+from rangesfm import solver
 from rangesfm.cli import main
 from rangesfm.errors import SolverError
 from rangesfm.installed_versions import check_versions, install_command, installed_builds, is_version
+from rangesfm.solver import check_compatibility
 
 REMEDY = "python -m pip install 'pycolmap>=4.2,<4.3' 'pyceres>=2.6,<2.7'"
 CUDA_REMEDY = REMEDY.replace("pycolmap", "pycolmap-cuda12")
@@ -56,7 +56,7 @@ def test_functions_refuse_too_and_say_so_with_an_error_of_the_package(
     complaint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delitem(sys.modules, "rangesfm.costs", raising=False)
-    for first_use in (lambda: ceres.range_cost, lambda: importlib.import_module("rangesfm.costs")):
+    for first_use in (lambda: solver.range_cost, lambda: importlib.import_module("rangesfm.costs")):
         with pytest.raises(SolverError) as caught:
             first_use()
         assert str(caught.value) == complaint

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PROGRAM = """
 import importlib, os, signal, sys
 from rangesfm.cli import main
-from rangesfm.vision import snapshots
+from rangesfm.sfm import snapshots
 
 module, name, num_calls, *argv = sys.argv[1:]
 module, left = importlib.import_module(module), int(num_calls)
@@ -36,11 +36,11 @@ def function_or_death(*arguments, **options):
 setattr(module, name, function_or_death)
 sys.exit(main(argv))
 """
-IN_MATCHING = ("rangesfm.vision.matching", "copy_matches", 0)
-IN_MAPPING = ("rangesfm.vision.snapshots", "_keep", 3)
-BEFORE_THE_RESULT = ("rangesfm.workflows.run_results", "input_hashes", 0)
-BEFORE_THE_REPORT = ("rangesfm.workflows.run_results", "write_report_of", 0)
-AMONG_RENAMES = ("rangesfm.files.output_folder", "_rename", 9)
+IN_MATCHING = ("rangesfm.sfm.matching", "copy_matches", 0)
+IN_MAPPING = ("rangesfm.sfm.snapshots", "_keep", 3)
+BEFORE_THE_RESULT = ("rangesfm.pipeline.run_results", "input_hashes", 0)
+BEFORE_THE_REPORT = ("rangesfm.pipeline.run_results", "write_report_of", 0)
+AMONG_RENAMES = ("rangesfm.util.files.output_folder", "_rename", 9)
 
 
 def killed(moment: tuple[str, str, int], *arguments: str, cwd: Path) -> str:

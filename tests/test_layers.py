@@ -13,30 +13,23 @@ import rangesfm
 
 PACKAGE = Path(rangesfm.__file__).parent
 
-# From the bottom to the top. A folder imports from itself and from the folders in lines below its own, so that stages
-# do not know each other. Files at the root are below all folders, except for the public modules (DOORS), which may
+# The rooms, from the bottom to the top. A room imports from itself and from the rooms in lines above its own, so that
+# stages do not know each other. Files at the root are below all rooms, except for the public modules (DOORS), which may
 # import from anywhere.
 LAYERS = (
-    "files processes",
-    "geometry",
-    "inference",
+    "util",
     "colmap",
-    "ceres",
-    "ranging",
-    "distances sources",
-    "positions",
+    "solver",
     "measurements",
     "estimation",
-    "vision scale export",
+    "sfm export",
     "survey",
-    "survey_discovery",
-    "join loops",
     "diagnostics",
     "planning",
     "result",
     "report",
     "comparison",
-    "workflows",
+    "pipeline",
     "batch",
     "demo",
     "cli",
@@ -49,9 +42,9 @@ MAX_NUM_FILES_AT_ROOT = 10
 # What only reads a folder of results, and the folders that it must not need.
 READS_RESULTS = (
     *("result.result_folder", "report", "comparison.before_after", "comparison.many_models"),
-    *("batch.run_batch", "workflows.measure", "workflows.export_result"),
+    *("batch.run_batch", "pipeline.measure", "pipeline.export_result"),
 )
-ESTIMATORS = {"scale", "refine", "estimation", "measurements", "loops", "join", "planning"}
+ESTIMATORS = ("estimation", "sfm.loops", "planning")
 MAX_NUM_OF_COMPARE, MAX_NUM_OF_REFINE = 25, 60
 
 MODULES = {
@@ -59,9 +52,18 @@ MODULES = {
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 
+OF_SENSOR = ("inertial_motions", "inertial_fit", "inertial_scale", "motion", "preintegration", "sensor_prior")
+# Modules that say how a kind is measured. Others in the folder of a kind hold what was read.
+KINDS = {
+    name
+    for name in MODULES
+    if name.startswith("measurements.")
+    and name.split(".")[-1] in ("cost", "points_cost", "gravity", "radio", "site_positions", *OF_SENSOR)
+}
+
 
 def folder_of(module: str) -> str:
-    """Return the first folder of a module inside the package, or the module's name at the root."""
+    """Return the room of a module, or the module's name at the root."""
     return module.partition(".")[0]
 
 
@@ -122,7 +124,7 @@ def test_only_one_package_touches_the_compiled_part_and_pyceres() -> None:
         if any(f"{name}.".startswith(("rangesfm._cpp.", "pyceres.")) for name in imports(path))
     ]
     assert touching, "not even the package that is there for it"
-    assert all(module.split(".")[0] == "ceres" for module in touching)
+    assert all(module.split(".")[0] == "solver" for module in touching)
 
 
 def reached(module: str) -> set[str]:
@@ -138,7 +140,7 @@ def reached(module: str) -> set[str]:
 
 @pytest.mark.parametrize("module", [*READS_RESULTS])
 def test_what_only_reads_results_loads_no_estimator(module: str) -> None:
-    assert not {folder_of(name) for name in reached(module)} & ESTIMATORS
+    assert not [name for name in reached(module) if name.startswith(ESTIMATORS) or name in KINDS]
 
 
 def test_few_modules_are_loaded_to_compare_paths_and_none_that_reads_logs_to_refine() -> None:
@@ -156,21 +158,12 @@ def test_importing_the_package_imports_neither_pycolmap_nor_scipy() -> None:
 
 def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
     """Whoever adds a kind writes its module or folder and its line in the table; no stage has to know of it."""
-    generic = {"joint_map", "kind", "marks", "places", "points", "prior", "source"}
-    # What the survey reads, before there is anything to measure.
-    generic |= {
-        "imu",
-        *(f"imu.{name}" for name in ("log", "signals", "formats", "turns", "alignment", "calibration", "sensor")),
-    }
-    kinds = {module for module in MODULES if folder_of(module) == "measurements"} - {"measurements"}
-    kinds -= {f"measurements.{name}" for name in generic}
-    assert {"measurements.ranges", "measurements.lengths", "measurements.positions"} <= kinds
-    knowing = {(module, name) for module in MODULES for name in own_imports(module) & kinds if module not in kinds}
-    # What makes several kinds of one log, the kinds on a map as one piece, and what is of ranges alone.
-    logs = {"measurements.radio", "measurements.site_positions"}
-    on_map = {"scale.scale_by_ranges", "scale.scale_problem", "scale.scale_by_positions"}
-    of_ranges = {"estimation.with_ranges", "workflows.make_metric_map"}
+    assert {f"measurements.{kind}.cost" for kind in ("ranges", "lengths", "positions")} <= KINDS
+    knowing = {(module, name) for module in MODULES.keys() - KINDS for name in own_imports(module) & KINDS}
+    # The kinds on a map as one piece, and what is of ranges alone.
+    on_map = {f"estimation.scale.{name}" for name in ("scale_by_ranges", "scale_problem", "scale_by_positions")}
+    of_ranges = {"estimation.with_ranges", "pipeline.make_metric_map"}
     assert {module for module, _ in knowing} <= {"survey.kinds_in_map", *on_map, *of_ranges}
-    kind_of = {module: module.split(".")[1] for module in kinds}
-    others = {(module, name) for module in kinds - logs for name in own_imports(module) & kinds}
-    assert not {(module, name) for module, name in others if kind_of[module] != kind_of[name]}
+    logs = {"measurements.ranges.radio", "measurements.positions.site_positions"}  # several kinds are in one log
+    others = {(module, name) for module in KINDS - logs for name in own_imports(module) & KINDS}
+    assert not {(module, name) for module, name in others if module.split(".")[1] != name.split(".")[1]}

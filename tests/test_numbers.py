@@ -13,9 +13,9 @@ from PIL import Image
 
 from rangesfm.cli import main
 from rangesfm.errors import InputError
+from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges
 from rangesfm.options import BIAS_M, COORDINATE_M, LENGTH_M, PIXEL, STDDEV_M, TIME_S
-from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
-from rangesfm.vision.image_times import times_from_exif, times_from_file_names
+from rangesfm.sfm.image_times import times_from_exif, times_from_file_names
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey

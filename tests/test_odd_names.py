@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pycolmap
 import pytest
 
-from rangesfm.files.text_tables import write_table
 from rangesfm.result.result_tables import CenterCovariances, PhotoTimes, RangesAsUsed
+from rangesfm.util.files.text_tables import write_table
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 from tests.outputs import names_in, paths_below
 
-from rangesfm.workflows import run_results
+from rangesfm.pipeline import run_results
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey

@@ -29,8 +29,8 @@ from tests.simulated.path import loop_path
 
 from rangesfm.cli.arguments import Commands, normalize, parse
 from rangesfm.export import EXPORTERS
+from rangesfm.measurements.ranges.readers import reader_names
 from rangesfm.planning.plan_file import PLAN_TABLES as PLAN_TABLES
-from rangesfm.ranging.readers import reader_names
 from rangesfm.survey.settings import KEYS
 from rangesfm.survey.survey_reader import read_survey
 

@@ -44,7 +44,7 @@ def test_surveys_and_logs_are_read_without_pycolmap() -> None:
 
 
 def test_stages_are_not_hidden_by_modules_of_their_name() -> None:
-    code = "import rangesfm.workflows.run, rangesfm.cli.arguments as a; a.parse(['doctor'])\n"
+    code = "import rangesfm.pipeline.run, rangesfm.cli.arguments as a; a.parse(['doctor'])\n"
     code += "assert all(callable(getattr(rangesfm, name)) for name in rangesfm.__all__[1:])"
     modules_after(code)
 
@@ -77,7 +77,7 @@ def test_names_are_sorted_listed_and_no_others() -> None:
 
 
 def test_import_is_silent_and_leaves_logging_alone() -> None:
-    code = "import logging, rangesfm, rangesfm.workflows.run\nassert not logging.getLogger().handlers"
+    code = "import logging, rangesfm, rangesfm.pipeline.run\nassert not logging.getLogger().handlers"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
 

@@ -23,7 +23,7 @@ from tests.outputs import paths_below
 from tests.test_kernels import NEEDED_FLAGS, why_not
 
 from rangesfm.colmap.model_files import read_model
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import PhotoRun, WalkedSurvey

@@ -20,15 +20,15 @@ import numpy.typing as npt
 import pycolmap
 import pytest
 from tests.conftest import ANCHORS_M, SITE_M, TAG_IN_CAM_M, Command, WalkedSurvey
-from tests.join.test_join_models import walk
+from tests.pipeline.test_join_models import walk
+from tests.pipeline.test_surveys_of_rigs import TAG_IN_CAM_M as RIG_TAG_IN_CAM_M
+from tests.pipeline.test_surveys_of_rigs import stereo_survey
 from tests.simulated.looped import bent_laps, write_survey
 from tests.simulated.surveys import TAG_IN_CAM_M as LAPS_TAG_IN_CAM_M
-from tests.workflows.test_surveys_of_rigs import TAG_IN_CAM_M as RIG_TAG_IN_CAM_M
-from tests.workflows.test_surveys_of_rigs import stereo_survey
 
-from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.vision.image_times import read_image_times_csv
+from rangesfm.sfm.image_times import read_image_times_csv
+from rangesfm.util.geometry.reference import Reference, write_reference
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 Log = dict[str, Any]

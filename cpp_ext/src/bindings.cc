@@ -3,7 +3,7 @@
 //
 // No class is bound. The factories return ceres::CostFunction or ceres::Manifold, types that pyceres registers, and
 // pass on the ownership: pyceres wraps the object in its own holder and deletes it. plugin/rangesfm/_cpp.pyi is made
-// from the signatures, which pybind11 puts into the first line of each docstring (tests/ceres/stub.py).
+// from the signatures, which pybind11 puts into the first line of each docstring (tests/solver/stub.py).
 
 #include <ceres/cost_function.h>
 #include <ceres/manifold.h>
@@ -333,7 +333,7 @@ PYBIND11_MODULE(_cpp, m) {
   using py::arg;
   using rangesfm::kLeastSquares;
   using rangesfm::kOwn;
-  m.doc() = "Cost functions of rangesfm, to be used through the package rangesfm.ceres.";
+  m.doc() = "Cost functions of rangesfm, to be used through the package rangesfm.solver.";
   m.attr("pybind11_version") = PYBIND11_TOSTRING(PYBIND11_VERSION_MAJOR) "." PYBIND11_TOSTRING(
       PYBIND11_VERSION_MINOR) "." PYBIND11_TOSTRING(PYBIND11_VERSION_PATCH);
   m.attr("ceres_version") = CERES_VERSION_STRING;

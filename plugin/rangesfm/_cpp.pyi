@@ -1,5 +1,5 @@
 """
-Cost functions of rangesfm, to be used through the package rangesfm.ceres.
+Cost functions of rangesfm, to be used through the package rangesfm.solver.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 installed pyceres (``rangesfm doctor`` says why).
 """
 
-from rangesfm.ceres import (
+from rangesfm.solver import (
     PlacedRanges,
     RangeBlocks,
     add_normal_prior,

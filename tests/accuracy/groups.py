@@ -25,7 +25,7 @@ from tests.studies.measured_distances import KINDS
 
 from rangesfm.demo.survey import PHOTOS
 from rangesfm.options import CameraOptions
-from rangesfm.vision.image_times import list_images
+from rangesfm.sfm.image_times import list_images
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FIRST_RANDOM = 30000

@@ -26,7 +26,7 @@ from tests.traps import set_traps
 from rangesfm.batch.workers import num_at_once, workers_of
 from rangesfm.cli import main
 from rangesfm.errors import InputError
-from rangesfm.files.output_folder import LOCK_NAME, PRIVATE_NAME
+from rangesfm.util.files.output_folder import LOCK_NAME, PRIVATE_NAME
 
 if TYPE_CHECKING:
     from tests.conftest import Command, PhotoRun, WalkedSurvey

@@ -45,23 +45,23 @@ from statistics import median
 from typing import Any
 
 import pycolmap
-from tests.vision.matches import content_of
+from tests.sfm.matches import content_of
 
 from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.mapper_options import MapperOptions
 from rangesfm.options import CameraOptions
+from rangesfm.pipeline.map_photos import find_keyframes
+from rangesfm.pipeline.run import run_survey
 from rangesfm.progress import Journal, SilentProgress
+from rangesfm.sfm.database import clear_matches
+from rangesfm.sfm.image_times import list_images
+from rangesfm.sfm.incremental_mapping import incremental_mapping
+from rangesfm.sfm.mapping import pipeline_options
+from rangesfm.sfm.matching import match_features, matching_options
+from rangesfm.sfm.photo_files import usable_photos
+from rangesfm.sfm.reconstruct import reconstruct
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import read_survey
-from rangesfm.vision.database import clear_matches
-from rangesfm.vision.image_times import list_images
-from rangesfm.vision.incremental_mapping import incremental_mapping
-from rangesfm.vision.mapping import pipeline_options
-from rangesfm.vision.matching import match_features, matching_options
-from rangesfm.vision.photo_files import usable_photos
-from rangesfm.vision.reconstruct import reconstruct
-from rangesfm.workflows.map_photos import find_keyframes
-from rangesfm.workflows.run import run_survey
 
 STAGES = ("features", "matching", "mapping")
 WAYS = ("rangesfm, reproducible", "rangesfm", "pycolmap")

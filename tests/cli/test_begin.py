@@ -124,7 +124,7 @@ def test_a_folder_runs_without_a_file_and_says_first_what_it_is(
         asked.append(survey)
         return SimpleNamespace(lines=["done"])
 
-    monkeypatch.setattr("rangesfm.workflows.run.run_survey", run)
+    monkeypatch.setattr("rangesfm.pipeline.run.run_survey", run)
     assert main(["run", str(folder), "--every_nth", "2"]) == 0
     told = capsys.readouterr().err.splitlines()
     assert "photos in DCIM: 9 of 96 x 64 pixels, 3 of 64 x 96 pixels" in told

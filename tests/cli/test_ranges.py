@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rangesfm.cli import main
-from rangesfm.ranging.readers import read_ranges
+from rangesfm.measurements.ranges.readers import read_ranges
 
 
 def test_faults_and_noise_of_a_log_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ import pytest
 from rangesfm.cli import main
 from rangesfm.cli.arguments import Commands, normalize, parse
 from rangesfm.cli.survey_flags import survey_from_arguments
-from rangesfm.ranging.errors.error_curve import read_error_curve
+from rangesfm.measurements.ranges.errors.error_curve import read_error_curve
 from rangesfm.survey.inputs import read_ranging_inputs
 
 ANCHORS = {"a": (0.0, 0.0, 2.0), "b": (6.0, 0.0, 0.3), "c": (6.0, 5.0, 2.0), "d": (0.0, 5.0, 0.3)}

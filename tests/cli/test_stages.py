@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from rangesfm.ceres.installation_checks import InstallationCheck
 from rangesfm.cli import main
+from rangesfm.solver.installation_checks import InstallationCheck
 from rangesfm.survey.settings import Survey
 
 
@@ -34,10 +34,10 @@ class Calls:
 @pytest.fixture
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
     calls = Calls()
-    pipeline = ModuleType("rangesfm.workflows.run")
+    pipeline = ModuleType("rangesfm.pipeline.run")
     for name in ("run_survey", "reconstruct_survey", "scale_model", "refine_model"):
         setattr(pipeline, name, calls.stage(name))
-    monkeypatch.setitem(sys.modules, "rangesfm.workflows.run", pipeline)
+    monkeypatch.setitem(sys.modules, "rangesfm.pipeline.run", pipeline)
     (tmp_path / "photos").mkdir()
     (tmp_path / "model").mkdir()
     for name in ("uwb.csv", "walk.MP4"):
@@ -109,7 +109,7 @@ def test_doctor_fails_where_a_part_does_not_fit(
         InstallationCheck("numpy", "2.0", "any", True),
         InstallationCheck("pyceres", "1.0", "2.6", ok, "" if ok else "pip install pyceres==2.6"),
     ]
-    monkeypatch.setattr("rangesfm.ceres.installation_checks.diagnose", lambda: checks)
+    monkeypatch.setattr("rangesfm.solver.installation_checks.diagnose", lambda: checks)
     assert main(["doctor"]) == status
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == (2 if ok else 3)

@@ -14,12 +14,12 @@ from tests.simulated.path import loop_path
 
 from rangesfm.cli import main
 from rangesfm.demo.simulated_radio import Radio, simulate_ranges
-from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
-from rangesfm.ranging.anchors.anchor_file import read_anchors
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.vision.image_times import read_image_times_csv
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.sfm.image_times import read_image_times_csv
+from rangesfm.util.geometry.reference import Reference, write_reference
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey

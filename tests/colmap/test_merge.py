@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 
 from rangesfm.colmap.transform import joined_model, rescale, without_photos
-from rangesfm.geometry.similarity import Similarity
+from rangesfm.util.geometry.similarity import Similarity
 
 TWICE_AS_LARGE = Similarity(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
 

@@ -8,7 +8,7 @@ from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import orbit_path
 
 from rangesfm.colmap.transform import rescale
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 
 @pytest.fixture(scope="module")

@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.comparison.comparison_page import write_comparison
 from rangesfm.comparison.many_models import ModelsComparison, compare_many, read_named_models
-from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import InputError
-from rangesfm.geometry.reference import read_reference
+from rangesfm.measurements.lengths.tape_file import read_tape
+from rangesfm.pipeline.ranges_for_models import ranges_of_survey
+from rangesfm.pipeline.run import scale_model
 from rangesfm.progress import SilentProgress
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.ranges_for_models import ranges_of_survey
-from rangesfm.workflows.run import scale_model
+from rangesfm.util.geometry.reference import read_reference
 
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey

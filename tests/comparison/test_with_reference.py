@@ -23,9 +23,9 @@ from rangesfm.comparison.with_reference import (
     with_true_scale,
 )
 from rangesfm.errors import InputError
-from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.util.geometry.reference import Reference, write_reference
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 

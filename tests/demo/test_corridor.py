@@ -14,10 +14,10 @@ from tests.outputs import names_in
 
 from rangesfm.demo.corridor import FOCAL_PX, NUM_PHOTOS, SIZE_PX, _walk, make_corridor_survey, render
 from rangesfm.demo.survey import TAG_IN_CAM_M, TIME_OFFSET_S, DemoSurvey
-from rangesfm.geometry.reference import read_reference
-from rangesfm.ranging.anchors.anchor_file import read_anchors
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
+from rangesfm.sfm.image_times import read_image_times_csv
 from rangesfm.survey.survey_reader import read_survey
-from rangesfm.vision.image_times import read_image_times_csv
+from rangesfm.util.geometry.reference import read_reference
 
 NUM_MADE = 3
 

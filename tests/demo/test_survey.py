@@ -23,11 +23,11 @@ from rangesfm.demo.survey import (
     make_demo_survey,
 )
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import sole_writer, write_text
-from rangesfm.geometry.reference import read_reference
-from rangesfm.ranging.anchors.anchor_file import read_anchors
-from rangesfm.ranging.readers import read_ranges
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
+from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.survey.survey_reader import read_survey
+from rangesfm.util.files.atomic import sole_writer, write_text
+from rangesfm.util.geometry.reference import read_reference
 
 NUM_PHOTOS = 4
 

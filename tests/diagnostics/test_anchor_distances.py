@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rangesfm.diagnostics.preflight import notes_on_distances
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.range_log import RangeLog
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.range_log import RangeLog
 
 SITE_M: dict[str, tuple[float, ...]] = {
     "A": (0.0, 0.0, 0.5),

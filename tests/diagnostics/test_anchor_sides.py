@@ -13,9 +13,9 @@ from tests.studies.drifting_maps import lap_of_drift
 
 from rangesfm.diagnostics.anchor_sides import likelier_sides
 from rangesfm.diagnostics.linearized import ranges_on_map
+from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.measurements.joint_map import find_kind
-from rangesfm.scale.scale_by_ranges import RangeScale
-from rangesfm.workflows.metric_result import MetricResult
+from rangesfm.pipeline.metric_result import MetricResult
 
 DRIFT_M, NUM_KEYFRAMES = 0.5, 100
 # As one piece, this map fits better with the anchor below the path. The anchor is above it, which is -y here.

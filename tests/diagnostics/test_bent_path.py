@@ -10,17 +10,17 @@ from tests.known import known
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
-from rangesfm.geometry.similarity import align_points, rmse
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
-from rangesfm.inference.bending import WalkBending
+from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.scale_by_ranges import RangeScale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_by_ranges import RangeScale
-from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.solver.bending import WalkBending
+from rangesfm.util.geometry.similarity import align_points, rmse
+from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 TAG_IN_CAM_M = (0.0, 0.0, 0.0)
 ANCHOR_M = np.array([8.0, -6.0, 0.3])

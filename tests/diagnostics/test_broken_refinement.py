@@ -13,13 +13,13 @@ from tests.known import known
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import SolverError
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.pipeline.run import refine_model, scale_model
+from rangesfm.pipeline.run_results import RunResult
 from rangesfm.progress import SilentProgress
 from rangesfm.result.result_folder import is_refined_model, read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.run import refine_model, scale_model
-from rangesfm.workflows.run_results import RunResult
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 if TYPE_CHECKING:
     from tests.conftest import WalkedSurvey

@@ -10,8 +10,8 @@ from tests.simulated.runs import run_stages
 from tests.simulated.surveys import MadeSurvey
 from tests.studies.drifting_maps import lap_of_drift, without_points
 
-from rangesfm.geometry.similarity import align_points, rmse
-from rangesfm.workflows.metric_result import MetricResult
+from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.util.geometry.similarity import align_points, rmse
 
 NUM_KEYFRAMES = 100
 

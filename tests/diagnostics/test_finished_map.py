@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tests.estimation.scale.conftest import MakeSurvey, Survey, make_survey
 from tests.known import known
-from tests.scale.conftest import MakeSurvey, Survey, make_survey
 
 from rangesfm.colmap.reprojection import PointErrors
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.diagnostics.finished_map import doubts_of_map, place_of_map
-from rangesfm.geometry.similarity import similarity_motions
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.options import ScaleOptions
-from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.util.geometry.similarity import similarity_motions
+from rangesfm.util.geometry.trajectory import Trajectory
 
 __all__ = ["make_survey"]
 

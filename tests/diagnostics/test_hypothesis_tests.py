@@ -19,7 +19,7 @@ from rangesfm.diagnostics.hypothesis_tests import Factorization, overlap, row_of
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.diagnostics.mistakes import find_mistakes
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
-from rangesfm.inference.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from tests.known import known
 from tests.simulated.model import synthetic_model
 
 from rangesfm.demo import survey as demo
-from rangesfm.ranging.readers import write_ranges_csv
+from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.pipeline.run import scale_model
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.run import scale_model
 
 ARM_M, ARM_DOWN_M = (0.05, -0.2, -0.08), (0.0, 0.22, 0.0)
 

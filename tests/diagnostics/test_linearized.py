@@ -17,10 +17,10 @@ from rangesfm.diagnostics.linearized import (
     RangesOnMap,
     linearized,
 )
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.range_observations import OnPath
-from rangesfm.scale.range_equation import RangeProblem, RangeState, predicted_ranges, state_after
+from rangesfm.estimation.scale.range_equation import RangeProblem, RangeState, predicted_ranges, state_after
+from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.range_observations import OnPath
+from rangesfm.util.geometry.similarity import Similarity
 
 NUM_POINTS, NUM_ANCHORS = 40, 3
 ARM_M = (0.1, -0.2, 0.05)

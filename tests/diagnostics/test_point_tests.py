@@ -13,11 +13,11 @@ from tests.conftest import SITE_M, WalkedSurvey
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
-from rangesfm.distances.map_points import MapPoint
-from rangesfm.distances.tape import CLICKED_STDDEV_PX, Marker
-from rangesfm.geometry.map_errors import MapPointErrors
-from rangesfm.inference.mistakes import MistakeTest, MistakeTests
-from rangesfm.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.measurements.lengths.map_points import MapPoint
+from rangesfm.measurements.lengths.tape import CLICKED_STDDEV_PX, Marker
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.solver.mistakes import MistakeTest, MistakeTests
+from rangesfm.util.geometry.map_errors import MapPointErrors
 
 STDDEV_M, NUM_POINTS = 0.01, 6
 

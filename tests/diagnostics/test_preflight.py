@@ -24,8 +24,8 @@ from rangesfm.diagnostics.preflight import (
     notes_on_silence,
     notes_on_times,
 )
-from rangesfm.distances.tape import Tape, TapedDistance
 from rangesfm.errors import InputError
+from rangesfm.measurements.lengths.tape import Tape, TapedDistance
 from rangesfm.survey.inputs import RangingInputs, read_ranging_inputs
 from rangesfm.survey.settings import Survey
 

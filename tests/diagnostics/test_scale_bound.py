@@ -16,8 +16,8 @@ from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.diagnostics.mistakes import find_mistakes
 from rangesfm.diagnostics.scale_bound import scale_bound
-from rangesfm.inference.mistakes import RISK, HiddenMistake
-from rangesfm.inference.posterior import ScaleUncertainty
+from rangesfm.solver.mistakes import RISK, HiddenMistake
+from rangesfm.solver.posterior import ScaleUncertainty
 
 ONE_PERCENT = ScaleUncertainty(0.0, {"noise": 0.01})
 

@@ -17,8 +17,8 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import MetricMap, apply_to, best_similarity, export_map, sfm_from_files
 from rangesfm.export.ply import write_points
-from rangesfm.geometry.similarity import IDENTITY, Similarity
 from rangesfm.options import ExportOptions
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
 
 METRIC_FROM_SFM = Similarity(2.5, Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix(), np.array([10.0, -20.0, 3.0]))
 VERTICES = np.random.default_rng(0).normal(size=(5, 3))

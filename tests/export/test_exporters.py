@@ -24,8 +24,8 @@ from rangesfm.export import (
     write_camera_positions,
     write_model,
 )
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.workflows.export_result import export_result
+from rangesfm.pipeline.export_result import export_result
+from rangesfm.util.geometry.similarity import Similarity
 
 FAR_AWAY = np.array([2_600_000.0, 1_200_000.0, 400.0])
 METRIC_FROM_SFM = Similarity(0.37, Rotation.from_rotvec([0.1, -0.7, 2.5]).as_matrix(), np.array([1 / 3, -2e5, 1e-7]))

@@ -25,9 +25,9 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import OFFSET_NAME, MetricMap, export_map
 from rangesfm.export.metric_map import colored_points, in_frame, moved, up_in_world
-from rangesfm.geometry.georeference import Georeference, georeference_at
-from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
+from rangesfm.util.geometry.georeference import Georeference, georeference_at
+from rangesfm.util.geometry.similarity import Similarity
 
 Array = npt.NDArray[np.float64]
 

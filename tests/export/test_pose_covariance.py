@@ -16,8 +16,8 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
 from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map
 from rangesfm.export.metric_map import moved
-from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
+from rangesfm.util.geometry.similarity import Similarity
 
 Array = npt.NDArray[np.float64]
 

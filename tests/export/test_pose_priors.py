@@ -13,7 +13,7 @@ from tests.simulated.path import loop_path
 from rangesfm.errors import InputError
 from rangesfm.export.colmap import write_pose_priors
 from rangesfm.export.metric_map import MetricMap
-from rangesfm.positions.pose_priors import read_pose_priors
+from rangesfm.measurements.positions.pose_priors import read_pose_priors
 
 
 @pytest.fixture

@@ -27,8 +27,8 @@ from tests.export.models import synthesized
 from rangesfm.colmap.transform import rescale
 from rangesfm.export import MetricMap, export_map
 from rangesfm.export.metric_map import colored_points
-from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
+from rangesfm.util.geometry.similarity import Similarity
 
 Array = npt.NDArray[np.float64]
 

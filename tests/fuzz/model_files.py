@@ -44,7 +44,7 @@ def make_survey(folder: Path) -> None:
     from tests.simulated.path import loop_path
 
     from rangesfm.demo.simulated_radio import Radio, simulate_ranges
-    from rangesfm.ranging.readers import write_ranges_csv
+    from rangesfm.measurements.ranges.readers import write_ranges_csv
 
     anchors_m = {"A1": (-6.0, -5.0, 0.5), "A2": (6.0, -5.0, 2.5), "A3": (6.0, 5.0, 0.7), "A4": (-6.0, 5.0, 2.2)}
     path = loop_path(15.0, start_s=0.0, seed=3)
@@ -116,13 +116,13 @@ def use(survey: Path, number: int, model_path: Path) -> str:
 def _do_what_is_done_with_models(model: object, model_path: Path) -> None:
     import pycolmap
 
-    from rangesfm.ceres.bundle_adjustment import bundle_adjustment, solve_bundle_adjustment
     from rangesfm.colmap.transform import rescale
     from rangesfm.errors import RangesfmError
     from rangesfm.export.ply import write_points
-    from rangesfm.geometry.similarity import Similarity
-    from rangesfm.geometry.trajectory import trajectory_from_reconstruction
     from rangesfm.options import CameraOptions, RefineOptions
+    from rangesfm.solver.bundle_adjustment import bundle_adjustment, solve_bundle_adjustment
+    from rangesfm.util.geometry.similarity import Similarity
+    from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
     assert isinstance(model, pycolmap.Reconstruction)
     path = trajectory_from_reconstruction(model)

@@ -12,23 +12,23 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.distances.tape import Tape
-from rangesfm.distances.tape_file import read_tape
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.export.apply import apply_to
-from rangesfm.geometry.reference import Reference, read_reference
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.anchor_file import read_anchors
-from rangesfm.ranging.errors.error_curve import ErrorCurve, read_error_curve
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.range_summary import summarize_ranges
-from rangesfm.ranging.readers import read_anchors_in_log, read_ranges, write_ranges_csv
+from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.lengths.tape_file import read_tape
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
+from rangesfm.measurements.ranges.errors.error_curve import ErrorCurve, read_error_curve
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.range_summary import summarize_ranges
+from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges, write_ranges_csv
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
+from rangesfm.sfm.image_times import ImageTimes, read_image_times_csv
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import read_survey
-from rangesfm.vision.image_times import ImageTimes, read_image_times_csv
+from rangesfm.util.geometry.reference import Reference, read_reference
+from rangesfm.util.geometry.similarity import Similarity
 
 CORPUS = Path(__file__).parent / "corpus"
 _WHOLE_CHECK_EVERY = 8  # only some inputs, chosen by a checksum, because this check takes the longest

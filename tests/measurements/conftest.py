@@ -14,13 +14,6 @@ from tests.known_errors import known_errors
 from tests.simulated.model import SyntheticModel, synthetic_model
 from tests.simulated.path import lap_path
 
-from rangesfm.distances.tape import Marker
-from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.poses import Poses, model_poses
-from rangesfm.geometry.robust_statistics import RobustLoss
-from rangesfm.geometry.similarity import IDENTITY
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.measurements.control_points import ControlPoints
 from rangesfm.measurements.gravity import UpwardDirection
 from rangesfm.measurements.imu.inertial_motions import (
     CLOCK,
@@ -36,17 +29,24 @@ from rangesfm.measurements.imu.motion import Mounting
 from rangesfm.measurements.imu.preintegration import preintegrate
 from rangesfm.measurements.imu.sensor_prior import SensorPrior
 from rangesfm.measurements.kind import LEAST_SQUARES, MapState, Measurements
-from rangesfm.measurements.lengths import Lengths
+from rangesfm.measurements.lengths.cost import Lengths
+from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.places import AntennaPlaces
 from rangesfm.measurements.points import NamedPoints
-from rangesfm.measurements.positions import AntennaPositions
+from rangesfm.measurements.positions.cost import AntennaPositions
+from rangesfm.measurements.positions.points_cost import ControlPoints
 from rangesfm.measurements.prior import Prior
-from rangesfm.measurements.radio import ranges_of_map
-from rangesfm.measurements.ranges import Ranges
+from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.cost import Ranges
+from rangesfm.measurements.ranges.radio import ranges_of_map
+from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RefineOptions
-from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.range_log import RangeLog
+from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.poses import Poses, model_poses
+from rangesfm.util.geometry.robust_statistics import RobustLoss
+from rangesfm.util.geometry.similarity import IDENTITY
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 KINDS = (

@@ -14,13 +14,13 @@ import pytest
 from tests.conftest import Command, WalkedSurvey
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.inference.linear_map import Columns
-from rangesfm.inference.noise import Component
-from rangesfm.inference.posterior import Observations, ScaleUncertainty
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.solver.linear_map import Columns
+from rangesfm.solver.noise import Component
+from rangesfm.solver.posterior import Observations, ScaleUncertainty
 from rangesfm.survey import kinds_in_map
 from rangesfm.survey.kinds_in_map import MapOfPhotos
+from rangesfm.util.geometry.similarity import Similarity
 
 STEPS, STEPS_STDDEV_M = "steps", 0.02
 SAID = "a step counter does not know how long a step is"

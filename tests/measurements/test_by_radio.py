@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rangesfm.measurements.radio import lengths_by_radio
-from rangesfm.ranging.range_log import RangeLog
+from rangesfm.measurements.ranges.radio import lengths_by_radio
+from rangesfm.measurements.ranges.range_log import RangeLog
 
 
 def log_of(rows: list[tuple[str, str, float]], stddev_m: float | None = None) -> RangeLog:

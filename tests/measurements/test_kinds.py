@@ -11,12 +11,12 @@ import pycolmap
 import pytest
 from tests.measurements.conftest import KINDS, Scene, marker_of, moved
 
-from rangesfm.ceres.bundle_adjustment import bundle_adjustment
-from rangesfm.geometry.trajectory import pose_of
 from rangesfm.measurements.kind import Block, Linearization, MapState, Measurements
 from rangesfm.measurements.marks import add_marks, remove_marks
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.solver.bundle_adjustment import bundle_adjustment
+from rangesfm.util.geometry.trajectory import pose_of
 
 Array = npt.NDArray[np.float64]
 STEP = 1e-5

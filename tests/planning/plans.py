@@ -10,10 +10,10 @@ import numpy.typing as npt
 from tests.simulated.path import loop_path
 
 from rangesfm.estimation.free_fit import GraphBending
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.planning.expected import Expected
 from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 Array = npt.NDArray[np.float64]
 Place = tuple[float, float, float]

@@ -10,12 +10,12 @@ from tests.known import known
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, Place, loop, planned
 
 from rangesfm.diagnostics.finished_map import by_similarity
-from rangesfm.distances.lengths_on_map import BENDING
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import Similarity
+from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.planning.expected import expect
 from rangesfm.planning.paths import path_through
-from rangesfm.scale.initialize import initialize_scale
+from rangesfm.util.geometry.similarity import Similarity
 
 
 @pytest.mark.parametrize(

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from tests.planning.plans import FIVE_ANCHORS_M, loop, planned
 
-from rangesfm.distances.tape import CHECK, CONTROL
 from rangesfm.errors import InputError
-from rangesfm.geometry.similarity import IDENTITY
-from rangesfm.geometry.trajectory import in_first_camera
-from rangesfm.inference.bending import WalkBending
+from rangesfm.estimation.scale.scale_by_positions import scale_by_positions
+from rangesfm.measurements.lengths.tape import CHECK, CONTROL
+from rangesfm.measurements.positions.control_points import ControlPoint
 from rangesfm.planning.expected import expect
 from rangesfm.planning.plan_file import read_plan
 from rangesfm.planning.planned import PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.survey_plan import plan_survey
-from rangesfm.positions.control_points import ControlPoint
-from rangesfm.scale.scale_by_positions import scale_by_positions
+from rangesfm.solver.bending import WalkBending
+from rangesfm.util.geometry.similarity import IDENTITY
+from rangesfm.util.geometry.trajectory import in_first_camera
 
 STDDEV_M = 0.02
 WALK = loop(30.0, 60)

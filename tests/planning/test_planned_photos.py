@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from tests.planning.plans import FIVE_ANCHORS_M, free_bend_m, loop, planned
 
-from rangesfm.inference.bending import BENDS
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned_photos import PlannedPhotos
+from rangesfm.solver.bending import BENDS
 
 OPEN = PlannedPhotos(num_points=60, feature_stddev=0.001)
 

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from tests.result_document import result_document
 
-from rangesfm.geometry.numerics import DOUBTFUL_ABOVE
 from rangesfm.report.checks import QualityCheck, quality_checks
 from rangesfm.result.summary import ResultSummary
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
 
 
 def check_of(name: str, **changes: Any) -> QualityCheck:

@@ -12,7 +12,7 @@ from PIL import Image
 from tests.outputs import names_in
 
 from rangesfm.errors import InputError
-from rangesfm.ranging.range_log import RangeLog
+from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.report import write_report_pictures
 from rangesfm.report.chart import figure_spec, write_picture
 from rangesfm.report.content import Content

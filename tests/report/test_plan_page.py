@@ -11,10 +11,10 @@ import pytest
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
 from rangesfm.diagnostics.mistake_words import mistake_in_words
+from rangesfm.measurements.positions.control_points import ControlPoint
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.survey_plan import SurveyPlan, plan_survey
-from rangesfm.positions.control_points import ControlPoint
 from rangesfm.report.plan_page import accuracy_views, render_plan
 
 

@@ -15,7 +15,7 @@ import rangesfm
 if TYPE_CHECKING:
     from tests.conftest import Command, WalkedSurvey
 
-    from rangesfm.workflows.run_results import RunResult
+    from rangesfm.pipeline.run_results import RunResult
 
 # Half the width of a 95 % interval, in standard deviations.
 HALF = 1.96

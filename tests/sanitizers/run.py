@@ -29,9 +29,11 @@ OPTIONS = {
     "UBSAN_OPTIONS": "print_stacktrace=1",
     "TSAN_OPTIONS": "halt_on_error=1",
 }
-TESTS = ("tests/ceres", "tests/ceres/test_covariance.py")
+TESTS = ("tests/solver",)
 # This test checks which libraries the extension needs, and here it needs the sanitizer's.
-NOT_MEANT = "tests/ceres/test_compatibility.py::test_the_compiled_part_needs_no_library_that_pycolmap_does_not_need_too"
+NOT_MEANT = (
+    "tests/solver/test_compatibility.py::test_the_compiled_part_needs_no_library_that_pycolmap_does_not_need_too"
+)
 _SITE = "import sys\nsys.meta_path = [finder for finder in sys.meta_path if isinstance(finder, type)]\n"
 
 

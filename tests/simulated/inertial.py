@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.measurements.imu.log import ImuLog
+from rangesfm.util.geometry.trajectory import Trajectory
 
 GRAVITY_M_S2 = 9.81
 CAM_FROM_IMU = Rotation.from_euler("zyx", (100.0, -20.0, 65.0), degrees=True).as_matrix()

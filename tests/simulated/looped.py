@@ -27,24 +27,24 @@ from rangesfm.colmap.pieces import MIN_NUM_SHARED
 from rangesfm.colmap.transform import rescale
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
-from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.geometry.similarity import IDENTITY, rmse
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.loops.loop_finder import LoopFinder
-from rangesfm.loops.merge import merge_tracks
-from rangesfm.loops.resection import Loop
-from rangesfm.loops.rounds import TriedPairs, close_in_rounds, find_in
-from rangesfm.measurements.radio import RadioLog, ranges_of_map
-from rangesfm.measurements.ranges import Ranges
+from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.cost import Ranges
+from rangesfm.measurements.ranges.radio import RadioLog, ranges_of_map
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.measurements.source import Measured
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.vision.database import create_database
+from rangesfm.sfm.database import create_database
+from rangesfm.sfm.loops.loop_finder import LoopFinder
+from rangesfm.sfm.loops.merge import merge_tracks
+from rangesfm.sfm.loops.resection import Loop
+from rangesfm.sfm.loops.rounds import TriedPairs, close_in_rounds, find_in
+from rangesfm.util.geometry.reference import Reference, write_reference
+from rangesfm.util.geometry.similarity import IDENTITY, rmse
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Pair = tuple[int, int]
 Matches = npt.NDArray[np.int64]

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from rangesfm.geometry.similarity import Similarity
+from rangesfm.util.geometry.similarity import Similarity
 
 FloatArray = npt.NDArray[np.float64]
 

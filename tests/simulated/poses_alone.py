@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.files import write_anchors, write_rows
 from tests.simulated.path import look_at
 
-from rangesfm.geometry.similarity import align_points
+from rangesfm.util.geometry.similarity import align_points
 
 Array = npt.NDArray[np.float64]
 Garble = Callable[[Array, np.random.Generator], Array]

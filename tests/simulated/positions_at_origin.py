@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array
 
-from rangesfm.positions.known_positions import KnownPositions
+from rangesfm.measurements.positions.known_positions import KnownPositions
 
 
 def known_positions(is_mark: list[bool], num_poses: int = 1, stddev_m: float = 0.1) -> KnownPositions:

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.ranging.errors.components import population
-from rangesfm.ranging.range_observations import RangeObservations
+from rangesfm.measurements.ranges.errors.components import population
+from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]

@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import Image
 
 from rangesfm.demo.survey import DemoSurvey, make_demo_survey
-from rangesfm.files.atomic import new_folder
+from rangesfm.util.files.atomic import new_folder
 
 _SHRINKING = 8 / 3  # from 960 x 640 pixels to 360 x 240
 

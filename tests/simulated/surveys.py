@@ -17,15 +17,15 @@ from tests.simulated.path import loop_path
 from tests.simulated.radio_errors import drawn_errors, usual_errors
 from tests.simulated.ranges import simulate_ranges_at
 
-from rangesfm.ceres.covariance import joint_covariance
-from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.colmap.transform import rescale
 from rangesfm.demo.simulated_radio import CameraPath, Radio
-from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.range_log import RangeLog
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.solver.covariance import joint_covariance
+from rangesfm.solver.normal_equations import NormalEquations
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 Place = tuple[float, float, float]

@@ -23,9 +23,9 @@ from tests.studies.measured_distances import marks_in
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.demo.simulated_radio import CameraPath
-from rangesfm.distances.tape import Marker
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 Row = dict[str, Any]

@@ -43,19 +43,19 @@ from tests.studies.known_positions import NO_RANGES, POINT_STDDEV_M, RECEIVERS, 
 from tests.studies.measured_distances import marks_in
 
 from rangesfm.demo.simulated_radio import CameraPath
-from rangesfm.distances.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.errors import RangesfmError
-from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.estimation.scale.scale_by_lengths import LengthScale
+from rangesfm.estimation.scale.scale_by_positions import PositionScale
+from rangesfm.measurements.lengths.tape import CONTROL, Marker, Tape, TapedDistance
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.options import RangesOptions
-from rangesfm.positions.antenna_track import AntennaTrack
-from rangesfm.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.positions.position_log import PositionLog
-from rangesfm.positions.surveyed_positions import SurveyedPositions
-from rangesfm.ranging.anchors.site import Site
-from rangesfm.scale.scale_by_lengths import LengthScale
-from rangesfm.scale.scale_by_positions import PositionScale
+from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.survey.inputs import RangingInputs
-from rangesfm.workflows.metric_result import MetricResult
+from rangesfm.util.geometry.similarity import align_points, rmse
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]

@@ -39,8 +39,8 @@ from tests.simulated.runs import run_stages
 from tests.simulated.surveys import HALL, TAG_IN_CAM_M, Kind, MadeSurvey, expected_drift_m, in_turn, made, truth_of
 
 from rangesfm.errors import GeometryError, SolverError
-from rangesfm.geometry.similarity import align_points, rmse
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.similarity import align_points, rmse
+from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]

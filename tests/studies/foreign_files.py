@@ -33,9 +33,9 @@ from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.demo.survey import TIME_OFFSET_S
 from rangesfm.export import EXPORTED_NAMES
-from rangesfm.files.output_folder import PRIVATE_NAME
 from rangesfm.result.result_folder import PHOTOS_NAMES, RESULT_NAMES
-from rangesfm.vision.steps import RECONSTRUCTION_NAMES
+from rangesfm.sfm.steps import RECONSTRUCTION_NAMES
+from rangesfm.util.files.output_folder import PRIVATE_NAME
 
 STATUSES = (0, 2, 3, 4, -signal.SIGKILL)
 FORMATS = ("colmap", "colmap_text", "undistorted", "tum", "ply", "opf", "transform", "nerfstudio", "opensfm")

@@ -50,15 +50,15 @@ from tests.studies.measured_distances import KINDS
 
 import rangesfm
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
+from rangesfm.estimation.scale.scale_by_lengths import LengthScale
+from rangesfm.estimation.scale.scale_by_positions import PositionScale
+from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.measurements.joint_map import find_kind
-from rangesfm.positions.grouped_positions import POSITIONS
-from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.scale.scale_by_lengths import LengthScale
-from rangesfm.scale.scale_by_positions import PositionScale
-from rangesfm.scale.scale_by_ranges import RangeScale
-from rangesfm.workflows import result_records
-from rangesfm.workflows.metric_result import MetricResult
-from rangesfm.workflows.run_results import RunResult, write_results
+from rangesfm.measurements.positions.grouped_positions import POSITIONS
+from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.pipeline import result_records
+from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.run_results import RunResult, write_results
 
 Values = dict[str, npt.NDArray[Any]]
 Tables = dict[str, dict[str, Any]]
@@ -214,7 +214,7 @@ def metric_of(survey_path: Path, output_path: Path) -> MetricResult:
         return write_results(run, metric)
 
     survey = rangesfm.read_survey(survey_path).changed({"output.path": output_path})
-    with patch("rangesfm.workflows.run.write_results", write):
+    with patch("rangesfm.pipeline.run.write_results", write):
         rangesfm.run_survey(survey)
     return kept[0]
 

@@ -40,8 +40,8 @@ from tests.simulated.path import look_at
 
 from rangesfm.cli import main as run_command
 from rangesfm.demo.simulated_radio import Radio, measure_ranges
-from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.ranging.readers import write_ranges_csv
+from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.util.geometry.reference import Reference, write_reference
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -43,8 +43,8 @@ from tests.studies.foreign_files import FORMATS, MODEL_FLAGS, RUN, content_of, m
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.demo.survey import TIME_OFFSET_S
-from rangesfm.files.output_folder import LOCK_NAME, PRIVATE_NAME
 from rangesfm.survey.settings import SURVEY_TABLES
+from rangesfm.util.files.output_folder import LOCK_NAME, PRIVATE_NAME
 
 STATUSES = (0, 2, 3, 4)
 MAX_SECONDS = 300.0

@@ -42,14 +42,14 @@ from tests.simulated.inertial import (
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.geometry.similarity import align_points
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.inference.bending import WalkBending
 from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS, read_imu
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.sensor import InertialSensor
+from rangesfm.solver.bending import WalkBending
+from rangesfm.util.geometry.similarity import align_points
+from rangesfm.util.geometry.trajectory import Trajectory
 
 MOTIONS: dict[str, Callable[[int], Motion]] = {
     "hand": by_hand,

@@ -31,7 +31,7 @@ from tests.simulated.small_demo import make_small_demo
 
 from rangesfm.colmap.model_files import read_model
 from rangesfm.demo.survey import TIME_OFFSET_S
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 TOLERANCE = 1e-9
 # All steps depend on the camera; the demo's has a focal length of 280.8 pixels.

@@ -38,27 +38,27 @@ from tests.simulated.runs import run_stages
 from tests.simulated.surveys import TAG_IN_CAM_M, MadeSurvey, Truth, photos_adjuster, simulated
 from tests.studies.measured_distances import KINDS, marks_in
 
-from rangesfm.ceres.covariance import PhotosAlone
-from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.demo.simulated_radio import CameraPath
-from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.photo_bending import PhotoBending
-from rangesfm.geometry.numerics import NORMAL_95
-from rangesfm.geometry.similarity import align_points, similarity_motions
-from rangesfm.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
+from rangesfm.estimation.scale.scale_by_positions import scale_by_positions
+from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.measurements.positions.position_formats import AUTONOMOUS_STDDEV_M
+from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import RangesOptions
-from rangesfm.positions.antenna_track import AntennaTrack
-from rangesfm.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.positions.position_formats import AUTONOMOUS_STDDEV_M
-from rangesfm.positions.position_log import PositionLog
-from rangesfm.positions.surveyed_positions import SurveyedPositions
-from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.scale.scale_by_positions import scale_by_positions
+from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.result_records import points_entry
+from rangesfm.solver.covariance import PhotosAlone
+from rangesfm.solver.normal_equations import NormalEquations
 from rangesfm.survey.inputs import RangingInputs
-from rangesfm.workflows.metric_result import MetricResult
-from rangesfm.workflows.result_records import points_entry
+from rangesfm.util.geometry.numerics import NORMAL_95
+from rangesfm.util.geometry.similarity import align_points, similarity_motions
+from rangesfm.util.geometry.trajectory import in_first_camera, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]

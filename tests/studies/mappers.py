@@ -33,15 +33,15 @@ from tests.simulated.path import loop_path
 from tests.studies.simulated_database import write_database
 
 from rangesfm.demo.simulated_radio import Radio, simulate_ranges
-from rangesfm.geometry.reference import Reference, read_reference, write_reference
 from rangesfm.mapper_options import MapperOptions
+from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.options import CameraOptions
 from rangesfm.progress import SilentProgress
-from rangesfm.ranging.readers import write_ranges_csv
-from rangesfm.vision.mapping import map_photos, mapping_options, read_mapped_models
-from rangesfm.vision.photo_files import Photos
-from rangesfm.vision.rigs import NO_RIGS
-from rangesfm.vision.steps import Workspace
+from rangesfm.sfm.mapping import map_photos, mapping_options, read_mapped_models
+from rangesfm.sfm.photo_files import Photos
+from rangesfm.sfm.rigs import NO_RIGS
+from rangesfm.sfm.steps import Workspace
+from rangesfm.util.geometry.reference import Reference, read_reference, write_reference
 
 TAG_IN_CAM_M = (0.03, -0.12, -0.05)
 _STEP_M = 0.5

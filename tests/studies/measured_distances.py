@@ -33,12 +33,12 @@ from tests.simulated.surveys import HALL, SITE_ANCHORS_M, Kind, Truth, simulated
 from tests.studies.drifting_maps import MAST_M
 
 from rangesfm.demo.simulated_radio import CameraPath
-from rangesfm.distances.map_points import MapPoints
-from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError, SolverError
-from rangesfm.geometry.gravity import UP_IN_SITE
-from rangesfm.workflows.measured_map import MeasuredMap, Measurement
-from rangesfm.workflows.metric_result import MetricResult
+from rangesfm.measurements.lengths.map_points import MapPoints
+from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.pipeline.measured_map import MeasuredMap, Measurement
+from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.util.geometry.gravity import UP_IN_SITE
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]

@@ -31,14 +31,14 @@ from tests.simulated.surveys import (
 from tests.studies.kept_runs import Row, spread, study
 
 from rangesfm.estimation.with_ranges import refine_with_ranges
-from rangesfm.geometry.similarity import align_points, rmse
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.errors.components import COMPONENTS
 from rangesfm.options import CameraOptions, RangeModelOptions
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.components import COMPONENTS
+from rangesfm.util.geometry.similarity import align_points, rmse
+from rangesfm.util.geometry.trajectory import Trajectory
 
 RANGE_MODEL = RangeModelOptions()
 # Of the simulated camera.

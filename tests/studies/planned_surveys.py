@@ -19,31 +19,31 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tests.scale.conftest import lengths_among
+from tests.estimation.scale.conftest import lengths_among
 from tests.simulated.path import lap_path, loop_path, sequence_path
 from tests.simulated.radio_errors import errors_of_radio
 from tests.simulated.surveys import METRES_PER_UNIT, in_world_of_its_own
 from tests.studies.kept_runs import Row, Study, spread, study
 
 from rangesfm.demo.simulated_radio import CameraPath
-from rangesfm.distances.lengths_on_map import BENDING
-from rangesfm.distances.locate_lengths import LocatedDistances
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.range_equation import RangeState
+from rangesfm.estimation.scale.scale_problem import ScaleProblem, scale_problem
+from rangesfm.estimation.scale.solution import solution_from
+from rangesfm.measurements.lengths.lengths_on_map import BENDING
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.errors.components import COMPONENTS, stddevs_in
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.components import COMPONENTS, stddevs_in
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.range_equation import RangeState
-from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
-from rangesfm.scale.solution import solution_from
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 

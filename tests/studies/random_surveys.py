@@ -44,8 +44,8 @@ from tests.studies.drawn_surveys import DrawnSurvey, draw
 from tests.studies.hostile import OWN_WORDS, STATUSES
 
 from rangesfm.cli import main as rangesfm
-from rangesfm.geometry.similarity import align_points
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.util.geometry.similarity import align_points
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 Line = dict[str, Any]

@@ -35,22 +35,22 @@ from rangesfm.diagnostics.bent_path import bent_to_ranges, estimate_by_bent
 from rangesfm.diagnostics.diagnosis import diagnose_ranges
 from rangesfm.diagnostics.linearized import ranges_on_map
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.reference import Reference, read_reference
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
-from rangesfm.inference.bending import WalkBending
+from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.scale_by_ranges import RangeScale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.errors.components import components, population
+from rangesfm.measurements.ranges.errors.error_curve import ErrorCurve, correct_ranges
+from rangesfm.measurements.ranges.errors.radio_calibration import calibrate_ranges
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.readers import read_ranges
 from rangesfm.options import AssociationOptions, ScaleOptions
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.anchor_file import read_anchors
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.errors.components import components, population
-from rangesfm.ranging.errors.error_curve import ErrorCurve, correct_ranges
-from rangesfm.ranging.errors.radio_calibration import calibrate_ranges
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.ranging.readers import read_ranges
-from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_by_ranges import RangeScale
-from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.solver.bending import WalkBending
+from rangesfm.util.geometry.reference import Reference, read_reference
+from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 FACTOR, MIN_STEP_S, MAX_GAP_S = 4.63, 0.1, 0.25
 
@@ -86,7 +86,7 @@ def main() -> None:
         for case in cases(log, anchors, path):
             if not (args.no_singles and case.name.startswith("only")):
                 observations = placed(log, case, given, sets[name], by_photo=args.by_photo)
-                with patch("rangesfm.ranging.errors.learned.COMPONENTS", expected):
+                with patch("rangesfm.measurements.ranges.errors.learned.COMPONENTS", expected):
                     found.append(one_survey(name, case, observations, given))
     known = np.array([row for row in found if row is not None], dtype=np.float64)
     if len(known):

@@ -23,10 +23,10 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.geometry.reference import read_reference
-from rangesfm.geometry.similarity import align_points, rmse
+from rangesfm.pipeline.run import refine_model
 from rangesfm.survey.settings import Survey
-from rangesfm.workflows.run import refine_model
+from rangesfm.util.geometry.reference import read_reference
+from rangesfm.util.geometry.similarity import align_points, rmse
 
 Array = npt.NDArray[np.float64]
 NUM_PHOTOS, NUM_CONTROL, STDDEV_M = 6, 3, 0.005

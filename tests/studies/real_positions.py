@@ -23,25 +23,25 @@ import pycolmap
 from tests.studies.known_positions import NO_RANGES
 from tests.studies.real_room import interpolated, path_and_truth
 
-from rangesfm.distances.tape import Tape
-from rangesfm.geometry.similarity import align_points
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.inference.posterior import ScaleUncertainty
+from rangesfm.estimation.scale.scale_by_positions import scale_by_positions
+from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.positions.antenna_places import locate_antenna
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.clock import find_antenna_offset
+from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.association import associate
 from rangesfm.options import RangesOptions
-from rangesfm.positions.antenna_places import locate_antenna
-from rangesfm.positions.antenna_track import AntennaTrack
-from rangesfm.positions.clock import find_antenna_offset
-from rangesfm.positions.position_log import PositionLog
-from rangesfm.positions.surveyed_positions import SurveyedPositions
+from rangesfm.pipeline.make_metric_map import bending_by_survey
+from rangesfm.pipeline.run import map_in_metres
 from rangesfm.progress import Journal, SilentProgress
-from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.association import associate
-from rangesfm.scale.scale_by_positions import scale_by_positions
+from rangesfm.solver.posterior import ScaleUncertainty
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
-from rangesfm.workflows.make_metric_map import bending_by_survey
-from rangesfm.workflows.run import map_in_metres
+from rangesfm.util.geometry.similarity import align_points
+from rangesfm.util.geometry.trajectory import Trajectory
 
 Array = npt.NDArray[np.float64]
 ANTENNA_IN_CAM_M, NOISE_M = np.array([0.1, -0.2, 0.05]), 0.1

@@ -13,11 +13,11 @@ import pycolmap
 from scipy.spatial.transform import Rotation, Slerp
 from tests.simulated.surveys import MadeSurvey
 
-from rangesfm.geometry.reference import read_reference
-from rangesfm.geometry.similarity import align_points
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.ranging.anchors.anchor_file import read_anchors
-from rangesfm.ranging.readers import read_ranges
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
+from rangesfm.measurements.ranges.readers import read_ranges
+from rangesfm.util.geometry.reference import read_reference
+from rangesfm.util.geometry.similarity import align_points
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 EVERY = 10
 MAX_GAP_S = 0.05

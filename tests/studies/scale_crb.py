@@ -31,13 +31,13 @@ from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.colmap.transform import rescale
 from rangesfm.demo.simulated_radio import Radio
+from rangesfm.estimation.scale.initialize import initialize_scale
 from rangesfm.estimation.with_ranges import refine_with_ranges
-from rangesfm.geometry.similarity import Similarity, align_points
-from rangesfm.geometry.trajectory import trajectory_from_reconstruction
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.association import associate
 from rangesfm.options import CameraOptions, RangeModelOptions
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.association import associate
-from rangesfm.scale.initialize import initialize_scale
+from rangesfm.util.geometry.similarity import Similarity, align_points
+from rangesfm.util.geometry.trajectory import trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 

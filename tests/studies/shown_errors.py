@@ -17,13 +17,13 @@ from unittest.mock import patch
 import numpy as np
 from tests.studies.real_logs import FACTOR, cases, path_of, placed, read_set
 
+from rangesfm.estimation.scale.binned_ranges import binned_ranges
+from rangesfm.estimation.scale.range_equation import predicted_ranges
+from rangesfm.estimation.scale.scale_problem import scale_problem
+from rangesfm.estimation.scale.solution import solve_scale
+from rangesfm.measurements.ranges.errors.components import components
+from rangesfm.measurements.ranges.errors.learned import learn_errors, radio_components
 from rangesfm.options import RangeModelOptions
-from rangesfm.ranging.errors.components import components
-from rangesfm.ranging.errors.learned import learn_errors, radio_components
-from rangesfm.scale.binned_ranges import binned_ranges
-from rangesfm.scale.range_equation import predicted_ranges
-from rangesfm.scale.scale_problem import scale_problem
-from rangesfm.scale.solution import solve_scale
 
 # Medians that the logs' errors suggest at first sight, metres, and below them how far each log may differ.
 START = {"white": 0.05, "time": 0.04, "drift": 0.01, "place": 0.03, "view": 0.035, "bias": 0.045, "common_bias": 0.2}
@@ -45,8 +45,8 @@ def main() -> None:
     args = parser.parse_args()
     sets = json.loads(Path(__file__).with_name("real_logs.json").read_text(encoding="utf-8"))
     start = components({name: (size, OF_WHITE if name == "white" else SPREAD) for name, size in START.items()})
-    likeliest = patch("rangesfm.inference.noise.ComponentLikelihood.mean_stddevs", lambda self, logs: np.exp(logs))
-    with patch("rangesfm.ranging.errors.learned.COMPONENTS", start), likeliest:
+    likeliest = patch("rangesfm.solver.noise.ComponentLikelihood.mean_stddevs", lambda self, logs: np.exp(logs))
+    with patch("rangesfm.measurements.ranges.errors.learned.COMPONENTS", start), likeliest:
         for name, described in sets.items():
             found = shown(args.data, described)
             print(f"{name:17}" + "  ".join(f"{part} {stddev:.4f}" for part, stddev in found.items()), flush=True)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from rangesfm.vision.database import create_database
+from rangesfm.sfm.database import create_database
 
 Array = npt.NDArray[np.float64]
 

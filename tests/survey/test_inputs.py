@@ -10,8 +10,8 @@ import pytest
 from tests.known import known
 
 from rangesfm.errors import InputError
+from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.options import AnchorOptions, RangesOptions
-from rangesfm.ranging.range_log import RangeKind
 from rangesfm.survey.inputs import read_ranging_inputs
 from rangesfm.survey.settings import Survey
 

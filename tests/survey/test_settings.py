@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from rangesfm.errors import InputError
 from rangesfm.mapper_options import MapperOptions
+from rangesfm.measurements.ranges.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 from rangesfm.options import OutputOptions
-from rangesfm.ranging.twr import DW1000_TICK_S, VACUUM_M_PER_S, StampOptions
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import input_paths, read_survey, survey_from_tables
 

@@ -9,11 +9,11 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from rangesfm.batch.batch_state import BatchState, SurveyRow
-from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.report import report_page
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, decimals_for, duration, fixed, plain
 from rangesfm.result.result_folder import REPORT_NAME
+from rangesfm.util.geometry.numerics import NORMAL_95
 
 BATCH_RELOAD_S = 5
 _HEADER = (

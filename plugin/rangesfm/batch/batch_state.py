@@ -10,8 +10,8 @@ from typing import Any, Literal, get_args
 from rangesfm.batch.jobs import Job
 from rangesfm.comparison.with_reference import text_or_dash
 from rangesfm.errors import FAILED, INTERNAL_ERROR, Failure, one_line
-from rangesfm.files.text_tables import align_rows
 from rangesfm.result.summary import ResultSummary
+from rangesfm.util.files.text_tables import align_rows
 
 Status = Literal["waiting", "running", "done", "failed", "interrupted"]
 STATUSES: tuple[Status, ...] = get_args(Status)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TypeAlias
 
 from rangesfm.errors import Failure, InputError, failure_of, one_line
-from rangesfm.files.folders import real_path
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import read_survey
+from rangesfm.util.files.folders import real_path
 
 _USUAL_BYTES = 2 * 10**9  # a reconstruction of some hundred photos needs less memory than this
 # The file of a survey as the user wrote it, on one printable line; and its settings, or why it cannot be used.

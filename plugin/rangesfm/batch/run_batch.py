@@ -13,11 +13,11 @@ from rangesfm.batch.batch_page import render_batch
 from rangesfm.batch.batch_state import STATUSES, BatchState, SurveyRow
 from rangesfm.batch.jobs import BatchOptions, Job
 from rangesfm.batch.workers import MAX_STOP_S, Crew, KilledError, on_scheduler, on_this_machine
-from rangesfm.ceres.installation_checks import recorded_versions
 from rangesfm.errors import FAILED, Failure
-from rangesfm.files.atomic import sole_writer, write_text
-from rangesfm.files.records import write_json
-from rangesfm.files.text_tables import write_table
+from rangesfm.solver.installation_checks import recorded_versions
+from rangesfm.util.files.atomic import sole_writer, write_text
+from rangesfm.util.files.records import write_json
+from rangesfm.util.files.text_tables import write_table
 
 _POLL_INTERVAL_S = 0.2
 TABLE_NAME, JSON_NAME, PAGE_NAME = "batch.csv", "batch.json", "batch.html"

@@ -14,7 +14,7 @@ def run_in_batch(survey: Survey, restart: bool, progress: Progress) -> dict[str,
     # The lock of the output folder names this command to other processes.
     sys.argv = ["rangesfm", "batch", str(survey.source.path)]
     from rangesfm.batch.batch_state import figures_of
-    from rangesfm.workflows.run import run_survey
+    from rangesfm.pipeline.run import run_survey
 
     summary = run_survey(survey, progress=progress, restart=restart).summary
     reasons = summary.scale.reasons if summary.scale.verdict != "good" else ()

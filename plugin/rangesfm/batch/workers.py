@@ -29,8 +29,8 @@ from distributed.system import MEMORY_LIMIT
 
 from rangesfm.batch.jobs import BatchOptions, share_this_machine
 from rangesfm.errors import FAILED, INTERRUPTED, Failure, InputError
-from rangesfm.processes.supervision import call_by_name, supervise
 from rangesfm.survey.settings import Survey
+from rangesfm.util.processes.supervision import call_by_name, supervise
 
 MAX_STOP_S = 30.0  # longer than it takes to interrupt a survey
 _CONNECT_S = 10

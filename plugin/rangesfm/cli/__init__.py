@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from rangesfm.cli.arguments import Outcome, normalize, parse
 from rangesfm.cli.terminal import discard_output, terminal_progress
 from rangesfm.errors import INTERNAL_ERROR, InputError, failure_of, one_line
-from rangesfm.processes.threads import settle_num_threads
+from rangesfm.util.processes.threads import settle_num_threads
 
 _BROKEN_PIPE = 141  # exit status after a broken pipe, the one that shells use
 # Address space that the libraries take when they are loaded, in bytes: 600 MB with one BLAS thread (ulimit -v).

@@ -19,7 +19,7 @@ from rangesfm.errors import InputError
 from rangesfm.progress import Progress
 
 if TYPE_CHECKING:
-    from rangesfm.workflows.check import CheckedSurvey
+    from rangesfm.pipeline.check import CheckedSurvey
 
 
 def add_begin_commands(commands: Commands) -> None:
@@ -43,13 +43,13 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
     example:
       rangesfm init my_survey --tag_in_cam 0.03,-0.12,-0.05
     """
-    from rangesfm.files.atomic import write_text
-    from rangesfm.files.output_folder import free_output
+    from rangesfm.pipeline.check import check_survey
+    from rangesfm.survey.discovery.found_files import SURVEY_NAME
+    from rangesfm.survey.discovery.survey_file import survey_text
+    from rangesfm.survey.discovery.understood import understand
     from rangesfm.survey.survey_reader import read_survey, survey_from_tables
-    from rangesfm.survey_discovery.found_files import SURVEY_NAME
-    from rangesfm.survey_discovery.survey_file import survey_text
-    from rangesfm.survey_discovery.understood import understand
-    from rangesfm.workflows.check import check_survey
+    from rangesfm.util.files.atomic import write_text
+    from rangesfm.util.files.output_folder import free_output
 
     folders = [Path(folder) for folder in args.folders]
     path = Path(args.output_path or folders[0])
@@ -74,7 +74,7 @@ def _init(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _make_way(path: Path) -> Path | None:
     """Rename a survey file that somebody has changed since it was written, and return its new path; else None."""
-    from rangesfm.files.output_folder import absolute, writer_of
+    from rangesfm.util.files.output_folder import absolute, writer_of
 
     with writer_of(path) as output:
         if output.is_own(absolute(path)):
@@ -92,7 +92,7 @@ def _check(args: argparse.Namespace, progress: Progress) -> Outcome:
     example:
       rangesfm check survey.toml
     """
-    from rangesfm.workflows.check import check_survey
+    from rangesfm.pipeline.check import check_survey
 
     checked = check_survey(survey_from_arguments(args, progress))
     return Outcome(told(checked, fault="error"), checked.exit_status)

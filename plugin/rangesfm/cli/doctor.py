@@ -19,8 +19,8 @@ def _doctor(args: argparse.Namespace, progress: Progress) -> Outcome:
     example:
       rangesfm doctor
     """
-    from rangesfm.ceres.installation_checks import diagnose
-    from rangesfm.files.text_tables import align_rows
+    from rangesfm.solver.installation_checks import diagnose
+    from rangesfm.util.files.text_tables import align_rows
 
     checks = diagnose()
     rows = []

@@ -30,18 +30,18 @@ def _plan(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     if (args.plan is None) == (args.result is None):
         raise InputError("expected either the file of a plan or --from RESULT")
-    from rangesfm.files.atomic import require_apart
     from rangesfm.planning.placement import place_anchors
     from rangesfm.planning.plan_file import read_plan
     from rangesfm.planning.survey_plan import REFUSED, plan_survey
     from rangesfm.report.plan_page import write_plan
+    from rangesfm.util.files.atomic import require_apart
 
     if args.output_path is not None:
         require_apart([Path(args.plan or args.result)], Path(args.output_path))
     if args.plan is not None:
         planned = place_anchors(read_plan(args.plan), progress)
     else:
-        from rangesfm.workflows.plan_again import plan_of_result
+        from rangesfm.pipeline.plan_again import plan_of_result
 
         planned = plan_of_result(args.result)
     plan = plan_survey(planned)

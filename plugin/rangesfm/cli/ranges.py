@@ -13,17 +13,17 @@ from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.help_pages import Parser
 from rangesfm.cli.survey_flags import add_flags, position, survey_from_arguments
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.files.clock_times import span_text
 from rangesfm.progress import Progress
+from rangesfm.util.files.clock_times import span_text
 
 if TYPE_CHECKING:
     from rangesfm.arrays import Array
+    from rangesfm.measurements.ranges.anchors.anchor import Anchor
+    from rangesfm.measurements.ranges.anchors.trilateration import AnchorPlacement
+    from rangesfm.measurements.ranges.errors.radio_calibration import RadioCalibration
+    from rangesfm.measurements.ranges.range_log import RangeLog
+    from rangesfm.measurements.ranges.range_summary import LinkSummary, RangeSummary
     from rangesfm.option_model import Bounds
-    from rangesfm.ranging.anchors.anchor import Anchor
-    from rangesfm.ranging.anchors.trilateration import AnchorPlacement
-    from rangesfm.ranging.errors.radio_calibration import RadioCalibration
-    from rangesfm.ranging.range_log import RangeLog
-    from rangesfm.ranging.range_summary import LinkSummary, RangeSummary
 
 _Value = TypeVar("_Value")
 
@@ -197,7 +197,7 @@ def _require_apart(args: argparse.Namespace, *inputs: str | Path | None) -> None
     Raises:
         InputError: it would overwrite the log or another input.
     """
-    from rangesfm.files.atomic import require_apart
+    from rangesfm.util.files.atomic import require_apart
 
     read = [Path(path) for path in (*args.log, *inputs) if path is not None]
     for output in (args.output_path, getattr(args, "plot", None)):
@@ -214,7 +214,7 @@ def _read_log(args: argparse.Namespace, anchor_ids: Sequence[str] = ()) -> Range
 
 def _read_anchors(args: argparse.Namespace) -> tuple[Anchor, ...]:
     """Read the anchor file that the arguments name."""
-    from rangesfm.ranging.anchors.anchor_file import read_anchors
+    from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
 
     options = survey_from_arguments(args).anchors
     return read_anchors(args.anchors, columns=options.columns, unit=options.unit)
@@ -222,8 +222,8 @@ def _read_anchors(args: argparse.Namespace) -> tuple[Anchor, ...]:
 
 def _read_placed_log(args: argparse.Namespace) -> tuple[RangeLog, Array]:
     """Read the n ranges of one tag, and return them with the position of the tag at each, (n, 3); NaN if unknown."""
-    from rangesfm.positions.true_positions import read_true_positions
-    from rangesfm.ranging.known_path import tag_positions
+    from rangesfm.measurements.positions.true_positions import read_true_positions
+    from rangesfm.measurements.ranges.known_path import tag_positions
     from rangesfm.survey.inputs import of_one_tag
 
     log, known = of_one_tag(_read_log(args), args.tag_id), read_true_positions(args.positions)
@@ -239,8 +239,8 @@ def _ranges(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm ranges log.csv --columns timestamp=t,anchor_id=node,range=d \
         --timestamp_unit ms --output_path ranges.csv
     """
-    from rangesfm.ranging.range_summary import summarize_ranges
-    from rangesfm.ranging.readers import read_anchors_in_log, write_ranges_csv
+    from rangesfm.measurements.ranges.range_summary import summarize_ranges
+    from rangesfm.measurements.ranges.readers import read_anchors_in_log, write_ranges_csv
 
     _require_apart(args, args.anchors)
     anchors = _read_anchors(args) if args.anchors is not None else ()
@@ -268,7 +268,7 @@ def _notes_of(log: RangeLog) -> list[str]:
 
 
 def _summary(summary: RangeSummary, of_reading: Sequence[str]) -> list[str]:
-    from rangesfm.files.text_tables import align_rows
+    from rangesfm.util.files.text_tables import align_rows
 
     step_m = summary.quantization_m
     between = {"anchor": 0, "tag": 0}
@@ -325,8 +325,8 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm ranges calibrate log.csv --anchors anchors.csv \
         --positions truth.csv --output_path curve.csv
     """
-    from rangesfm.ranging.errors.error_curve import write_error_curve
-    from rangesfm.ranging.errors.radio_calibration import calibrate_ranges
+    from rangesfm.measurements.ranges.errors.error_curve import write_error_curve
+    from rangesfm.measurements.ranges.errors.radio_calibration import calibrate_ranges
 
     _require_apart(args, args.anchors, args.positions)
     anchors = _read_anchors(args)
@@ -349,7 +349,7 @@ def _calibrate(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 
 def _calibrated(calibration: RadioCalibration, num_in_log: int) -> list[str]:
-    from rangesfm.files.text_tables import align_rows
+    from rangesfm.util.files.text_tables import align_rows
 
     curve, share = calibration.curve, f"{100 * calibration.outlier_share:.1f} % do not fit"
     columns = (curve.distance_m, curve.error_m, curve.stddev_m, curve.noise_stddev_m)
@@ -377,8 +377,8 @@ def _trilaterate(args: argparse.Namespace, progress: Progress) -> Outcome:
         --output_path anchors.csv
       rangesfm run survey.toml --anchors anchors.csv --anchor_frame site
     """
-    from rangesfm.ranging.anchors.anchor_file import write_anchors
-    from rangesfm.ranging.anchors.trilateration import TrilaterationOptions, trilaterate_anchors
+    from rangesfm.measurements.ranges.anchors.anchor_file import write_anchors
+    from rangesfm.measurements.ranges.anchors.trilateration import TrilaterationOptions, trilaterate_anchors
 
     _require_apart(args, args.positions)
     log, tags_m = _read_placed_log(args)
@@ -418,7 +418,7 @@ def _of_anchors(flag: str, given: dict[str, _Value], log: RangeLog) -> dict[str,
 
 
 def _placed(log: RangeLog, placements: Sequence[AnchorPlacement]) -> list[str]:
-    from rangesfm.files.text_tables import align_rows
+    from rangesfm.util.files.text_tables import align_rows
 
     rows: list[Sequence[str]] = [("anchor", "ranges", "fit", "x m", "y m", "z m", "stddev m", "bias m", "noise m")]
     notes = [""]

@@ -11,8 +11,8 @@ from rangesfm.cli.arguments import Commands, Outcome
 from rangesfm.cli.help_pages import Parser
 from rangesfm.cli.survey_flags import add_flags, flags_given, overrides_from_arguments, survey_from_arguments
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import require_apart
 from rangesfm.progress import Progress
+from rangesfm.util.files.atomic import require_apart
 
 if TYPE_CHECKING:
     from rangesfm.options import ExportOptions
@@ -99,7 +99,7 @@ def _measure(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm measure out --pairs pairs.csv --markers marks.csv \
         --output_path measured.csv
     """
-    from rangesfm.workflows.measure import measure, read_point_pairs
+    from rangesfm.pipeline.measure import measure, read_point_pairs
 
     if again := {name for name in args.points if args.points.count(name) > 1}:
         raise InputError(f"{min(again)} is given twice, expected different points")
@@ -124,7 +124,7 @@ def _export(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     from rangesfm.export import NERFSTUDIO_IMAGES, TRAINERS_FORMATS
     from rangesfm.export.offset import offset_note
-    from rangesfm.workflows.export_result import apply_result, export_result
+    from rangesfm.pipeline.export_result import apply_result, export_result
 
     source = _result_path(args)
     options = survey_from_arguments(args).export
@@ -191,9 +191,9 @@ def _compare(args: argparse.Namespace, progress: Progress) -> Outcome:
 
 def _compare_many(args: argparse.Namespace, paths: list[Path]) -> Outcome:
     from rangesfm.comparison.many_models import compare_many, read_named_models
-    from rangesfm.distances.tape_file import read_tape
-    from rangesfm.positions.true_positions import read_true_positions
-    from rangesfm.workflows.ranges_for_models import ranges_of_survey
+    from rangesfm.measurements.lengths.tape_file import read_tape
+    from rangesfm.measurements.positions.true_positions import read_true_positions
+    from rangesfm.pipeline.ranges_for_models import ranges_of_survey
 
     if args.output_path is not None:
         require_apart(paths, Path(args.output_path))

@@ -75,7 +75,7 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     survey = survey_from_arguments(args, progress)
     if args.survey is not None and survey.source.path is None:  # the argument is a folder without a survey file
-        from rangesfm.workflows.check import check_survey
+        from rangesfm.pipeline.check import check_survey
 
         for fact in check_survey(survey).understood():
             progress.message(fact)
@@ -84,7 +84,7 @@ def _run(args: argparse.Namespace, progress: Progress) -> Outcome:
         survey.require_metres()
     else:
         _require_model_and_metres(survey)
-    from rangesfm.workflows.run import run_survey
+    from rangesfm.pipeline.run import run_survey
 
     return Outcome(run_survey(survey, progress=progress, restart=args.restart).lines)
 
@@ -99,8 +99,8 @@ def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     from rangesfm.demo import corridor
     from rangesfm.demo import survey as yard
+    from rangesfm.pipeline.run import run_survey
     from rangesfm.survey.survey_reader import read_survey
-    from rangesfm.workflows.run import run_survey
 
     most = corridor.NUM_PHOTOS if args.scene == "corridor" else yard.NUM_PHOTOS
     num_photos = most if args.num_photos is None else args.num_photos
@@ -126,7 +126,7 @@ def _reconstruct(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     survey = survey_from_arguments(args)
     _require_images(survey)
-    from rangesfm.workflows.run import reconstruct_survey
+    from rangesfm.pipeline.run import reconstruct_survey
 
     return Outcome(reconstruct_survey(survey, progress=progress, restart=args.restart))
 
@@ -140,7 +140,7 @@ def _scale(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     survey = survey_from_arguments(args)
     _require_model_and_metres(survey)
-    from rangesfm.workflows.run import scale_model
+    from rangesfm.pipeline.run import scale_model
 
     return Outcome(scale_model(survey, progress=progress).lines)
 
@@ -155,7 +155,7 @@ def _refine(args: argparse.Namespace, progress: Progress) -> Outcome:
     """
     survey = survey_from_arguments(args)
     _require_model_and_metres(survey)
-    from rangesfm.workflows.run import refine_model
+    from rangesfm.pipeline.run import refine_model
 
     return Outcome(refine_model(survey, progress=progress).lines)
 
@@ -170,13 +170,13 @@ def _join(args: argparse.Namespace, progress: Progress) -> Outcome:
       rangesfm join monday/out tuesday/out --output_path site
     """
     survey = survey_from_arguments(args)
-    from rangesfm.workflows.join_surveys import join_surveys
+    from rangesfm.pipeline.join_surveys import join_surveys
 
     return Outcome(join_surveys(survey, [Path(result) for result in args.results], progress=progress).lines)
 
 
 def _require_images(survey: Survey) -> None:
-    from rangesfm.sources.source import is_source
+    from rangesfm.survey.sources.source import is_source
 
     path = survey.photos_path
     if not (os.path.isdir(path) or (is_source(path) and path.is_file())):

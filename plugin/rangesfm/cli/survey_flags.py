@@ -226,8 +226,8 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress = SILENT)
     Raises:
         InputError: the file cannot be read, or a key or a flag is wrong.
     """
+    from rangesfm.survey.discovery.found_files import SURVEY_NAME
     from rangesfm.survey.survey_reader import read_survey, survey_from_tables
-    from rangesfm.survey_discovery.found_files import SURVEY_NAME
 
     overrides = overrides_from_arguments(args)
     path = None if getattr(args, "survey", None) is None else Path(args.survey)
@@ -235,8 +235,8 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress = SILENT)
     if path is None:
         return survey_from_tables({}, Path.cwd(), overrides)
     if path.is_dir():
-        from rangesfm.files.output_folder import free_output
-        from rangesfm.survey_discovery.understood import understand
+        from rangesfm.survey.discovery.understood import understand
+        from rangesfm.util.files.output_folder import free_output
 
         given = {"output.path": free_output(path.absolute()), **overrides}
         values, notes = understand([path], given, getattr(args, "typed", ()))
@@ -247,6 +247,6 @@ def survey_from_arguments(args: argparse.Namespace, progress: Progress = SILENT)
 
 
 def _is_table(path: str) -> bool:
-    from rangesfm.sources.source import is_source
+    from rangesfm.survey.sources.source import is_source
 
     return path.endswith(".csv") or (os.path.isfile(path) and not is_source(Path(path)))

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rangesfm.colmap.glog import logging_into
-from rangesfm.files.atomic import scratch_folder
+from rangesfm.util.files.atomic import scratch_folder
 
 
 @contextmanager

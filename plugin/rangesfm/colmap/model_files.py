@@ -18,9 +18,9 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import is_plain_name
-from rangesfm.files.contents import open_regular
-from rangesfm.files.text_tables import read_text
+from rangesfm.util.files.atomic import is_plain_name
+from rangesfm.util.files.contents import open_regular
+from rangesfm.util.files.text_tables import read_text
 
 MAX_COORDINATE = 1e12
 """Largest accepted coordinate of points and poses, in any unit; its square is still exact enough as a double."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import pose_of
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import pose_of
 
 
 def rescale(reconstruction: pycolmap.Reconstruction, metric_from_sfm: Similarity) -> pycolmap.Reconstruction:

@@ -12,13 +12,13 @@ from rangesfm.arrays import Array, median, rms
 from rangesfm.comparison.same_photos import Length, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import format_table, papers_table
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import align_rows
-from rangesfm.geometry.reference import read_reference
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import read_result_folder
 from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.util.files.text_tables import align_rows
+from rangesfm.util.geometry.reference import read_reference
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+from rangesfm.util.processes.threads import with_one_blas_thread
 
 _Pair = tuple[float, ...]
 

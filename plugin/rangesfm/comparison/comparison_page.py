@@ -9,11 +9,11 @@ import numpy as np
 from rangesfm.comparison.many_models import ModelsComparison, NamedModel
 from rangesfm.comparison.same_photos import carried_by
 from rangesfm.export.metric_map import colored_points
-from rangesfm.files.atomic import sole_writer
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.plot import WIDE_SIZE, Figure, Series, equal_view, figure_of, from_zero, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.scene import Scene, ScenePath, view_of
+from rangesfm.util.files.atomic import sole_writer
+from rangesfm.util.geometry.trajectory import Trajectory
 
 COLORS = ("after", "before", "third", "fourth")
 

@@ -17,21 +17,21 @@ from rangesfm.colmap.model_files import read_model
 from rangesfm.comparison.model_ranges import ModelRanges, ranges_of_result
 from rangesfm.comparison.same_photos import Length, carried_by, common_photos, lengths_along, reprojection_rms_px
 from rangesfm.comparison.with_reference import compare, known_keyframes, similarity_onto, text_or_dash
-from rangesfm.distances.locate_lengths import locate_distances
-from rangesfm.distances.tape import Tape
-from rangesfm.distances.tape_file import markers_of_photos
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import align_rows
-from rangesfm.geometry.reference import Reference
-from rangesfm.geometry.similarity import Similarity, rmse
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.positions.true_positions import read_true_positions
+from rangesfm.measurements.lengths.locate_lengths import locate_distances
+from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.lengths.tape_file import markers_of_photos
+from rangesfm.measurements.positions.true_positions import read_true_positions
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder, read_result_folder
 from rangesfm.result.summary import ResultSummary
 from rangesfm.survey.photo_times import times_of_model
 from rangesfm.survey.settings import Survey
+from rangesfm.util.files.text_tables import align_rows
+from rangesfm.util.geometry.reference import Reference
+from rangesfm.util.geometry.similarity import Similarity, rmse
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 _NO_RANGES = (math.nan, math.nan)
 

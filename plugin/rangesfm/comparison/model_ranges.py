@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.options import AssociationOptions
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.range_log import RangeLog
 from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.util.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.similarity import Similarity, rmse
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.util.geometry.similarity import Similarity, rmse
+from rangesfm.util.geometry.trajectory import Trajectory
 
 Length = tuple[str, str, tuple[float, ...]]
 """A distance between two photos: their names, and the length in each model, in the unit of that model."""

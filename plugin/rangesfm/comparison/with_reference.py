@@ -10,12 +10,12 @@ import numpy.typing as npt
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, number_text
-from rangesfm.files.text_tables import align_rows
-from rangesfm.geometry.reference import Reference
-from rangesfm.geometry.similarity import Similarity, align_points, rmse, similarity_between
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.result.entries import ComparisonRow, rmse_heading
+from rangesfm.util.files.text_tables import align_rows
+from rangesfm.util.geometry.reference import Reference
+from rangesfm.util.geometry.similarity import Similarity, align_points, rmse, similarity_between
+from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.processes.threads import with_one_blas_thread
 
 MIN_NUM_ALIGNED = 3
 """Smallest number of keyframes for an alignment: two points always fit exactly after Sim(3)."""

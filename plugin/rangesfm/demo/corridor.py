@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array, Indices
 from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
 from rangesfm.demo.survey import TAG_IN_CAM_M, TIME_OFFSET_S, DemoSurvey, write_demo
-from rangesfm.geometry.reference import Reference
+from rangesfm.util.geometry.reference import Reference
 
 NUM_PHOTOS = 96
 SIZE_PX, FOCAL_PX = (360, 240), 230.0

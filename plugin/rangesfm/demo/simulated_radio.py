@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from rangesfm.arrays import Array
-from rangesfm.ranging.range_log import RangeLog
+from rangesfm.measurements.ranges.range_log import RangeLog
 
 # Shortest range that a radio measures; ranges in a log are positive.
 _MIN_RANGE_M = 0.01

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.demo.simulated_radio import CameraPath, Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_folder, sole_writer, write_text
-from rangesfm.files.output_folder import PRIVATE_NAME
-from rangesfm.geometry.reference import Reference, write_reference
-from rangesfm.ranging.readers import write_ranges_csv
+from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.util.files.atomic import new_folder, sole_writer, write_text
+from rangesfm.util.files.output_folder import PRIVATE_NAME
+from rangesfm.util.geometry.reference import Reference, write_reference
 
 PHOTOS = Path(__file__).with_name("photos")
 PATH_FILE = PHOTOS / "path.csv"

@@ -11,14 +11,14 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import MEASURE_AGAIN, Correction, corrected, where_ranges_meet
 from rangesfm.diagnostics.linearized import RangesOnMap
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
-from rangesfm.geometry.robust_statistics import CAUCHY
-from rangesfm.geometry.similarity import IDENTITY, Similarity, align_points
-from rangesfm.inference.mistakes import in_axes
-from rangesfm.ranging.range_observations import OUTLIER_BELOW
-from rangesfm.ranging.readers.units import FOOT_M
-from rangesfm.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, solve
-from rangesfm.scale.starts import multilaterate_all, spread_rows
+from rangesfm.estimation.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, solve
+from rangesfm.estimation.scale.starts import multilaterate_all, spread_rows
+from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
+from rangesfm.measurements.ranges.readers.units import FOOT_M
+from rangesfm.solver.mistakes import in_axes
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
+from rangesfm.util.geometry.robust_statistics import CAUCHY
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points
 
 # Ranges of each anchor in a refit: alternatives are only compared.
 _NUM_PER_ANCHOR = 25

@@ -10,10 +10,10 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, after_step, at_state, is_nearly_at, linearized
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
-from rangesfm.geometry.similarity import path_shape
-from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.scale.range_equation import RangeState, antenna_positions
+from rangesfm.estimation.scale.range_equation import RangeState, antenna_positions
+from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
+from rangesfm.util.geometry.similarity import path_shape
 
 
 @dataclass(frozen=True)

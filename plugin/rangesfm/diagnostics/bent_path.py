@@ -20,17 +20,17 @@ from rangesfm.diagnostics.linearized import (
     linearized,
     slopes_by_poses,
 )
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
-from rangesfm.geometry.similarity import rmse
-from rangesfm.inference.bending import BENDS, WalkBending
-from rangesfm.inference.linear_map import regular
-from rangesfm.inference.posterior import Posterior
+from rangesfm.estimation.scale.range_equation import RangeState
+from rangesfm.estimation.scale.scale_by_ranges import RangeScale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.estimation.scale.scale_verdict import doubts_of_ranges, judge, remarks_on_anchors
+from rangesfm.measurements.ranges.range_observations import status_by_weight
 from rangesfm.options import ScaleOptions
-from rangesfm.ranging.range_observations import status_by_weight
-from rangesfm.scale.range_equation import RangeState
-from rangesfm.scale.scale_by_ranges import RangeScale
-from rangesfm.scale.scale_estimate import ScaleEstimate
-from rangesfm.scale.scale_verdict import doubts_of_ranges, judge, remarks_on_anchors
+from rangesfm.solver.bending import BENDS, WalkBending
+from rangesfm.solver.linear_map import regular
+from rangesfm.solver.posterior import Posterior
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
+from rangesfm.util.geometry.similarity import rmse
 
 # Number of Gauss-Newton steps after which the bins are kept: with bins and outliers chosen anew each time, a map may
 # swing to and fro for ever.

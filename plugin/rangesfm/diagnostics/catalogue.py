@@ -21,7 +21,7 @@ from rangesfm.diagnostics.hypothesis import (
     too_long,
 )
 from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.inference.mistakes import in_axes
+from rangesfm.solver.mistakes import in_axes
 
 SAME_HEIGHT_M = 1e-3
 """Nobody measures heights of anchors that agree to within this, metres."""

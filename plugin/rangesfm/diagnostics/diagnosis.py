@@ -14,10 +14,10 @@ from rangesfm.diagnostics.hypothesis_tests import Test, row_of
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
 from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
-from rangesfm.geometry.numerics import DOUBTFUL_ABOVE
-from rangesfm.inference.mistakes import MistakeTest, MistakeTests
-from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.ranging.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
+from rangesfm.measurements.ranges.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
+from rangesfm.solver.mistakes import MistakeTest, MistakeTests
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
+from rangesfm.util.processes.threads import with_one_blas_thread
 
 # Largest standard deviation, metres, of noise, and of lasting errors. Real radios show 0.03 to 0.15 m beside outliers,
 # old ones 0.2 m; more has another cause.

@@ -16,9 +16,9 @@ from rangesfm.arrays import Indices
 from rangesfm.diagnostics.hypothesis import longest_m
 from rangesfm.diagnostics.hypothesis_tests import Factorization
 from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.inference.linear_map import FALSE_ALARM_RATE
-from rangesfm.inference.noise import Component
-from rangesfm.ranging.errors.components import BURSTS, LASTING_S
+from rangesfm.measurements.ranges.errors.components import BURSTS, LASTING_S
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE
+from rangesfm.solver.noise import Component
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,14 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
+from rangesfm.estimation.scale.scale_by_ranges import RangeScale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
-from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
-from rangesfm.geometry.similarity import path_shape, similarity_motions
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.measurements.joint_map import Doubt
-from rangesfm.ranging.range_observations import RangeStatus
-from rangesfm.scale.scale_by_ranges import RangeScale
-from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.ranges.range_observations import RangeStatus
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
+from rangesfm.util.geometry.similarity import path_shape, similarity_motions
+from rangesfm.util.geometry.trajectory import Trajectory
 
 # Allowance for comparing medians: ``_max_growth`` bounds sums of squares, while medians ignore a few large errors.
 _OF_MEDIANS = 1.5

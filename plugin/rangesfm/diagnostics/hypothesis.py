@@ -9,9 +9,9 @@ import numpy as np
 
 from rangesfm.arrays import Array, Mask
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap
-from rangesfm.geometry.numerics import ROUNDING
-from rangesfm.ranging.anchors.point_fit import multilaterate
-from rangesfm.scale.range_equation import antenna_positions
+from rangesfm.estimation.scale.range_equation import antenna_positions
+from rangesfm.measurements.ranges.anchors.point_fit import multilaterate
+from rangesfm.util.geometry.numerics import ROUNDING
 
 # Step, in the unit of a hypothesis, of the difference quotient for its effect: then rounding and curvature spoil it by
 # about the same.

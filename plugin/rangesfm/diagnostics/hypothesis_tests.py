@@ -12,9 +12,9 @@ from scipy.linalg import solve_triangular
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
 from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.geometry.numerics import UNDETERMINED
-from rangesfm.inference.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
-from rangesfm.inference.mistakes import MistakeTest, finite, row_of_mistake
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
+from rangesfm.solver.mistakes import MistakeTest, finite, row_of_mistake
+from rangesfm.util.geometry.numerics import UNDETERMINED
 
 # Random surveys from which the thresholds come: 20 of them exceed one.
 _NUM_DRAWS = 1000

@@ -15,16 +15,16 @@ import pycolmap
 from scipy import special
 from scipy.spatial.distance import pdist
 
-from rangesfm import ceres
-from rangesfm.ceres.bundle_adjustment import bundle_adjustment, keyframe_centers
+from rangesfm import solver
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.errors import SolverError
 from rangesfm.estimation.photo_bending import LARGEST_FACTOR, MEDIAN_FACTOR
-from rangesfm.geometry.numerics import DOUBTFUL_ABOVE
-from rangesfm.geometry.similarity import align_points
-from rangesfm.inference.mistakes import RISK
 from rangesfm.measurements.joint_map import Doubt
 from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.solver.bundle_adjustment import bundle_adjustment, keyframe_centers
+from rangesfm.solver.mistakes import RISK
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE
+from rangesfm.util.geometry.similarity import align_points
 
 # For each of COLMAP's camera models one that contains it. All others are tested with other parameters of their own.
 _RICHER = {
@@ -159,10 +159,10 @@ def _adjust(model: pycolmap.Reconstruction, *, lens_is_free: bool) -> Any:
     """
     lens = dict.fromkeys(("refine_focal_length", "refine_extra_params", "refine_principal_point"), lens_is_free)
     # By this loss, wrong matches do not outweigh a lens.
-    solver = {"function_tolerance": _FUNCTION_TOLERANCE}
+    of_solver = {"function_tolerance": _FUNCTION_TOLERANCE}
     if lens_is_free:
-        solver["initial_trust_region_radius"] = _TRUST_REGION_RADIUS
-    ceres_options = {"loss_function_type": "SOFT_L1", "solver_options": solver}
+        of_solver["initial_trust_region_radius"] = _TRUST_REGION_RADIUS
+    ceres_options = {"loss_function_type": "SOFT_L1", "solver_options": of_solver}
     options = RefineOptions(
         max_num_iterations=_MAX_NUM_ITERATIONS,
         bundle_adjustment={**lens, "refine_sensor_from_rig": False, "ceres": ceres_options},
@@ -171,7 +171,7 @@ def _adjust(model: pycolmap.Reconstruction, *, lens_is_free: bool) -> Any:
     adjuster = bundle_adjustment(model, CameraOptions(), options, fixed_frame_id=frame_id, num_threads=1).adjuster
     if adjuster.problem.num_residuals() <= adjuster.problem.num_parameters():
         raise SolverError("the photos see too few points to tell anything of the lens")
-    summary = ceres.solve_adjuster(adjuster, lambda step: False)
+    summary = solver.solve_adjuster(adjuster, lambda step: False)
     if not (summary.IsSolutionUsable() and summary.final_cost > 0):
         raise SolverError(f"the adjustment for the lens failed: {summary.message}")
     return summary

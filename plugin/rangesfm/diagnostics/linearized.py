@@ -9,19 +9,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
-from rangesfm.geometry.robust_statistics import MIN_STDDEV_M, robust_stddev
-from rangesfm.geometry.similarity import similarity_motions
-from rangesfm.inference.bending import MapBending
-from rangesfm.inference.linear_map import LinearMap
-from rangesfm.inference.noise import Component, noise_of_sizes, usual_sizes
-from rangesfm.ranging.errors.components import DRIFT_S, PLACES, WANDERING, OtherError
-from rangesfm.ranging.errors.learned import LearnedErrors, learn_errors, radio_components
-from rangesfm.ranging.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
-from rangesfm.ranging.range_gradient import RangeGradient
-from rangesfm.ranging.range_observations import OnPath
-from rangesfm.scale.binned_ranges import ruled_out
-from rangesfm.scale.range_equation import (
+from rangesfm.estimation.scale.binned_ranges import ruled_out
+from rangesfm.estimation.scale.range_equation import (
     RangeProblem,
     RangeState,
     antenna_positions,
@@ -31,8 +20,19 @@ from rangesfm.scale.range_equation import (
     range_jacobian,
     state_after,
 )
-from rangesfm.scale.scale_problem import ScaleProblem
-from rangesfm.scale.solution import Solution
+from rangesfm.estimation.scale.scale_problem import ScaleProblem
+from rangesfm.estimation.scale.solution import Solution
+from rangesfm.measurements.ranges.errors.components import DRIFT_S, PLACES, WANDERING, OtherError
+from rangesfm.measurements.ranges.errors.learned import LearnedErrors, learn_errors, radio_components
+from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
+from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.measurements.ranges.range_observations import OnPath
+from rangesfm.solver.bending import MapBending
+from rangesfm.solver.linear_map import LinearMap
+from rangesfm.solver.noise import Component, noise_of_sizes, usual_sizes
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS
+from rangesfm.util.geometry.robust_statistics import MIN_STDDEV_M, robust_stddev
+from rangesfm.util.geometry.similarity import similarity_motions
 
 # Fewer bins than for an interval, because the tests learn the errors many times.
 _MAX_NUM_BINS = 160

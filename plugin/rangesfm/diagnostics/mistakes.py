@@ -17,10 +17,10 @@ from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
 from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_other_map, at_state, linearized
 from rangesfm.diagnostics.scale_bound import hidden_among
 from rangesfm.diagnostics.timed_hypotheses import SCANNING
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
-from rangesfm.inference.bending import WalkBending
-from rangesfm.inference.mistakes import HiddenMistake
-from rangesfm.scale.range_equation import RangeState, state_after
+from rangesfm.estimation.scale.range_equation import RangeState, state_after
+from rangesfm.solver.bending import WalkBending
+from rangesfm.solver.mistakes import HiddenMistake
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
 
 # Numbers of explanations that are tried, each with the noise that it leaves: in all, of one kind, and when no test
 # exceeds its threshold.

@@ -11,15 +11,15 @@ from scipy import special
 from scipy.linalg import block_diag
 
 from rangesfm.arrays import Array
-from rangesfm.distances.map_points import MapPoint, MapPoints
-from rangesfm.distances.tape import CHECK, CONTROL
-from rangesfm.geometry.map_errors import MapErrors
-from rangesfm.geometry.similarity import similarity_motions
-from rangesfm.inference.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
-from rangesfm.inference.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
-from rangesfm.positions.control_points import ControlPoint, ControlPoints, marks_seen
-from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.scale.position_tests import LOOK_AGAIN
+from rangesfm.estimation.scale.position_tests import LOOK_AGAIN
+from rangesfm.measurements.lengths.map_points import MapPoint, MapPoints
+from rangesfm.measurements.lengths.tape import CHECK, CONTROL
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints, marks_seen
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved
+from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_mistake
+from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.similarity import similarity_motions
+from rangesfm.util.processes.threads import with_one_blas_thread
 
 _ONE_FRAME = "look whether points and anchors are in one frame, and measured to the same height of the antennas"
 _ALL = "frame of the points"

@@ -13,18 +13,18 @@ from scipy import special
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
 from rangesfm.diagnostics.catalogue import LARGEST_RIG_M, SAME_HEIGHT_M
-from rangesfm.distances.tape import Tape
 from rangesfm.errors import InputError, number_text
-from rangesfm.files.clock_times import are_seconds_since_1970
-from rangesfm.inference.linear_map import FALSE_ALARM_RATE
-from rangesfm.positions.known_positions import MIN_NUM_POSITIONS
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.range_log import RangeKind, RangeLog
-from rangesfm.ranging.readers.table import CANONICAL, MAPPED, TABLE
-from rangesfm.ranging.readers.units import UNITS_PER_METRE
+from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
+from rangesfm.measurements.ranges.readers.table import CANONICAL, MAPPED, TABLE
+from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.settings import Survey
+from rangesfm.util.files.clock_times import are_seconds_since_1970
 
 SAME_PLACE_M = 0.01
 """Two anchors that are nearer to each other than this, metres, are in one place, which cannot be."""

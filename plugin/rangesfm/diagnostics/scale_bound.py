@@ -19,9 +19,9 @@ from scipy.optimize import brentq
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.hypothesis_tests import Test
 from rangesfm.diagnostics.mistake_words import mistake_in_words
-from rangesfm.inference.linear_map import noncentrality
-from rangesfm.inference.mistakes import RISK, HiddenMistake
-from rangesfm.inference.posterior import ScaleUncertainty
+from rangesfm.solver.linear_map import noncentrality
+from rangesfm.solver.mistakes import RISK, HiddenMistake
+from rangesfm.solver.posterior import ScaleUncertainty
 
 
 def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:

@@ -20,8 +20,8 @@ from rangesfm.diagnostics.hypothesis import (
     too_long,
 )
 from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.inference.mistakes import in_axes
-from rangesfm.scale.range_equation import antenna_positions
+from rangesfm.estimation.scale.range_equation import antenna_positions
+from rangesfm.solver.mistakes import in_axes
 
 # Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.
 _NUM_TIMES, _NUM_FINER = 32, 17

@@ -25,12 +25,12 @@ from rangesfm.estimation.vision_information import (
     steps_of_points,
     vision_information,
 )
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
-from rangesfm.geometry.poses import Poses, model_poses
-from rangesfm.geometry.robust_statistics import wider
-from rangesfm.geometry.similarity import Similarity, align_points, are_apart, rmse
-from rangesfm.geometry.trajectory import pose_of
 from rangesfm.measurements.kind import Block, MapState
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
+from rangesfm.util.geometry.poses import Poses, model_poses
+from rangesfm.util.geometry.robust_statistics import wider
+from rangesfm.util.geometry.similarity import Similarity, align_points, are_apart, rmse
+from rangesfm.util.geometry.trajectory import pose_of
 
 # Relative change of the weights that ends the iteration: with some hundred measurements noise is not known better.
 SAME_NOISE = 0.05

@@ -16,17 +16,17 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.ceres.bundle_adjustment import farthest, still_to_come
-from rangesfm.ceres.linear_solver import factor, normal_matrix, resized
-from rangesfm.ceres.nested_dissection import NestedFactor, SingularError
 from rangesfm.estimation.vision_information import VisionInformation
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
-from rangesfm.geometry.poses import Poses, relative_poses
-from rangesfm.geometry.rotations import cross_matrices
-from rangesfm.geometry.similarity import rounding_of
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.inference.bending import Bending, bending_part, without_similarity
 from rangesfm.measurements.kind import Block, Linearization, MapState, Measurements
+from rangesfm.solver.bending import Bending, bending_part, without_similarity
+from rangesfm.solver.bundle_adjustment import farthest, still_to_come
+from rangesfm.solver.linear_solver import factor, normal_matrix, resized
+from rangesfm.solver.nested_dissection import NestedFactor, SingularError
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
+from rangesfm.util.geometry.poses import Poses, relative_poses
+from rangesfm.util.geometry.rotations import cross_matrices
+from rangesfm.util.geometry.similarity import rounding_of
+from rangesfm.util.geometry.trajectory import Trajectory
 
 _INITIAL_DAMPING = 1e-8
 _MAX_DAMPING = 1e6

@@ -9,18 +9,18 @@ import numpy as np
 import pycolmap
 from scipy.optimize import approx_fprime
 
-from rangesfm import ceres
+from rangesfm import solver
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.bundle_adjustment import BundleAdjustment, bundle_adjustment
-from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.colmap.calibrated_cameras import cameras_as_given
 from rangesfm.errors import InputError
-from rangesfm.geometry.numerics import ROUNDING
-from rangesfm.geometry.poses import model_poses
-from rangesfm.geometry.trajectory import Trajectory, pose_of
 from rangesfm.measurements.kind import Block, MapState, Measurements
 from rangesfm.measurements.source import Measured
 from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.solver.bundle_adjustment import BundleAdjustment, bundle_adjustment
+from rangesfm.solver.normal_equations import NormalEquations
+from rangesfm.util.geometry.numerics import ROUNDING
+from rangesfm.util.geometry.poses import model_poses
+from rangesfm.util.geometry.trajectory import Trajectory, pose_of
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def add_calibration(bundle: BundleAdjustment, options: CameraOptions) -> None:
         params = metric.camera(camera_id).params
         if problem.has_parameter_block(params) and not problem.is_parameter_block_constant(params):
             stddev = parameter_stddevs(given, table.calibration_stddev_px(given.mean_focal_length()))
-            ceres.add_normal_prior(bundle.adjuster, params, given.params, stddev / bundle.pixel_stddev)
+            solver.add_normal_prior(bundle.adjuster, params, given.params, stddev / bundle.pixel_stddev)
 
 
 def parameter_stddevs(camera: pycolmap.Camera, focal_length_stddev_px: float) -> Array:

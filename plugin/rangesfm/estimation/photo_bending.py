@@ -9,23 +9,23 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.ceres.bundle_adjustment import bundle_adjustment
-from rangesfm.ceres.covariance import PhotosAlone
-from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.colmap.pieces import frames_of_largest_part
 from rangesfm.errors import GeometryError, InputError, SolverError
 from rangesfm.estimation.vision_information import misplaced_points, model_observations
-from rangesfm.geometry.numerics import NORMAL_95
-from rangesfm.geometry.poses import model_poses
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
-from rangesfm.inference.bending import (
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.solver.bending import (
     Bending,
     MapBending,
     WalkBending,
     bending_part,
     without_similarity,
 )
-from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.solver.bundle_adjustment import bundle_adjustment
+from rangesfm.solver.covariance import PhotosAlone
+from rangesfm.solver.normal_equations import NormalEquations
+from rangesfm.util.geometry.numerics import NORMAL_95
+from rangesfm.util.geometry.poses import model_poses
+from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 # How much more a map is bent than its reprojection errors suggest (median, and stddev of the logarithm): about 1 with
 # independent errors of features, as in simulations; 4 in a room of real photos, 8 to 12 in three scenes of others

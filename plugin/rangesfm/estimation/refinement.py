@@ -14,17 +14,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Indices
-from rangesfm.ceres.bundle_adjustment import (
-    BundleAdjustment,
-    SolverRun,
-    pixel_stddev_of,
-    solve_bundle_adjustment,
-    solve_until_still,
-)
-from rangesfm.ceres.covariance import JointCovariance, ResidualErrors, joint_covariance
-from rangesfm.ceres.normal_equations import NormalEquations
 from rangesfm.colmap.pieces import frames_of_largest_part
-from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.drift import SAME_NOISE, Straightened, close_in_graph, straighten, straighten_again
 from rangesfm.estimation.map_problem import AddedMeasurements, MapProblem
@@ -35,9 +25,19 @@ from rangesfm.estimation.vision_information import (
     model_observations,
     project,
 )
-from rangesfm.geometry.poses import Poses, model_poses
 from rangesfm.measurements.kind import Block, MapState
+from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.marks import add_marks, errors_beyond_features, remove_marks
+from rangesfm.solver.bundle_adjustment import (
+    BundleAdjustment,
+    SolverRun,
+    pixel_stddev_of,
+    solve_bundle_adjustment,
+    solve_until_still,
+)
+from rangesfm.solver.covariance import JointCovariance, ResidualErrors, joint_covariance
+from rangesfm.solver.normal_equations import NormalEquations
+from rangesfm.util.geometry.poses import Poses, model_poses
 
 # Largest number of solutions of the full problem, between which the noise is estimated again.
 _MAX_NUM_ROUNDS = 3

@@ -19,12 +19,12 @@ from scipy import sparse
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.pieces import seen_in
 from rangesfm.errors import SolverError
-from rangesfm.geometry.numerics import ROUNDING
-from rangesfm.geometry.poses import Poses, relative_poses
-from rangesfm.geometry.robust_statistics import RobustLoss
-from rangesfm.geometry.rotations import cross_matrices
-from rangesfm.geometry.trajectory import pose_of
-from rangesfm.processes.threads import side_by_side
+from rangesfm.util.geometry.numerics import ROUNDING
+from rangesfm.util.geometry.poses import Poses, relative_poses
+from rangesfm.util.geometry.robust_statistics import RobustLoss
+from rangesfm.util.geometry.rotations import cross_matrices
+from rangesfm.util.geometry.trajectory import pose_of
+from rangesfm.util.processes.threads import side_by_side
 
 # A long track is cut into overlapping pieces of this length; distant keyframes are linked through those in between.
 _MAX_PIECE = 8

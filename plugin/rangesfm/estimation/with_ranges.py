@@ -10,23 +10,23 @@ import numpy.typing as npt
 import pycolmap
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.covariance import JointCovariance
-from rangesfm.distances.tape import Tape
 from rangesfm.estimation.map_problem import map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine
-from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.measurements.gravity import Upwards
-from rangesfm.measurements.lengths import TapedLengths
-from rangesfm.measurements.radio import RadioLog, ranges_of, ranges_of_map
-from rangesfm.measurements.ranges import CLOCK, SHORT, Ranges, anchors_at
+from rangesfm.measurements.lengths.cost import TapedLengths
+from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.measurements.ranges.cost import CLOCK, SHORT, Ranges, anchors_at
+from rangesfm.measurements.ranges.errors.range_errors import Misfit, RangeErrors, misfits
+from rangesfm.measurements.ranges.radio import RadioLog, ranges_of, ranges_of_map
+from rangesfm.measurements.ranges.range_observations import RangeObservations, status_by_weight
 from rangesfm.measurements.source import Measured
 from rangesfm.options import CameraOptions, RefineOptions
-from rangesfm.processes.threads import at_most, with_one_blas_thread
-from rangesfm.ranging.anchors.anchor import AnchorEstimate
-from rangesfm.ranging.errors.range_errors import Misfit, RangeErrors, misfits
-from rangesfm.ranging.range_observations import RangeObservations, status_by_weight
+from rangesfm.solver.covariance import JointCovariance
+from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.processes.threads import at_most, with_one_blas_thread
 
 
 @with_one_blas_thread

@@ -25,10 +25,10 @@ from rangesfm.export.offset import OFFSET_NAME, write_offset
 from rangesfm.export.photogrammetry import NERFSTUDIO_IMAGES, write_nerfstudio, write_opensfm, write_opf
 from rangesfm.export.ply import write_anchor_vertices, write_cameras, write_points
 from rangesfm.export.trajectories import COVARIANCE_FORMATS, write_covariances, write_kitti, write_trajectory
-from rangesfm.files.atomic import make_output_folder
-from rangesfm.files.contents import AnyPath
-from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import ExportOptions
+from rangesfm.util.files.atomic import make_output_folder
+from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.geometry.similarity import Similarity
 
 __all__ = [
     "COVARIANCE_FORMATS",

@@ -14,9 +14,9 @@ from rangesfm.colmap.colmap_log import colmap_log
 from rangesfm.colmap.model_files import write_binary_model
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap, photo_files, registered_images, require_space
-from rangesfm.files.atomic import new_file, new_folder, write_text
-from rangesfm.files.folders import real_path
-from rangesfm.geometry.similarity import Similarity
+from rangesfm.util.files.atomic import new_file, new_folder, write_text
+from rangesfm.util.files.folders import real_path
+from rangesfm.util.geometry.similarity import Similarity
 
 
 def write_model(reconstruction: pycolmap.Reconstruction, path: Path, *, as_text: bool = False) -> Path:

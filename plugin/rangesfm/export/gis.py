@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.export.metric_map import MetricMap, colored_points
-from rangesfm.files.atomic import new_file
-from rangesfm.geometry.georeference import GEOGRAPHIC, is_geographic
 from rangesfm.installed_versions import missing_extra
+from rangesfm.util.files.atomic import new_file
+from rangesfm.util.geometry.georeference import GEOGRAPHIC, is_geographic
 
 _STEP_M = 1e-4
 _STEP_DEG = 1e-9

@@ -19,12 +19,12 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
 from rangesfm.errors import InputError
-from rangesfm.files.folders import stays_inside
-from rangesfm.geometry.georeference import Georeference, check_crs, georeference_of_anchor
-from rangesfm.geometry.gravity import UP_IN_SITE
-from rangesfm.geometry.similarity import Similarity, path_shape
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.options import ExportOptions
+from rangesfm.util.files.folders import stays_inside
+from rangesfm.util.geometry.georeference import Georeference, check_crs, georeference_of_anchor
+from rangesfm.util.geometry.gravity import UP_IN_SITE
+from rangesfm.util.geometry.similarity import Similarity, path_shape
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 # Largest ratio of the path's extent perpendicular to its plane to its second largest extent; above, it has no plane.
 _MAX_ROUGHNESS = 0.3

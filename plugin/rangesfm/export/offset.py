@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.files.atomic import write_text
+from rangesfm.util.files.atomic import write_text
 
 OFFSET_NAME = "offset.txt"
 """File with the offset, beside the files that it belongs to."""

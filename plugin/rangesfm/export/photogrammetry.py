@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap, colored_points, photo_files, registered_images, require_space
 from rangesfm.export.ply import write_points
-from rangesfm.files.atomic import new_folder
-from rangesfm.files.folders import real_path
-from rangesfm.files.records import write_json
+from rangesfm.util.files.atomic import new_folder
+from rangesfm.util.files.folders import real_path
+from rangesfm.util.files.records import write_json
 
 NERFSTUDIO_IMAGES = "images"
 """Folder of the photos beside transforms.json."""

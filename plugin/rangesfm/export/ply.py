@@ -15,10 +15,10 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import colored_points
-from rangesfm.files.atomic import new_file
-from rangesfm.files.contents import open_regular
-from rangesfm.geometry.similarity import Similarity, overflow_raised
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.util.files.atomic import new_file
+from rangesfm.util.files.contents import open_regular
+from rangesfm.util.geometry.similarity import Similarity, overflow_raised
+from rangesfm.util.geometry.trajectory import Trajectory
 
 CAMERA_COLOR = (37, 99, 235)
 ANCHOR_COLOR = (162, 28, 175)

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
 from rangesfm.export.metric_map import MetricMap
-from rangesfm.files.atomic import new_file
-from rangesfm.files.text_tables import write_table
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.util.files.atomic import new_file
+from rangesfm.util.files.text_tables import write_table
+from rangesfm.util.geometry.trajectory import Trajectory
 
 # Formats that need covariances.
 COVARIANCE_FORMATS = ("tum_covariance", "kitti_covariance")

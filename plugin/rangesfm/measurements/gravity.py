@@ -8,12 +8,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from rangesfm import ceres
+from rangesfm import solver
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.bundle_adjustment import BundleAdjustment
-from rangesfm.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.measurements.kind import LEAST_SQUARES, Block, Linearization, MapState, Measurements, Weights
 from rangesfm.measurements.source import MapToFit, Source
+from rangesfm.solver.bundle_adjustment import BundleAdjustment
+from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class UpwardDirection(Measurements):
 
     def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
         first = adjustment.adjuster.problem.num_residuals()
-        cost = ceres.direction_cost(
+        cost = solver.direction_cost(
             direction_in_world=UP_IN_SITE,
             direction_in_cam=self.gravity.up_in_first_camera,
             stddev_rad=self.gravity.stddev_rad / adjustment.pixel_stddev,
         )
-        ceres.add_residual_block(adjustment.adjuster, cost, None, [poses[0]])
+        solver.add_residual_block(adjustment.adjuster, cost, None, [poses[0]])
         return np.arange(first, adjustment.adjuster.problem.num_residuals())
 
 

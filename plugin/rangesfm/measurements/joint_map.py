@@ -16,14 +16,11 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
-from rangesfm.geometry.similarity import IDENTITY, Similarity
-from rangesfm.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
-from rangesfm.inference.bending import MapBending
-from rangesfm.inference.linear_map import FALSE_ALARM_RATE, noncentrality
-from rangesfm.inference.mistakes import MistakeTest, MistakeTests, finite
-from rangesfm.inference.posterior import (
+from rangesfm.measurements.source import Source
+from rangesfm.solver.bending import MapBending
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
+from rangesfm.solver.mistakes import MistakeTest, MistakeTests, finite
+from rangesfm.solver.posterior import (
     MAX_NUM_OBSERVATIONS,
     JointProblem,
     Observations,
@@ -32,7 +29,10 @@ from rangesfm.inference.posterior import (
     ScaleUncertainty,
     joined,
 )
-from rangesfm.measurements.source import Source
+from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
 
 if TYPE_CHECKING:
     from typing_extensions import Self

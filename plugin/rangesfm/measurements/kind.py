@@ -11,9 +11,9 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.bundle_adjustment import BundleAdjustment
-from rangesfm.geometry.poses import Poses
-from rangesfm.geometry.robust_statistics import RobustLoss
+from rangesfm.solver.bundle_adjustment import BundleAdjustment
+from rangesfm.util.geometry.poses import Poses
+from rangesfm.util.geometry.robust_statistics import RobustLoss
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -10,9 +10,9 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.ceres.bundle_adjustment import BundleAdjustment
-from rangesfm.distances.markers import images_by_name, mark_covariance, triangulate_marker
-from rangesfm.distances.tape import Marker
+from rangesfm.measurements.lengths.markers import images_by_name, mark_covariance, triangulate_marker
+from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.solver.bundle_adjustment import BundleAdjustment
 
 
 def add_marks(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.geometry.poses import Poses
+from rangesfm.util.geometry.poses import Poses
 
 
 @dataclass(frozen=True)

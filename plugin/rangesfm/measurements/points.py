@@ -9,11 +9,11 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.distances.markers import images_by_name
-from rangesfm.distances.tape import Marker
-from rangesfm.geometry.rotations import cross_matrices
-from rangesfm.geometry.trajectory import pose_of
 from rangesfm.measurements.kind import Block, ByBlock, Linearization, MapState
+from rangesfm.measurements.lengths.markers import images_by_name
+from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.util.geometry.rotations import cross_matrices
+from rangesfm.util.geometry.trajectory import pose_of
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from rangesfm import ceres
+from rangesfm import solver
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.bundle_adjustment import BundleAdjustment
 from rangesfm.measurements.kind import LEAST_SQUARES, Block, ByBlock, Linearization, MapState, Measurements, Weights
+from rangesfm.solver.bundle_adjustment import BundleAdjustment
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,6 @@ class Prior(Measurements):
         if not all(are_there):
             missing = [name for name, is_there in zip(self.names, are_there, strict=True) if not is_there]
             raise ValueError(f"a joint prior of {self.names}, but nothing else depends on {missing}")
-        cost = ceres.joint_prior_cost(mean=self.mean, whitening=adjustment.pixel_stddev * self.root_information)
-        ceres.add_residual_block(adjustment.adjuster, cost, None, own)
+        cost = solver.joint_prior_cost(mean=self.mean, whitening=adjustment.pixel_stddev * self.root_information)
+        solver.add_residual_block(adjustment.adjuster, cost, None, own)
         return np.arange(first, problem.num_residuals())

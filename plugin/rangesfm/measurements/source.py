@@ -10,12 +10,12 @@ from typing import NamedTuple
 import pycolmap
 
 from rangesfm.arrays import Indices
-from rangesfm.distances.tape import Marker
-from rangesfm.geometry.poses import Poses, model_poses
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.measurements.kind import Measurements
+from rangesfm.measurements.lengths.tape import Marker
 from rangesfm.measurements.points import NamedPoints
 from rangesfm.options import RefineOptions
+from rangesfm.util.geometry.poses import Poses, model_poses
+from rangesfm.util.geometry.trajectory import Trajectory
 
 
 class MapToFit(NamedTuple):

@@ -11,10 +11,13 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.preflight import SAME_PLACE_M
-from rangesfm.distances.tape import CONTROL
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.similarity import NEARLY_STRAIGHT, path_shape
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.estimation.scale.scale_verdict import CALIBRATE, FEW_RANGES
+from rangesfm.measurements.lengths.tape import CONTROL
+from rangesfm.measurements.positions.control_points import ControlPoint
+from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.errors.components import COMPONENTS
 from rangesfm.options import PointOptions
 from rangesfm.planning.expected import Expected, expect_roughly
 from rangesfm.planning.paths import NUM_WAVES, way_along
@@ -22,11 +25,8 @@ from rangesfm.planning.placement import LEAST_GAIN, spread_places
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.planned_photos import PlannedPhotos
 from rangesfm.planning.walls import AT_WALL_M, lead_through
-from rangesfm.positions.control_points import ControlPoint
-from rangesfm.positions.known_positions import MIN_NUM_POSITIONS
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.errors.components import COMPONENTS
-from rangesfm.scale.scale_verdict import CALIBRATE, FEW_RANGES
+from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, path_shape
+from rangesfm.util.geometry.trajectory import Trajectory
 
 # Changes of an anchor's height that are tried, metres.
 _RAISED_M = (1.0, -1.0, 2.0, -2.0)

@@ -13,17 +13,28 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.diagnostics.finished_map import by_similarity
-from rangesfm.distances.lengths_on_map import lengths_on_map
-from rangesfm.distances.tape import CHECK
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.free_fit import GraphBending
+from rangesfm.estimation.scale.anchor_plane import mirrored_map
+from rangesfm.estimation.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges
+from rangesfm.estimation.scale.placement_prior import PlacementPrior
+from rangesfm.estimation.scale.range_equation import antenna_positions, fit_at
+from rangesfm.estimation.scale.scale_by_positions import doubts_of_positions, planned_positions, refuse_open_turn
+from rangesfm.estimation.scale.scale_problem import ScaleProblem
+from rangesfm.estimation.scale.scale_verdict import Verdict, doubts_of_ranges, judge
+from rangesfm.estimation.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
 from rangesfm.estimation.vision_information import VisionInformation
-from rangesfm.geometry.similarity import similarity_motions
-from rangesfm.geometry.trajectory import in_first_camera
-from rangesfm.inference.bending import BENDS, MapBending, WalkBending
-from rangesfm.inference.linear_map import Columns
-from rangesfm.inference.noise import Component, noise_of_sizes, usual_sizes
-from rangesfm.inference.posterior import (
+from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
+from rangesfm.measurements.lengths.tape import CHECK
+from rangesfm.measurements.ranges.errors.learned import LearnedErrors
+from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
+from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.options import LENGTH_M, ScaleOptions
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.solver.bending import BENDS, MapBending, WalkBending
+from rangesfm.solver.linear_map import Columns
+from rangesfm.solver.noise import Component, noise_of_sizes, usual_sizes
+from rangesfm.solver.posterior import (
     MAX_NUM_OBSERVATIONS,
     JointProblem,
     Observations,
@@ -31,19 +42,8 @@ from rangesfm.inference.posterior import (
     ScaleUncertainty,
     joined,
 )
-from rangesfm.options import LENGTH_M, ScaleOptions
-from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.ranging.errors.learned import LearnedErrors
-from rangesfm.ranging.errors.noise import START_STDDEV_M
-from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.anchor_plane import mirrored_map
-from rangesfm.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges
-from rangesfm.scale.placement_prior import PlacementPrior
-from rangesfm.scale.range_equation import antenna_positions, fit_at
-from rangesfm.scale.scale_by_positions import doubts_of_positions, planned_positions, refuse_open_turn
-from rangesfm.scale.scale_problem import ScaleProblem
-from rangesfm.scale.scale_verdict import Verdict, doubts_of_ranges, judge
-from rangesfm.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
+from rangesfm.util.geometry.similarity import similarity_motions
+from rangesfm.util.geometry.trajectory import in_first_camera
 
 # Numbers of ranges, of bins and of keyframes in the quick computation that compares plans.
 _NUM_COMPARED_RANGES, _NUM_COMPARED_BINS, _NUM_COMPARED_KEYFRAMES = 600, 120, 15

@@ -9,9 +9,9 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError, OptionError
-from rangesfm.geometry.numerics import UNDETERMINED
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.positions.true_positions import read_true_positions
+from rangesfm.measurements.positions.true_positions import read_true_positions
+from rangesfm.util.geometry.numerics import UNDETERMINED
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 # A plan of more would take minutes.
 _MAX_NUM_KEYFRAMES = 20_000

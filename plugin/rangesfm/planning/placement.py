@@ -8,13 +8,13 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.planning.expected import expect_roughly
 from rangesfm.planning.paths import places_on_way, way_along
 from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.processes.threads import with_one_blas_thread
 from rangesfm.progress import SILENT, Progress
-from rangesfm.ranging.anchors.anchor import Anchor
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
+from rangesfm.util.processes.threads import with_one_blas_thread
 
 # Numbers of places along x, y and z of a box. As many are tried along all walls together, at two heights.
 _GRID = (4, 4, 2)

@@ -11,9 +11,9 @@ from rangesfm.arrays import Array
 from rangesfm.diagnostics.catalogue import LARGEST_RIG_M
 from rangesfm.diagnostics.preflight import FAR_M, SAME_PLACE_M
 from rangesfm.errors import OptionError
+from rangesfm.measurements.ranges.anchors.site import coordinates_text
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.walls import are_outside, lead_through
-from rangesfm.ranging.anchors.site import coordinates_text
 
 # Difference of height between camera and anchor, metres, that only masts and drones reach.
 _TALL_M = 20.0

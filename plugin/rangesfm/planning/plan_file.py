@@ -10,10 +10,13 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array
-from rangesfm.distances.tape import CONTROL
 from rangesfm.errors import InputError, OptionError
-from rangesfm.files.contents import AnyPath
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.measurements.lengths.tape import CONTROL
+from rangesfm.measurements.positions.control_point_file import read_control_points
+from rangesfm.measurements.positions.control_points import ControlPoint
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
+from rangesfm.measurements.ranges.errors.components import COMPONENTS, LOGS, stddevs_in
 from rangesfm.option_model import KeyMeta, Options
 from rangesfm.options import LENGTH_M, PointOptions, RangeModelOptions, TagOptions, Uncertainty
 from rangesfm.planning.paths import loop_inside, path_from_file, path_from_model, path_through
@@ -21,12 +24,9 @@ from rangesfm.planning.placement import places_in_box, places_on_walls, spread_a
 from rangesfm.planning.plan_checks import oddities, require_possible
 from rangesfm.planning.planned import Coordinate, Place, PlannedAntenna, PlannedSurvey
 from rangesfm.planning.planned_photos import MAX_NUM_PHOTOS, PlannedPhotos, ascending
-from rangesfm.positions.control_point_file import read_control_points
-from rangesfm.positions.control_points import ControlPoint
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.anchor_file import read_anchors
-from rangesfm.ranging.errors.components import COMPONENTS, LOGS, stddevs_in
 from rangesfm.survey.survey_reader import absolute_value, parse_toml, refuse_unknown_tables
+from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.geometry.trajectory import Trajectory
 
 _Spot = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 # A plan with more anchors, or of a longer survey (seconds), would take minutes.

@@ -10,26 +10,26 @@ import numpy as np
 from pydantic import Field
 
 from rangesfm.arrays import Array
-from rangesfm.distances.lengths_on_map import BENDING
-from rangesfm.distances.locate_lengths import LocatedDistances
-from rangesfm.geometry.similarity import IDENTITY, Similarity
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.estimation.scale.placement_prior import PlacementPrior
+from rangesfm.estimation.scale.range_equation import RangeState
+from rangesfm.estimation.scale.scale_problem import ScaleProblem, scale_problem
+from rangesfm.measurements.lengths.lengths_on_map import BENDING
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.positions.antenna_places import locate_antenna
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.control_points import ControlPoint
+from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions, joined_positions
+from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.option_model import Options
 from rangesfm.options import AssociationOptions, RangeModelOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
-from rangesfm.positions.antenna_places import locate_antenna
-from rangesfm.positions.antenna_track import AntennaTrack
-from rangesfm.positions.control_points import ControlPoint
-from rangesfm.positions.known_positions import LASTING_S, KnownPositions, joined_positions
-from rangesfm.positions.position_log import PositionLog
-from rangesfm.ranging.anchors.anchor import Anchor
-from rangesfm.ranging.anchors.site import Site
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.range_observations import RangeObservations
-from rangesfm.scale.placement_prior import PlacementPrior
-from rangesfm.scale.range_equation import RangeState
-from rangesfm.scale.scale_problem import ScaleProblem, scale_problem
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
 
 # Offset of anchors with unknown positions, metres. In practice no anchor is exactly in line with a path or in its
 # plane. In a plan it may be, and the linearized problem would then miss what is not determined.

@@ -16,16 +16,16 @@ import pycolmap
 from pydantic import AfterValidator, Field
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.distances.markers import images_by_name, triangulate_marker
-from rangesfm.distances.tape import Marker
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.vision_information import Observations, VisionInformation, vision_information
-from rangesfm.geometry.poses import Poses
-from rangesfm.geometry.trajectory import Trajectory
+from rangesfm.measurements.lengths.markers import images_by_name, triangulate_marker
+from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.measurements.positions.known_marks import locate_points
+from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.option_model import KeyMeta, Options
-from rangesfm.positions.control_points import ControlPoint, ControlPoints
-from rangesfm.positions.known_marks import locate_points
-from rangesfm.positions.known_positions import KnownPositions
+from rangesfm.util.geometry.poses import Poses
+from rangesfm.util.geometry.trajectory import Trajectory
 
 MAX_NUM_PHOTOS = 2000
 """Largest number of photos; more would take minutes, and with fewer photos the path bends in the same way."""

@@ -15,13 +15,13 @@ from rangesfm.diagnostics.hypothesis_tests import Factorization, row_of
 from rangesfm.diagnostics.linearized import linearized, ranges_on_map
 from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.numerics import NORMAL_95
-from rangesfm.inference.mistakes import MistakeTest
+from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey
-from rangesfm.processes.threads import with_one_blas_thread
-from rangesfm.ranging.errors.components import component_words
+from rangesfm.solver.mistakes import MistakeTest
+from rangesfm.util.geometry.numerics import NORMAL_95
+from rangesfm.util.processes.threads import with_one_blas_thread
 
 REFUSED, OPEN_PLACE = "refused", "open"
 """Verdicts of a plan: a run will refuse the scale; it will leave open where the map is."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rangesfm.files.atomic import sole_writer
-from rangesfm.files.contents import AnyPath
 from rangesfm.report.chart import write_pictures
 from rangesfm.report.content import Content
 from rangesfm.report.report_page import render_report, sections_of, write_page
 from rangesfm.result.result_folder import REPORT_NAME, read_result_folder
+from rangesfm.util.files.atomic import sole_writer
+from rangesfm.util.files.contents import AnyPath
 
 __all__ = ["write_report", "write_report_of", "write_report_pictures"]
 

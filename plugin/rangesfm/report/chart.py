@@ -15,11 +15,11 @@ from PIL import Image
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import make_output_folder, new_file
-from rangesfm.processes.draw_pictures import draw_pictures
 from rangesfm.report.packing import pack
 from rangesfm.report.plot import Figure, Mark, Panel, Range, Series
 from rangesfm.report.scene import data_uri
+from rangesfm.util.files.atomic import make_output_folder, new_file
+from rangesfm.util.processes.draw_pictures import draw_pictures
 
 ASSETS = Path(__file__).with_name("assets")
 Spec: TypeAlias = dict[str, Any]

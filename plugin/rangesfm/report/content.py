@@ -13,11 +13,11 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.export.metric_map import colored_points
-from rangesfm.files.folders import real_path
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.result.model_path import path_in_result
 from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.util.files.folders import real_path
+from rangesfm.util.geometry.trajectory import Trajectory
 
 DEFAULT_FOLDER = "out"
 MAX_KEYFRAME_SHARE = 0.1

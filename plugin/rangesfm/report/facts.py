@@ -6,9 +6,9 @@ from datetime import datetime, timezone
 
 import numpy as np
 
-from rangesfm.files.clock_times import are_seconds_since_1970
 from rangesfm.report.content import Content
 from rangesfm.report.text import count, duration, fixed
+from rangesfm.util.files.clock_times import are_seconds_since_1970
 
 
 def facts_of(content: Content) -> list[tuple[str, str]]:

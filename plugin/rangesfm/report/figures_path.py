@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.similarity import align_points
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.content import Content
 from rangesfm.report.plot import (
     WIDE_SIZE,
@@ -20,6 +18,8 @@ from rangesfm.report.plot import (
     figure_of,
     views_of,
 )
+from rangesfm.util.geometry.similarity import align_points
+from rangesfm.util.geometry.trajectory import Trajectory
 
 PICTURE_WIDTH_PX = 900
 

@@ -7,11 +7,9 @@ import colorsys
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.files.clock_times import time_text
-from rangesfm.files.folders import natural_order
-from rangesfm.ranging.errors.error_curve import ErrorCurve
-from rangesfm.ranging.range_log import RangeLog
-from rangesfm.ranging.range_observations import RangeStatus
+from rangesfm.measurements.ranges.errors.error_curve import ErrorCurve
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.plot import (
     WIDE_SIZE,
@@ -27,6 +25,8 @@ from rangesfm.report.plot import (
     time_axis,
 )
 from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.util.files.clock_times import time_text
+from rangesfm.util.files.folders import natural_order
 
 NUM_HISTOGRAM_BINS = 60
 NUM_MEDIAN_BINS = 48

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rangesfm.files.folders import natural_order
 from rangesfm.report.content import Content
 from rangesfm.report.plot import WIDE_SIZE, Figure, Mark, Series, every_nth, figure_of, from_zero, time_axis
 from rangesfm.report.text import signed
 from rangesfm.result.result_tables import ScaleCandidates, ScaleConsensus, TimeOffsetCurve
+from rangesfm.util.files.folders import natural_order
 
 MAX_NUM_CANDIDATES = 3000
 CANDIDATE_AXIS = (-1.0, 4.0)

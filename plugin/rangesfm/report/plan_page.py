@@ -12,15 +12,15 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.mistake_words import mistake_in_words
-from rangesfm.files.atomic import make_output_folder, write_text
-from rangesfm.geometry.numerics import NORMAL_95
+from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan, size_in_words
-from rangesfm.ranging.errors.components import component_words
 from rangesfm.report.plot import Figure, Limits, Mark, Panel, Pixels, Series, View, equal_view, views_of
 from rangesfm.report.report_page import Section, render_page, write_page
 from rangesfm.report.report_tables import ReportTable
 from rangesfm.report.text import count, duration, fixed, percent, rough
+from rangesfm.util.files.atomic import make_output_folder, write_text
+from rangesfm.util.geometry.numerics import NORMAL_95
 
 # From the smallest to the largest stddev; each colour is as visible on a light page as on a dark one.
 _COLORS = ("#2f7ebc", "#2a9d8f", "#6f9a2b", "#c98b12", "#d4512b")

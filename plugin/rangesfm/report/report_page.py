@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from markupsafe import Markup
 
-from rangesfm.files.atomic import new_file
 from rangesfm.report import figures_mistakes, figures_path, figures_ranges, figures_scale, report_tables, text
 from rangesfm.report.chart import ASSETS, css, page_chart
 from rangesfm.report.checks import quality_checks
@@ -20,6 +19,7 @@ from rangesfm.report.facts import facts_of
 from rangesfm.report.figures_loops import loops_figure
 from rangesfm.report.plot import Figure
 from rangesfm.report.scene import scene_of, view_of
+from rangesfm.util.files.atomic import new_file
 
 if TYPE_CHECKING:
     from jinja2 import Environment

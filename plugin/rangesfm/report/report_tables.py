@@ -14,13 +14,13 @@ from markupsafe import Markup
 
 from rangesfm.arrays import median, rms
 from rangesfm.diagnostics.mistake_words import CHECKED_KINDS, mistake_in_words
-from rangesfm.files.folders import natural_order
-from rangesfm.geometry.numerics import NORMAL_95
-from rangesfm.ranging.errors.components import component_words
+from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.report.content import Content
 from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, sentence, signed
 from rangesfm.result.entries import AnchorEntry, rmse_heading
 from rangesfm.survey.settings import KEYS
+from rangesfm.util.files.folders import natural_order
+from rangesfm.util.geometry.numerics import NORMAL_95
 
 _Columns = Mapping[str, Callable[[Any], str]]
 _WAYS = ("to the right", "downward", "forward")

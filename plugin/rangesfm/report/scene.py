@@ -15,9 +15,7 @@ import numpy.typing as npt
 from PIL import Image, ImageOps
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.processes.threads import side_by_side
-from rangesfm.ranging.range_observations import RangeStatus
+from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.report.content import Content
 from rangesfm.report.packing import pack
 from rangesfm.report.plot import every_nth
@@ -26,7 +24,9 @@ from rangesfm.report.text import count
 from rangesfm.result.entries import AnchorEntry
 from rangesfm.result.places import is_within
 from rangesfm.result.result_tables import USED_LABELS
-from rangesfm.vision.photo_files import UNREADABLE, opened_image
+from rangesfm.sfm.photo_files import UNREADABLE, opened_image
+from rangesfm.util.geometry.trajectory import Trajectory
+from rangesfm.util.processes.threads import side_by_side
 
 MAX_NUM_POINTS = 500_000
 MAX_NUM_RANGES = 20_000

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.geometry.map_errors import Kind, MapErrors
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.report.packing import pack
 from rangesfm.result.summary import ResultSummary
+from rangesfm.util.geometry.map_errors import Kind, MapErrors
+from rangesfm.util.geometry.trajectory import Trajectory
 
 # Shifts by a mode are stored as whole steps, of which the largest shift by that mode has this number.
 _NUM_STEPS = 32767

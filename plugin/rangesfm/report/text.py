@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from rangesfm import progress
 from rangesfm.errors import number_text
-from rangesfm.geometry.numerics import NORMAL_95
+from rangesfm.util.geometry.numerics import NORMAL_95
 
 NOTHING = "–"
 

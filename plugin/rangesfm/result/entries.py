@@ -11,10 +11,20 @@ import numpy as np
 from pydantic import AfterValidator, AliasChoices, AliasPath, BeforeValidator, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from rangesfm.files.records import Count, Flag, IntervalOrNull, Number, NumberOrNull, Record, Text, Vector, VectorOrNull
-from rangesfm.geometry.georeference import Georeference
-from rangesfm.geometry.similarity import Similarity
 from rangesfm.options import COORDINATE_M, AssociationOptions
+from rangesfm.util.files.records import (
+    Count,
+    Flag,
+    IntervalOrNull,
+    Number,
+    NumberOrNull,
+    Record,
+    Text,
+    Vector,
+    VectorOrNull,
+)
+from rangesfm.util.geometry.georeference import Georeference
+from rangesfm.util.geometry.similarity import Similarity
 
 
 def _unit(quaternion: tuple[float, ...]) -> tuple[float, ...]:

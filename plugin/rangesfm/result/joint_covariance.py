@@ -10,8 +10,8 @@ from typing import get_args
 import numpy as np
 
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import new_file
-from rangesfm.geometry.map_errors import Kind, MapErrors, PartErrors
+from rangesfm.util.files.atomic import new_file
+from rangesfm.util.geometry.map_errors import Kind, MapErrors, PartErrors
 
 JOINT_COVARIANCE_NAME = "joint_covariance.npz"
 _KINDS: tuple[Kind, ...] = get_args(Kind)

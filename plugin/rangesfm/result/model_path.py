@@ -5,9 +5,9 @@ from __future__ import annotations
 import pycolmap
 
 from rangesfm.errors import InputError
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 from rangesfm.result.result_folder import ResultFolder
 from rangesfm.result.result_tables import PhotoTimes
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 
 def path_in_result(model: pycolmap.Reconstruction, result: ResultFolder) -> Trajectory:

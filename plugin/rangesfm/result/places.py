@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import path_of
-from rangesfm.files.folders import real_path
 from rangesfm.survey.settings import KEYS, Survey
+from rangesfm.util.files.atomic import path_of
+from rangesfm.util.files.folders import real_path
 
 
 def recorded_path(path: Path, folder: Path) -> str:

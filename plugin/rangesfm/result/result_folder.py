@@ -14,14 +14,14 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.model_files import read_model
 from rangesfm.errors import InputError
-from rangesfm.files.atomic import path_of, scratch_folder, sole_writer
-from rangesfm.files.folders import real_path
-from rangesfm.geometry.map_errors import MapErrors
-from rangesfm.geometry.reference import Reference, read_reference
 from rangesfm.result.joint_covariance import JOINT_COVARIANCE_NAME, read_map_errors
 from rangesfm.result.places import input_beside, path_in
 from rangesfm.result.result_tables import RESULT_TABLES, PhotoTimes, TableFile
 from rangesfm.result.summary import ResultSummary
+from rangesfm.util.files.atomic import path_of, scratch_folder, sole_writer
+from rangesfm.util.files.folders import real_path
+from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.reference import Reference, read_reference
 
 _Table = TypeVar("_Table", bound=TableFile)
 

@@ -12,8 +12,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.files.text_tables import read_table, write_table
-from rangesfm.ranging.range_observations import USED
+from rangesfm.measurements.ranges.range_observations import USED
+from rangesfm.util.files.text_tables import read_table, write_table
 
 _Kind = TypeVar("_Kind", bound="TableFile")
 _TEXT = "s"

@@ -17,10 +17,10 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import number_text
-from rangesfm.files.records import NumberOrNull, Record, Text
-from rangesfm.geometry.gravity import UP_IN_SITE, gravity_of
-from rangesfm.geometry.numerics import NORMAL_95
 from rangesfm.result import entries
+from rangesfm.util.files.records import NumberOrNull, Record, Text
+from rangesfm.util.geometry.gravity import UP_IN_SITE, gravity_of
+from rangesfm.util.geometry.numerics import NORMAL_95
 
 # Change of the scale, in percent per centimetre of an error, above which the summary mentions it.
 _NOTABLE_PERCENT = 0.5

@@ -6,10 +6,10 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from rangesfm.files.contents import sha256_of
-from rangesfm.files.folders import walk
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_reader import input_paths
+from rangesfm.util.files.contents import sha256_of
+from rangesfm.util.files.folders import walk
 
 
 def input_hashes(survey: Survey) -> list[dict[str, Any]]:

@@ -9,29 +9,29 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.distances.tape import Marker, Tape
-from rangesfm.distances.tape_file import markers_of_photos, read_tape
 from rangesfm.errors import InputError
-from rangesfm.files.folders import natural_order
-from rangesfm.geometry.reference import Reference
 from rangesfm.measurements.imu.sensor import InertialSensor, read_sensor
+from rangesfm.measurements.lengths.tape import Marker, Tape
+from rangesfm.measurements.lengths.tape_file import markers_of_photos, read_tape
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.control_point_file import read_control_points
+from rangesfm.measurements.positions.known_positions import LASTING_S
+from rangesfm.measurements.positions.position_formats import read_positions
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.positions.true_positions import read_true_positions
+from rangesfm.measurements.ranges.anchors.anchor import Anchor, default_anchor_frame
+from rangesfm.measurements.ranges.anchors.anchor_file import read_anchor_list
+from rangesfm.measurements.ranges.anchors.anchor_ids import ids_in_log
+from rangesfm.measurements.ranges.anchors.site import Site, local_site, site_of
+from rangesfm.measurements.ranges.errors.error_curve import correct_ranges, read_error_curve
+from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
+from rangesfm.measurements.ranges.readers import read_anchors_in_log, read_ranges
 from rangesfm.options import LogOptions
-from rangesfm.positions.antenna_track import AntennaTrack
-from rangesfm.positions.control_point_file import read_control_points
-from rangesfm.positions.known_positions import LASTING_S
-from rangesfm.positions.position_formats import read_positions
-from rangesfm.positions.surveyed_positions import SurveyedPositions
-from rangesfm.positions.true_positions import read_true_positions
-from rangesfm.ranging.anchors.anchor import Anchor, default_anchor_frame
-from rangesfm.ranging.anchors.anchor_file import read_anchor_list
-from rangesfm.ranging.anchors.anchor_ids import ids_in_log
-from rangesfm.ranging.anchors.site import Site, local_site, site_of
-from rangesfm.ranging.errors.error_curve import correct_ranges, read_error_curve
-from rangesfm.ranging.range_log import RangeKind, RangeLog
-from rangesfm.ranging.readers import read_anchors_in_log, read_ranges
+from rangesfm.sfm.exif_positions import read_exif_positions
+from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.exif_positions import read_exif_positions
-from rangesfm.vision.rigs import read_rigs
+from rangesfm.util.files.folders import natural_order
+from rangesfm.util.geometry.reference import Reference
 
 # Distance between two anchors over the sum of the ranges to them. It is at most 1 where all are in metres; above each
 # of these numbers, the anchors are in that unit.

@@ -8,27 +8,27 @@ from dataclasses import dataclass, field, replace
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.distances.lengths_on_map import LENGTHS
-from rangesfm.distances.locate_lengths import locate_distances
-from rangesfm.distances.tape import Tape
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.similarity import IDENTITY
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.inference.bending import MapBending
+from rangesfm.estimation.scale.scale_by_lengths import LengthScale, lengths_between_points
+from rangesfm.estimation.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.measurements.gravity import Upwards
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import IMU, InertialScale, scale_by_sensor
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, find_kind
 from rangesfm.measurements.kind import Block
-from rangesfm.measurements.lengths import TapedLengths
-from rangesfm.measurements.positions import ARM, CLOCK
+from rangesfm.measurements.lengths.cost import TapedLengths
+from rangesfm.measurements.lengths.lengths_on_map import LENGTHS
+from rangesfm.measurements.lengths.locate_lengths import locate_distances
+from rangesfm.measurements.lengths.tape import Tape
+from rangesfm.measurements.positions.cost import ARM, CLOCK
+from rangesfm.measurements.positions.grouped_positions import POSITIONS
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.source import Source
-from rangesfm.positions.grouped_positions import POSITIONS
-from rangesfm.positions.surveyed_positions import SurveyedPositions
-from rangesfm.scale.scale_by_lengths import LengthScale, lengths_between_points
-from rangesfm.scale.scale_by_positions import PositionScale, scale_by_positions
+from rangesfm.solver.bending import MapBending
 from rangesfm.survey.inputs import RangingInputs
+from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.similarity import IDENTITY
+from rangesfm.util.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rangesfm.errors import InputError
-from rangesfm.geometry.trajectory import photos_by_frame
+from rangesfm.sfm.image_times import ImageTimes, find_image_times, list_images, read_image_times_csv, times_at_rate
+from rangesfm.sfm.rigs import read_rigs
 from rangesfm.survey.settings import Survey
-from rangesfm.vision.image_times import ImageTimes, find_image_times, list_images, read_image_times_csv, times_at_rate
-from rangesfm.vision.rigs import read_rigs
+from rangesfm.util.geometry.trajectory import photos_by_frame
 
 if TYPE_CHECKING:
     import pycolmap

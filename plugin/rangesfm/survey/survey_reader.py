@@ -12,13 +12,13 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from rangesfm.errors import InputError, OptionError, nearest_known, printable, shown
-from rangesfm.files.atomic import path_of
-from rangesfm.files.contents import AnyPath
-from rangesfm.files.text_tables import read_text
+from rangesfm.measurements.ranges.readers import files_of_log
 from rangesfm.option_model import PathRole
 from rangesfm.options import CameraOptions
-from rangesfm.ranging.readers import files_of_log
 from rangesfm.survey.settings import ROLE_OF_PATH, SURVEY_TABLES, OptionsOrigin, Survey
+from rangesfm.util.files.atomic import path_of
+from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.text_tables import read_text
 
 if sys.version_info >= (3, 11):
     import tomllib

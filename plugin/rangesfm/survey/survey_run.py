@@ -10,23 +10,23 @@ import numpy as np
 import pycolmap
 
 from rangesfm.arrays import Array
-from rangesfm.distances.locate_lengths import NO_DISTANCES, locate_distances
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.files.clock_times import span_text
-from rangesfm.files.photo_names import told_none, told_unknown
-from rangesfm.geometry.trajectory import Trajectory, in_first_camera
-from rangesfm.inference.bending import MapBending, WalkBending
+from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, locate_distances
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.clock.offset import TimeOffset
+from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
+from rangesfm.measurements.ranges.range_log import RangeKind
+from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
 from rangesfm.progress import Journal
-from rangesfm.ranging.association import associate
-from rangesfm.ranging.clock.offset import TimeOffset
-from rangesfm.ranging.clock.time_offset import estimate_time_offset
-from rangesfm.ranging.range_log import RangeKind
-from rangesfm.ranging.range_observations import RangeObservations, RangeStatus, hold_out
-from rangesfm.scale.initialize import initialize_scale
-from rangesfm.scale.scale_estimate import ScaleEstimate
+from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.survey.inputs import RangingInputs
 from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map
 from rangesfm.survey.settings import Survey
+from rangesfm.util.files.clock_times import span_text
+from rangesfm.util.files.photo_names import told_none, told_unknown
+from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tests.ranging.readers.test_readers_ros import TYPES
+from tests.measurements.ranges.readers.test_readers_ros import TYPES
 from tests.simulated.inertial import by_hand, imu_log
-from tests.sources.recorded import Message, write_bag
+from tests.survey.sources.recorded import Message, write_bag
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from tests.refine.conftest import bent, poses_and_rays
+from tests.estimation.conftest import bent, poses_and_rays
 from tests.simulated.inertial import CAM_FROM_IMU, Motion, by_hand, imu_log
 from tests.simulated.model import SyntheticModel, synthetic_model
 
@@ -14,11 +14,6 @@ from rangesfm.colmap.transform import rescale
 from rangesfm.estimation.drift import carry_model
 from rangesfm.estimation.map_problem import map_problem
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine
-from rangesfm.geometry.poses import Poses
-from rangesfm.geometry.rotations import exponentials
-from rangesfm.geometry.similarity import IDENTITY, align_points, rmse
-from rangesfm.geometry.trajectory import Trajectory, trajectory_from_reconstruction
-from rangesfm.inference.bending import WalkBending
 from rangesfm.measurements.imu.inertial_fit import InertialProblem, InertialState
 from rangesfm.measurements.imu.inertial_motions import GRAVITY, SCALE_ERRORS, InertialLog
 from rangesfm.measurements.imu.inertial_scale import scale_by_sensor
@@ -28,6 +23,11 @@ from rangesfm.measurements.imu.preintegration import NUM_OF_SENSOR, Preintegrate
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, SensorPrior
 from rangesfm.measurements.source import Measured, Source
 from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.solver.bending import WalkBending
+from rangesfm.util.geometry.poses import Poses
+from rangesfm.util.geometry.rotations import exponentials
+from rangesfm.util.geometry.similarity import IDENTITY, align_points, rmse
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
 
 Array = npt.NDArray[np.float64]
 MOUNTING = Mounting(CAM_FROM_IMU, np.zeros(3))

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.inertial import CAM_FROM_IMU, Motion, by_hand, imu_log, photos
 
 from rangesfm.errors import GeometryError
-from rangesfm.inference.bending import WalkBending
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import InertialScale, scale_by_sensor
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.motion import Mounting
 from rangesfm.measurements.imu.sensor_prior import SensorPrior
+from rangesfm.solver.bending import WalkBending
 
 Array = npt.NDArray[np.float64]
 METRES_PER_UNIT = 1 / 0.37

@@ -11,10 +11,10 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.ceres import inertial_cost
-from rangesfm.geometry.poses import Poses
 from rangesfm.measurements.imu.motion import MotionErrors, Mounting
 from rangesfm.measurements.imu.preintegration import NUM_OF_SENSOR, Preintegrated, preintegrate
+from rangesfm.solver import inertial_cost
+from rangesfm.util.geometry.poses import Poses
 
 Array = npt.NDArray[np.float64]
 

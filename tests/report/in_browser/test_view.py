@@ -15,9 +15,9 @@ from tests.report.conftest import ANCHORS
 from tests.report.in_browser.conftest import downloaded
 
 import rangesfm
-from rangesfm.geometry.map_errors import MapErrors, PartErrors
 from rangesfm.report import write_report
 from rangesfm.result.joint_covariance import write_map_errors
+from rangesfm.util.geometry.map_errors import MapErrors, PartErrors
 
 if TYPE_CHECKING:
     from tests.report.in_browser.conftest import Browser, Pixels

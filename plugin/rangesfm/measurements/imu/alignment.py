@@ -17,12 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask, rms
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.files.clock_times import span_text
-from rangesfm.geometry.robust_statistics import CAUCHY
-from rangesfm.geometry.rotations import cross_matrices
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.turns import GyroTurns
+from rangesfm.util.files.clock_times import span_text
+from rangesfm.util.geometry.robust_statistics import CAUCHY
+from rangesfm.util.geometry.rotations import cross_matrices
+from rangesfm.util.geometry.trajectory import Trajectory
 
 MIN_NUM_TURNS = 8
 """Fewest turns between photos that tell offset, rotation and bias, seven numbers of three equations each."""

@@ -10,9 +10,9 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from rangesfm.errors import InputError
-from rangesfm.files.text_tables import read_text
 from rangesfm.measurements.imu.log import ImuNoise
 from rangesfm.option_model import Bounds
+from rangesfm.util.files.text_tables import read_text
 
 _DENSITY = Bounds(0.0, 1e3, "noise density")
 _KEYS = (

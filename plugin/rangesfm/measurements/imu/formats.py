@@ -18,8 +18,6 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import InputError
-from rangesfm.files.bags import is_bag, messages_of, open_bag, stamp_s, type_name
-from rangesfm.files.text_tables import TextTable, header_names, read_head, read_text
 from rangesfm.measurements.imu.log import ImuLog, times_of_sampling
 from rangesfm.measurements.imu.signals import (
     ACCEL,
@@ -30,10 +28,12 @@ from rangesfm.measurements.imu.signals import (
     kind_of_file,
     rank_of_file,
 )
-from rangesfm.ranging.readers import vocabulary as terms
-from rangesfm.ranging.readers.columns import read_timestamps
-from rangesfm.ranging.readers.guess import Guess, find_time, is_rising
-from rangesfm.ranging.readers.layout import MISSING, Layout, find_layout
+from rangesfm.measurements.ranges.readers import vocabulary as terms
+from rangesfm.measurements.ranges.readers.columns import read_timestamps
+from rangesfm.measurements.ranges.readers.guess import Guess, find_time, is_rising
+from rangesfm.measurements.ranges.readers.layout import MISSING, Layout, find_layout
+from rangesfm.util.files.bags import is_bag, messages_of, open_bag, stamp_s, type_name
+from rangesfm.util.files.text_tables import TextTable, header_names, read_head, read_text
 
 CANONICAL_COLUMNS = (
     "timestamp_s",

@@ -16,12 +16,6 @@ from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.errors import GeometryError
-from rangesfm.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS, UNDETERMINED
-from rangesfm.geometry.poses import Poses
-from rangesfm.geometry.robust_statistics import GEMAN_MCCLURE
-from rangesfm.geometry.rotations import logarithms
-from rangesfm.geometry.trajectory import Trajectory
-from rangesfm.inference.linear_map import regular
 from rangesfm.measurements.imu.alignment import ImuAlignment
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.imu.motion import MotionErrors, Mounting
@@ -41,6 +35,12 @@ from rangesfm.measurements.imu.sensor_prior import (
     GRAVITY_STDDEV,
     SensorPrior,
 )
+from rangesfm.solver.linear_map import regular
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, NEGLIGIBLE_STDDEVS, SIGNIFICANT_STDDEVS, UNDETERMINED
+from rangesfm.util.geometry.poses import Poses
+from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE
+from rangesfm.util.geometry.rotations import logarithms
+from rangesfm.util.geometry.trajectory import Trajectory
 
 SCALE, GRAVITY, SENSOR, TURN, ARM = slice(0, 1), slice(1, 4), slice(4, 17), slice(17, 20), slice(20, 23)
 """What all intervals share: logarithm of the scale, gravity, the sensor's numbers, turn and place of the mounting."""

@@ -8,11 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from rangesfm import ceres
+from rangesfm import solver
 from rangesfm.arrays import Array, Indices
-from rangesfm.ceres.bundle_adjustment import BundleAdjustment
-from rangesfm.geometry.robust_statistics import RobustLoss, factor_of_stddevs
-from rangesfm.geometry.rotations import left_jacobians, logarithms
 from rangesfm.measurements.imu.inertial_fit import InertialProblem, InertialState
 from rangesfm.measurements.imu.motion import MotionErrors, Mounting
 from rangesfm.measurements.imu.preintegration import ACCEL_BIAS, ACCEL_SCALE, GYRO_BIAS, GYRO_SCALE, Preintegrated
@@ -28,6 +25,9 @@ from rangesfm.measurements.kind import (
 )
 from rangesfm.measurements.prior import Prior
 from rangesfm.measurements.source import MapToFit, Source
+from rangesfm.solver.bundle_adjustment import BundleAdjustment
+from rangesfm.util.geometry.robust_statistics import RobustLoss, factor_of_stddevs
+from rangesfm.util.geometry.rotations import left_jacobians, logarithms
 
 GRAVITY: Block = ("gravity", "imu")
 SCALE_ERRORS: Block = ("scale_errors", "imu")
@@ -126,7 +126,7 @@ class InertialMotions(Measurements):
     def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
         first, at, roots = adjustment.adjuster.problem.num_residuals(), self.intervals, self._root_information
         for k, (before, after) in enumerate(zip(at.before.tolist(), at.after.tolist(), strict=True)):
-            cost = ceres.inertial_cost(
+            cost = solver.inertial_cost(
                 interval_s=at.interval_s[k],
                 turn=at.turn[k],
                 speed=at.speed[k],
@@ -141,7 +141,7 @@ class InertialMotions(Measurements):
             velocities = [blocks[velocity_block(photo)] for photo in (before, after)]
             biases = blocks[bias_block(int(self.stretch[k]))]
             further = [blocks[GRAVITY], biases, *(blocks[name] for name in (SCALE_ERRORS, CLOCK, MOUNTING))]
-            ceres.add_residual_block(
+            solver.add_residual_block(
                 adjustment.adjuster, cost, None, [poses[before], poses[after], *velocities, *further]
             )
         return np.arange(first, adjustment.adjuster.problem.num_residuals())
@@ -194,10 +194,10 @@ class BiasWalk(Measurements):
     def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
         first = adjustment.adjuster.problem.num_residuals()
         for k, root in enumerate(self.weights.root_information):
-            cost = ceres.joint_prior_cost(
+            cost = solver.joint_prior_cost(
                 mean=np.zeros((2, 6)), whitening=adjustment.pixel_stddev * np.hstack([-root, root])
             )
-            ceres.add_residual_block(adjustment.adjuster, cost, None, [blocks[name] for name in self.names[k : k + 2]])
+            solver.add_residual_block(adjustment.adjuster, cost, None, [blocks[name] for name in self.names[k : k + 2]])
         return np.arange(first, adjustment.adjuster.problem.num_residuals())
 
 
@@ -220,8 +220,8 @@ class GravityLength(Measurements):
         """Add the cost along the present direction, which turns by little in a bundle adjustment."""
         first, (_, down) = adjustment.adjuster.problem.num_residuals(), _length_and_direction(blocks[GRAVITY])
         root = adjustment.pixel_stddev * self.weights.root_information[0] * down
-        cost = ceres.joint_prior_cost(mean=GRAVITY_M_S2 * down[None], whitening=root)
-        ceres.add_residual_block(adjustment.adjuster, cost, None, [blocks[GRAVITY]])
+        cost = solver.joint_prior_cost(mean=GRAVITY_M_S2 * down[None], whitening=root)
+        solver.add_residual_block(adjustment.adjuster, cost, None, [blocks[GRAVITY]])
         return np.array([first])
 
 

@@ -10,21 +10,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.gravity import Gravity
-from rangesfm.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
-from rangesfm.geometry.similarity import Similarity
-from rangesfm.inference.bending import MapBending
-from rangesfm.inference.linear_map import Columns
-from rangesfm.inference.mistakes import MistakeTests
-from rangesfm.inference.noise import Component
-from rangesfm.inference.posterior import (
-    MAX_NUM_OBSERVATIONS,
-    JointProblem,
-    Observations,
-    ScaleByKind,
-    ScaleUncertainty,
-    joined,
-)
 from rangesfm.measurements.imu.inertial_fit import (
     ARM,
     GRAVITY,
@@ -49,8 +34,23 @@ from rangesfm.measurements.imu.preintegration import (
 )
 from rangesfm.measurements.imu.sensor_prior import GRAVITY_M_S2, GRAVITY_STDDEV, PHOTO_TIMES, POSE_PLACES, POSE_TURNS
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, fit_kinds, in_first_cameras_frame
+from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.measurements.source import Source
-from rangesfm.ranging.errors.components import component_words
+from rangesfm.solver.bending import MapBending
+from rangesfm.solver.linear_map import Columns
+from rangesfm.solver.mistakes import MistakeTests
+from rangesfm.solver.noise import Component
+from rangesfm.solver.posterior import (
+    MAX_NUM_OBSERVATIONS,
+    JointProblem,
+    Observations,
+    ScaleByKind,
+    ScaleUncertainty,
+    joined,
+)
+from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NUM_REWEIGHTINGS, SIGNIFICANT_STDDEVS
+from rangesfm.util.geometry.similarity import Similarity
 
 IMU = "imu"
 # Observations from which the sizes of errors are learnt before there are other kinds.

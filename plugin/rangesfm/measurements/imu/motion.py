@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.poses import Poses
-from rangesfm.geometry.rotations import cross_matrices, exponentials, left_jacobians, logarithms
 from rangesfm.measurements.imu.preintegration import SHIFT, SPEED, TURN, Preintegrated
+from rangesfm.util.geometry.poses import Poses
+from rangesfm.util.geometry.rotations import cross_matrices, exponentials, left_jacobians, logarithms
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.geometry.rotations import cross_matrices, exponentials, left_jacobians
+from rangesfm.util.geometry.rotations import cross_matrices, exponentials, left_jacobians
 
 GYRO, ACCEL = 0, 1
 """The two sensors, in arrays that have one entry for each."""

@@ -8,12 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
-from rangesfm.geometry.trajectory import Trajectory
 from rangesfm.measurements.imu.alignment import ImuAlignment, align_imu
 from rangesfm.measurements.imu.calibration import read_imu_noise
 from rangesfm.measurements.imu.formats import read_imu
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.options import ImuOptions
+from rangesfm.util.geometry.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from rangesfm.ranging.readers.vocabulary import words_of
+from rangesfm.measurements.ranges.readers.vocabulary import words_of
 
 GYRO, ACCEL, GRAVITY = "gyroscope", "accelerometer", "gravity"
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.geometry.rotations import cross_matrices
+from rangesfm.util.geometry.rotations import cross_matrices
 
 _SLIGHT_TURN = 1e-4  # radians, below which a Jacobian is its series
 

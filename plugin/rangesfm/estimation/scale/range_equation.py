@@ -1,0 +1,441 @@
+"""The range equation and its robust least squares solution.
+
+    predicted = || scale * R c + t + R r - a || + b
+
+c: camera centre in the model's unit; r: lever arm turned into the model's world, metres;
+R, t, scale: metric world from model world; a: anchor position; b: range bias of the anchor.
+This is the model of Lee, Zhu, Giorgi and Günther (2018), extended by a bias and by anchors that may be unknown. The
+lever arm is metric, so it is never scaled. Several models can share one set of anchors and biases; each has its own
+metric world from model world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.estimation.scale.placement_prior import PlacementPrior
+from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
+from rangesfm.measurements.ranges.errors.noise import bias_whitening
+from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.solver.linear_map import Columns
+from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
+from rangesfm.util.geometry.robust_statistics import CAUCHY, SAME_COST, RobustLoss
+from rangesfm.util.geometry.rotations import left_jacobians
+from rangesfm.util.geometry.similarity import Similarity
+
+
+@dataclass(frozen=True)
+class RangeProblem:
+    """n ranges to m anchors, and the prior knowledge about them.
+
+    Attributes:
+        centers: (n, 3) camera centres, model units.
+        tag_from_center: (n, 3) lever arms turned into the model's world, metres.
+        anchor_index: (n,) into the anchors.
+        range_m: (n,) measured ranges.
+        stddev_m: (n,) standard deviation of their noise.
+        anchor_mean_m: (m, 3) prior positions in the metric world; NaN where unknown.
+        anchor_stddev_m: (m,) of each prior coordinate; 0: exact, inf: unknown.
+        bias_mean_m, bias_stddev_m: (m,) prior of each bias; standard deviation 0 fixes it.
+        common_bias_stddev_m: prior of the bias that all free biases share, such as the tag's own delay.
+        frame_is_free: whether rotation and translation are estimated; otherwise they stay as started.
+        gravity: the upward direction, if given and the frame is free; None otherwise.
+        placement: what known positions say of the frame, if it is free; None without any.
+        distances: measured ones to fit; they refer to anchors by index, like ``anchor_index``.
+        share: (n,) factor on the cost of each range, below 1 where ranges from one place err alike; None: 1.
+    """
+
+    centers: Array
+    tag_from_center: Array
+    anchor_index: Indices
+    range_m: Array
+    stddev_m: Array
+    anchor_mean_m: Array
+    anchor_stddev_m: Array
+    bias_mean_m: Array
+    bias_stddev_m: Array
+    common_bias_stddev_m: float
+    frame_is_free: bool
+    distances: LocatedDistances = NO_DISTANCES
+    gravity: Gravity | None = None
+    placement: PlacementPrior | None = None
+    share: Array | None = None
+
+    @property
+    def num_anchors(self) -> int:
+        return len(self.anchor_stddev_m)
+
+    @cached_property
+    def uncertain(self) -> tuple[Indices, Indices]:
+        """Indices of the anchors, and of the biases, whose prior is neither exact nor unknown."""
+        anchors, biases = (np.flatnonzero((s > 0) & np.isfinite(s)) for s in (self.anchor_stddev_m, self.bias_stddev_m))
+        return anchors, biases
+
+    @cached_property
+    def bias_whitening(self) -> Array:
+        """``noise.bias_whitening`` of the uncertain biases; cached because every step of a solve needs it."""
+        return bias_whitening(self.bias_stddev_m[self.uncertain[1]], self.common_bias_stddev_m)
+
+    def subset(self, rows: Indices) -> RangeProblem:
+        """Return the problem with some of its ranges."""
+        return replace(
+            self,
+            centers=self.centers[rows],
+            tag_from_center=self.tag_from_center[rows],
+            anchor_index=self.anchor_index[rows],
+            range_m=self.range_m[rows],
+            stddev_m=self.stddev_m[rows],
+            share=None if self.share is None else self.share[rows],
+        )
+
+    def by_some(self, rows: Indices) -> RangeProblem:
+        """Return the problem with some of its ranges, reweighted to stand for all ranges of their anchors.
+
+        Args:
+            rows: at least one range of each anchor.
+        """
+        part = self.subset(rows)
+        num, taken = (np.bincount(each.anchor_index, minlength=self.num_anchors) for each in (self, part))
+        share = np.ones(len(rows)) if part.share is None else part.share
+        return replace(part, share=share * (num / np.maximum(taken, 1))[part.anchor_index])
+
+    def of_anchor(self, k: int) -> RangeProblem:
+        """Return the problem of the ranges to anchor k alone, with a fixed frame."""
+        part, one = self.subset(np.flatnonzero(self.anchor_index == k)), slice(k, k + 1)
+        return replace(
+            part,
+            anchor_index=np.zeros(len(part.range_m), dtype=np.int64),
+            anchor_mean_m=self.anchor_mean_m[one],
+            anchor_stddev_m=self.anchor_stddev_m[one],
+            bias_mean_m=self.bias_mean_m[one],
+            bias_stddev_m=self.bias_stddev_m[one],
+            frame_is_free=False,
+            distances=NO_DISTANCES,
+        )
+
+
+@dataclass(frozen=True)
+class RangeState:
+    """Values of all unknowns of a RangeProblem.
+
+    Attributes:
+        metric_from_model: of the model; of the first one if there are several.
+        anchors_m: (m, 3). bias_m: (m,).
+        others: metric_from_model of the further models.
+    """
+
+    metric_from_model: Similarity
+    anchors_m: Array
+    bias_m: Array
+    others: tuple[Similarity, ...] = ()
+
+    @property
+    def similarities(self) -> tuple[Similarity, ...]:
+        """The metric_from_model of each model."""
+        return self.metric_from_model, *self.others
+
+    @property
+    def of_models(self) -> tuple[RangeState, ...]:
+        """The state of each model, as a state of one model."""
+        return tuple(RangeState(each, self.anchors_m, self.bias_m) for each in self.similarities)
+
+
+@dataclass(frozen=True)
+class RangeFit:
+    """A solution of a RangeProblem; with several models, the n ranges are those of each model in turn.
+
+    Attributes:
+        state: the estimate.
+        residuals_m: (n,) predicted minus measured.
+        weights: (n,) of the robust loss; 1 for a range that fits.
+        cost: half the robust sum of squares, priors included.
+        information: (p, p) Gauss-Newton approximation with the robust weights, in the parameters of ``columns``.
+        gradients: (n, p) Jacobian of the residuals in standard deviations, each row times its range's weight and share.
+        columns: for each model, which of the p parameters is what; the very first is the logarithm of the scale.
+    """
+
+    state: RangeState
+    residuals_m: Array
+    weights: Array
+    cost: float
+    information: Array
+    gradients: Array
+    columns: tuple[Columns, ...]
+
+    @property
+    def log_scale_stddev(self) -> float:
+        """Formal standard deviation of the logarithm of the scale, which is the scale's relative error."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def covariance(self) -> Array:
+        """(p, p) formal covariance; undetermined directions get a huge variance."""
+        # Scaled by the diagonal, so that the rule does not depend on units.
+        diagonal = np.sqrt(np.maximum(np.diag(self.information), 1e-200))
+        values, vectors = np.linalg.eigh(self.information / np.outer(diagonal, diagonal))
+        return np.asarray((vectors / np.maximum(values, 1e-14)) @ vectors.T / np.outer(diagonal, diagonal))
+
+    def of_anchors(self, covariance: Array) -> Array:
+        """Return the (m, 3, 3) parts of the anchors in a (p, p) covariance; 0 for anchors that are not estimated."""
+        parts = np.zeros((len(self.state.anchors_m), 3, 3))
+        for k, column in enumerate(self.columns[0].anchor):
+            if column >= 0:
+                parts[k] = covariance[column : column + 3, column : column + 3]
+        return parts
+
+
+def columns_of(parts: Sequence[RangeProblem]) -> tuple[Columns, ...]:
+    """Return the columns of all unknowns of one problem, or of the joint problem of several models."""
+    of_own, next_column = [], 0
+    for part in parts:
+        of_own.append((next_column, next_column + 1 if part.frame_is_free else -1))
+        next_column += 7 if part.frame_is_free else 1
+    anchor = np.full(parts[0].num_anchors, -1, dtype=np.int64)
+    bias = anchor.copy()
+    for k in np.flatnonzero(parts[0].anchor_stddev_m > 0):
+        anchor[k], next_column = next_column, next_column + 3
+    for k in np.flatnonzero(parts[0].bias_stddev_m > 0):
+        bias[k], next_column = next_column, next_column + 1
+    return tuple(Columns(scale, frame, anchor, bias, next_column) for scale, frame in of_own)
+
+
+def antenna_positions(problem: RangeProblem, metric_from_model: Similarity) -> Array:
+    """Return the (n, 3) antenna positions in the metric world."""
+    turned: Array = problem.tag_from_center @ metric_from_model.rotation.T
+    return metric_from_model.apply(problem.centers) + turned
+
+
+def range_gradient(problem: RangeProblem, state: RangeState) -> RangeGradient:
+    """Return the n distances between antenna and anchor, with their derivatives."""
+    tags = antenna_positions(problem, state.metric_from_model)
+    return RangeGradient.of(tags - state.anchors_m[problem.anchor_index])
+
+
+def predicted_ranges(problem: RangeProblem, state: RangeState) -> Array:
+    """Return the (n,) predicted ranges, biases included, in metres."""
+    return range_gradient(problem, state).distance_m + state.bias_m[problem.anchor_index]
+
+
+def solve(
+    problem: RangeProblem,
+    start: RangeState,
+    *,
+    others: Sequence[RangeProblem] = (),
+    loss: RobustLoss = CAUCHY,
+    tolerance: float = ROUNDING,
+    max_num_evaluations: int = 100,
+) -> RangeFit:
+    """Solve by robust least squares, with scipy's trust region solver and an analytic Jacobian.
+
+    Args:
+        others: problems of further models, each in its own unit and with its own ``frame_is_free``. Anchors, biases
+            and all priors are taken from the first problem.
+        start: initial values; an anchor without a position must have no ranges.
+        loss: robust loss of the ranges.
+        tolerance: relative change of cost and of parameters at which the solver stops. Candidates to choose among need
+            not be at the very minimum.
+    """
+    columns = columns_of((problem, *others))
+    system = _System((problem, *others), columns, start, loss)
+    result = least_squares(
+        lambda x: np.concatenate(system.residuals(state_after(columns, start, x))),
+        np.zeros(columns[0].num),
+        jac=lambda x: np.concatenate(system.jacobian(state_after(columns, start, x))),
+        loss=system.rho_with_derivatives,
+        x_scale="jac",
+        method="trf",
+        ftol=tolerance,
+        xtol=tolerance,
+        # Only a start at the very minimum is below this; without it, the solver would divide zero by zero there.
+        gtol=float(np.finfo(np.float64).eps),
+        max_nfev=max_num_evaluations,
+    )
+    x = _settled(system, result.x) if tolerance <= ROUNDING else result.x
+    return system.fit(state_after(columns, start, x), float(result.cost))
+
+
+def fit_at(problem: RangeProblem, state: RangeState, weights: Array) -> RangeFit:
+    """Return the fit that would end at this state, without solving.
+
+    Args:
+        weights: (n,) robust weights; larger than 1 for a range that stands for several.
+    """
+    return _System((problem,), columns_of((problem,)), state, CAUCHY).fit(state, 0.0, weights)
+
+
+def _settled(system: _System, x: Array) -> Array:
+    """Move to the exact minimum by Newton steps that use the gradient alone.
+
+    The trust region stops where rounding hides the decrease of the cost, some 1e-9 from the minimum. On which side it
+    stops depends on the last digit of the input. A step is measured by the decrease of the cost that is expected of it,
+    which is squared standard deviations of the parameters. Where a step promises more than the solver's tolerance, the
+    solver has not converged, and its result is left as it is.
+    """
+    for _ in range(MAX_NUM_ROUNDS):
+        gradient, curvature = system.slope(state_after(system.columns, system.start, x))
+        step = np.linalg.lstsq(curvature, gradient, rcond=ROUNDING)[0]
+        gain = float(gradient @ step)
+        if not ROUNDING**2 < gain < SAME_COST:
+            break
+        x = x - step
+    return x
+
+
+@dataclass(frozen=True)
+class _System:
+    """Residuals and derivatives of one problem, or of the joint problem of several models, as functions of a state."""
+
+    parts: tuple[RangeProblem, ...]
+    columns: tuple[Columns, ...]
+    start: RangeState
+    loss: RobustLoss
+
+    @property
+    def share(self) -> Array:
+        return np.concatenate([np.ones(len(p.range_m)) if p.share is None else p.share for p in self.parts])
+
+    def rho_with_derivatives(self, z: Array) -> Array:
+        # Priors have no robust loss: only ranges have outliers.
+        rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
+        share = self.share
+        rho[:, : len(share)] = share * self.loss.rho(z[: len(share)])
+        return rho
+
+    def residuals(self, state: RangeState) -> tuple[Array, Array]:
+        """Return the residuals of ranges and of priors, in standard deviations."""
+        of_parts = zip(self.parts, state.of_models, strict=True)
+        ranges = [(predicted_ranges(part, own) - part.range_m) / part.stddev_m for part, own in of_parts]
+        return np.concatenate(ranges), prior_residuals(self.parts[0], self.columns[0], state)
+
+    def jacobian(self, state: RangeState) -> tuple[Array, Array]:
+        """Return the Jacobians of the residuals of ranges and of priors."""
+        of_parts = zip(self.parts, self.columns, self.start.of_models, state.of_models, strict=True)
+        priors = prior_jacobian(self.parts[0], self.columns[0], self.start, state)
+        return np.concatenate([range_jacobian(*each) for each in of_parts]), priors
+
+    def slope(self, state: RangeState) -> tuple[Array, Array]:
+        """Return the (p,) gradient and the (p, p) curvature of the cost.
+
+        As in scipy, a range beyond the inflection point of the loss adds no curvature.
+        """
+        (scaled, off_priors), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
+        _, first, second = self.rho_with_derivatives(scaled**2)
+        curvature = (jacobian * np.maximum(first + 2 * second * scaled**2, 0.0)[:, None]).T @ jacobian
+        return jacobian.T @ (first * scaled) + of_priors.T @ off_priors, curvature + of_priors.T @ of_priors
+
+    def fit(self, state: RangeState, cost: float, weights: Array | None = None) -> RangeFit:
+        """Return the fit at a state; ``weights``: (n,), or None to take them from the loss."""
+        (scaled, _), (jacobian, of_priors) = self.residuals(state), self.jacobian(state)
+        weights = self.loss.weights(scaled) if weights is None else weights
+        gradients = jacobian * (self.share * weights)[:, None]
+        return RangeFit(
+            state=state,
+            residuals_m=scaled * np.concatenate([part.stddev_m for part in self.parts]),
+            weights=weights,
+            cost=cost,
+            information=gradients.T @ jacobian + of_priors.T @ of_priors,
+            gradients=gradients,
+            columns=self.columns,
+        )
+
+
+def state_after(columns: Sequence[Columns], start: RangeState, x: Array) -> RangeState:
+    """Return the start moved by a parameter vector (p,)."""
+    anchors, bias = start.anchors_m.copy(), start.bias_m.copy()
+    first, *others = (
+        _moved(own.metric_from_model, each, x) for each, own in zip(columns, start.of_models, strict=True)
+    )
+    for k, (anchor, own_bias) in enumerate(zip(columns[0].anchor, columns[0].bias, strict=True)):
+        if anchor >= 0:
+            anchors[k] += x[anchor : anchor + 3]
+        if own_bias >= 0:
+            bias[k] += x[own_bias]
+    return RangeState(first, anchors, bias, tuple(others))
+
+
+def _moved(similarity: Similarity, columns: Columns, x: Array) -> Similarity:
+    scale = similarity.scale * float(np.exp(np.clip(x[columns.scale], -20, 20)))
+    if columns.frame < 0:
+        return replace(similarity, scale=scale)
+    turn, shift = x[columns.frame : columns.frame + 6].reshape(2, 3)
+    rotation = Rotation.from_rotvec(turn).as_matrix() @ similarity.rotation
+    return Similarity(scale, rotation, similarity.translation + shift)
+
+
+def range_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
+    """Return the (n, p) Jacobian of the residuals of one model's ranges, in standard deviations."""
+    similarity, index = state.metric_from_model, problem.anchor_index
+    grown = similarity.scale * problem.centers @ similarity.rotation.T
+    by = range_gradient(problem, state)
+    jacobian = np.zeros((len(index), columns.num))
+    jacobian[:, columns.scale] = by.by_log_scale(grown)
+    if columns.frame >= 0:
+        arms = grown + problem.tag_from_center @ similarity.rotation.T
+        jacobian[:, columns.frame : columns.frame + 3] = by.by_turn_of_world(arms) @ _left_of_step(start, state)
+        jacobian[:, columns.frame + 3 : columns.frame + 6] = by.by_tag
+    rows = np.flatnonzero(columns.anchor[index] >= 0)
+    jacobian[rows[:, None], columns.anchor[index[rows], None] + np.arange(3)] = by.by_anchor[rows]
+    rows = np.flatnonzero(columns.bias[index] >= 0)
+    jacobian[rows, columns.bias[index[rows]]] = 1.0
+    jacobian /= problem.stddev_m[:, None]
+    return jacobian
+
+
+def _left_of_step(start: RangeState, state: RangeState) -> Array:
+    """Return the left Jacobian of SO(3) at the rotation from start to state.
+
+    The rotation vector acts on the left of the start's rotation, so away from zero its derivative needs this factor.
+    """
+    turned = Rotation.from_matrix(state.metric_from_model.rotation @ start.metric_from_model.rotation.T)
+    return left_jacobians(turned.as_rotvec())
+
+
+def prior_residuals(problem: RangeProblem, columns: Columns, state: RangeState) -> Array:
+    """Return the (r,) residuals of anchors, biases, distances, gravity and known positions, in standard deviations."""
+    anchors, biases = problem.uncertain
+    off_anchor = (state.anchors_m - problem.anchor_mean_m)[anchors] / problem.anchor_stddev_m[anchors, None]
+    off_bias = problem.bias_whitening @ (state.bias_m - problem.bias_mean_m)[biases]
+    of_distances = problem.distances.residuals(state.metric_from_model.scale, state.anchors_m)
+    priors = [off_anchor.ravel(), off_bias, of_distances]
+    if problem.gravity is not None and columns.frame >= 0:
+        priors.append(problem.gravity.residuals(state.metric_from_model.rotation))
+    if problem.placement is not None and columns.frame >= 0:
+        priors.append(problem.placement.residuals(state.metric_from_model))
+    return np.concatenate(priors)
+
+
+def prior_cost(problem: RangeProblem, state: RangeState) -> float:
+    """Return half the sum of squares of the residuals of priors, distances and gravity."""
+    off = prior_residuals(problem, columns_of([problem])[0], state)
+    return 0.5 * float(off @ off)
+
+
+def prior_jacobian(problem: RangeProblem, columns: Columns, start: RangeState, state: RangeState) -> Array:
+    """Return the (r, p) Jacobian of ``prior_residuals``."""
+    anchors, biases = problem.uncertain
+    jacobian = np.zeros((3 * len(anchors) + len(biases), columns.num))
+    for row, k in enumerate(anchors):
+        for axis in range(3):
+            jacobian[3 * row + axis, columns.anchor[k] + axis] = 1 / problem.anchor_stddev_m[k]
+    jacobian[3 * len(anchors) :, columns.bias[biases]] = problem.bias_whitening
+    similarity = state.metric_from_model
+    of_distances = problem.distances.jacobian(similarity.scale, state.anchors_m, columns.anchor, columns.num)
+    blocks = [jacobian, of_distances]
+    if problem.gravity is not None and columns.frame >= 0:
+        block = np.zeros((3, columns.num))
+        turn = problem.gravity.jacobian(similarity.rotation, _left_of_step(start, state))
+        block[:, columns.frame : columns.frame + 3] = turn
+        blocks.append(block)
+    if problem.placement is not None and columns.frame >= 0:
+        block = np.zeros((7, columns.num))
+        block[:, columns.of_map] = problem.placement.jacobian(similarity, _left_of_step(start, state))
+        blocks.append(block)
+    return np.concatenate(blocks)

@@ -1,0 +1,411 @@
+"""The similarity from a map to the site by known positions: of marks (control points) and of an antenna on the camera.
+
+It is fitted robustly, and control points that contradict the others are left out.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from rangesfm.arrays import Array, Indices, Mask, median, rms
+from rangesfm.errors import GeometryError
+from rangesfm.estimation.scale.anchor_plane import is_line
+from rangesfm.estimation.scale.position_tests import tests_of_positions
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap
+from rangesfm.measurements.lengths.tape import LEFT_OUT
+from rangesfm.measurements.positions.grouped_positions import (
+    POSITIONS,
+    GroupedPositions,
+    PositionFit,
+    at_point,
+    design_of_positions,
+    stddev_of,
+)
+from rangesfm.measurements.positions.known_positions import (
+    LASTING_S,
+    MIN_NUM_POSITIONS,
+    KnownPositions,
+    LearntPositions,
+)
+from rangesfm.measurements.positions.site_positions import UsedPositions
+from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.ranges.errors.components import FRAME
+from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
+from rangesfm.measurements.source import Source
+from rangesfm.solver.bending import MapBending
+from rangesfm.solver.linear_map import FALSE_ALARM_RATE, NUM_SUSPECTS, EstimatedMistake
+from rangesfm.solver.mistakes import MistakeTests
+from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, ScaleByKind, ScaleUncertainty, joined
+from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, MAX_NUM_ROUNDS, NORMAL_95, ROUNDING, UNDETERMINED
+from rangesfm.util.geometry.robust_statistics import CAUCHY, MIN_STDDEV_M
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity, align_points, path_shape
+from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity
+from rangesfm.util.processes.threads import with_one_blas_thread
+
+# Most triples for a start.
+_MAX_NUM_TRIPLES = 300
+# Largest standard deviation of a turn of the map, radians, for which its effect is linear.
+_MAX_TURN_STDDEV = 0.3
+
+
+@dataclass(frozen=True)
+class PositionScale(KindOnMap):
+    """k known positions on a map, and its scale and place by them alone.
+
+    Attributes:
+        fit: robust one of the positions alone.
+        is_left_out: (k,) control points that contradict the others.
+        threshold: squared error of a control point, in standard deviations, above which it is left out.
+        by_themselves: as ``alone``.
+        inflation: standard deviation of the scale by the antenna's positions, divided by that for independent errors.
+        surveyed: what the positions were given as.
+    """
+
+    fit: PositionFit
+    is_left_out: Mask
+    threshold: float
+    by_themselves: JointMap
+    inflation: float
+    surveyed: SurveyedPositions = field(default_factory=SurveyedPositions)
+
+    kind = POSITIONS
+    words, remedy = "known positions", "look at the units of both"
+
+    @property
+    def start(self) -> Similarity:
+        """The similarity of the robust fit."""
+        return self.fit.similarity
+
+    @property
+    def alone(self) -> JointMap:
+        """The map by the positions alone, about the similarity of their fit."""
+        return self.by_themselves
+
+    @property
+    def places_map(self) -> bool:
+        """True: they are in the site."""
+        return True
+
+    def observed(
+        self, placed: Similarity, *, in_site: bool = True, max_num: int = MAX_NUM_OBSERVATIONS
+    ) -> GroupedPositions:
+        """Linearise the positions about a placement."""
+        del in_site
+        return self.fit.at(placed, max_num)
+
+    @property
+    def known(self) -> KnownPositions:
+        """The positions."""
+        return self.fit.known
+
+    def stddevs_m(self, on_map: JointMap) -> Array:
+        """Return (k,) standard deviations of a coordinate, without errors that last, as learnt on a map."""
+        given, learnt = stddev_of(self.known.covariance_m2), on_map.problem.sizes
+        base = np.where(np.isfinite(given), given, self.fit.stddev_m)
+        return base * np.where(self.known.is_mark, learnt.get("points", 1.0), learnt.get("positions", 1.0))
+
+    def entry(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return how the positions of an antenna fit the map; empty without an antenna."""
+        track = self.surveyed.antenna
+        if track is None:
+            return {}
+        mine, used = ~self.known.is_mark, ~self.known.is_mark & self.used
+        off_m, is_timed = self.known.misclosures_m(on_map.estimate)[used], track.log.timestamp_s is not None
+        return {
+            "num": len(track.log),
+            "num_used": int(used.sum()),
+            "num_rejected": int((mine & ~used).sum()),
+            "rms_m": rms(np.linalg.norm(off_m, axis=1)),
+            "rms_by_axis_m": tuple(map(rms, off_m.T)) if len(off_m) else None,
+            "stddev_m": median(self.stddevs_m(on_map)[used]),
+            "inflation": self.inflation,
+            "time_offset_s": (track.offset_s or 0.0) if is_timed else None,
+            "time_offset_stddev_s": track.offset_stddev_s if is_timed else None,
+            "antenna_in_cam_m": np.array(track.antenna_in_cam_m).tolist(),
+        }
+
+    def sources(self, on_map: JointMap) -> tuple[Source, ...]:
+        """Return the positions that take part in the fit."""
+        antenna, markers = self.surveyed.antenna, self.surveyed.markers
+        track = () if antenna is None else (antenna,)
+        stddevs_m = self.stddevs_m(on_map)
+        return (UsedPositions(self.known, self.takes_part, stddevs_m, on_map.estimate, markers, track),)
+
+    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return the errors of the antenna's positions themselves: neither the map's bending nor that of a clock."""
+        observed = self.grouped(on_map)
+        groups, rows = observed.grouping[::3, ::3].nonzero()
+        pairs = zip(groups.tolist(), rows.tolist(), strict=True)
+        group_of = {self.known.names[row]: group for group, row in pairs if not self.known.is_mark[row]}
+        noise = on_map.problem.noise_of(POSITIONS)
+        own = (name for name in noise.names if name in ("places", FRAME) or name.startswith(POSITIONS))
+        return {"position": LearntPositions(group_of, noise.only(*own).covariance_m2)}
+
+    def grouped(self, on_map: JointMap) -> GroupedPositions:
+        """Return the groups of the positions on a map."""
+        observed = on_map.observed[POSITIONS]
+        assert isinstance(observed, GroupedPositions), "positions come in groups"
+        return observed
+
+    def columns_of(self, on_map: JointMap, of_positions: Array) -> Array:
+        """Return the columns (c, m) of a map's problem by those (3 k, m) of the positions."""
+        return on_map.columns(POSITIONS, self.grouped(on_map).grouping @ of_positions)
+
+    @property
+    def names_left_out(self) -> list[str]:
+        """Names of the control points that contradict the others, or did so before."""
+        points = () if self.surveyed.points is None else self.surveyed.points.points
+        before = [point.name for point in points if point.kind == LEFT_OUT]
+        return [*(self.known.names[row] for row in np.flatnonzero(self.is_left_out).tolist()), *before]
+
+    def tests(self, on_map: JointMap, by_kind: Mapping[str, ScaleByKind]) -> MistakeTests:
+        """Return the tests of each control point, of the antenna's positions, and of all against other kinds."""
+        return tests_of_positions(self, on_map, self.against_others(on_map, by_kind))
+
+    @property
+    def takes_part(self) -> Mask:
+        """(k,) control positions that do not contradict the others, outliers of an antenna among them."""
+        return np.asarray(~self.known.is_check & ~self.is_left_out)
+
+    @property
+    def used(self) -> Mask:
+        """(k,) positions that take part and are no outliers."""
+        return np.asarray(self.takes_part & (self.known.is_mark | (self.fit.weights >= OUTLIER_BELOW)))
+
+    def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
+        """Yield that nothing tells which of three positions is wrong, and why the interval is wide."""
+        return doubts_of_positions(int(self.used.sum()), uncertainty, has_check=bool(self.known.is_check.any()))
+
+
+def doubts_of_positions(num_used: int, uncertainty: ScaleUncertainty, *, has_check: bool) -> Iterator[Doubt]:
+    """Yield the faults of a map by known positions.
+
+    Args:
+        num_used: number of positions. has_check: whether others check them.
+    """
+    if num_used == MIN_NUM_POSITIONS and not has_check:
+        reason = f"the map rests on {num_used} known positions, so that nothing tells which of them is wrong if one is"
+        yield Doubt(reason, "survey a fourth control point, far from the others")
+    by_frame = uncertainty.components.get(FRAME, 0.0)
+    if NORMAL_95 * by_frame > DOUBTFUL_ABOVE:
+        reason = (
+            "a system whose positions err as these do may also measure the whole site too large or too small, by up to "
+            f"{100 * NORMAL_95 * by_frame:.1f} % (95 %): its positions alone cannot show that"
+        )
+        yield Doubt(reason, "tape a long distance in the map (--distances), or survey control points (--points)")
+    elif uncertainty.half_width_95 > DOUBTFUL_ABOVE:
+        reason = "the known positions are too close together for their standard deviations"
+        yield Doubt(reason, "survey control points at the ends of the site, or walk farther")
+
+
+@with_one_blas_thread
+def scale_by_positions(
+    known: KnownPositions,
+    path: Trajectory,
+    bending: MapBending,
+    *,
+    refined: Similarity | None = None,
+    lasting_s: Sequence[float] = LASTING_S,
+    metres_per_unit: float = 1.0,
+) -> PositionScale:
+    """Estimate the similarity to the site by known positions alone, with contradicting control points left out.
+
+    Args:
+        known: positions in the model of ``path``. path: of the camera. bending: of the map.
+        refined: similarity of a map that photos and positions made together; None: the map is one piece, and its
+            similarity is estimated.
+        lasting_s: for how long errors of the antenna's positions last, seconds.
+        metres_per_unit: as of ``PositionFit``.
+
+    Raises:
+        GeometryError: the positions are too few, or on one line.
+    """
+    search = _Search(known, path, refined, tuple(lasting_s), metres_per_unit)
+    search.require_enough()
+    used = ~known.is_check
+    num_control = int(np.count_nonzero(known.is_mark & used))
+    threshold = float(special.chdtri(3, FALSE_ALARM_RATE / max(num_control, 1)))
+    learnt = search.learnt(bending, used)
+    while (worst := search.worst(bending, learnt, threshold)) is not None:
+        learnt = worst
+    fit, observed, problem = learnt
+    is_at_rest = refined is not None
+    posterior = problem.posterior(is_refined=is_at_rest)
+    alone = JointMap((), path, fit.similarity, bending, is_at_rest, {POSITIONS: observed}, problem, posterior)
+    refuse_open_turn(posterior.place)
+    return PositionScale(fit, used & ~fit.used, threshold, alone, _inflation(learnt))
+
+
+class _Learnt(NamedTuple):
+    """A fit of positions, these about its similarity, and their problem with errors learnt from what the fit leaves."""
+
+    fit: PositionFit
+    observed: GroupedPositions
+    problem: JointProblem
+
+    def mistake(self, row: int) -> EstimatedMistake:
+        """Estimate by how much a known position is off."""
+        return self.problem.mistake(self.observed.grouping @ at_point(self.fit.known, row))
+
+
+def _inflation(learnt: _Learnt) -> float:
+    """Return the inflation for the scale by an antenna's positions."""
+    fit, observed, problem = learnt
+    used = problem.is_used
+    linear, noise = problem.among(used)
+    as_independent, _ = linear.solved(problem.alone_m2[np.ix_(used, used)]).gains
+    is_antenna = np.asarray(abs(observed.grouping) @ np.repeat(~fit.known.is_mark, 3) > 0)[used]
+    effects = noise.effects(np.where(is_antenna, as_independent[0], 0.0))
+    of_parts = {name: size for name, size in effects.items() if name.startswith(POSITIONS)}
+    alone = of_parts.get(POSITIONS, 0.0)
+    return float(np.linalg.norm([*of_parts.values()])) / alone if alone > 0 else 1.0
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The fit of positions to a map; arguments as for ``scale_by_positions``."""
+
+    known: KnownPositions
+    path: Trajectory
+    refined: Similarity | None
+    lasting_s: tuple[float, ...]
+    metres_per_unit: float
+
+    def require_enough(self) -> None:
+        """Raise GeometryError if the positions do not determine a similarity."""
+        is_control = ~self.known.is_check
+        if not _determine(self.known, is_control):
+            expected = f"expected {MIN_NUM_POSITIONS} or more that are not on one line"
+            raise GeometryError(f"{np.count_nonzero(is_control)} known positions are in the map, {expected}")
+
+    def fit(self, used: Mask, start: Similarity | None = None) -> PositionFit:
+        """Fit the similarity by iteratively reweighted least squares."""
+        known = self.known
+        similarity = self.refined or start or _of_triples(known, np.flatnonzero(used))
+        for _ in range(MAX_NUM_ROUNDS):
+            off_m = known.misclosures_m(similarity)
+            stddev_m = self._stddevs_m(off_m, used)
+            away = np.sqrt(np.mean(off_m**2, axis=1)) / stddev_m
+            weights = used * CAUCHY.weights(away)
+            if self.refined is not None:  # the map has its place; only outliers are told apart
+                break
+            step = self._step(similarity, off_m, weights / stddev_m**2)
+            similarity = moved_similarity(similarity, step, self.path)
+            if np.abs(step).max() < ROUNDING:
+                break
+        return PositionFit(similarity, known, self.path, used, weights, stddev_m, self.lasting_s, self.metres_per_unit)
+
+    def learnt(self, bending: MapBending, used: Mask, start: Similarity | None = None) -> _Learnt:
+        """Return the fit with what is learnt from it."""
+        fit = self.fit(used, start)
+        observed = fit.at(fit.similarity)
+        return _Learnt(fit, observed, joined([observed], bending).learnt())
+
+    def _step(self, similarity: Similarity, off_m: Array, weights: Array) -> Array:
+        root = np.repeat(np.sqrt(weights), 3)
+        by = root[:, None] * design_of_positions(self.known, similarity, self.path)
+        return np.asarray(np.linalg.lstsq(by, -root * off_m.ravel(), rcond=ROUNDING)[0])
+
+    def _stddevs_m(self, off_m: Array, used: Mask) -> Array:
+        """Return (k,) standard deviations of a coordinate: as given, or larger if the residuals of its kind are."""
+        known, stddevs = self.known, np.ones(len(self.known))
+        given = stddev_of(known.covariance_m2)
+        freedom = np.sqrt(3 * used.sum() / max(3 * used.sum() - 7, 1))
+        # Half of all vectors of three normally distributed numbers are shorter than this.
+        median_length = np.sqrt(special.chdtri(3, 0.5))
+        for of_kind in (known.is_mark, ~known.is_mark):
+            if (rows := used & of_kind).any():
+                is_given = bool(np.isfinite(given[of_kind]).all())
+                ratio = given if is_given else np.ones(len(known))
+                shown = freedom * float(np.median(np.linalg.norm(off_m[rows], axis=1) / ratio[rows])) / median_length
+                stddevs[of_kind] = ratio[of_kind] * max(shown, 1.0 if is_given else MIN_STDDEV_M)
+        return stddevs
+
+    def worst(self, bending: MapBending, learnt: _Learnt, threshold: float) -> _Learnt | None:
+        """Return the fit without the control point that contradicts the others most; None if none does.
+
+        The errors are learnt again without each suspect, as its own error would be taken for theirs.
+        """
+        used = learnt.fit.used
+        rows = np.flatnonzero(used & self.known.is_mark)
+        statistics = np.array([learnt.mistake(row).statistic for row in rows.tolist()])
+        found, largest = None, threshold
+        for row in rows[np.argsort(-statistics, kind="stable")[:NUM_SUSPECTS]].tolist():
+            others = used & (np.arange(len(used)) != row)
+            if int(others.sum()) <= MIN_NUM_POSITIONS - 1 or not _determine(self.known, others):
+                continue
+            without = self.learnt(bending, others, learnt.fit.similarity)
+            if (statistic := without.mistake(row).statistic) > largest:
+                found, largest = without, statistic
+        return found
+
+
+def planned_positions(
+    known: KnownPositions, path: Trajectory, lasting_s: Sequence[float], max_num: int
+) -> GroupedPositions:
+    """Return the observations of positions that are planned, on a map that is true.
+
+    Args:
+        known: without errors, in the model of ``path``, whose world is the site.
+        max_num: largest number of observations of an antenna.
+
+    Raises:
+        GeometryError: the positions are too few, or on one line.
+    """
+    search = _Search(known, path, IDENTITY, tuple(lasting_s), 1.0)
+    search.require_enough()
+    return search.fit(~known.is_check).at(IDENTITY, max_num)
+
+
+def _determine(known: KnownPositions, used: Mask) -> bool:
+    """Return whether positions determine a similarity: three or more that are not on one line."""
+    if used.sum() < MIN_NUM_POSITIONS:
+        return False
+    stddevs = path_shape(known.places[used]).stddevs
+    return bool(stddevs[1] > UNDETERMINED * stddevs[0])
+
+
+def refuse_open_turn(covariance: Array) -> None:
+    """Raise GeometryError if a (7, 7) covariance of a similarity by known positions leaves its turn open."""
+    turn_stddev = float(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1]))
+    if turn_stddev > _MAX_TURN_STDDEV:
+        raise GeometryError(
+            "the known positions are nearly on one line, which leaves the turn of the map about it open "
+            f"({np.rad2deg(turn_stddev):.0f} degrees, 1 stddev): survey a point off that line"
+        )
+
+
+def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:
+    """Return the similarity of three positions with the least sum of distances of all: a robust start.
+
+    Lever arms are taken off with the rotation of a first fit.
+    """
+    places, targets = known.places[rows], known.position_m[rows]
+    for _ in range(2):
+        candidates = [align_points(places, targets)]
+        for chosen in map(list, _triples(len(rows))):
+            if not any(is_line(path_shape(each)) for each in (places[chosen], targets[chosen])):
+                candidates.append(align_points(places[chosen], targets[chosen]))
+        best = candidates[int(np.argmin([_distance_sum(each, places, targets) for each in candidates]))]
+        targets = known.position_m[rows] - known.arms_m[rows] @ best.rotation.T
+    return best
+
+
+def _distance_sum(similarity: Similarity, places: Array, targets: Array) -> float:
+    return float(np.linalg.norm(similarity.apply(places) - targets, axis=1).sum())
+
+
+def _triples(num: int) -> Iterator[tuple[int, ...]]:
+    """Yield triples of numbers below ``num``: all if they are few, else some that are spread over them."""
+    if num * (num - 1) * (num - 2) // 6 <= _MAX_NUM_TRIPLES:
+        yield from itertools.combinations(range(num), MIN_NUM_POSITIONS)
+        return
+    rng = np.random.default_rng(0)
+    for _ in range(_MAX_NUM_TRIPLES):
+        yield tuple(rng.choice(num, MIN_NUM_POSITIONS, replace=False).tolist())

@@ -1,0 +1,225 @@
+"""Ranges on a map, which are solved beside measurements of other kinds, and the scale by the ranges alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.estimation.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved
+from rangesfm.estimation.scale.placement_prior import PlacementPrior
+from rangesfm.estimation.scale.range_equation import RangeProblem, RangeState, fit_at, predicted_ranges, solve
+from rangesfm.estimation.scale.scale_problem import ScaleProblem
+from rangesfm.estimation.scale.scale_verdict import doubts_of_ranges, remarks_on_anchors, remarks_on_places
+from rangesfm.estimation.scale.solution import Solution, weighted, with_unknown_anchors
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, join_kinds
+from rangesfm.measurements.kind import MapState
+from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.measurements.ranges.cost import Ranges, anchors_at
+from rangesfm.measurements.ranges.errors.learned import LearnedErrors
+from rangesfm.solver.bending import MapBending
+from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Posterior, ScaleUncertainty
+from rangesfm.util.geometry.numerics import ROUNDING
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, moved_similarity
+
+
+@dataclass(frozen=True)
+class RangeScale(KindOnMap):
+    """Ranges on a map, at the solution of their problem beside the other kinds.
+
+    Attributes:
+        posed: the scale problem. solution: the state of the map, with its errors.
+        path: of the map. unit: of it in the units of the problem, which has the same path. bending: of the map.
+        per_anchor: scale from each anchor alone, by id. anchors: estimates. They are judged with the scale.
+    """
+
+    posed: ScaleProblem
+    solution: Solution
+    path: Trajectory
+    unit: float
+    bending: MapBending
+    per_anchor: Mapping[str, float] = field(default_factory=dict)
+    anchors: tuple[AnchorEstimate, ...] = ()
+
+    kind = words = RANGES
+    remedy = "calibrate the radio (rangesfm ranges calibrate)"
+
+    @property
+    def places_map(self) -> bool:
+        """Whether the frame is that of surveyed anchors."""
+        return self.posed.ranges.frame_is_free
+
+    def observed(
+        self, placed: Similarity, *, in_site: bool = False, max_num: int = MAX_NUM_OBSERVATIONS
+    ) -> BinnedRanges:
+        """Linearise the ranges about their solution, which is at the placement."""
+        del placed, in_site
+        return binned_ranges(self.posed, self.solution, max_num)
+
+    @property
+    def metric_from_model(self) -> Similarity:
+        """From the frame of the first camera of the problem's path to the metric world."""
+        return self.solution.fit.state.metric_from_model
+
+    @property
+    def placed(self) -> Similarity:
+        """From the world of the path to the metric world."""
+        return self.metric_from_model @ replace(IDENTITY, scale=self.unit) @ first_camera_from(self.path)
+
+    @property
+    def predicted_m(self) -> Array:
+        """The (k,) predicted ranges."""
+        return predicted_ranges(self.solution.problem, self.solution.fit.state)
+
+    @property
+    def start(self) -> Similarity:
+        """The placement of the solution."""
+        return self.placed
+
+    @cached_property
+    def alone(self) -> JointMap:
+        """The map by the ranges alone, solved again from here."""
+        own = self._without_others
+        return join_kinds((own,), self.path, own.placed, self.bending)
+
+    @cached_property
+    def _without_others(self) -> RangeScale:
+        posed = replace(self.posed, ranges=_ranges_alone(self.posed.ranges))
+        return replace(self, posed=posed, solution=_solved(self.solution, _ranges_alone(self.solution.problem)))
+
+    @property
+    def with_their_share(self) -> RangeScale:
+        """The ranges solved beside other kinds with all of them weighted by how well they know the scale.
+
+        That is the formal over the learnt variance of the scale by ranges alone, at most 1. Where ranges alone say
+        nothing of the scale, they keep a share that has no effect: with none at all, nothing would place the anchors.
+        """
+        alone, problem, known = self._without_others.solution, self.solution.problem, self.alone.scale
+        formal = alone.fit.log_scale_stddev * alone.errors.inflation
+        share = float(np.clip((formal * known.value / known.stddev) ** 2, ROUNDING, 1.0))
+        shares = share * (np.ones(len(problem.range_m)) if problem.share is None else problem.share)
+        return replace(self, solution=_solved(self.solution, replace(problem, share=shares)))
+
+    def posterior(self, problem: JointProblem) -> Posterior:
+        """Return what they say of the map, which is where their robust weights have it."""
+        return problem.posterior(formal=self.solution.fit.log_scale_stddev)
+
+    def moved(self, known: Posterior) -> RangeScale:
+        """Return the ranges on the map at the estimate of a posterior, with the same robust weights."""
+        return replace(self, solution=moved(self.solution, known))
+
+    def on_refined_map(
+        self,
+        path: Trajectory,
+        scale: float,
+        ranges: Ranges,
+        at: MapState,
+        others: Sequence[KindOnMap],
+        bending: MapBending,
+    ) -> RangeScale:
+        """Return the ranges on the map that the scaled one became, as a scale problem in the unit of the latter.
+
+        Args:
+            path: of the refined map, in the metric world. scale: its metres per unit of the unscaled model.
+            ranges: as weighted in the refined map. at: its state.
+            others: measurements of other kinds on it. bending: of it.
+        """
+        unit, trajectory = 1 / scale, path.transformed(1 / scale, np.eye(3), np.zeros(3))
+        placed = Similarity(scale, first_camera_from(trajectory).rotation.T, path.centers[0])
+        tags_m, centers_m = ranges.antennas_m(at)
+        problem = replace(
+            self.posed.ranges,
+            centers=placed.inverse().apply(centers_m),
+            tag_from_center=(tags_m - centers_m) @ placed.rotation,
+            distances=with_lengths(self.posed.ranges.distances, others, scale),
+            # The model's frame is that of the first camera, in the unit of the unscaled model.
+            placement=placement_by(others, replace(IDENTITY, scale=unit) @ first_camera_from(path)),
+        )
+        anchors = anchors_at(ranges.anchors, at.blocks)
+        state = RangeState(
+            placed,
+            np.array([anchor.position_m for anchor in anchors]),
+            np.array([anchor.range_bias_m for anchor in anchors]),
+        )
+        by_errors, errors = weighted(problem, ranges.errors), ranges.errors
+        off_m = predicted_ranges(problem, state) + ranges.shared_m(at)[ranges.rows] - problem.range_m
+        fit = fit_at(by_errors, state, errors.robust_weights(off_m))
+        solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
+        posed = replace(self.posed, ranges=problem, trajectory=trajectory)
+        return RangeScale(posed, solution, path, unit, bending, anchors=self.anchors)
+
+    def learnt(self, on_map: JointMap) -> LearnedErrors:
+        """Return the errors of the ranges as learnt on a map, with those of the map."""
+        observed = on_map.observed[RANGES]
+        assert isinstance(observed, BinnedRanges), "ranges come in bins"
+        return LearnedErrors.from_noise(on_map.problem.noise_of(RANGES), observed.bins)
+
+    def learnt_errors(self, on_map: JointMap) -> Mapping[str, object]:
+        """Return these for the ranges in a bundle adjustment."""
+        return {"range": self.learnt(on_map)}
+
+    def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
+        """Yield the faults of the path, of the anchors and of the ranges."""
+        return doubts_of_ranges(self.posed, self.solution, uncertainty, self.per_anchor)
+
+    def remarks(self, on_map: JointMap) -> Iterator[Doubt]:
+        """Yield what is not determined, and that the anchors' coordinates widen the interval."""
+        yield from remarks_on_anchors(self.solution, self.anchors)
+        if np.isfinite(self.posed.ranges.anchor_stddev_m).any():
+            posed, solution = with_unknown_anchors(self.posed, self.solution.fit.state)
+            unknown = replace(self, posed=posed, solution=solution)
+            others = [unknown if each is self else each for each in on_map.kinds]
+            unplaced = on_map.rejoined(others, unknown.placed).posterior.uncertainty
+            yield from remarks_on_places(on_map.posterior.uncertainty, unplaced)
+
+
+def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarity) -> PlacementPrior | None:
+    """Return what the first other kind that places the map says of the place of the first camera's frame.
+
+    The problem of the ranges is solved and tested with it.
+
+    Args:
+        first_camera_from_model: with the unit of the problem.
+    """
+    for each in others:
+        if each.places_map and each.is_used:
+            known = each.alone.posterior
+            best = moved_similarity(each.alone.placed, known.columns.map_step(known.step), each.alone.path)
+            return PlacementPrior.with_covariance(best @ first_camera_from_model.inverse(), np.zeros(3), known.place)
+    return None
+
+
+def with_lengths(distances: LocatedDistances, others: Sequence[KindOnMap], unit: float = 1.0) -> LocatedDistances:
+    """Return distances between anchors with one length in the map for each other kind that gives its scale alone.
+
+    With them the problem of the ranges is solved and tested.
+
+    Args:
+        unit: of the model to which the distances refer, in units of that of the other kinds.
+    """
+    found = distances.subset(~distances.is_between_points)
+    one = np.ones(1)
+    for each in others:
+        if each.is_used and not each.places_map:
+            alone = each.alone.scale
+            length = LocatedDistances.control(unit * alone.value * one, unit * alone.stddev * one, model_length=one)
+            found = length.joined(found)
+    return found
+
+
+def _solved(solution: Solution, problem: RangeProblem) -> Solution:
+    """Return the solution of another problem of the same ranges, starting from this one."""
+    return replace(solution, problem=problem, fit=solve(problem, solution.fit.state, loss=solution.errors.loss))
+
+
+def _ranges_alone(problem: RangeProblem) -> RangeProblem:
+    distances = problem.distances.subset(~problem.distances.is_between_points)
+    if problem.placement is None:
+        return replace(problem, distances=distances)
+    is_placed = bool(np.isfinite(problem.anchor_stddev_m).any())
+    return replace(problem, distances=distances, placement=None, frame_is_free=is_placed)

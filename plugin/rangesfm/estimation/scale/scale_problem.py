@@ -1,0 +1,269 @@
+"""The range problem of a survey: ranges and anchors in the first camera's frame."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.estimation.scale.anchor_plane import are_on_line, is_steep
+from rangesfm.estimation.scale.placement_prior import PlacementPrior
+from rangesfm.estimation.scale.range_equation import RangeProblem
+from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances, surveyed_distances
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.anchors.trilateration import MIN_NUM_RANGES, walking_times_s
+from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
+from rangesfm.measurements.ranges.radio import lengths_by_radio
+from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.options import RangeModelOptions
+from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.util.geometry.similarity import Similarity, path_shape, rounding_of
+from rangesfm.util.geometry.trajectory import MIN_NUM_KEYFRAMES, Trajectory, first_camera_from
+
+MIN_RANGES = 8
+"""Fewest ranges that determine a scale: there are seven unknowns, and one more checks the fit."""
+
+
+@dataclass(frozen=True)
+class ScaleProblem:
+    """A RangeProblem and how it belongs to the survey.
+
+    Attributes:
+        ranges: the problem; its model world is the first camera's frame, unscaled.
+        errors: prior errors of its ranges, before anything is estimated.
+        observations: all ranges of the log.
+        rows: (k,) rows of the observations that its ranges are.
+        trajectory: path of the unscaled model.
+        frame: metric world of the solution: "site" or "first_camera".
+        anchors_are_known: whether given anchor positions are used.
+        notes: why the map has no place in the site frame, for the user.
+        left_out: anchors with too few ranges on the path to be placed.
+        order_given: ids of the anchors in the order of their file.
+        site: frame of their positions here, from which texts get the coordinates in that file.
+    """
+
+    ranges: RangeProblem
+    errors: RangeErrors
+    observations: RangeObservations
+    rows: Indices
+    trajectory: Trajectory
+    frame: str
+    anchors_are_known: bool
+    notes: tuple[str, ...]
+    left_out: tuple[str, ...]
+    order_given: tuple[str, ...]
+    site: Site = field(default_factory=Site)
+
+    @property
+    def first_camera_from_sfm(self) -> Similarity:
+        """Rigid motion from the world of the unscaled model to the model world of the ranges."""
+        return first_camera_from(self.trajectory)
+
+    @property
+    def model_from_cam(self) -> Array:
+        """(k, 3, 3) rotations of the keyframe nearest to each range."""
+        turned: Array = self.trajectory.world_from_cam[0].T @ self.trajectory.world_from_cam[self._nearest]
+        return turned
+
+    @property
+    def velocity(self) -> Array | None:
+        """(k, 3) camera velocity at each range, model units per second.
+
+        None without times, or if the photos' times do not increase along the path.
+        """
+        times = self.trajectory.timestamps_s
+        # Two photos at once, or a path that goes back in time, have no velocity.
+        if self.observations.log.timestamp_s is None or times is None or len(times) < 2 or (np.diff(times) <= 0).any():
+            return None
+        velocities = np.gradient(self.trajectory.centers, times, axis=0)[self._nearest]
+        return np.asarray(velocities @ self.trajectory.world_from_cam[0])
+
+    @property
+    def curve_stddev_m(self) -> Array | None:
+        """(k,) standard deviations of a learnt error curve that was subtracted from the ranges; None if none was."""
+        of_log = self.observations.log.shared_stddev_m
+        return None if of_log is None else of_log[self.rows]
+
+    @property
+    def _nearest(self) -> Indices:
+        return self.observations.nearest[self.rows]
+
+    def times_s(self, metres_per_unit: float) -> Array:
+        """Return (k,) times of the ranges in seconds; where the log names photos, as of somebody who walks."""
+        if self.observations.log.timestamp_s is not None:
+            return self.observations.log.timestamp_s[self.rows]
+        before = self.observations.before[self.rows]
+        _, first, of_range = np.unique(before, return_index=True, return_inverse=True)
+        return walking_times_s(metres_per_unit * self.ranges.centers[first])[of_range]
+
+    def placing_stddev_m(self, metres_per_unit: float) -> Array:
+        """Return the (k,) standard deviation of each coordinate of the antennas, metres, in a map of this scale."""
+        return self.observations.placing_stddev_m(metres_per_unit)[self.rows]
+
+
+def scale_problem(
+    observations: RangeObservations,
+    trajectory: Trajectory,
+    anchors: Sequence[Anchor],
+    anchor_frame: str,
+    range_model: RangeModelOptions,
+    distances: LocatedDistances = NO_DISTANCES,
+    gravity: Gravity | None = None,
+    placement: PlacementPrior | None = None,
+    *,
+    place_is_open: bool = False,
+    site: Site = Site(),
+) -> ScaleProblem:
+    """Set up the range problem.
+
+    Args:
+        distances: measured ones, with the anchors of the log in its order; distances measured by radio between anchors
+            are added from the log.
+        gravity: the upward direction, as given by the user.
+        placement: what known positions say of the map's place, for the first camera's frame; None without any.
+        place_is_open: whether the map has more than one possible place in the site. Then only the distances between
+            surveyed anchors are used, not their positions.
+        site: frame of the anchors' positions.
+
+    Raises:
+        InputError: an anchor of the log is not among ``anchors``.
+        GeometryError: too few ranges have a place on the path.
+    """
+    log = observations.log
+    in_log = _anchors_of_log(log.anchor_ids, anchors)
+    given = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
+    rows, heard = _usable_ranges(observations, given)
+    known, notes = _usable_positions(in_log, given & heard, anchor_frame, gravity is not None)
+    known &= not place_is_open
+    if placement is not None:  # any number of surveyed anchors helps a map that has its place
+        known, notes = given & heard, []
+    # A surveyed anchor whose ranges are all held out keeps its position, so that they can be checked against it.
+    placed = known | (given & known.any())
+    left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
+    bias_m = np.array([a.range_bias_m for a in in_log])
+    bias_stddev_m = np.array([_bias_stddev(a, range_model) for a in in_log])
+    measured = [distances]
+    if anchor_frame == "site" and not known.any():
+        measured += _between_surveyed(in_log, given & heard)
+    noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
+    pairs, length_m, stddev_m = lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m)
+    measured.append(LocatedDistances.control(length_m, stddev_m, anchor_pair=pairs))
+    errors = RangeErrors.begin(observations, rows, range_model)
+    ranges = RangeProblem(
+        centers=_centers_in_first_camera(observations.centers[rows], trajectory),
+        tag_from_center=observations.tag_from_center[rows] @ trajectory.world_from_cam[0],
+        anchor_index=log.anchor_index[rows],
+        range_m=log.range_m[rows],
+        stddev_m=errors.stddev_m,
+        anchor_mean_m=np.array(
+            [_position(a) if k else np.full(3, np.nan) for a, k in zip(in_log, placed, strict=True)]
+        ),
+        anchor_stddev_m=np.where(heard, np.where(known, np.array([a.position_stddev_m for a in in_log]), np.inf), 0.0),
+        bias_mean_m=bias_m,
+        bias_stddev_m=np.where(heard, bias_stddev_m, 0.0),
+        common_bias_stddev_m=common_stddev_m,
+        frame_is_free=placement is not None or (anchor_frame == "site" and bool(known.any())),
+        distances=_control(functools.reduce(LocatedDistances.joined, measured), heard | placed),
+        gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
+        placement=placement,
+    )
+    frame = "site" if ranges.frame_is_free else "first_camera"
+    return ScaleProblem(
+        ranges,
+        errors,
+        observations,
+        rows,
+        trajectory,
+        frame,
+        bool(known.any()),
+        tuple(notes),
+        left_out,
+        tuple(anchor.anchor_id for anchor in anchors),
+        site,
+    )
+
+
+def _control(distances: LocatedDistances, has_place: Mask) -> LocatedDistances:
+    """Return the distances to fit: no checks, and only between points or anchors in use."""
+    takes_part = np.append(has_place, True)[distances.anchor_pair].all(axis=1) & ~distances.is_check
+    return distances.subset(takes_part)
+
+
+def _anchors_of_log(anchor_ids: tuple[str, ...], anchors: Sequence[Anchor]) -> list[Anchor]:
+    by_id = {anchor.anchor_id: anchor for anchor in anchors}
+    missing = [anchor_id for anchor_id in anchor_ids if anchor_id not in by_id]
+    if missing:
+        raise InputError(f"anchor {missing[0]!r} of the log is not among the anchors ({', '.join(by_id)})")
+    return [by_id[anchor_id] for anchor_id in anchor_ids]
+
+
+def _position(anchor: Anchor) -> Array:
+    return np.full(3, np.nan) if anchor.position_m is None else anchor.position_m
+
+
+def _bias_stddev(anchor: Anchor, range_model: RangeModelOptions) -> float:
+    return range_model.range_bias_stddev_m if anchor.range_bias_stddev_m is None else anchor.range_bias_stddev_m
+
+
+def _usable_ranges(observations: RangeObservations, given: Mask) -> tuple[Indices, Mask]:
+    """Return the rows of the ranges in use, and a (m,) mask of the anchors that have enough of them."""
+    rows = observations.placed_rows
+    index = observations.log.anchor_index
+    counts = np.bincount(index[rows], minlength=len(given))
+    heard = counts >= np.where(given, 1, MIN_NUM_RANGES)
+    rows = rows[heard[index[rows]]]
+    keyframes = np.union1d(observations.before[rows], observations.after[rows])
+    if len(rows) < MIN_RANGES or len(keyframes) < MIN_NUM_KEYFRAMES:
+        raise GeometryError(
+            f"the scale is not determined: {len(rows)} of {len(observations.log)} ranges lie on the path, near "
+            f"{len(keyframes)} keyframes; {MIN_RANGES} near {MIN_NUM_KEYFRAMES} are needed (do the clocks agree?)"
+        )
+    return rows, heard
+
+
+def _centers_in_first_camera(centers: Array, trajectory: Trajectory) -> Array:
+    """Return (k, 3) centres in the first camera's frame.
+
+    The first camera's own centre is set to exactly 0 and not to a rounding error, so that no scale moves it.
+    """
+    off = centers - trajectory.centers[0]
+    off[np.linalg.norm(off, axis=1) <= rounding_of(trajectory.centers)] = 0.0
+    return np.asarray(off @ trajectory.world_from_cam[0])
+
+
+def _usable_positions(
+    anchors: Sequence[Anchor], given: Mask, anchor_frame: str, gravity_is_known: bool
+) -> tuple[Mask, list[str]]:
+    """Return a (m,) mask of anchors whose given positions can be used in this frame, and notes why others cannot."""
+    num = int(given.sum())
+    if anchor_frame != "site" or num == 0:
+        return given, []
+    positions_m = np.array([_position(a) for a, k in zip(anchors, given, strict=True) if k])
+    levelled = gravity_is_known and not is_steep(path_shape(positions_m))
+    if num >= 2 and (not are_on_line(positions_m) or levelled):
+        return given, []
+    if num == 1:
+        why = "1 surveyed anchor lets the map turn about it freely"
+    else:
+        which = "2 surveyed anchors" if num == 2 else "surveyed anchors on one line"
+        why = f"{which} let the map turn about their line freely"
+    fix = "a third anchor off it" if num > 1 else "three anchors not on a line"
+    # Gravity does not fix the turn about a vertical line, and with one anchor it does not fix the heading.
+    help_of_gravity = "" if gravity_is_known else " (two not above each other, with up_in_first_camera)"
+    note = f"{why}: the map gets metres, but no place in the site; {fix} would fix it{help_of_gravity}"
+    return np.zeros(len(anchors), dtype=bool), [note]
+
+
+def _between_surveyed(anchors: Sequence[Anchor], given: Mask) -> list[LocatedDistances]:
+    """Return the distances between anchors with given positions; they hold in any frame."""
+    ids = [anchor.anchor_id for anchor in anchors]
+    pairs = surveyed_distances([anchor for anchor, k in zip(anchors, given, strict=True) if k])
+    lengths_m, stddevs_m = np.array([[pair.distance_m, pair.stddev_m] for pair in pairs]).reshape(-1, 2).T
+    ends = np.array([[ids.index(end) for end in pair.ends] for pair in pairs])
+    return [LocatedDistances.control(lengths_m, stddevs_m, anchor_pair=ends)] if pairs else []

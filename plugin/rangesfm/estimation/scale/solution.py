@@ -1,0 +1,303 @@
+"""The best solution of a survey's range problem, and the check that no other solution fits as well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Array
+from rangesfm.errors import GeometryError
+from rangesfm.estimation.scale.anchor_plane import is_on_side, mirrored_map, on_side
+from rangesfm.estimation.scale.range_equation import (
+    RangeFit,
+    RangeProblem,
+    RangeState,
+    antenna_positions,
+    predicted_ranges,
+    prior_cost,
+    solve,
+)
+from rangesfm.estimation.scale.scale_problem import ScaleProblem
+from rangesfm.estimation.scale.starts import (
+    complete_unknown_anchors,
+    each_once,
+    first_camera_starts,
+    site_starts,
+    sphere_swaps,
+    spread_rows,
+    spread_subset,
+    unknown_anchor_starts,
+)
+from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors, fit_with_own_errors
+from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
+from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
+from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP
+from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape
+
+# Number of fits, each with the errors that the one before shows.
+_NUM_ROUNDS = 2
+# Noise that falls to less than this share of what a fit assumed: another fit is made.
+_FALLS = 0.5
+# Number of different maps that are compared. Two maps are the same if the logarithms of their scales, their rotations
+# (degrees) and the places of the path's middle (extents of the path) are no further apart than this.
+_NUM_ALTERNATIVES = 4
+_SAME_LOG_SCALE, _SAME_ROTATION_DEG, _SAME_SHIFT = 0.03, 5.0, 0.05
+MANY_OUTLIERS = 0.3
+"""Share of outliers above which a map is doubted, so that rivals are not compared any more."""
+
+WHY_SCALE_IS_OPEN = {
+    "straight": ("the path is straight", "walk a bend"),
+    "circular": (
+        "the path is a flat circle, and its radius and the anchors' heights can make up for each other",
+        "walk another shape, or survey an anchor",
+    ),
+    "spherical": (
+        "the path lies on a sphere, and its radius and the anchor's distance from its centre can change places",
+        "walk another shape, or add an anchor",
+    ),
+    "flat": ("the path is flat", "go up and down too, or add an anchor"),
+    "general": ("the path is too short or runs round the anchor", "vary it, or add an anchor"),
+}
+"""Reasons why another scale fits as well, and what to do about it, by the kind of path."""
+
+
+class OpenPlaceError(GeometryError):
+    """The map also fits in another place of the site, with the same scale.
+
+    Attributes:
+        in_first_camera: the fit, carried into the first camera's frame.
+    """
+
+    def __init__(self, text: str, fitted: RangeState):
+        super().__init__(text)
+        placed = fitted.metric_from_model
+        from_site = replace(placed, scale=1.0).inverse()
+        alone = Similarity(placed.scale, np.eye(3), np.zeros(3))
+        self.in_first_camera = RangeState(alone, from_site.apply(fitted.anchors_m), fitted.bias_m)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A fit weighted by the noise level that it shows itself.
+
+    Attributes:
+        problem: with the final standard deviations; its priors are scaled for ranges with independent errors.
+        fit: the estimate.
+        errors: of the problem's ranges; every formal standard deviation must be multiplied by their inflation.
+        noise_stddev_m: standard deviation of an ordinary range, estimated from the fit.
+        rivals: states of other maps that fit worse, the likeliest first.
+    """
+
+    problem: RangeProblem
+    fit: RangeFit
+    errors: RangeErrors
+    noise_stddev_m: float
+    rivals: tuple[RangeState, ...] = ()
+
+
+def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> Solution:
+    """Solve from all starts, estimate the noise, and refuse if two different maps fit equally well.
+
+    Args:
+        camera_side: the scale option of this name.
+
+    Raises:
+        GeometryError: nothing fits, or two different maps fit (OpenPlaceError: they have the same scale).
+    """
+    problem, errors = posed.ranges, posed.errors
+    if problem.placement is not None:  # known positions say where the map is, so that there is nothing to search for
+        start = RangeState(problem.placement.mean, problem.anchor_mean_m.copy(), problem.bias_mean_m.copy())
+        return solution_from(posed, complete_unknown_anchors(problem, start))
+    camera_side = camera_side if problem.frame_is_free else None
+    fits = on_side(problem, _distinct_fits(problem, posed.anchors_are_known, seed), camera_side)
+    starts = [fit.state for fit in fits]
+    if posed.anchors_are_known and not problem.frame_is_free:
+        starts += _consensus_states(problem)
+    starts.sort(key=lambda state: _unlikeliness(problem, errors, state))
+    likeliest = each_once(starts, lambda *both: _are_same(problem, *both), _NUM_ALTERNATIVES)
+    solutions = [solution_from(posed, start) for start in likeliest]
+    solutions.sort(key=lambda solution: _unlikeliness(problem, errors, solution.fit.state))
+    on_side(problem, [solutions[0].fit], camera_side)
+    others = [solution.fit.state for solution in solutions[1:]]
+    refuse_ambiguity(solutions[0], others, camera_side)
+    return replace(solutions[0], rivals=tuple(each for each in others if is_on_side(problem, each, camera_side)))
+
+
+def _unlikeliness(problem: RangeProblem, errors: RangeErrors, state: RangeState) -> float:
+    """Return the negative logarithm of the posterior, up to a constant."""
+    residuals = predicted_ranges(problem, state) - problem.range_m
+    return prior_cost(problem, state) - errors.noise_of_all(residuals).log_likelihood
+
+
+def _consensus_states(problem: RangeProblem) -> list[RangeState]:
+    """Return the states with the highest consensus, not refined: a fit from there may be drawn away by outliers."""
+    starts = first_camera_starts(_known_only(problem))[:_NUM_ALTERNATIVES]
+    if np.isinf(problem.anchor_stddev_m).any():
+        return [complete_unknown_anchors(problem, start) for start in starts]
+    return starts
+
+
+def _distinct_fits(problem: RangeProblem, anchors_are_known: bool, seed: int) -> list[RangeFit]:
+    """Return the local minima, best first, each different map once.
+
+    They are searched with few ranges per anchor and ranked with more.
+    """
+    small = spread_subset(problem, ENOUGH_TO_SEARCH)
+    if not anchors_are_known:
+        starts = unknown_anchor_starts(problem)
+    else:
+        starts = site_starts(problem, seed) if problem.frame_is_free else first_camera_starts(_known_only(problem))
+    fits = [solve(_known_only(small) if anchors_are_known else small, start, tolerance=1e-8) for start in starts]
+    fits = [fit for fit in fits if np.isfinite(fit.cost)]
+    if not fits:
+        raise GeometryError("the scale is not determined: no scale explains the ranges")
+    distinct = _each_once(small, fits)
+    if problem.frame_is_free:
+        mirrored = [mirrored_map(problem, fit.state) for fit in distinct]
+        again = [solve(_known_only(small), state, tolerance=1e-8) for state in mirrored if state is not None]
+        distinct = _each_once(small, distinct + again)
+    if anchors_are_known and np.isinf(problem.anchor_stddev_m).any():
+        distinct = [solve(small, complete_unknown_anchors(small, fit.state)) for fit in distinct]
+    if not anchors_are_known:
+        swapped = [solve(small, state, tolerance=1e-8) for state in sphere_swaps(small, distinct[0].state)]
+        distinct = _each_once(small, distinct + swapped)
+    enough = spread_subset(problem, ENOUGH_TO_JUDGE)
+    return _each_once(enough, [solve(enough, fit.state, tolerance=1e-8) for fit in distinct])
+
+
+def _each_once(problem: RangeProblem, fits: list[RangeFit]) -> list[RangeFit]:
+    """Return the best fits, best first, each different map once."""
+    ranked = sorted(fits, key=lambda f: f.cost)
+    return each_once(ranked, lambda a, b: _are_same(problem, a.state, b.state), _NUM_ALTERNATIVES)
+
+
+def _known_only(problem: RangeProblem) -> RangeProblem:
+    """Return the ranges to anchors with a given position; all other anchors are held fixed."""
+    known, distances = np.isfinite(problem.anchor_stddev_m), problem.distances
+    part = problem.subset(np.flatnonzero(known[problem.anchor_index]))
+    return replace(
+        part,
+        anchor_stddev_m=np.where(known, problem.anchor_stddev_m, 0.0),
+        bias_stddev_m=np.where(known, problem.bias_stddev_m, 0.0),
+        distances=distances.subset(distances.is_between_points),
+    )
+
+
+def _are_same(problem: RangeProblem, first: RangeState, second: RangeState) -> bool:
+    """Return True if two states are the same map, up to the tolerances above."""
+    a, b = first.metric_from_model, second.metric_from_model
+    scales_differ = bool(abs(np.log(a.scale / b.scale)) > _SAME_LOG_SCALE)
+    if scales_differ or not problem.frame_is_free:
+        return not scales_differ
+    turn = np.rad2deg(Rotation.from_matrix(a.rotation.T @ b.rotation).magnitude())
+    shape = path_shape(problem.centers)
+    shift = np.linalg.norm(a.apply(shape.centroid) - b.apply(shape.centroid)) / np.linalg.norm(a.scale * shape.stddevs)
+    return not (turn > _SAME_ROTATION_DEG or shift > _SAME_SHIFT)
+
+
+def solution_from(posed: ScaleProblem, start: RangeState) -> Solution:
+    """Alternate between fitting and estimating the errors, from one start; the last fit uses all ranges."""
+    given = posed.ranges
+    rows = spread_rows(given, ENOUGH_TO_JUDGE)
+
+    def residuals_m(state: RangeState) -> Array:
+        return predicted_ranges(given, state) - given.range_m
+
+    def seen(errors: RangeErrors, state: RangeState) -> RangeErrors:
+        placed = state.metric_from_model
+        errors = errors.at(antenna_positions(given, placed), posed.placing_stddev_m(placed.scale))
+        return errors.seen_by_rigid_map(residuals_m(state), prior_cost(given, state))
+
+    def shown(errors: RangeErrors, fitted: RangeFit) -> RangeErrors:
+        return seen(errors.inflated(residuals_m(fitted.state)), fitted.state)
+
+    def fit(errors: RangeErrors, before: RangeFit | None) -> RangeFit:
+        state = start if before is None else before.state
+        return solve(weighted(given, errors).by_some(rows), state, loss=errors.loss)
+
+    rough, _, used = fit_with_own_errors(fit, shown, seen(posed.errors, start), max_num_rounds=_NUM_ROUNDS)
+    state = rough.state
+    for _ in range(MAX_NUM_ROUNDS):
+        problem = weighted(given, used)
+        fitted = solve(problem, state, loss=used.loss)
+        last = shown(used, fitted)
+        # The first rounds may have taken garbage for noise, which the last fit does not any more.
+        if last.noise_m > _FALLS * used.noise_m:
+            break
+        used, state = last, fitted.state
+    return Solution(problem, fitted, replace(used, inflation=last.inflation), last.noise_m)
+
+
+def with_unknown_anchors(posed: ScaleProblem, start: RangeState) -> tuple[ScaleProblem, Solution]:
+    """Return the problem as it would be if no place of an anchor were known, and its solution from a start.
+
+    The map then stays in a frame of its own, unless known positions place it.
+    """
+    unknown, is_placed = np.full(posed.ranges.num_anchors, np.inf), posed.ranges.placement is not None
+    posed = replace(posed, ranges=replace(posed.ranges, anchor_stddev_m=unknown, frame_is_free=is_placed))
+    return posed, solution_from(posed, start)
+
+
+def weighted(problem: RangeProblem, errors: RangeErrors) -> RangeProblem:
+    """Return the problem weighted by the errors.
+
+    Correlated ranges carry less information than independent ones. The ranges keep their nominal weights, and the
+    priors get more weight instead, by the square of the inflation.
+    """
+    distances, gravity, inflation = problem.distances, problem.gravity, errors.inflation
+    placement = problem.placement
+    return replace(
+        problem,
+        stddev_m=errors.stddev_m,
+        share=errors.share,
+        bias_stddev_m=problem.bias_stddev_m / inflation,
+        common_bias_stddev_m=problem.common_bias_stddev_m / inflation,
+        distances=replace(distances, stddev_m=distances.stddev_m / inflation),
+        gravity=None if gravity is None else replace(gravity, stddev_rad=gravity.stddev_rad / inflation),
+        placement=None if placement is None else replace(placement, whitening=placement.whitening * inflation),
+    )
+
+
+def refuse_ambiguity(solution: Solution, rivals: Sequence[RangeState], camera_side: str | None) -> None:
+    """Raise GeometryError if the map of a rival fits as well.
+
+    Does nothing where even the best map explains too few ranges: then that is the reason to doubt it.
+    """
+    problem = solution.problem
+    if np.mean(solution.fit.weights < OUTLIER_BELOW) > MANY_OUTLIERS:
+        return
+    for rival in rivals:
+        other = solve(solution.problem, rival, loss=solution.errors.loss, tolerance=1e-8)
+        is_elsewhere = not is_on_side(problem, other.state, camera_side)
+        if is_elsewhere or _are_same(problem, other.state, solution.fit.state):
+            continue
+        gap = (other.cost - solution.fit.cost) / solution.errors.inflation**2
+        if gap < MIN_COST_GAP:
+            ours, theirs = solution.fit.state.metric_from_model.scale, other.state.metric_from_model.scale
+            extent = float(np.linalg.norm(path_shape(solution.problem.centers).stddevs))
+            if min(ours, theirs) * extent < solution.noise_stddev_m:
+                raise GeometryError("the scale is not determined: a camera that stands still fits the ranges as well")
+            if abs(np.log(ours / theirs)) <= _SAME_LOG_SCALE:
+                raise _another_place(solution)
+            raise GeometryError(
+                f"two scales fit the ranges equally well ({ours:.4g} and {theirs:.4g} m per unit): "
+                f"{'; '.join(WHY_SCALE_IS_OPEN[path_kind(problem.centers)])}"
+            )
+
+
+def _another_place(solution: Solution) -> GeometryError:
+    """Return the error for two maps of the same scale that fit in the site frame."""
+    stddevs = path_shape(solution.problem.centers).stddevs
+    if stddevs[1] < NEARLY_STRAIGHT * stddevs[0]:
+        return GeometryError(
+            "the path is nearly straight, and the map fits the ranges as well if it is turned about it: walk a bend"
+        )
+    return OpenPlaceError(
+        "the map and its mirror image in the anchors' plane fit the ranges equally well, as the path is flat too: "
+        "add an anchor at another height, or say on which side of that plane the camera went (camera_side)",
+        solution.fit.state,
+    )

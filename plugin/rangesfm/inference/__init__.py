@@ -1,1 +1,0 @@
-"""The linear Gaussian problem of all measurements: noise, posterior, tests; no kind of measurement is known here."""

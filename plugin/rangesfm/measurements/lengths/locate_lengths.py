@@ -1,0 +1,238 @@
+"""Measured lengths in a model: the ends of taped lengths, and lengths between anchors."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.sparse import csr_array, vstack
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import InputError
+from rangesfm.measurements.lengths.map_points import MapPoints, by_pose
+from rangesfm.measurements.lengths.markers import images_by_name, mark_covariance, triangulate_markers, variance_along
+from rangesfm.measurements.lengths.tape import CONTROL, Tape, TapedDistance
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.util.geometry.trajectory import Trajectory
+
+# Smallest standard deviation of a length between anchors, because lengths are weighted by its inverse.
+_MIN_STDDEV_M = 1e-3
+# Names of printed tags' corners, as ``find_tags`` gives them.
+_TAG = re.compile(r"tag\d+\.[0-3]")
+
+
+@dataclass(frozen=True)
+class LocatedDistances:
+    """k measured lengths whose ends were found in one model: two of its points, or two anchors.
+
+    Attributes:
+        model_length: (k,) length between two points in the model's unit; NaN between anchors.
+        anchor_pair: (k, 2) int, indices of the two anchors; -1 between points.
+        distance_m, stddev_m: (k,) measured length and its standard deviation.
+        is_check: (k,) bool, lengths that do not take part in the estimate.
+        ends: (k, 2, 3) the two points in the model's world and unit; NaN if unknown.
+        mark_stddev: (k,) standard deviation of the model's length due to errors of marks in photos, in its unit.
+        is_printed: (k,) bool, sides of printed tags, which share one error of their size.
+        is_everywhere: (k,) bool, lengths that occur all along the map, so that its bending does not matter.
+        by_pose: (k, 6 n) sparse derivatives of the model's length by the n poses of a path, as of ``KnownPositions``;
+            zero where they do not matter or are not known.
+    """
+
+    model_length: Array
+    anchor_pair: Indices
+    distance_m: Array
+    stddev_m: Array
+    is_check: Mask
+    ends: Array
+    mark_stddev: Array
+    is_printed: Mask
+    is_everywhere: Mask
+    by_pose: csr_array
+
+    @classmethod
+    def control(
+        cls,
+        distance_m: Array,
+        stddev_m: Array,
+        *,
+        model_length: Array | None = None,
+        anchor_pair: Indices | None = None,
+    ) -> LocatedDistances:
+        """Make control lengths, between anchors or between points whose positions are unknown."""
+        k = len(distance_m)
+        length = np.full(k, np.nan) if model_length is None else model_length
+        pair = np.full((k, 2), -1, dtype=np.int64) if anchor_pair is None else anchor_pair
+        no, nowhere = np.zeros(k, dtype=bool), np.full((k, 2, 3), np.nan)
+        return cls(length, pair, distance_m, stddev_m, no, nowhere, np.zeros(k), no, no, csr_array((k, 0)))
+
+    @property
+    def is_between_points(self) -> Mask:
+        """Lengths between points of the model, not anchors, (k,)."""
+        return np.asarray(self.anchor_pair[:, 0] < 0)
+
+    def __len__(self) -> int:
+        return len(self.distance_m)
+
+    def subset(self, rows: Mask) -> LocatedDistances:
+        """Return the lengths that are true in ``rows`` (k,)."""
+        return LocatedDistances(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+    def joined(self, others: LocatedDistances) -> LocatedDistances:
+        """Return these lengths followed by others."""
+        columns = dict[str, Any](
+            (field.name, np.concatenate([getattr(self, field.name), getattr(others, field.name)]))
+            for field in fields(self)
+            if field.name != "by_pose"
+        )
+        num = max(self.by_pose.shape[1], others.by_pose.shape[1])
+        parts = [csr_array(of.by_pose, shape=(len(of), num)) for of in (self, others)]
+        return LocatedDistances(**columns, by_pose=vstack(parts, format="csr"))
+
+    def lengths_m(self, scale: float, anchors_m: Array) -> Array:
+        """Return the lengths in a map (k,), in metres; NaN where an anchor has no position.
+
+        Args:
+            scale: scale of the model.
+            anchors_m: (m, 3) positions of the anchors.
+        """
+        lengths = scale * self.model_length
+        between_anchors = ~self.is_between_points
+        first, second = anchors_m[self.anchor_pair[between_anchors].T]
+        lengths[between_anchors] = np.linalg.norm(first - second, axis=1)
+        return lengths
+
+    def residuals(self, scale: float, anchors_m: Array) -> Array:
+        """Return the (k,) residuals in such a map, predicted minus measured, in standard deviations."""
+        return (self.lengths_m(scale, anchors_m) - self.distance_m) / self.stddev_m
+
+    def jacobian(self, scale: float, anchors_m: Array, anchor_column: Indices, num_columns: int) -> Array:
+        """Return the (k, p) Jacobian of the residuals.
+
+        Args:
+            anchor_column: (m,) first of the three columns of each anchor; -1 for an anchor that is held fixed.
+            num_columns: p; the first column is the logarithm of the scale.
+        """
+        jacobian, between_points = np.zeros((len(self), num_columns)), self.is_between_points
+        jacobian[between_points, 0] = (scale * self.model_length / self.stddev_m)[between_points]
+        rows = np.flatnonzero(~between_points)
+        first, second = self.anchor_pair[rows].T
+        by = RangeGradient.of(anchors_m[first] - anchors_m[second])
+        for anchor, slopes in ((first, by.by_tag), (second, by.by_anchor)):
+            free = anchor_column[anchor] >= 0
+            columns = anchor_column[anchor[free], None] + np.arange(3)
+            jacobian[rows[free, None], columns] = slopes[free] / self.stddev_m[rows[free], None]
+        return jacobian
+
+
+NO_DISTANCES = LocatedDistances.control(np.zeros(0), np.zeros(0))
+
+
+def locate_distances(
+    tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str], path: Trajectory | None = None
+) -> LocatedDistances:
+    """Find the ends of measured lengths in a model.
+
+    An end is the photo of that name (its projection centre), else the marker, else the anchor.
+
+    Args:
+        path: of the model, by whose poses the derivatives are; None: they are not needed.
+
+    Raises:
+        InputError: an end is none of these, a photo is not in the model, only one of the two ends is an anchor, or the
+            marks of a marker are too few, seen from one direction only, or not of one point. The error gives the line.
+    """
+    images, markers = images_by_name(model), triangulate_markers(tape, model)
+    points = {name: image.projection_center() for name, image in images.items()} | markers
+    finder = MapPoints(model, {}, tape.markers, np.nan, tape.markers_path)
+    slopes = np.zeros((len(tape.distances), 0 if path is None else 6 * len(path)))
+    ends, mark_stddev = np.full((len(tape.distances), 2, 3), np.nan), np.zeros(len(tape.distances))
+    pairs = np.full((len(tape.distances), 2), -1, dtype=np.int64)
+    for row, taped in enumerate(tape.distances):
+        start, end = taped.ends
+        if start in points and end in points:
+            ends[row] = points[start], points[end]
+            marked = [(tape.markers[name], points[name]) for name in taped.ends if name in markers]
+            of_ends = [mark_covariance(marker, point, images) for marker, point in marked]
+            mark_stddev[row] = np.sqrt(variance_along(ends[row, 0], ends[row, 1], sum(of_ends, np.zeros((3, 3)))))
+            if path is not None and not taped.is_everywhere:
+                found = [finder.find_marker(name) if name in markers else finder.find(name) for name in taped.ends]
+                apart = by_pose(found[1], path) - by_pose(found[0], path)
+                away = ends[row, 1] - ends[row, 0]
+                slopes[row] = away / max(float(np.linalg.norm(away)), 1e-12) @ apart
+        elif start in anchor_ids and end in anchor_ids:
+            pairs[row] = anchor_ids.index(start), anchor_ids.index(end)
+        else:
+            raise InputError(_what_is_wrong(taped, points, anchor_ids), tape.distances_path, taped.line)
+    return LocatedDistances(
+        np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1),
+        pairs,
+        np.array([taped.distance_m for taped in tape.distances], dtype=np.float64),
+        np.array([taped.stddev_m for taped in tape.distances], dtype=np.float64),
+        np.array([taped.kind != CONTROL for taped in tape.distances], dtype=bool),
+        ends,
+        mark_stddev,
+        np.array([taped.is_printed for taped in tape.distances], dtype=bool),
+        np.array([taped.is_everywhere for taped in tape.distances], dtype=bool),
+        csr_array(slopes),
+    )
+
+
+def check_ends(tape: Tape, photos: Collection[str], anchor_ids: Collection[str], *, may_be_tags: bool) -> None:
+    """Check that the ends of measured lengths exist, before there is a model.
+
+    Args:
+        photos: names of those that may be in the model. anchor_ids: of the log.
+        may_be_tags: whether printed tags will be looked for, so that an end such as ``tag7.0`` may be found.
+
+    Raises:
+        InputError: an end does not, or a marker is in fewer than two photos. The error gives the line.
+    """
+    points = {*photos, *tape.markers}
+    for taped in tape.distances:
+        known = points | {end for end in taped.ends if may_be_tags and _TAG.fullmatch(end)}
+        if not any(ends >= {*taped.ends} for ends in (known, {*anchor_ids})):
+            raise InputError(_what_is_wrong(taped, known, anchor_ids), tape.distances_path, taped.line)
+        for end in {*taped.ends} & tape.markers.keys() - {*photos}:
+            marker = tape.markers[end]
+            if (num := len({*marker.image_names} & {*photos})) < 2:
+                message = f"marker {end!r} is marked in {num} photos of the survey, expected two or more"
+                raise InputError(message, tape.markers_path, marker.lines[0])
+
+
+def distances_within(tape: Tape, model: pycolmap.Reconstruction, anchor_ids: Sequence[str]) -> Tape:
+    """Return the tape with only the lengths whose two ends are both in this model, or are both anchors."""
+    images = images_by_name(model)
+    marked = {
+        name for name, marker in tape.markers.items() if sum(photo in images for photo in marker.image_names) >= 2
+    }
+    ends = (images.keys() | marked, set(anchor_ids))
+    within = (taped for taped in tape.distances if any(known.issuperset(taped.ends) for known in ends))
+    return replace(tape, distances=tuple(within))
+
+
+def _what_is_wrong(taped: TapedDistance, points: Collection[str], anchor_ids: Collection[str]) -> str:
+    for name in taped.ends:
+        if name not in points and name not in anchor_ids:
+            return f"an end is {name!r}, expected a photo that is in the model, a marker or an anchor of the log"
+    return f"from {taped.ends[0]!r} to {taped.ends[1]!r}: expected two anchors, or two ends that are not anchors"
+
+
+def surveyed_distances(anchors: Sequence[Anchor]) -> tuple[TapedDistance, ...]:
+    """Return the length between each pair of anchors with given positions, like a taped length."""
+    return tuple(
+        TapedDistance(
+            (first.anchor_id, second.anchor_id),
+            float(np.linalg.norm(first.position_m - second.position_m)),
+            max(float(np.hypot(first.position_stddev_m, second.position_stddev_m)), _MIN_STDDEV_M),
+            CONTROL,
+            line=0,
+        )
+        for first, second in itertools.combinations(anchors, 2)
+        if first.position_m is not None and second.position_m is not None
+    )

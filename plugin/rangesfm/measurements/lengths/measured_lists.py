@@ -1,0 +1,156 @@
+"""Lists of taped lengths, of pairs of points, and of marks in photos: tables of any layout, known by their columns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rangesfm.errors import InputError, printable
+from rangesfm.measurements.ranges.readers import vocabulary as terms
+from rangesfm.measurements.ranges.readers.layout import MISSING, ColumnSample, Layout, find_layout
+from rangesfm.measurements.ranges.readers.lists import ListRows, layout_of_list, read_canonical_rows, read_rows
+from rangesfm.util.files.text_tables import header_names, is_plain_table, read_head
+
+
+@dataclass(frozen=True)
+class ListForm:
+    """A kind of list.
+
+    Attributes:
+        what: what it lists, for messages.
+        required, optional: columns of the canonical CSV, by quantity.
+        find: returns the columns that may hold each quantity by their names, or None if others say that it is no such
+            list.
+        by_values: the same for a table without names.
+    """
+
+    what: str
+    required: Mapping[str, str]
+    optional: Mapping[str, str]
+    find: Callable[[Layout], dict[str, list[ColumnSample]] | None]
+    by_values: Callable[[Layout], dict[str, list[ColumnSample]] | None]
+
+    def read(self, path: Path) -> ListRows:
+        """Read a list.
+
+        Raises:
+            InputError: the file is no such list, or a line is not a row of the table.
+        """
+        if is_plain_table(read_head(path), self.required.values()):
+            rows = read_canonical_rows(path, {**self.required, **self.optional}, [*self.required.values()])
+            return replace(rows, missing=MISSING)
+        expected = f"expected {','.join(self.required.values())}"
+        layout = layout_of_list(path, self.what, expected)
+        found = (self.find if layout.has_names else self.by_values)(layout) or {}
+        for quantity in self.required:
+            if (num := len(those := found.get(quantity, []))) != 1:
+                which = f"columns {', '.join(column.name for column in those)} may all be" if num else "no column is"
+                listed = printable(", ".join(layout.units))
+                message = f"a table of {self.what} in which {which} {self.required[quantity]}; found {listed}"
+                raise InputError(f"{message}; {expected}", path)
+        columns = _single(found)
+        return read_rows(path, layout, columns, of=[quantity for quantity in ("distance",) if quantity in columns])
+
+    def is_such(self, path: Path) -> bool:
+        """Return whether a file is such a list by the names of its columns."""
+        names = {*header_names(read_head(path))}
+        if names >= {*self.required.values()}:
+            return not self.optional or names <= {*self.required.values(), *self.optional.values()}
+        layout = find_layout(path)
+        found = self.find(layout) if layout is not None and layout.has_names else None
+        return found is not None and self.required.keys() <= _single(found).keys()
+
+
+def _single(found: Mapping[str, Sequence[ColumnSample]]) -> dict[str, str]:
+    return {quantity: those[0].name for quantity, those in found.items() if len(those) == 1}
+
+
+def _ends(columns: Sequence[ColumnSample]) -> tuple[list[ColumnSample], list[ColumnSample]]:
+    """Return the columns that may be the first and the second end: von, nach; point 1, point 2; else two texts."""
+    start, end = ([c for c in columns if {*c.words} & words] for words in (terms.FROM, terms.TO))
+    if start and end:
+        return start, end
+    about = terms.POINT | terms.MARK | terms.ANCHOR | terms.PHOTO | terms.ID | terms.TAG | {"end", "ende"}
+    first, second = (
+        [c for c in columns if {*c.words} & words and {*c.words} <= words | about] for words in terms.FIRST_AND_SECOND
+    )
+    if first and second:
+        return first, second
+    texts = [c for c in columns if c.kind == "text" and not {*c.words} & terms.REMARK]
+    return (texts[:1], texts[1:]) if len(texts) == 2 else ([], [])
+
+
+def _lengths_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
+    of: dict[str, list[ColumnSample]] = {"distance": [], "stddev": [], "kind": []}
+    others = []
+    for column in layout.columns:
+        words = {*column.words} - terms.LENGTH_UNIT - terms.PLAIN
+        if words and words <= terms.LENGTH:
+            of["distance"].append(column)
+        elif words & terms.STDDEV and words <= terms.STDDEV | terms.LENGTH:
+            of["stddev"].append(column)
+        elif words and words <= terms.KIND:
+            of["kind"].append(column)
+        else:
+            others.append(column)
+    start, end = _ends(others)
+    if any(column.kind not in ("text", "nothing") for column in others if column not in (*start, *end)):
+        return None  # other numbers: a log of ranges, or a list of something else
+    return {"from": start, "to": end, **of}
+
+
+def _lengths_by_value(layout: Layout) -> dict[str, list[ColumnSample]] | None:
+    kinds = [column.kind for column in layout.columns]
+    if kinds[2:] not in (["numbers"], ["numbers", "numbers"]):
+        return None
+    return dict(zip(("from", "to", "distance", "stddev"), ([column] for column in layout.columns)))
+
+
+def _marks_by_name(layout: Layout) -> dict[str, list[ColumnSample]] | None:
+    of: dict[str, list[ColumnSample]] = {"marker": [], "image_name": [], "x": [], "y": []}
+    for column in layout.columns:
+        words = {*column.words}
+        if column.names_photos or (words & terms.PHOTO and words <= terms.PHOTO | terms.FILE | terms.ID):
+            of["image_name"].append(column)
+        elif words and words <= terms.POINT | terms.MARK | terms.ID:
+            of["marker"].append(column)
+        elif axis := next((a for a, those in terms.PIXEL_AXES.items() if set() < words - terms.PIXEL <= those), None):
+            of[axis].append(column)
+        elif words & terms.COORDINATES["z"]:
+            return None  # a list of points in space
+    return of
+
+
+def _marks_by_value(layout: Layout) -> dict[str, list[ColumnSample]] | None:
+    photos = [column for column in layout.columns if column.names_photos]
+    numbers = [column for column in layout.columns if column.kind == "numbers"]
+    others = [column for column in layout.columns if column not in (*photos, *numbers)]
+    if not others and len(numbers) == 3:  # markers that have numbers for names
+        others, numbers = numbers[:1], numbers[1:]
+    pixels: Iterator[list[ColumnSample]] = ([column] for column in numbers)
+    return {"marker": others, "image_name": photos, **dict(zip(("x", "y"), pixels))} if len(numbers) == 2 else None
+
+
+_ENDS = {"from": "from", "to": "to"}
+LENGTHS = ListForm(
+    "taped distances",
+    {**_ENDS, "distance": "distance_m"},
+    {"stddev": "stddev_m", "kind": "kind"},
+    _lengths_by_name,
+    _lengths_by_value,
+)
+PAIRS = ListForm(
+    "pairs of points",
+    _ENDS,
+    {},
+    lambda layout: dict(zip(_ENDS, _ends(layout.columns))),
+    lambda layout: dict(zip(_ENDS, ([column] for column in layout.columns))),
+)
+MARKS = ListForm(
+    "marks in photos",
+    {"marker": "marker", "image_name": "image_name", "x": "x_px", "y": "y_px"},
+    {},
+    _marks_by_name,
+    _marks_by_value,
+)

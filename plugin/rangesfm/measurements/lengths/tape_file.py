@@ -1,0 +1,87 @@
+"""Files of measured lengths, and of marks in photos."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.errors import InputError
+from rangesfm.measurements.lengths.measured_lists import LENGTHS, MARKS
+from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker, Tape, TapedDistance
+from rangesfm.measurements.ranges.readers.lists import ListRows
+from rangesfm.options import LENGTH_M, PIXEL, STDDEV_M
+from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.photo_names import photos_meant
+from rangesfm.util.files.text_tables import repeated
+
+# Standard deviation of a length measured with care by a steel tape.
+DEFAULT_STDDEV_M = 0.01
+
+
+def read_tape(distances_path: AnyPath, markers_path: AnyPath | None = None) -> Tape:
+    """Read ``from,to,distance_m[,stddev_m,kind]`` and ``marker,image_name,x_px,y_px``, or other tables of these.
+
+    A length without a kind is a control length. Without a standard deviation it gets DEFAULT_STDDEV_M.
+
+    Raises:
+        InputError: a file is not valid; the error gives the line.
+    """
+    listed = LENGTHS.read(Path(distances_path))
+    markers = {} if markers_path is None else read_markers(markers_path)
+    of_markers = None if markers_path is None else Path(markers_path)
+    return Tape(_distances(listed), markers, Path(distances_path), of_markers, listed.notes)
+
+
+def _distances(listed: ListRows) -> tuple[TapedDistance, ...]:
+    table = listed.table
+    if not len(table):
+        raise InputError("holds no distance, expected one per line", table.path)
+    starts, ends = listed.text("from"), listed.text("to")
+    kinds = [kind.lower() for kind in listed.text("kind", CONTROL)]
+    for row, (start, end, kind) in enumerate(zip(starts, ends, kinds, strict=True)):
+        if start == end:
+            raise table.error(row, listed.columns["to"], "another end than 'from'")
+        if kind not in (CONTROL, CHECK):
+            raise table.error(row, listed.columns["kind"], f"{CONTROL} or {CHECK}")
+    lengths = listed.metres("distance", LENGTH_M)
+    stddevs = listed.metres("stddev", STDDEV_M, DEFAULT_STDDEV_M)
+    rows = zip(starts, ends, lengths.tolist(), stddevs.tolist(), kinds, table.line.tolist(), strict=True)
+    return tuple(TapedDistance((a, b), length, stddev, kind, line) for a, b, length, stddev, kind, line in rows)
+
+
+def read_markers(path: AnyPath, stddev_px: float = CLICKED_STDDEV_PX) -> dict[str, Marker]:
+    """Read ``marker,image_name,x_px,y_px``, or another table of marks in photos.
+
+    Args:
+        path: the file.
+        stddev_px: standard deviation of each coordinate.
+
+    Raises:
+        InputError: the file is not valid; the error gives the line.
+    """
+    listed = MARKS.read(Path(path))
+    names, image_names = listed.text("marker"), listed.text("image_name")
+    pixels = np.column_stack([listed.table.numbers(listed.columns[axis], bounds=PIXEL) for axis in ("x", "y")])
+    rows_of: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        rows_of.setdefault(name, []).append(row)
+    markers = {}
+    for name, rows in rows_of.items():
+        seen_in = tuple(image_names[row] for row in rows)
+        if again := repeated(seen_in):
+            raise listed.table.error(rows[again[0]], listed.columns["image_name"], "each photo once for this marker")
+        markers[name] = Marker(seen_in, pixels[rows], tuple(listed.table.line[rows].tolist()), stddev_px)
+    return markers
+
+
+def markers_of_photos(markers: Mapping[str, Marker], photos: Collection[str]) -> dict[str, Marker]:
+    """Return markers with the names of their photos as these are, by ``photos_meant``."""
+    listed = [*dict.fromkeys(name for marker in markers.values() for name in marker.image_names)]
+    meant = dict(zip(listed, photos_meant(listed, photos), strict=True))
+    return {
+        name: replace(marker, image_names=tuple(meant[photo] for photo in marker.image_names))
+        for name, marker in markers.items()
+    }

@@ -1,0 +1,224 @@
+"""The time offset of an antenna's positions: their fit to the camera's path at every offset, and at one of them.
+
+The rule by which offsets are found, compared and doubted is that of ranges (``rangesfm.measurements.ranges.clock``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.ranges.clock.fit import OffsetFit, Timing, refine_offset
+from rangesfm.measurements.ranges.clock.search import (
+    Cells,
+    OffsetCurve,
+    PathSamples,
+    Scanned,
+    centred_columns,
+    scan_parts,
+)
+from rangesfm.measurements.ranges.clock.squares import residual_stddev
+from rangesfm.measurements.ranges.clock.time_offset import (
+    ObservedKind,
+    offset_of_motion,
+    path_to_search,
+    require_enough,
+)
+from rangesfm.progress import SILENT
+from rangesfm.util.files.photo_names import rows_of_photos, told_none
+from rangesfm.util.geometry.numerics import NUM_REWEIGHTINGS, UNDETERMINED
+from rangesfm.util.geometry.robust_statistics import CAUCHY
+from rangesfm.util.geometry.similarity import Similarity, align_points, rounding_of, similarity_motions
+from rangesfm.util.geometry.trajectory import Trajectory
+
+# A given offset is wrong if the residuals with it are at least so many times those with another one.
+_MUCH_WORSE = 3.0
+
+
+class TimedPositions(NamedTuple):
+    """n positions in metres, with times on their clock."""
+
+    times_s: Array
+    position_m: Array
+
+    def take(self, rows: Indices | Mask) -> TimedPositions:
+        """Return some of the positions."""
+        return TimedPositions(self.times_s[rows], self.position_m[rows])
+
+
+@dataclass(frozen=True)
+class SimilarityFit:
+    """Robust fit of a similarity from points on a path to n positions.
+
+    Attributes:
+        site_from_model: the similarity.
+        predicted_m, residuals_m: (n, 3) fitted positions, and measured minus fitted.
+        weights_of_positions: (n,) in [0, 1].
+    """
+
+    site_from_model: Similarity
+    predicted_m: Array
+    residuals_m: Array
+    weights_of_positions: Array
+    num_unknowns: int = 7
+
+    @property
+    def scale(self) -> float:
+        """Metres per model unit."""
+        return self.site_from_model.scale
+
+    @property
+    def weights(self) -> Array:
+        """Weights of the coordinates (3 n,)."""
+        return np.repeat(self.weights_of_positions, 3)
+
+    @property
+    def weighted_residuals(self) -> Array:
+        """Residuals times the roots of their weights (3 n,), metres."""
+        return np.asarray(np.sqrt(self.weights) * self.residuals_m.ravel())
+
+    @cached_property
+    def basis(self) -> Array:
+        """Orthonormal weighted columns (3 n, p) of the similarity; p is smaller if the path leaves a turn open."""
+        motions = similarity_motions(self.predicted_m - self.predicted_m.mean(axis=0)).reshape(-1, self.num_unknowns)
+        columns = np.sqrt(self.weights)[:, None] * motions
+        lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        basis, strengths, _ = np.linalg.svd(columns / lengths, full_matrices=False)
+        return np.asarray(basis[:, strengths > UNDETERMINED * strengths[0]])
+
+    def unexplained(self, values: Array) -> Array:
+        """Return weighted changes of the coordinates (3 n, k) without the parts that a similarity can explain."""
+        weighted = np.sqrt(self.weights)[:, None] * values
+        return np.asarray(weighted - self.basis @ (self.basis.T @ weighted))
+
+
+def fit_similarity(points: Array, position_m: Array) -> SimilarityFit:
+    """Fit a similarity from (n, 3) points to (n, 3) positions by iteratively reweighted least squares."""
+    weights = _weights_by_place(position_m)
+    for _ in range(NUM_REWEIGHTINGS + 1):
+        found = align_points(points, position_m, weights=weights)
+        predicted_m = found.apply(points)
+        residuals_m = position_m - predicted_m
+        away = np.sqrt(np.mean(residuals_m**2, axis=1)) / residual_stddev(residuals_m.ravel())
+        weights = CAUCHY.weights(away)
+    return SimilarityFit(found, predicted_m, residuals_m, weights)
+
+
+def fit_positions(positions: TimedPositions, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
+    """Fit the positions that are on the path at one offset.
+
+    Args:
+        scale: metres per model unit, for the lever arm; infinity leaves the lever arm out.
+    """
+    positions = positions.take(path.knows(positions.times_s + offset_s))
+    num = len(positions.times_s)
+    points, velocities = path.tag(positions.times_s + offset_s, np.zeros(num, dtype=np.int64), scale)
+    solved = fit_similarity(points, positions.position_m)
+    rates = solved.scale * velocities @ solved.site_from_model.rotation.T
+    axes = np.tile(np.arange(3), num)
+    measured_m = positions.position_m.ravel()
+    return OffsetFit.from_solution(
+        offset_s, positions, measured_m, axes, solved, solved.residuals_m.ravel(), rates.ravel()
+    )
+
+
+def residual_stddev_at(positions: TimedPositions, path: PathSamples, offset_s: float) -> float:
+    """Return the robust stddev of a coordinate's residuals at one offset, metres; infinite with too few positions."""
+    if not path.knows(positions.times_s + offset_s).any():
+        return np.inf
+    fit = fit_positions(positions, path, offset_s, fit_positions(positions, path, offset_s).solved.scale)
+    return fit.residual_stddev_m if fit.is_testable else np.inf
+
+
+def scan_positions(positions: TimedPositions, path: PathSamples, weights: Array | None = None) -> OffsetCurve:
+    """Compute cost and score of every offset at which positions and path overlap, without the lever arm.
+
+    Args:
+        positions: n positions in any order. path: a path with at least one known pose.
+        weights: (n,) of the positions; None: less for those far from most others.
+    """
+    weights = _weights_by_place(positions.position_m) if weights is None else weights
+    return scan_parts(positions.times_s, path, lambda rows: _scan(positions.take(rows), weights[rows], path))
+
+
+def _weights_by_place(position_m: Array) -> Array:
+    """Return (n,) weights that keep positions far away from most others from deciding."""
+    far_m = np.linalg.norm(position_m - np.median(position_m, axis=0), axis=1)
+    return CAUCHY.weights(far_m / max(float(np.median(far_m)), rounding_of(position_m)))
+
+
+def _scan(positions: TimedPositions, weights: Array, path: PathSamples) -> Scanned:
+    """Return the result for one part of the log, by the similarity that fits best at each offset.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991. Its
+    sums over pairs of points are correlations in time.
+    """
+    cells = Cells.from_times(positions.times_s, path)
+    correlate = cells.correlate
+    squared, *centers, known = centred_columns(path, cells.stride).T
+    of_path = [correlate.transform(values) for values in (known, *centers, squared)]
+    position_m = positions.position_m - np.median(positions.position_m, axis=0)
+    of_log = [cells.transform(weights * values) for values in (np.ones(len(weights)), *position_m.T)]
+    square_m2 = np.sum(position_m**2, axis=1)
+    num = correlate(of_path[0], of_log[0])
+    total = np.maximum(num, 1e-12 * weights.sum())
+    mean_of_path = np.stack([correlate(values, of_log[0]) for values in of_path[1:4]], axis=1) / total[:, None]
+    mean_m = np.stack([correlate(of_path[0], values) for values in of_log[1:]], axis=1) / total[:, None]
+    products = np.array([[correlate(own, values) for own in of_path[1:4]] for values in of_log[1:]]) / total
+    cross = np.moveaxis(products, 2, 0) - mean_m[:, :, None] * mean_of_path[:, None, :]
+    of_places = np.maximum(correlate(of_path[4], of_log[0]) / total - np.sum(mean_of_path**2, axis=1), 0.0)
+    variation = correlate(of_path[0], cells.transform(weights * square_m2)) / total - np.sum(mean_m**2, axis=1)
+    strengths = np.linalg.svd(cross, compute_uv=False)
+    strengths[:, 2] *= np.sign(np.linalg.det(cross))  # a reflection is no answer
+    explained = strengths.sum(axis=1) ** 2 / np.maximum(of_places, 1e-12)
+    return Scanned(num, cells.offsets_s, total * variation, total * (variation - explained))
+
+
+def _fit_clock(positions: TimedPositions, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:
+    """Refine an offset; a drift of the clocks is not looked for."""
+    fit = refine_offset(positions, path, offset_s, fit_at=fit_positions)
+    return fit, fit.timing(), 0.0, float(positions.times_s.mean())
+
+
+POSITIONS = ObservedKind(
+    "positions", "give the time offset (--positions_time_offset)", scan_positions, fit_positions, _fit_clock
+)
+
+
+def find_antenna_offset(track: AntennaTrack, path: Trajectory) -> AntennaTrack:
+    """Return the track with its time offset, which is searched for if it is not given.
+
+    Raises:
+        InputError: the positions are by time and the photos have none, or they are of other photos.
+        GeometryError: the motion does not determine the offset.
+    """
+    if track.log.timestamp_s is None:
+        listed = track.log.image_name or ()
+        if np.all(rows_of_photos(listed, path.image_names) < 0):
+            raise InputError(told_none("the file", listed, path.image_names), track.log.path)
+        return track
+    if path.timestamps_s is None:
+        raise InputError("the positions have times but the photos have none: give image times", track.log.path)
+    positions = TimedPositions(track.log.timestamp_s, track.log.position_m)
+    try:
+        require_enough(path, len(track.log), POSITIONS)
+        samples = path_to_search(path, track.antenna_in_cam_m[None], track.association)
+        found = offset_of_motion(positions, samples, POSITIONS, seed=0, progress=SILENT)
+    except GeometryError:
+        if track.offset_s is None:
+            raise
+        return track
+    if track.offset_s is None:
+        return replace(track, offset_s=found.value_s, offset_stddev_s=found.stddev_s, search=found)
+    # Of the same positions: a map that drifts fits a part of them better than all.
+    offsets_s = (track.offset_s, found.value_s)
+    on_both = np.logical_and(*(samples.knows(positions.times_s + each_s) for each_s in offsets_s))
+    compared = positions.take(on_both) if on_both.any() else positions
+    off_m = [residual_stddev_at(compared, samples, each_s) for each_s in offsets_s]
+    return replace(track, other_offset_s=found.value_s) if off_m[0] > _MUCH_WORSE * off_m[1] else track

@@ -1,0 +1,171 @@
+"""Files of control and check points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.errors import InputError
+from rangesfm.measurements.lengths.tape import CHECK, CLICKED_STDDEV_PX, CONTROL, Marker
+from rangesfm.measurements.lengths.tape_file import read_markers
+from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
+from rangesfm.measurements.positions.position_log import crs_of_line
+from rangesfm.measurements.ranges.anchors.anchor_file import find_anchor_columns, like_anchors
+from rangesfm.measurements.ranges.readers.layout import Layout
+from rangesfm.measurements.ranges.readers.lists import (
+    AXES,
+    ListRows,
+    UnclearListError,
+    columns_by_user,
+    layout_of_list,
+    read_canonical_rows,
+    read_rows,
+)
+from rangesfm.measurements.ranges.readers.vocabulary import KIND
+from rangesfm.options import COORDINATE_M, PIXEL, STDDEV_M, PointOptions
+from rangesfm.util.files.text_tables import has_columns, is_number, is_plain_table, read_head, read_text, repeated
+
+POINT_COLUMNS = ("marker", "x_m", "y_m", "z_m")
+_CANONICAL = {"marker": "marker", "x": "x_m", "y": "y_m", "z": "z_m", "stddev": "stddev_m", "kind": "kind"}
+QUANTITIES = tuple(_CANONICAL)
+_KINDS = (CONTROL, CHECK)
+_EXPECTED = f"expected a table with {','.join(POINT_COLUMNS)}"
+_NUM_GCP_NUMBERS, _GCP_COLUMNS = 5, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
+
+
+def read_control_points(options: PointOptions, markers_path: Path | None) -> ControlPoints | None:
+    """Read ``marker,x_m,y_m,z_m[,stddev_m,kind]`` or another table of points, or ODM's ``gcp_list.txt``.
+
+    A point without a kind is a control point.
+
+    Args:
+        options: which name the file.
+        markers_path: file of the marks in photos; None: those of ``gcp_list.txt``, or printed tags.
+
+    Raises:
+        UnclearListError: the columns are not known for sure; the advice says what to type.
+        InputError: a file is not valid; the error gives the line.
+    """
+    path = options.path
+    if path is None:
+        return None
+    head = read_head(path)
+    markers = {} if markers_path is None else read_markers(markers_path)
+    read = _gcp_list if is_gcp_list(head) else _table
+    found = replace(read(path, options, head), markers_path=markers_path)
+    return found.with_more(markers)
+
+
+def is_gcp_list(head: str) -> bool:
+    """Return whether a file with this beginning is ODM's list of ground control points."""
+    first, *rows = [line for line in head.split("\n") if line.strip() and not line.startswith("#")] or [""]
+    cells = [row.split() for row in rows]
+    are_points = any(len(row) > _NUM_GCP_NUMBERS and all(map(is_number, row[:_NUM_GCP_NUMBERS])) for row in cells)
+    return crs_of_line(first) is not None and are_points
+
+
+def is_point_file(head: str) -> bool:
+    """Return whether a file with this beginning holds coordinates of marks."""
+    return has_columns(head, POINT_COLUMNS) or is_gcp_list(head)
+
+
+def _table(path: Path, options: PointOptions, head: str) -> ControlPoints:
+    if not options.columns and options.unit is None and is_plain_table(head, POINT_COLUMNS):
+        return _points(read_canonical_rows(path, _CANONICAL, POINT_COLUMNS), options)
+    layout = layout_of_list(path, "points", _EXPECTED)
+    columns = (
+        columns_by_user(options.columns, QUANTITIES, ("marker", *AXES), layout, path)
+        if options.columns
+        else _found_columns(path, layout, head)
+    )
+    return _points(read_rows(path, layout, columns, options.unit), options)
+
+
+def _found_columns(path: Path, layout: Layout, head: str) -> dict[str, str]:
+    """Return the name of the column of each quantity: as in the canonical CSV, else recognized as in one of anchors."""
+    if has_columns(head, POINT_COLUMNS):
+        return {quantity: name for quantity, name in _CANONICAL.items() if name in layout.units}
+    try:
+        found = find_anchor_columns(path, layout)
+        if found is None and (unclear := like_anchors(path)) is not None:
+            raise unclear
+    except UnclearListError as error:
+        raise error.about_other("points", {"anchor_id": "marker"}, {"--anchor_": "--point_"}) from None
+    if found is None:
+        raise InputError(f"no columns of points; found {', '.join(layout.units)}; {_EXPECTED}", path)
+    own = {"anchor_id": "marker", "position_stddev": "stddev"}
+    columns = {own.get(quantity, quantity): name for quantity, name in found.items() if "bias" not in quantity}
+    kinds = [
+        column.name
+        for column in layout.columns
+        if {*column.words} & KIND and {cell.strip().lower() for cell in column.cells} <= {*_KINDS, ""}
+    ]
+    return columns | ({"kind": kinds[0]} if len(kinds) == 1 else {})
+
+
+def _points(rows: ListRows, options: PointOptions) -> ControlPoints:
+    table = rows.table
+    if not len(table):
+        raise InputError("names no point, expected one per line", table.path)
+    markers = rows.text("marker")
+    if again := repeated(markers):
+        raise table.error(again[0], rows.columns["marker"], "each point once")
+    positions = np.column_stack([rows.metres(axis, COORDINATE_M) for axis in AXES])
+    stddevs = rows.metres("stddev", STDDEV_M, options.stddev_m)
+    kinds = [kind.lower() for kind in rows.text("kind", CONTROL)]
+    if (wrong := np.array([kind not in _KINDS for kind in kinds])).any():
+        table.refuse(wrong, rows.columns["kind"], f"{CONTROL} or {CHECK}")
+    each = zip(markers, positions, stddevs.tolist(), kinds, table.line.tolist(), strict=True)
+    points = tuple(ControlPoint(*row) for row in each)
+    return ControlPoints(points, {}, "stddev" in rows.columns, None, table.path, None, rows.notes)
+
+
+def _gcp_list(path: Path, options: PointOptions, _head: str) -> ControlPoints:
+    """Read ODM's ``gcp_list.txt``: the coordinate system, then lines of a point and its pixel in one photo.
+
+    A point without a name is known by its coordinates.
+    """
+    crs, points, marks = None, dict[str, ControlPoint](), dict[str, list[tuple[str, list[float], int]]]()
+    for line, text in enumerate(read_text(path).split("\n"), 1):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        if crs is None:
+            crs = crs_of_line(text)
+            continue
+        numbers, image_name, rest = _cells_of_gcp(text, path, line)
+        name = rest or next(
+            (known.name for known in points.values() if known.position_m.tolist() == numbers[:3]),
+            f"point {len(points) + 1}",
+        )
+        point = ControlPoint(name, np.array(numbers[:3]), options.stddev_m, CONTROL, line)
+        if points.setdefault(name, point).position_m.tolist() != numbers[:3]:
+            message = f"point {name} has other coordinates than in line {points[name].line}, expected the same"
+            raise InputError(message, path, line)
+        marks.setdefault(name, []).append((image_name, numbers[3:], line))
+    markers = {name: _marker(name, seen, path) for name, seen in marks.items()}
+    return ControlPoints(tuple(points.values()), markers, False, crs, path)
+
+
+def _cells_of_gcp(text: str, path: Path, line: int) -> tuple[list[float], str, str]:
+    """Return the five numbers, the photo and the name (may be empty) of a line of ``gcp_list.txt``."""
+    cells = text.split("\t") if text.count("\t") >= _NUM_GCP_NUMBERS else text.split()
+    cells = [cell.strip() for cell in cells]
+    check: Sequence[Callable[[float], bool]] = [COORDINATE_M.hold] * 3 + [PIXEL.hold] * 2
+    try:
+        numbers = [float(cell) for cell in cells[:_NUM_GCP_NUMBERS]]
+        is_right = len(cells) > _NUM_GCP_NUMBERS and all(holds(x) for holds, x in zip(check, numbers, strict=True))
+    except ValueError:
+        is_right = False
+    if not is_right:
+        raise InputError(f"is no line of a point, expected {_GCP_COLUMNS}", path, line)
+    return numbers, cells[_NUM_GCP_NUMBERS], cells[_NUM_GCP_NUMBERS + 1] if len(cells) > _NUM_GCP_NUMBERS + 1 else ""
+
+
+def _marker(name: str, seen: Sequence[tuple[str, list[float], int]], path: Path) -> Marker:
+    photos, pixels, lines = zip(*seen, strict=True)
+    if again := repeated(photos):
+        raise InputError(f"point {name} is twice in {photos[again[0]]}, expected once", path, lines[again[0]])
+    return Marker(photos, np.array(pixels), lines, CLICKED_STDDEV_PX)

@@ -1,0 +1,81 @@
+"""Marks with known coordinates: control points, which hold the map in the site, and check points, which test it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.measurements.lengths.markers import images_by_name
+from rangesfm.measurements.lengths.tape import Marker
+
+
+@dataclass(frozen=True)
+class ControlPoint:
+    """A mark whose coordinates are known.
+
+    Attributes:
+        name: of its marker.
+        position_m: (3,) in the site's frame, metres.
+        stddev_m: standard deviation of each coordinate.
+        kind: "control" (it holds the map), "check" (it is compared with the result) or "left out".
+        line: in the file.
+    """
+
+    name: str
+    position_m: Array
+    stddev_m: float
+    kind: str
+    line: int
+
+
+@dataclass(frozen=True)
+class ControlPoints:
+    """Marks with known coordinates, and where they are seen.
+
+    Attributes:
+        points: in the order of the file.
+        markers: marks in photos, by name; a point without any is in no photo.
+        stddevs_are_given: whether the file gives the standard deviations.
+        crs: coordinate system named in the file; None if there is none.
+        path, markers_path: the files, for messages.
+        notes: lines for the user about how the file was read.
+    """
+
+    points: tuple[ControlPoint, ...]
+    markers: Mapping[str, Marker] = field(default_factory=dict)
+    stddevs_are_given: bool = True
+    crs: str | None = None
+    path: Path | None = None
+    markers_path: Path | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def positions_m(self) -> Array:
+        """(k, 3) coordinates of all points."""
+        return np.array([point.position_m for point in self.points]).reshape(-1, 3)
+
+    def moved_to(self, positions_m: Array) -> ControlPoints:
+        """Return the points with other coordinates (k, 3)."""
+        moved = (replace(point, position_m=at) for point, at in zip(self.points, positions_m, strict=True))
+        return replace(self, points=tuple(moved))
+
+    def with_more(self, markers: Mapping[str, Marker]) -> ControlPoints:
+        """Return the points with more markers; their own are kept where a new one has an equal name."""
+        return replace(self, markers={**markers, **self.markers})
+
+    def without(self, names: Sequence[str]) -> ControlPoints:
+        """Return the points with those of these names marked as left out."""
+        points = (replace(point, kind="left out") if point.name in names else point for point in self.points)
+        return replace(self, points=tuple(points))
+
+
+def marks_seen(points: ControlPoints, model: pycolmap.Reconstruction) -> Mask:
+    """Return which points (k,) are marked in two photos of a model or more."""
+    images = images_by_name(model)
+    photos = (points.markers[point.name].image_names if point.name in points.markers else () for point in points.points)
+    return np.array([sum(photo in images for photo in of_point) >= 2 for of_point in photos], dtype=bool)

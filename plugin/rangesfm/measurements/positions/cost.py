@@ -1,0 +1,177 @@
+"""Known positions of an antenna on the camera, as measurements of the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.sparse import bsr_array, csr_array
+
+from rangesfm import solver
+from rangesfm.arrays import Array, Indices, rows_by_key
+from rangesfm.measurements.kind import Block, ByBlock, LearntErrors, Linearization, MapState, Measurements, Weights
+from rangesfm.measurements.places import AntennaPlaces
+from rangesfm.measurements.positions.known_positions import LearntPositions
+from rangesfm.measurements.prior import Prior
+from rangesfm.measurements.ranges.errors.noise import correlation_inflation
+from rangesfm.solver.bundle_adjustment import BundleAdjustment
+from rangesfm.util.geometry.robust_statistics import RobustLoss, factor_of_stddevs
+
+ARM: Block = ("lever_arm", "positions")
+CLOCK: Block = ("clock", "positions")
+
+
+@dataclass(frozen=True)
+class AntennaPositions(Measurements):
+    """k positions of an antenna, with their errors as learnt on a rigid map.
+
+    Attributes:
+        names: of the photo or the time of each.
+        places: on the path.
+        position_m: (k, 3) in the metric world.
+        root_information: (k, 3, 3) inverse roots of the covariances as learnt.
+        stated_share: (k,) factor of the standard deviations with which they are those that the log states, which is the
+            smallest one; 0 where it states none.
+        group: (k,) label of each position's stretch of time, in which errors may be alike.
+        arm_m: (3,) lever arm as given. arm_stddev_m: of its coordinates; 0 holds it.
+        clock_stddev_s: of the time offset; 0: it was given.
+        loss: of the length of an error, in standard deviations of its coordinates.
+        factor: of the standard deviations, as residuals of a map that may bend show it.
+        inflation: factor on the standard deviation of estimates from many positions, for their errors' correlation in
+            time, as residuals of such a map show it.
+        learnt: errors at the map at rest; None before.
+    """
+
+    kind: ClassVar[str] = "position"
+    counts_in_metres: ClassVar[bool] = True
+
+    names: tuple[str, ...]
+    places: AntennaPlaces
+    position_m: Array
+    root_information: Array
+    stated_share: Array
+    group: Indices
+    arm_m: Array
+    arm_stddev_m: float
+    clock_stddev_s: float
+    loss: RobustLoss
+    factor: float = 1.0
+    inflation: float = 1.0
+    learnt: LearntPositions | None = None
+
+    @property
+    def blocks(self) -> Mapping[Block, Array]:
+        return {ARM: self.arm_m, CLOCK: np.zeros(1)}
+
+    @property
+    def fixed(self) -> frozenset[Block]:
+        held = ((ARM, self.arm_stddev_m), (CLOCK, self.clock_stddev_s))
+        return frozenset(name for name, stddev in held if not stddev > 0)
+
+    def priors(self) -> Iterator[Prior]:
+        """Yield what is known of the blocks."""
+        if self.arm_stddev_m > 0:
+            yield Prior.of_one(ARM, self.arm_m, self.arm_stddev_m)
+        if self.clock_stddev_s > 0:
+            yield Prior.of_one(CLOCK, np.zeros(1), self.clock_stddev_s)
+
+    @property
+    def _root_information(self) -> Array:
+        return self.root_information / np.maximum(self.factor, self.stated_share)[:, None, None]
+
+    @property
+    def weights(self) -> Weights:
+        return Weights(self._root_information, np.full(len(self.position_m), self.inflation**-2), self.loss)
+
+    def linearize(self, state: MapState) -> Linearization:
+        num, later_s = len(self.position_m), float(state.blocks[CLOCK][0])
+        arms_m, axes = np.tile(state.blocks[ARM], (num, 1)), np.tile(np.eye(3), (num, 1, 1))
+        all_of_one = np.zeros(num, dtype=np.int64)
+        by_block = (
+            ByBlock((ARM,), all_of_one, self.places.by_arm(state.poses, axes, later_s)),
+            ByBlock((CLOCK,), all_of_one, self.places.by_time(state.poses, arms_m, axes)),
+        )
+        return Linearization(
+            self.places.at(state.poses, arms_m, later_s) - self.position_m,
+            self.places.keyframes,
+            self.places.by_pose(state.poses, arms_m, axes, later_s),
+            by_block,
+        )
+
+    def add_to(self, adjustment: BundleAdjustment, poses: list[Array], blocks: Mapping[Block, Array]) -> Indices:
+        first, at, roots = adjustment.adjuster.problem.num_residuals(), self.places, self._root_information
+        arm_is_free, clock_is_free = self.arm_stddev_m > 0, self.clock_stddev_s > 0
+        groups = rows_by_key(at.before, at.after)
+        for rows in groups:
+            ends = list(dict.fromkeys((int(at.before[rows[0]]), int(at.after[rows[0]]))))
+            is_between = len(ends) == 2
+            cost = solver.position_cost(
+                position_m=self.position_m[rows],
+                whitening=roots[rows],
+                tag_in_cam_m=None if arm_is_free else self.arm_m,
+                weight=at.fraction[rows] if is_between else None,
+                offset_in_world_m=at.offset_m[rows] if is_between else None,
+                interval_s=at.interval_s[rows[0]] if is_between and clock_is_free else None,
+                share=(adjustment.pixel_stddev / self.inflation) ** 2,
+                loss_scale=self.loss.width,
+            )
+            further = [blocks[ARM]] if arm_is_free else []
+            further += [blocks[CLOCK]] if is_between and clock_is_free else []
+            solver.add_residual_block(adjustment.adjuster, cost, None, [*(poses[end] for end in ends), *further])
+        coordinates = (3 * np.concatenate(groups)[:, None] + np.arange(3)).ravel()
+        return np.asarray(first + np.argsort(coordinates))
+
+    def like(self, other: AntennaPositions) -> AntennaPositions:
+        return replace(self, factor=other.factor, inflation=other.inflation)
+
+    def under(self, loss: RobustLoss) -> AntennaPositions:
+        return replace(self, loss=loss)
+
+    def with_noise_of(self, residual: Array, num_absorbed: float) -> AntennaPositions:
+        shown = replace(self, factor=self._shown(residual, num_absorbed))
+        scaled = shown.weights.whitened(residual)
+        weights = np.repeat(self.loss.weights(np.linalg.norm(scaled, axis=1)), 3)
+        groups = (3 * self.group[:, None] + np.arange(3)).ravel()
+        return replace(shown, inflation=correlation_inflation(scaled.ravel(), weights, groups))
+
+    def _shown(self, residual: Array, num_absorbed: float) -> float:
+        """Return the factor of the standard deviations that residuals show; arguments as for ``with_noise_of``."""
+        scaled = np.einsum("gij,gj->gi", self.root_information, residual)
+        return factor_of_stddevs(scaled, num_absorbed)
+
+    def change(self, other: AntennaPositions) -> float:
+        mine, others = (of.inflation * np.maximum(of.factor, of.stated_share) for of in (self, other))
+        return float(np.max(np.abs(np.log(mine / others))))
+
+    def with_learnt(self, learned: object) -> AntennaPositions:
+        assert isinstance(learned, LearntPositions), "errors of positions"
+        return replace(self, learnt=learned)
+
+    def learnt_errors(self, residual: Array) -> LearntErrors | None:
+        if self.learnt is None:
+            return None
+        group = np.array([self.learnt.group_of.get(name, -1) for name in self.names])
+        takes_part = np.flatnonzero(group >= 0)
+        by_error = self._slopes(residual) @ self._root_information / self.inflation
+        starts = np.append(0, np.cumsum(group >= 0))
+        shape = (3 * len(group), len(self.learnt.covariance_m2))
+        rows = bsr_array((by_error[takes_part], group[takes_part], starts), shape=shape)
+        return LearntErrors(csr_array(rows), self.learnt.covariance_m2, frozenset())
+
+    def _slopes(self, residual: Array) -> Array:
+        """Return (k, 3, 3) derivatives of the robust residuals, whose squared length is the loss, by whitened ones.
+
+        With g the root of the loss of the length n of a whitened residual, the robust one is ``g / n`` times it.
+        """
+        scaled = self.weights.whitened(residual)
+        lengths = np.maximum(np.linalg.norm(scaled, axis=1), 1e-300)
+        along = scaled / lengths[:, None]
+        across = np.sqrt(self.loss.rho(lengths**2)[0]) / lengths
+        more = self.loss.slopes(lengths) - across
+        slopes = across[:, None, None] * np.eye(3) + more[:, None, None] * along[:, :, None] * along[:, None]
+        return np.asarray(slopes)
+
+    def log_likelihood(self, residual: Array) -> float:
+        return -residual.size * float(np.log(max(self._shown(residual, 0.0), 1e-300)))

@@ -1,0 +1,247 @@
+"""Known positions as observations of a map: groups, with errors of points and receivers (section 4 of ``model.md``).
+
+A known position p of something with the place c in the model and the lever arm a obeys p = scale * R c + R a + t. Its
+error has several parts: the survey of the point, the marks in the photos, noise of the antenna's positions, and errors
+of these that last for some time or belong to a place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse import block_diag, csr_array, diags_array, kron
+from scipy.spatial.distance import cdist
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.measurements.positions.known_positions import KnownPositions
+from rangesfm.measurements.ranges.errors.components import CLOCKS, FRAME
+from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
+from rangesfm.solver.linear_map import Columns
+from rangesfm.solver.noise import Component, independent_unknowns
+from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, Observations
+from rangesfm.util.geometry.similarity import Similarity, similarity_motions
+from rangesfm.util.geometry.trajectory import Trajectory
+
+POSITIONS = "positions"
+# Names of errors of an antenna's positions that last for some time start with this, as do all of its positions.
+_LASTING = "positions_"
+_WARP = f"{_LASTING}warp"
+# Standard deviation of the logarithm of what a system says of its own errors, and of what is guessed of them; and the
+# share of the noise that lasts, before anything is known.
+_SPREAD_GIVEN, _SPREAD_GUESSED, _LASTING_SHARE = 0.5, 1.0, 0.3
+# Number of times of a group over which its correlation with others is averaged.
+_NUM_WITHIN = 8
+
+
+@dataclass(frozen=True)
+class GroupedPositions(Observations):
+    """Known positions in groups, three coordinates each, about a similarity.
+
+    Attributes:
+        grouping: (3 g, 3 k) sparse weights of the positions in the groups.
+    """
+
+    grouping: csr_array = field(kw_only=True)
+
+
+@dataclass(frozen=True)
+class PositionFit:
+    """A robust fit of known positions to a map.
+
+    Attributes:
+        similarity: from the model of ``path`` to the site.
+        known: the k positions. used: (k,) those that take part. weights, stddev_m: (k,) robust weights, and standard
+            deviations of a coordinate that they assume.
+        lasting_s: for how long errors of an antenna's positions last.
+        metres_per_unit: units of the model of ``path`` in one unit of the path that ``MapBending`` has.
+    """
+
+    similarity: Similarity
+    known: KnownPositions
+    path: Trajectory
+    used: Mask
+    weights: Array
+    stddev_m: Array
+    lasting_s: tuple[float, ...]
+    metres_per_unit: float = 1.0
+
+    def at(self, similarity: Similarity, max_num: int = MAX_NUM_OBSERVATIONS) -> GroupedPositions:
+        """Return the observations about a similarity, of which an antenna has at most ``max_num``."""
+        known = self.known
+        grouping = _grouped_by_time(known, self.weights, max_num // 3)
+        takes_part = self.used & ((self.weights >= OUTLIER_BELOW) | known.is_mark)
+        used = np.asarray((abs(grouping) @ np.repeat(takes_part, 3)) > 0)
+        by_pose = groups_by_pose(known, similarity, self.path, grouping)
+        by_pose.reshape(len(by_pose), -1, 6)[:, :, 3:] *= self.metres_per_unit
+        design = grouping @ design_of_positions(known, similarity, self.path)
+        variances = np.repeat(self.stddev_m**2 / np.maximum(self.weights, OUTLIER_BELOW), 3)
+        weighed = (grouping @ diags_array(variances) @ grouping.T).toarray()
+        components = tuple(_components(known, similarity, grouping, self.stddev_m, self.lasting_s))
+        nothing = np.zeros(0, dtype=np.int64)
+        return GroupedPositions(
+            kind=POSITIONS,
+            columns=Columns(0, 1, nothing, nothing, 7),
+            design=design,
+            residual_m=grouping @ known.misclosures_m(similarity).ravel(),
+            by_pose=by_pose,
+            components=_with_frame(components, known, similarity, grouping, design, used),
+            alone_m2=weighed,
+            is_used=used,
+            grouping=grouping,
+        )
+
+
+def design_of_positions(known: KnownPositions, site_from_model: Similarity, path: Trajectory) -> Array:
+    """Return the (3 k, 7) derivatives of the positions by scale, turn and shift about the first camera."""
+    origin = site_from_model.apply(path.centers[:1])[0]
+    motions = similarity_motions(known.predicted_m(site_from_model) - origin)
+    motions[:, :, 0] = site_from_model.apply(known.places) - origin  # the lever arm does not scale
+    return motions.reshape(-1, 7)
+
+
+def groups_by_pose(known: KnownPositions, similarity: Similarity, path: Trajectory, grouping: csr_array) -> Array:
+    """Return (3 g, 6 n) derivatives of groups of positions by the poses of a path, with shifts as in its first camera.
+
+    These are the axes in which ``MapBending`` has the shifts.
+    """
+    rotation = kron(np.eye(len(known)), similarity.rotation, format="csr")
+    by_pose = grouping @ rotation @ (similarity.scale * known.by_pose + known.arms_by_pose)
+    parts = by_pose.toarray().reshape(by_pose.shape[0], -1, 6)
+    parts[:, :, 3:] = parts[:, :, 3:] @ path.world_from_cam[0]
+    return np.asarray(parts.reshape(len(parts), -1))
+
+
+def at_point(known: KnownPositions, row: int) -> Array:
+    """Return the (3 k, 3) effect of a known position that is too large by a metre in each coordinate."""
+    columns = np.zeros((3 * len(known), 3))
+    columns[3 * row : 3 * row + 3] = np.eye(3)
+    return columns
+
+
+def stddev_of(covariances: Array) -> Array:
+    """Return (k,) standard deviations of a coordinate: the root of the mean variance."""
+    return np.asarray(np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 3))
+
+
+def _grouped_by_time(known: KnownPositions, weights: Array, max_num: int) -> csr_array:
+    """Return the (3 g, 3 k) weights of positions in groups: marks alone, an antenna's averaged in the order of time."""
+    marks = np.flatnonzero(known.is_mark)
+    others = np.flatnonzero(~known.is_mark & (weights >= OUTLIER_BELOW))
+    order = (
+        others[np.argsort(known.time_s[others], kind="stable")] if np.isfinite(known.time_s[others]).all() else others
+    )
+    groups = [np.array([row]) for row in marks]
+    groups += [part for part in np.array_split(order, min(len(order), max_num) or 1) if len(part)]
+    shares = [np.ones(1) if known.is_mark[rows[0]] else weights[rows] / weights[rows].sum() for rows in groups]
+    lines = np.repeat(np.arange(len(groups)), [len(rows) for rows in groups])
+    shape = (len(groups), len(known))
+    alone = csr_array((np.concatenate(shares), (lines, np.concatenate(groups))), shape=shape)
+    return kron(alone, np.eye(3), format="csr")
+
+
+def _components(
+    known: KnownPositions, similarity: Similarity, grouping: csr_array, stddev_m: Array, lasting_s: Sequence[float]
+) -> Iterator[Component]:
+    """Yield the components of the errors."""
+    rotation = similarity.rotation
+    places = similarity.scale**2 * rotation @ known.own_covariance @ rotation.T
+    places += known.arm_stddev_m[:, None, None] ** 2 * np.eye(3)
+    covariance = known.covariance_m2
+    assumed = stddev_m[:, None, None] ** 2 * np.eye(3)
+    for name, of_kind, names_of_place in (("points", known.is_mark, "marks"), ("positions", ~known.is_mark, "places")):
+        if not of_kind.any():
+            continue
+        yield Component(names_of_place, _covariance_of_groups(grouping, places, of_kind))
+        is_known = bool(np.isfinite(covariance[of_kind]).all())
+        own = _covariance_of_groups(grouping, covariance if is_known else assumed, of_kind)
+        spread = 0.0 if known.is_stated[of_kind].all() and name == "points" else _SPREAD_GIVEN
+        yield Component(name, own, spread=spread if is_known else _SPREAD_GUESSED)
+    if known.clock_stddev_s.any():
+        moved_m = similarity.scale * known.velocity @ rotation.T * known.clock_stddev_s[:, None]
+        of_clock = grouping @ moved_m.ravel()
+        yield Component(CLOCKS, np.outer(of_clock, of_clock))
+    if not (rows := np.flatnonzero(~known.is_mark & np.isfinite(known.time_s))).size:
+        return
+    size_m = np.where(np.isfinite(stddev_of(covariance)), stddev_of(covariance), stddev_m)
+    of_groups, times_s = _times_of_groups(grouping, known, size_m, rows)
+    for within_s in lasting_s:
+        apart = np.exp(-np.abs(times_s.reshape(-1, 1) - times_s.ravel()) / within_s)
+        alike = apart.reshape(len(times_s), _NUM_WITHIN, -1, _NUM_WITHIN).mean(axis=(1, 3))
+        own = np.kron(alike * np.outer(of_groups, of_groups), np.eye(3))
+        yield Component(f"{_LASTING}{within_s:g}s", own, _LASTING_SHARE, _SPREAD_GUESSED)
+    if (off_middle := _off_middle(known, similarity, grouping)) is not None:
+        places_m, _, _, extent_m = off_middle
+        warp = np.exp(-cdist(places_m, places_m) / extent_m) * np.outer(of_groups, of_groups)
+        yield Component(_WARP, np.asarray(np.kron(warp, np.eye(3))), _LASTING_SHARE, _SPREAD_GUESSED)
+
+
+def _with_frame(
+    components: Sequence[Component],
+    known: KnownPositions,
+    similarity: Similarity,
+    grouping: csr_array,
+    design: Array,
+    used: Mask,
+) -> tuple[Component, ...]:
+    """Return the components with the error of the frame of an antenna's positions, in its place and its scale.
+
+    Positions alone do not show it, as place and scale of the map are no other. A system is taken to shift and to
+    stretch its frame (as a root mean square over the path) by as much as a coordinate errs for some time, or at some
+    place: by what of these errors a similarity does not take up.
+    """
+    off_middle = _off_middle(known, similarity, grouping)
+    if off_middle is None or not used.any():
+        return tuple(components)
+    _, has_frame, from_middle, extent_m = off_middle
+    is_geodetic = known.is_geodetic[~known.is_mark & np.isfinite(known.time_s)].all()
+    stretch = (0.0 if is_geodetic else 1.0) / extent_m * from_middle.ravel()
+    frame = np.kron(np.outer(has_frame, has_frame), np.eye(3)) + np.outer(stretch, stretch)
+    taken_up, _ = independent_unknowns(design[used], np.zeros((0, design.shape[1])))
+
+    def left(component: Component) -> float:
+        alike = component.alike[np.ix_(used, used)]
+        return max(float(np.trace(alike) - np.sum(taken_up * (alike @ taken_up))), 0.0) / np.count_nonzero(used)
+
+    return tuple(
+        replace(each, tied={FRAME: left(each) * frame}) if each.name.startswith(_LASTING) else each
+        for each in components
+    )
+
+
+def _off_middle(
+    known: KnownPositions, similarity: Similarity, grouping: csr_array
+) -> tuple[Array, Array, Array, float] | None:
+    """Return (g, 3) places of groups, (g,) which are an antenna's, (g, 3) these from their middle, and their extent.
+
+    None for an antenna that did not move, and without any.
+    """
+    is_timed = ~known.is_mark & np.isfinite(known.time_s)
+    of_groups = grouping[::3, ::3]
+    has_frame = (of_groups @ is_timed > 0).astype(np.float64)
+    if not has_frame.any():
+        return None
+    places_m: Array = of_groups @ known.predicted_m(similarity)
+    from_middle = has_frame[:, None] * (places_m - has_frame @ places_m / has_frame.sum())
+    extent_m = float(np.sqrt(np.sum(from_middle**2) / has_frame.sum()))
+    return (places_m, has_frame, from_middle, extent_m) if extent_m > 0 else None
+
+
+def _covariance_of_groups(grouping: csr_array, covariances: Array, rows: Mask) -> Array:
+    """Return the (3 g, 3 g) covariance of groups from independent (k, 3, 3) ones of the positions in ``rows``."""
+    blocks = block_diag(list(np.where(rows[:, None, None], covariances, 0.0)), format="csr")
+    return np.asarray((grouping @ blocks @ grouping.T).toarray())
+
+
+def _times_of_groups(grouping: csr_array, known: KnownPositions, size_m: Array, rows: Indices) -> tuple[Array, Array]:
+    """Return (g,) mean standard deviations of the antenna's positions in each group (0: marks), and (g, t) times."""
+    of_groups = grouping[::3, ::3]
+    is_timed = np.zeros(len(known))
+    is_timed[rows] = 1.0
+    times = np.zeros((of_groups.shape[0], _NUM_WITHIN))
+    for group in range(of_groups.shape[0]):
+        members = of_groups.indices[of_groups.indptr[group] : of_groups.indptr[group + 1]]
+        if is_timed[members].all():
+            times[group] = np.quantile(known.time_s[members], np.linspace(0, 1, _NUM_WITHIN))
+    return of_groups @ (is_timed * size_m), times

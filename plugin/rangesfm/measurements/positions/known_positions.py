@@ -1,0 +1,122 @@
+"""Positions known in the site, found in a model: of marks that its photos show, and of an antenna on its path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array, vstack
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.util.geometry.similarity import Similarity
+
+LASTING_S = (3.0, 30.0, 300.0)
+"""Times for which errors of an antenna's positions last, seconds: those of filters and reflections for seconds, those
+of the troposphere, of satellites and of echoes in a hall for minutes. A mixture follows any time between."""
+
+MIN_NUM_POSITIONS = 3
+"""Fewest positions, not on one line, that determine a similarity."""
+
+
+@dataclass(frozen=True)
+class KnownPositions:
+    """k positions in the site, each with the place of the same thing in a model.
+
+    In the site the place is ``scale * R c + R a + t``, with c the place in the model, a the lever arm and
+    (scale, R, t) the similarity from the model's world to the site.
+
+    Attributes:
+        names: of marks; the photo or the time of an antenna's positions.
+        is_mark: (k,) whether it is a mark; otherwise it is the antenna.
+        is_check: (k,) positions that do not take part in the estimate.
+        position_m: (k, 3) in the site. covariance_m2: (k, 3, 3) of these; NaN where it is unknown.
+        is_stated: (k,) whether the covariance was given with the position, and not assumed.
+        is_geodetic: (k,) whether it was given in a coordinate system of the Earth, whose scale is right.
+        places: (k, 3) in the model's world and unit. arms_m: (k, 3) lever arms in the axes of the model's world.
+        own_covariance: (k, 3, 3) of the places, in the model's world and unit, without errors of the poses.
+        arm_stddev_m: (k,) of each coordinate of the arms.
+        time_s: (k,) on the photos' clock, or the number of the photo where these have no times; NaN for marks.
+        clock_stddev_s: (k,) of the time offset that all share.
+        velocity: (k, 3) of the antenna, model units per second; 0 for marks.
+        world_from_cam: (k, 3, 3) rotations of the camera; 0 for marks.
+        by_pose, arms_by_pose: (3 k, 6 n) sparse derivatives of places and arms by the n poses of a path: for each, a
+            turn in its own frame and a shift, in the model's world and unit.
+        on_path: (k, 2) keyframes before and after; -1 for marks. fraction: (k,) of the later one.
+        from_line: (k, 3) deviation of the curved path from the straight line between them, in the model's unit.
+    """
+
+    names: tuple[str, ...]
+    is_mark: Mask
+    is_check: Mask
+    position_m: Array
+    covariance_m2: Array
+    is_stated: Mask
+    is_geodetic: Mask
+    places: Array
+    arms_m: Array
+    own_covariance: Array
+    arm_stddev_m: Array
+    time_s: Array
+    clock_stddev_s: Array
+    velocity: Array
+    world_from_cam: Array
+    by_pose: csr_array
+    arms_by_pose: csr_array
+    on_path: Indices
+    fraction: Array
+    from_line: Array
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def subset(self, rows: Indices) -> KnownPositions:
+        """Return some of the positions."""
+        chosen: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAYS}
+        coordinates = (3 * rows[:, None] + np.arange(3)).ravel()
+        chosen |= {name: getattr(self, name)[coordinates] for name in _SPARSE}
+        return KnownPositions(names=tuple(self.names[row] for row in rows.tolist()), **chosen)
+
+    def joined(self, others: KnownPositions | None) -> KnownPositions:
+        """Return these positions followed by others in the same model."""
+        if others is None:
+            return self
+        both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(others, name)]) for name in _ARRAYS}
+        both |= {name: vstack([getattr(self, name), getattr(others, name)], format="csr") for name in _SPARSE}
+        return KnownPositions(names=self.names + others.names, **both)
+
+    def predicted_m(self, site_from_model: Similarity) -> Array:
+        """Return the (k, 3) positions in the site."""
+        return np.asarray(site_from_model.apply(self.places) + self.arms_m @ site_from_model.rotation.T)
+
+    def misclosures_m(self, site_from_model: Similarity) -> Array:
+        """Return the (k, 3) differences: in the map minus known."""
+        return self.predicted_m(site_from_model) - self.position_m
+
+
+class LearntPositions(NamedTuple):
+    """Errors of an antenna's positions that g groups of them share, as learnt at a map at rest.
+
+    Attributes:
+        group_of: group of each position that takes part, by name.
+        covariance_m2: (3 g, 3 g) of the groups' coordinates.
+    """
+
+    group_of: Mapping[str, int]
+    covariance_m2: Array
+
+
+_SPARSE = ("by_pose", "arms_by_pose")
+_ARRAYS = tuple(field.name for field in fields(KnownPositions) if field.name not in ("names", *_SPARSE))
+
+
+def joined_positions(parts: Sequence[KnownPositions | None]) -> KnownPositions | None:
+    """Return the positions of several kinds together; None if there are none."""
+    known = [part for part in parts if part is not None and len(part)]
+    if not known:
+        return None
+    first, *others = known
+    for part in others:
+        first = first.joined(part)
+    return first

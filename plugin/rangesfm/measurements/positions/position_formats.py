@@ -1,0 +1,481 @@
+"""Readers of positions: tables of any layout, TUM, NMEA, RTKLIB, ODM, Marvelmind's dashboard, and COLMAP's databases.
+
+Each is a function that returns a PositionLog, and one that recognises the beginning of a file. Pozyx and other systems
+write tables with names of columns, which are recognised like those of range logs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.errors import InputError, nearest_known, printable
+from rangesfm.measurements.positions.pose_priors import is_database, read_pose_priors
+from rangesfm.measurements.positions.position_columns import (
+    COVARIANCES,
+    QUANTITIES,
+    STDDEVS,
+    find_position_columns,
+    is_degrees,
+)
+from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog, crs_in_head, crs_of_line
+from rangesfm.measurements.ranges.anchors.site import WIDEST_DEG
+from rangesfm.measurements.ranges.readers import vocabulary as terms
+from rangesfm.measurements.ranges.readers.columns import read_timestamps
+from rangesfm.measurements.ranges.readers.layout import MISSING
+from rangesfm.measurements.ranges.readers.lists import (
+    AXES,
+    Choice,
+    UnclearListError,
+    columns_by_user,
+    layout_of_list,
+    length_units,
+)
+from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE
+from rangesfm.option_model import Bounds
+from rangesfm.options import COORDINATE_M, STDDEV_M, TIME_S, PositionOptions
+from rangesfm.util.files.text_tables import (
+    FOUND,
+    TextTable,
+    has_columns,
+    header_names,
+    is_number,
+    read_head,
+    read_table,
+    read_text,
+)
+from rangesfm.util.geometry.reference import is_reference_file, is_tum_row, tum_table
+
+_CANONICAL = {
+    "timestamp": "timestamp_s",
+    "image_name": "image_name",
+    **{name: f"{name}_m" for name in (*AXES, "stddev", *STDDEVS)},
+    **{name: f"{name}_m2" for name in COVARIANCES},
+    "quality": "quality",
+}
+POSITION_COLUMNS = tuple(_CANONICAL[axis] for axis in AXES)
+_EXPECTED = f"expected a table with timestamp_s or image_name, and {','.join(POSITION_COLUMNS)}"
+DEGREES = Bounds(-360, 360, "degrees")
+_SLOWEST_S = 120.0
+_GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
+_SECONDS_OF_DAY = 86400.0
+AUTONOMOUS_STDDEV_M = 3.0
+"""Standard deviation of a coordinate by satellites without corrections, metres."""
+# Standard deviations of positions by the quality that NMEA's GGA reports, metres: autonomous, differential, fixed RTK,
+# float RTK. Receivers that send GST sentences say it themselves.
+_NMEA_STDDEVS_M = {1: AUTONOMOUS_STDDEV_M, 2: 1.0, 4: 0.02, 5: 0.3}
+_NMEA = re.compile(r"\$(?:[A-Z]{2})(GGA|RMC|GST|ZDA),([^*\r\n]*)(?:\*([0-9A-Fa-f]{2}))?\s*")
+
+Reader = Callable[[Path, PositionOptions], PositionLog]
+
+
+def read_positions(options: PositionOptions) -> PositionLog | None:
+    """Read the positions that a survey names; None if it names none.
+
+    Raises:
+        UnclearListError: the columns are not known for sure; the advice says what to type.
+        InputError: the file is not valid; the error gives the line.
+    """
+    path = options.path
+    if path is None:
+        return None
+    if options.format is not None:
+        if options.format not in POSITION_READERS:
+            near = nearest_known(options.format, POSITION_READERS)
+            raise InputError(f"unknown format of positions '{printable(options.format)}'; the nearest is '{near}'")
+        return POSITION_READERS[options.format][1](path, options)
+    head = read_head(path)
+    if options.columns:
+        return _read_table(path, options)
+    read = next((read for is_it, read in POSITION_READERS.values() if is_it(head)), _read_table)
+    return read(path, options)
+
+
+def is_of_positions(head: str) -> bool:
+    """Return whether a file with this beginning holds measured positions in a format that nothing else looks like."""
+    return _is_nmea(head) or _is_rtklib(head) or _is_odm(head)
+
+
+def _is_canonical(head: str) -> bool:
+    return any(has_columns(head, [_CANONICAL[key], *POSITION_COLUMNS]) for key in ("timestamp", "image_name"))
+
+
+def _read_canonical(path: Path, options: PositionOptions) -> PositionLog:
+    if options.columns or options.unit or options.timestamp_unit or not _is_canonical(read_head(path)):
+        return _read_table(path, options)
+    key = "timestamp" if has_columns(read_head(path), [_CANONICAL["timestamp"]]) else "image_name"
+    optional = [name for quantity, name in _CANONICAL.items() if quantity not in (key, *AXES)]
+    table = read_table(path, [_CANONICAL[key], *POSITION_COLUMNS], optional, separator=FOUND)
+    names = {quantity: name for quantity, name in _CANONICAL.items() if name in table}
+    times = table.numbers(names["timestamp"], bounds=TIME_S) if key == "timestamp" else None
+    return _log_of_table(table, names, dict.fromkeys(QUANTITIES, "m"), times, path, [], options)
+
+
+def _read_table(path: Path, options: PositionOptions) -> PositionLog:
+    layout = layout_of_list(path, "positions", _EXPECTED)
+    columns, notes = (
+        (columns_by_user(options.columns, QUANTITIES, (*AXES, "timestamp or image_name"), layout, path), [])
+        if options.columns
+        else find_position_columns(path, layout)
+    )
+    table, more = layout.read()
+    notes += more
+    times = None
+    if "timestamp" in columns:
+
+        def ask(units: Sequence[str], why: str) -> InputError:
+            choices = [Choice(f"if they are {one}", ("--position_time_unit", one)) for one in units]
+            return UnclearListError("positions", path, layout, [f"the times have {why}"], choices)
+
+        said = options.timestamp_unit
+        times, _ = read_timestamps(table, columns, layout.units, said, notes, ask, slowest_s=_SLOWEST_S)
+    units, more = length_units(layout, columns, options.unit)
+    return _log_of_table(table, columns, units, times, path, [*notes, *more], options)
+
+
+def _log_of_table(
+    table: TextTable,
+    names: Mapping[str, str],
+    units: Mapping[str, str],
+    times: Array | None,
+    path: Path,
+    notes: list[str],
+    options: PositionOptions,
+) -> PositionLog:
+    """Return the log of a table, given the column and the unit of each quantity."""
+    crs = crs_in_head(read_head(path))
+    kept = _of_one_tag(table, names, options.tag_id, path)
+    columns = [table.numbers(names[axis], empty=np.nan, missing=MISSING, expected=str(COORDINATE_M)) for axis in AXES]
+    are_degrees = crs is None and options.crs is None and options.unit is None and _are_degrees(names, columns)
+    bounds = {axis: DEGREES if are_degrees and axis != "z" else COORDINATE_M for axis in AXES}
+    for k, axis in enumerate(AXES):
+        columns[k] /= 1.0 if are_degrees and axis != "z" else UNITS_PER_METRE[units[axis]]
+        table.refuse(~(np.isnan(columns[k]) | bounds[axis].hold(columns[k])), names[axis], str(bounds[axis]))
+    position = np.column_stack(columns)
+    is_lost = np.zeros(len(table), dtype=bool)
+    if are_degrees or crs is not None:  # receivers without a fix write zeros, which is in the Atlantic
+        is_lost |= (position[:, 0] == 0) & (position[:, 1] == 0)
+    if "quality" in names:
+        is_lost |= table.numbers(names["quality"], empty=0.0, missing=MISSING) == 0
+    position[is_lost] = np.nan
+    image_name = None if times is not None else [name for name, k in zip(table.text(names["image_name"]), kept) if k]
+    log = PositionLog.in_time_order(
+        path,
+        "table",
+        position[kept],
+        table.line[kept],
+        times_s=None if times is None else times[kept],
+        image_name=image_name,
+        covariance_m2=_covariances(table, names, units)[kept],
+        notes=notes,
+    )
+    return replace(log, crs=GEOGRAPHIC if are_degrees else crs)
+
+
+def _are_degrees(names: Mapping[str, str], columns: Sequence[Array]) -> bool:
+    """Return whether x and y are longitude and latitude: by their names, or where these leave it open by their spread.
+
+    They are degrees if they spread over less than a survey of metres does.
+    """
+    if not all(is_degrees(names[axis], axis) for axis in ("x", "y")):
+        return False
+    if not any(axis in terms.words_of(names[axis]) for axis in ("x", "y")):
+        return True
+    known = [values[np.isfinite(values)] for values in columns[:2]]
+    return all(len(values) > 0 and float(np.ptp(values)) < WIDEST_DEG for values in known)
+
+
+def _of_one_tag(table: TextTable, names: Mapping[str, str], tag_id: str | None, path: Path) -> Mask:
+    """Return which rows (n,) are of the wanted tag."""
+    if "tag_id" not in names:
+        return np.ones(len(table), dtype=bool)
+    ids = np.array(table.text(names["tag_id"], empty=""), dtype=str)
+    found = sorted(set(ids.tolist()))
+    if tag_id is None and len(found) > 1:
+        raise InputError(
+            f"has positions of several tags ({', '.join(found)}): say which it is (--position_tag_id)", path
+        )
+    if tag_id is not None and tag_id not in found:
+        raise InputError(f"has no position of tag {tag_id!r}, found {', '.join(found)}", path)
+    return np.asarray(ids == (found[0] if tag_id is None else tag_id))
+
+
+def _covariances(table: TextTable, names: Mapping[str, str], units: Mapping[str, str]) -> Array:
+    """Return (n, 3, 3) covariances, NaN where the table has none: as a matrix, by axis, or of any coordinate."""
+    covariances = np.full((len(table), 3, 3), np.nan)
+    if set(COVARIANCES) <= names.keys():
+        rows, columns = np.triu_indices(3)
+        for name, i, j in zip(COVARIANCES, rows, columns, strict=True):
+            covariances[:, i, j] = covariances[:, j, i] = table.numbers(names[name], empty=np.nan)
+        is_valid = np.isnan(covariances).any(axis=(1, 2)) | (np.linalg.eigvalsh(np.nan_to_num(covariances))[:, 0] > 0)
+        table.refuse(~is_valid, names["cov_xx"], "a positive definite covariance")
+        return covariances
+    for axis, own in enumerate(STDDEVS):
+        if (name := own if own in names else "stddev") in names:
+            stddev = table.numbers(names[name], empty=np.nan) / UNITS_PER_METRE[units[name]]
+            table.refuse(~(np.isnan(stddev) | STDDEV_M.hold(stddev)), names[name], f"{STDDEV_M}, or nothing")
+            covariances[:, axis] = 0.0
+            covariances[:, axis, axis] = stddev**2
+    covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
+    return covariances
+
+
+def _is_tum(head: str) -> bool:
+    return is_tum_row(header_names(head)) and is_reference_file(head)  # with a quaternion of unit length
+
+
+def _read_tum(path: Path, _options: PositionOptions) -> PositionLog:
+    table = tum_table(path)
+    times_s, *places = (table.numbers(name, empty=np.nan, missing=MISSING) for name in table.columns[:4])
+    return PositionLog.in_time_order(path, "tum", np.column_stack(places), table.line, times_s=times_s)
+
+
+def _is_odm(head: str) -> bool:
+    """Return whether the first line is a coordinate system, and the next one a photo with numbers."""
+    first, second = ([line for line in head.split("\n") if line.strip() and line[0] != "#"] + ["", ""])[:2]
+    name, *numbers = second.split() or [""]
+    are_numbers = len(numbers) > 1 and all(map(is_number, numbers[:2]))
+    return crs_of_line(first) is not None and not is_number(name) and are_numbers
+
+
+def _read_odm(path: Path, options: PositionOptions) -> PositionLog:
+    """Read ODM's ``geo.txt``: the coordinate system, then image_name geo_x geo_y geo_z [yaw pitch roll [stddevs]].
+
+    The two stddevs at the end are horizontal and vertical (docs.opendronemap.org, "Image geolocation files").
+    """
+    crs, names, lines, numbers = None, list[str](), list[int](), list[list[float]]()
+    for line, text in enumerate(read_text(path).split("\n"), 1):
+        if not text.strip() or text.startswith("#"):
+            continue
+        if crs is None:
+            crs = crs_of_line(text)
+            continue
+        name, *cells = text.split("\t") if text.count("\t") > 2 else text.split()
+        try:
+            values = [float("nan" if cell.strip().lower() in MISSING else cell) for cell in cells]
+        except ValueError:
+            values = []
+        if len(values) < 3:
+            raise InputError("is no line of a photo, expected image_name geo_x geo_y geo_z", path, line)
+        names.append(name.strip())
+        lines.append(line)
+        numbers.append((values + 5 * [np.nan])[:8])
+    rows = np.array(numbers).reshape(-1, 8)
+    covariances = np.zeros((len(rows), 3, 3))
+    for axis, column in enumerate((6, 6, 7)):
+        covariances[:, axis, axis] = np.where(rows[:, column] > 0, rows[:, column], np.nan) ** 2
+    covariances[np.isnan(covariances).any(axis=(1, 2))] = np.nan
+    log = PositionLog.in_time_order(path, "odm", rows[:, :3], lines, image_name=names, covariance_m2=covariances)
+    return replace(log, crs=crs)
+
+
+def _is_marvelmind(head: str) -> bool:
+    """Return whether lines are those of Marvelmind's dashboard: UNIX time in ms, two intervals, address, x, y, z."""
+    rows = [line.split(",") for line in head.split("\n")[:5] if line.strip()]
+    try:
+        return bool(rows) and all(
+            len(row) >= 9 and len(row) % 2 and 1e12 < float(row[0]) < 4e12 and float(row[3]).is_integer()
+            for row in rows
+        )
+    except ValueError:
+        return False
+
+
+def _read_marvelmind(path: Path, options: PositionOptions) -> PositionLog:
+    """Read the dashboard's CSV (operation manual, "CSV format")."""
+    rows, lines, ids = [], [], []
+    for line, text in enumerate(read_text(path).split("\n"), 1):
+        cells = text.strip().split(",")
+        if cells == [""]:
+            continue
+        try:
+            numbers = [float(cell) for cell in (cells[0], *cells[4:7])]
+        except (ValueError, IndexError):
+            raise InputError("is no line of Marvelmind's dashboard, expected time, ..., x, y, z", path, line) from None
+        if not (TIME_S.hold(numbers[0] / 1e3) and all(map(COORDINATE_M.hold, numbers[1:])) and len(numbers) == 4):
+            raise InputError("has no time and place, expected time in ms, ..., x, y, z in metres", path, line)
+        rows.append(numbers)
+        lines.append(line)
+        ids.append(cells[3].strip())
+    wanted = options.tag_id or (ids[0] if len(set(ids)) == 1 else "")
+    if wanted not in ids:
+        raise InputError(f"has positions of {', '.join(sorted(set(ids)))}: say which it is (--position_tag_id)", path)
+    kept = np.array(ids) == wanted
+    values = np.array(rows)[kept]
+    return PositionLog.in_time_order(
+        path, "marvelmind", values[:, 1:], np.array(lines)[kept], times_s=values[:, 0] / 1e3
+    )
+
+
+def _is_nmea(head: str) -> bool:
+    return any(_NMEA.fullmatch(line.strip()) for line in head.split("\n")[:50])
+
+
+def _read_nmea(path: Path, _options: PositionOptions) -> PositionLog:
+    """Read GGA sentences, with dates from RMC or ZDA and standard deviations from GST, if they are there.
+
+    The height is above the ellipsoid: that above the sea plus the separation of the geoid. Times are UTC.
+    """
+    rows, lines, stddevs, num_broken = list[list[float]](), list[int](), list[Array](), 0
+    day_s, last_s, errors = 0.0, -np.inf, dict[float, Array]()
+    for line, text in enumerate(read_text(path, errors="replace").split("\n"), 1):
+        found = _NMEA.fullmatch(text.strip())
+        if found is None:
+            continue
+        kind, body, checksum = found.groups()
+        cells = body.split(",")
+        try:
+            if checksum is not None and _checksum(text) != int(checksum, 16):
+                raise ValueError
+            if kind in ("RMC", "ZDA"):
+                day_s = _day_of_nmea(kind, cells)
+            elif kind == "GST":
+                errors[_seconds_of_day(cells[0])] = np.array([float(cells[6]), float(cells[5]), float(cells[7])])
+            elif int(cells[5]) > 0:
+                second = _seconds_of_day(cells[0])
+                day_s += _SECONDS_OF_DAY if second < last_s - _SECONDS_OF_DAY / 2 else 0.0
+                last_s = second
+                height_m = float(cells[8]) + float(cells[10] or 0.0)
+                rows.append([day_s + second, _degrees(cells[3], cells[4]), _degrees(cells[1], cells[2]), height_m])
+                lines.append(line)
+                usual = _NMEA_STDDEVS_M.get(int(cells[5]), 10.0) * np.array([1.0, 1.0, 2.0])
+                stddevs.append(errors.get(second, usual))
+        except (ValueError, IndexError):
+            num_broken += 1
+    notes = [f"{num_broken} broken sentences are left out"] if num_broken else []
+    values = np.array(rows).reshape(-1, 4)
+    covariances = np.array([np.diag(stddev**2) for stddev in stddevs]).reshape(-1, 3, 3)
+    log = PositionLog.in_time_order(
+        path, "nmea", values[:, 1:], lines, times_s=values[:, 0], covariance_m2=covariances, notes=notes
+    )
+    return replace(log, crs=GEOGRAPHIC)
+
+
+def _checksum(text: str) -> int:
+    total = 0
+    for character in text.strip()[1 : text.strip().index("*")]:
+        total ^= ord(character)
+    return total
+
+
+def _seconds_of_day(cell: str) -> float:
+    return 3600 * int(cell[:2]) + 60 * int(cell[2:4]) + float(cell[4:])
+
+
+def _day_of_nmea(kind: str, cells: Sequence[str]) -> float:
+    """Return the seconds from 1970 to the beginning of the day of an RMC or ZDA sentence."""
+    if kind == "RMC":
+        day, month, year = int(cells[8][:2]), int(cells[8][2:4]), 2000 + int(cells[8][4:6])
+    else:
+        day, month, year = int(cells[1]), int(cells[2]), int(cells[3])
+    return datetime(year, month, day, tzinfo=timezone.utc).timestamp()
+
+
+def _degrees(cell: str, half: str) -> float:
+    minutes_at = cell.index(".") - 2
+    degrees = float(cell[:minutes_at]) + float(cell[minutes_at:]) / 60
+    return -degrees if half in ("S", "W") else degrees
+
+
+def _is_rtklib(head: str) -> bool:
+    return _rtklib_header(head.split("\n")) is not None
+
+
+def _rtklib_header(lines: Sequence[str]) -> list[str] | None:
+    """Return the names of the columns of an RTKLIB solution; None if it is not one."""
+    for line in lines:
+        names = line.lstrip("% ").split()
+        if line.startswith("%") and names and names[0] in ("GPST", "UTC", "JST") and "Q" in names:
+            return names
+    return None
+
+
+def _read_rtklib(path: Path, _options: PositionOptions) -> PositionLog:
+    """Read a solution (.pos) of RTKLIB: latitude and longitude, or east, north and up from a base, with covariances.
+
+    Source: RTKLIB manual 2.4.2, appendix B.1. The off-diagonal columns are signed roots of covariances.
+    """
+    lines = read_text(path).split("\n")
+    names = _rtklib_header(lines)
+    if names is None:
+        raise InputError("has no header row of an RTKLIB solution (% GPST ...)", path)
+    is_geographic, is_enu = "latitude(deg)" in names, "e-baseline(m)" in names
+    if not (is_geographic or is_enu):
+        raise InputError(
+            "an RTKLIB solution with these columns is not read, expected latitude, longitude, height", path
+        )
+    rows, at_lines = list[list[float]](), list[int]()
+    for line, text in enumerate(lines, 1):
+        cells = text.split()
+        if not cells or text.startswith("%"):
+            continue
+        try:
+            numbers = [float(cell) for cell in cells[2:13]]
+            rows.append([_time_of_rtklib(cells[0], cells[1]), *numbers])
+        except (ValueError, IndexError):
+            rows.append([])
+        if len(rows[-1]) < 12:
+            raise InputError(
+                "is no row of an RTKLIB solution, expected date, time, 3 coordinates, Q, ns, 6 stddevs", path, line
+            )
+        at_lines.append(line)
+    values = np.array(rows).reshape(-1, 12)
+    north_first = values[:, [2, 1, 3]] if is_geographic else values[:, 1:4]
+    notes = ["times are GPS time, which is ahead of UTC by leap seconds"] if names[0] == "GPST" else []
+    log = PositionLog.in_time_order(
+        path,
+        "rtklib",
+        north_first,
+        at_lines,
+        times_s=values[:, 0],
+        covariance_m2=_covariance_of_rtklib(values[:, 6:12], is_geographic),
+        notes=notes,
+    )
+    return replace(log, crs=GEOGRAPHIC if is_geographic else None)
+
+
+def _time_of_rtklib(first: str, second: str) -> float:
+    """Return seconds since 1970 of a date and a time, or of a GPS week and its seconds."""
+    if "/" in first:
+        day = datetime.strptime(first, "%Y/%m/%d").replace(tzinfo=timezone.utc)
+        hours, minutes, seconds = second.split(":")
+        return day.timestamp() + 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+    return (_GPS_EPOCH + timedelta(weeks=int(first))).timestamp() + float(second)
+
+
+def _covariance_of_rtklib(roots: Array, is_geographic: bool) -> Array:
+    """Return (n, 3, 3) covariances east, north, up from sdn, sde, sdu, sdne, sdeu, sdun; sde, sdn, .. of baselines."""
+    north, east, up = (0, 1, 2) if is_geographic else (1, 0, 2)
+    squares = np.sign(roots) * roots**2
+    covariances = np.zeros((len(roots), 3, 3))
+    covariances[:, 0, 0], covariances[:, 1, 1], covariances[:, 2, 2] = (
+        squares[:, east],
+        squares[:, north],
+        squares[:, up],
+    )
+    east_up, up_north = (4, 5) if is_geographic else (5, 4)
+    for (i, j), column in (((0, 1), 3), ((0, 2), east_up), ((1, 2), up_north)):
+        covariances[:, i, j] = covariances[:, j, i] = squares[:, column]
+    # Rounded to tenths of millimetres, a matrix may lose its definiteness: then its diagonal is taken.
+    is_bad = np.linalg.eigvalsh(covariances)[:, 0] <= 0
+    diagonals = np.einsum("nii->ni", covariances)
+    covariances[is_bad] = np.maximum(diagonals[is_bad], 1e-8)[:, :, None] * np.eye(3)
+    return covariances
+
+
+POSITION_READERS: dict[str, tuple[Callable[[str], bool], Reader]] = {
+    "colmap": (is_database, lambda path, _options: read_pose_priors(path)),
+    "nmea": (_is_nmea, _read_nmea),
+    "rtklib": (_is_rtklib, _read_rtklib),
+    "odm": (_is_odm, _read_odm),
+    "tum": (_is_tum, _read_tum),
+    "marvelmind": (_is_marvelmind, _read_marvelmind),
+    "table": (_is_canonical, _read_canonical),
+}
+"""Formats by name: whether a file begins like one, and its reader."""

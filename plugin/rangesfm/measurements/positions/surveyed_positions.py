@@ -1,0 +1,125 @@
+"""All that is known of positions in a site, and its comparison with the map."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import pycolmap
+
+from rangesfm.arrays import Array
+from rangesfm.measurements.lengths.tape import Marker
+from rangesfm.measurements.positions.antenna_places import locate_antenna
+from rangesfm.measurements.positions.antenna_track import AntennaTrack
+from rangesfm.measurements.positions.control_points import ControlPoints, marks_seen
+from rangesfm.measurements.positions.known_marks import locate_points
+from rangesfm.measurements.positions.known_positions import LASTING_S, KnownPositions, joined_positions
+from rangesfm.util.geometry.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class SurveyedPositions:
+    """Positions in the site's frame: of marks, and of an antenna.
+
+    Attributes:
+        points: control and check points; None without any.
+        antenna: positions of an antenna on the camera; None without any.
+        lasting_s: for how long errors of the antenna's positions last, seconds.
+    """
+
+    points: ControlPoints | None = None
+    antenna: AntennaTrack | None = None
+    lasting_s: tuple[float, ...] = LASTING_S
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines for the user about how the files were read."""
+        of_points = () if self.points is None else self.points.notes
+        return (*of_points, *(() if self.antenna is None else self.antenna.log.notes))
+
+    def facts(self) -> Iterator[str]:
+        """Yield lines that say what is known, before any map is made."""
+        if self.points is not None:
+            nums = Counter(point.kind for point in self.points.points)
+            kinds = " and ".join(f"{num} {kind}" for kind, num in nums.items())
+            num = sum(point.name in self.points.markers for point in self.points.points)
+            yield f"known points: {kinds}, {num} of them with marks in photos so far"
+        if self.antenna is not None:
+            log = self.antenna.log
+            name = "" if log.path is None else f" in {log.path.name}"
+            yield f"positions: {len(log)}{name} ({log.format})"
+
+    @property
+    def are_known(self) -> bool:
+        """True if there are any."""
+        return self.points is not None or self.antenna is not None
+
+    @property
+    def needs_times(self) -> bool:
+        """True if the photos' times are needed."""
+        return self.antenna is not None and self.antenna.log.timestamp_s is not None
+
+    def located(self, model: pycolmap.Reconstruction, path: Trajectory) -> KnownPositions | None:
+        """Find the positions in a model; None if none of them is there. Those by a wrong clock are left out.
+
+        Args:
+            model: in any world. path: of its keyframes.
+
+        Raises:
+            InputError: the marks of a point are not of one point, or are seen from one direction only.
+        """
+        marks = None if self.points is None else locate_points(self.points, model, path)
+        is_on_path = self.antenna is not None and self.antenna.other_offset_s is None
+        return joined_positions([marks, locate_antenna(self.antenna, path) if self.antenna and is_on_path else None])
+
+    def with_more_markers(self, markers: Mapping[str, Marker]) -> SurveyedPositions:
+        """Return the positions with more marks in photos."""
+        return self if self.points is None else replace(self, points=self.points.with_more(markers))
+
+    def without(self, names: Iterable[str]) -> SurveyedPositions:
+        """Return the positions with the points of these names marked as left out."""
+        return self if self.points is None else replace(self, points=self.points.without([*names]))
+
+    def doubts_of_clock(self) -> Iterator[str]:
+        """Yield the reason to doubt the given time offset of the antenna's positions, if there is one."""
+        track = self.antenna
+        if track is not None and track.other_offset_s is not None and track.offset_s is not None:
+            ahead_s = track.offset_s - track.other_offset_s
+            yield (
+                f"the positions fit the photos' path at a time offset of {track.other_offset_s:+.2f} s, not at the "
+                f"given {track.offset_s:+.2f} s: their clock is {abs(ahead_s):.1f} s "
+                f"{'ahead' if ahead_s > 0 else 'behind'}, as by leap seconds, or a time zone; they are not used"
+            )
+
+    def doubts_of_found_clock(self) -> Iterator[str]:
+        """Yield the reason to doubt the time offset that was found, which moves the map along the path."""
+        search = None if self.antenna is None else self.antenna.search
+        if search is not None and not search.is_certain and search.note is not None:
+            yield search.note
+
+    def notes_on(self, model: pycolmap.Reconstruction) -> Iterator[str]:
+        """Yield a line for the user about points that a model does not show."""
+        if self.points is None:
+            return
+        points, is_seen = self.points.points, marks_seen(self.points, model)
+        unseen = [point.name for point, seen in zip(points, is_seen, strict=True) if not seen]
+        if unseen:
+            yield (
+                f"{len(unseen)} of {len(points)} known points are left out, as fewer than two photos of the map have "
+                f"marks of them: {', '.join(unseen)}"
+            )
+
+    def moved(self, offset_m: Array) -> SurveyedPositions:
+        """Return the positions in a frame whose coordinates are larger by ``offset_m`` (3,)."""
+        points, antenna = self.points, self.antenna
+        if points is not None:
+            points = points.moved_to(points.positions_m + offset_m)
+        if antenna is not None:
+            antenna = replace(antenna, log=antenna.log.moved_to(antenna.log.position_m + offset_m))
+        return replace(self, points=points, antenna=antenna)
+
+    @property
+    def markers(self) -> Mapping[str, Marker]:
+        """Marks of the points in photos, by name."""
+        return {} if self.points is None else self.points.markers

@@ -1,0 +1,446 @@
+"""Trilateration: positions of anchors from ranges at known positions of the tag.
+
+This is the first step of Lee, Zhu, Giorgi and Günther (2018), with robust estimation and a realistic uncertainty. Every
+anchor is located on its own. The errors of the ranges are learnt from those of all anchors together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.errors import GeometryError
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.point_fit import (
+    ENOUGH_TO_JUDGE,
+    FitErrors,
+    PointFit,
+    PointProblem,
+    errors_of_fits,
+    fit_with_own_noise,
+    improve,
+)
+from rangesfm.measurements.ranges.errors.noise import short_range_stddev
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.util.geometry.numerics import UNDETERMINED
+from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP, MIN_STDDEV_M, SAME_COST
+from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, PathShape, oriented, path_shape
+from rangesfm.util.processes.threads import with_one_blas_thread
+
+# Three ranges determine a position, and a fourth one checks it.
+MIN_NUM_RANGES = 4
+# Standard deviations above this fraction of the distance are computed from the cost itself, not from its curvature.
+_NONLINEAR = 0.05
+# Distances at which the cost is then evaluated, metres.
+_PROFILE_STEPS_M = np.geomspace(0.01, 100.0, 41)
+# Standard deviation of a known height.
+_HEIGHT_STDDEV_M = 0.01
+
+
+@dataclass(frozen=True)
+class TrilaterationOptions:
+    """Options of trilateration.
+
+    Attributes:
+        range_stddev_m: noise of ranges for which the log gives none; None: estimated from the residuals.
+        range_bias_m: prior mean of the bias of the ranges, positive if they are too long.
+        range_bias_stddev_m: standard deviation of that prior, by default over the radios of ``components.py``; 0: the
+            bias is exactly known.
+        max_position_stddev_m: an anchor with a larger standard deviation in any direction is refused.
+    """
+
+    range_stddev_m: float | None = None
+    range_bias_m: float = 0.0
+    range_bias_stddev_m: float = 0.25
+    max_position_stddev_m: float = 1.0
+
+
+@dataclass(frozen=True)
+class Trilateration:
+    """Position of an anchor, found from n ranges.
+
+    Attributes:
+        position_m: (3,) position in the frame of the tag's positions.
+        covariance_m2: (3, 3) covariance of the position.
+        mirror_position_m: (3,) mirror image in the tag's positions, if it fits as well; or None.
+        range_bias_m, range_bias_stddev_m: bias of the ranges, positive if they are too long, and its standard
+            deviation.
+        noise_stddev_m: median noise of a range.
+        residuals_m: (n,) predicted minus measured ranges.
+        weights: (n,) weights of the robust loss, 1 for a range that fits.
+    """
+
+    position_m: Array
+    covariance_m2: Array
+    mirror_position_m: Array | None
+    range_bias_m: float
+    range_bias_stddev_m: float
+    noise_stddev_m: float
+    residuals_m: Array
+    weights: Array
+
+    @property
+    def position_stddev_m(self) -> float:
+        """Root of the mean variance of the three coordinates, metres."""
+        return float(np.sqrt(np.trace(self.covariance_m2) / 3))
+
+
+@dataclass(frozen=True)
+class AnchorRanges:
+    """n ranges of one anchor to known positions of the tag.
+
+    Attributes:
+        tag_positions_m: (n, 3) positions of the tag's antenna.
+        range_m: (n,) measured ranges.
+        range_stddev_m: (n,) noise of each range, NaN where unknown; or None.
+        shared_stddev_m: (n,) standard deviation of the error that ranges of about this length share by the radio's
+            error curve; None: there is no error curve, and short ranges get a larger standard deviation.
+        timestamp_s: (n,) times of the ranges; None: they are in the order of time.
+        tag_index: (n,) index of each range's tag; None: all ranges are of one tag.
+        toward: (3,) direction from the anchor's mirror image to the anchor; or None.
+        height_m: z of the anchor, if it is known.
+    """
+
+    tag_positions_m: Array
+    range_m: Array
+    range_stddev_m: Array | None = None
+    shared_stddev_m: Array | None = None
+    timestamp_s: Array | None = None
+    tag_index: Indices | None = None
+    toward: Array | None = None
+    height_m: float | None = None
+
+    @property
+    def times_s(self) -> Array:
+        """Times of the ranges (n,), seconds; if there are none, those of a tag that somebody carries."""
+        if self.timestamp_s is not None:
+            return self.timestamp_s
+        return walking_times_s(self.tag_positions_m)
+
+    @property
+    def tags(self) -> Indices:
+        """Index of each range's tag (n,)."""
+        return np.zeros(len(self.range_m), dtype=np.int64) if self.tag_index is None else self.tag_index
+
+    @property
+    def shape(self) -> PathShape:
+        """Shape of the tag's positions about their mean; if the anchor's height is known, of their horizontal parts."""
+        centred = self.tag_positions_m - self.tag_positions_m.mean(axis=0)
+        return path_shape(centred if self.height_m is None else centred * [1.0, 1.0, 0.0])
+
+    def fit(self, options: TrilaterationOptions) -> PointFit:
+        """Find the most likely position, assuming independent errors of the ranges."""
+        num = len(self.range_m)
+        middle = self.tag_positions_m.mean(axis=0)
+        mean = np.array([0.0, 0.0, 0.0, options.range_bias_m])
+        # A known bias is held by a prior that is far stronger than any ranges.
+        prior = np.array([[0.0, 0.0, 0.0, 1 / max(options.range_bias_stddev_m, MIN_STDDEV_M)]])
+        if self.height_m is not None:
+            mean[2] = self.height_m - middle[2]
+            prior = np.vstack([prior, [0.0, 0.0, 1 / _HEIGHT_STDDEV_M, 0.0]])
+        shared = short_range_stddev(self.range_m) if self.shared_stddev_m is None else self.shared_stddev_m
+        problem = PointProblem(self.tag_positions_m - middle, self.range_m, np.ones(num), shared, mean, prior)
+        given = np.full(num, np.nan) if self.range_stddev_m is None else self.range_stddev_m
+        return fit_with_own_noise(problem, np.where(np.isfinite(given), given, options.range_stddev_m or np.nan))
+
+
+def walking_times_s(places_m: Array) -> Array:
+    """Return (n,) times, seconds, at which somebody who walks a metre a second is at (n, 3) places, from 0."""
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places_m, axis=0), axis=1)))
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A fit with the errors of its ranges.
+
+    Attributes:
+        fit: the fit. Its prior is strengthened by ``inflation``, to balance ranges whose common errors are not in their
+            weights.
+        errors: errors of its ranges.
+        inflation: ratio of the bias's standard deviation to the one for independent errors.
+    """
+
+    fit: PointFit
+    errors: FitErrors
+    inflation: float
+
+    def judged_by(self, inflation: float) -> PointProblem:
+        """Return the problem with standard deviations that account for common errors, for comparing costs."""
+        problem = self.fit.problem
+        return replace(problem, stddev_m=inflation * problem.stddev_m, prior=problem.prior / self.inflation)
+
+
+def _found(fit: PointFit, errors: FitErrors) -> _Found:
+    inflation = errors.inflation_of_bias(fit)
+    problem = replace(fit.problem, prior=fit.problem.prior * inflation)
+    return _Found(replace(fit, problem=problem, x=improve(problem, fit.x)), errors, inflation)
+
+
+@with_one_blas_thread
+def trilaterate(
+    tag_positions_m: npt.ArrayLike,
+    range_m: npt.ArrayLike,
+    *,
+    options: TrilaterationOptions = TrilaterationOptions(),
+    height_m: float | None = None,
+    **known: npt.ArrayLike | None,
+) -> Trilateration:
+    """Find an anchor from its ranges to known positions of the tag.
+
+    Up to about half of the ranges may be wrong by any amount. If the tag's positions lie in a plane, the anchor's
+    mirror image in that plane fits as well. Then both are returned, unless ``toward`` selects one. If both fit equally,
+    the upper one comes first. With a known height, the same applies to positions that lie on a line seen from above.
+
+    Args:
+        tag_positions_m, range_m, height_m: as in ``AnchorRanges``.
+        known: other attributes of ``AnchorRanges``: ``range_stddev_m``, ``shared_stddev_m``, ``timestamp_s``,
+            ``toward``.
+
+    Raises:
+        GeometryError: there are too few ranges, the positions lie on a line or close together, or the anchor's standard
+            deviation exceeds ``options.max_position_stddev_m``.
+    """
+    positions, ranges = (np.asarray(values, dtype=np.float64) for values in (tag_positions_m, range_m))
+    arrays: dict[str, Any] = {
+        name: None if values is None else np.asarray(values, dtype=np.float64) for name, values in known.items()
+    }
+    anchor = AnchorRanges(positions, ranges, height_m=height_m, **arrays)
+    (placement,) = _trilaterate_together({"": anchor}, options)
+    if placement.found is None:
+        raise GeometryError(str(placement.why_not))
+    return placement.found
+
+
+@dataclass(frozen=True)
+class AnchorPlacement:
+    """Result of trilateration for one anchor.
+
+    Attributes:
+        anchor_id: id in the log.
+        num_ranges: number of its ranges at known positions of the tag.
+        found: its position; None if it is not determined.
+        why_not: why it is not determined; None if it is.
+    """
+
+    anchor_id: str
+    num_ranges: int
+    found: Trilateration | None
+    why_not: str | None
+
+    @property
+    def anchor(self) -> Anchor:
+        """Anchor for an anchor file, without a position if none was found, or if a mirror image fits as well."""
+        if self.found is None:
+            return Anchor(self.anchor_id)
+        bias = (self.found.range_bias_m, self.found.range_bias_stddev_m)
+        if self.found.mirror_position_m is not None:
+            return Anchor(self.anchor_id, None, 0.0, *bias)
+        return Anchor(self.anchor_id, self.found.position_m, self.found.position_stddev_m, *bias)
+
+
+@with_one_blas_thread
+def trilaterate_anchors(
+    log: RangeLog,
+    tag_positions_m: Array,
+    *,
+    toward: Mapping[str, Sequence[float]] | None = None,
+    height_m: Mapping[str, float] | None = None,
+    options: TrilaterationOptions = TrilaterationOptions(),
+) -> tuple[AnchorPlacement, ...]:
+    """Locate every anchor of a log; the errors of the ranges are learnt from all anchors together.
+
+    Args:
+        log: n ranges.
+        tag_positions_m: (n, 3) position of the tag at each range; NaN where unknown (see ``tag_positions``).
+        toward: by anchor, the direction from its mirror image to it, where both fit alike (see ``trilaterate``).
+        height_m: by anchor, its z if that is known.
+
+    Returns:
+        One placement for each anchor, in the order of the log.
+    """
+    known = np.isfinite(tag_positions_m).all(axis=1)
+    rows = [np.flatnonzero(known & (log.anchor_index == k)) for k in range(len(log.anchor_ids))]
+    anchors = {
+        anchor_id: AnchorRanges(
+            tag_positions_m[own],
+            log.range_m[own],
+            range_stddev_m=log.range_stddev_m[own],
+            shared_stddev_m=None if log.shared_stddev_m is None else log.shared_stddev_m[own],
+            timestamp_s=None if log.timestamp_s is None else log.timestamp_s[own],
+            tag_index=log.tag_index[own],
+            toward=None if toward is None or anchor_id not in toward else np.asarray(toward[anchor_id], np.float64),
+            height_m=None if height_m is None else height_m.get(anchor_id),
+        )
+        for anchor_id, own in zip(log.anchor_ids, rows, strict=True)
+    }
+    return _trilaterate_together(anchors, options)
+
+
+def _trilaterate_together(
+    anchors: Mapping[str, AnchorRanges], options: TrilaterationOptions
+) -> tuple[AnchorPlacement, ...]:
+    """Locate anchors of one radio system, whose ranges have errors of the same kind."""
+    fits = {name: anchor.fit(options) for name, anchor in anchors.items() if len(anchor.range_m) >= MIN_NUM_RANGES}
+    fitted = [anchors[name] for name in fits]
+    times_s, tags = [anchor.times_s for anchor in fitted], [anchor.tags for anchor in fitted]
+    is_calibrated = all(anchor.shared_stddev_m is not None for anchor in fitted)
+    errors = errors_of_fits([*fits.values()], times_s, tags, is_calibrated=is_calibrated) if fits else []
+    errors_of, placements = dict(zip(fits, errors, strict=True)), []
+    for name, anchor in anchors.items():
+        num, found = len(anchor.range_m), None
+        why_not: str | None = f"{num} ranges at known positions of the tag, {MIN_NUM_RANGES} are needed"
+        if name in fits:
+            try:
+                found, why_not = _conclude(anchor, _found(fits[name], errors_of[name]), options), None
+            except GeometryError as error:
+                why_not = str(error)
+        placements.append(AnchorPlacement(name, num, found, why_not))
+    return tuple(placements)
+
+
+def _conclude(anchor: AnchorRanges, found: _Found, options: TrilaterationOptions) -> Trilateration:
+    covariance, shape = _covariance(found), anchor.shape
+    _refuse_uncertain(covariance, shape, options)
+    # With a known height, position and mirror image have the same height, and the plane between them is vertical.
+    level = np.cross([0.0, 0.0, 1.0], shape.axes[:, 0])
+    across = shape.axes[:, 2] if anchor.height_m is None else oriented(level[:, None])[:, 0]
+    mirror = _mirror(found, covariance, shape.centroid, across)
+    if mirror is not None:
+        apart = (mirror - found.fit.x)[:3]
+        told = None if anchor.toward is None else _unless_along_plane(anchor.toward, apart)
+        # If both have the same cost, the choice would depend on rounding, so the order is fixed.
+        is_free = told is not None or abs(_gap(found, mirror)) < SAME_COST
+        if is_free and apart @ (across if told is None else told) > 0:
+            found, mirror = replace(found, fit=replace(found.fit, x=mirror)), found.fit.x
+            covariance = _covariance(found)
+        mirror = mirror if told is None else None
+    middle = anchor.tag_positions_m.mean(axis=0)
+    return Trilateration(
+        position_m=middle + found.fit.x[:3],
+        covariance_m2=covariance[:3, :3],
+        mirror_position_m=None if mirror is None else middle + mirror[:3],
+        range_bias_m=float(found.fit.x[3]),
+        range_bias_stddev_m=float(np.sqrt(covariance[3, 3])) if options.range_bias_stddev_m > 0 else 0.0,
+        noise_stddev_m=found.fit.noise_m,
+        residuals_m=found.fit.residuals_m,
+        weights=found.fit.weights,
+    )
+
+
+def _covariance(found: _Found) -> Array:
+    """Return the covariance (4, 4) of position and bias, given the errors of the ranges.
+
+    It is the sandwich covariance of a robust estimate: the covariance of the gradient between two inverses of the
+    information (Huber and Ronchetti, "Robust Statistics", 2009, section 6.3). The weakest direction may instead be
+    evaluated by the cost itself.
+    """
+    problem, weights = found.fit.problem, found.fit.weights
+    jacobian = problem.jacobian(found.fit.x)
+    of_prior = problem.prior.T @ problem.prior
+    inverse = _inverse((jacobian * weights[:, None]).T @ jacobian + of_prior)
+    influence = inverse @ (jacobian * (weights / problem.stddev_m)[:, None]).T
+    sandwich = found.errors.of_sums(influence) + found.inflation**2 * inverse @ of_prior @ inverse
+    return _with_weak_direction(found, sandwich, inverse)
+
+
+def _inverse(information: Array) -> Array:
+    # Position and bias are scaled to units of their own. In metres, the large information of a known bias would hide
+    # that of the position.
+    strongest = np.diag(information)
+    unit = 1 / np.sqrt(np.append(np.full(3, strongest[:3].max()), strongest[3]))
+    values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
+    inverse: Array = unit[:, None] * ((vectors / np.maximum(values, 1e-12)) @ vectors.T) * unit
+    return inverse
+
+
+def _with_weak_direction(found: _Found, sandwich: Array, formal: Array) -> Array:
+    """Return the covariance with the variance of the weakest direction from the cost itself, where that is needed.
+
+    Near the plane of the tag's positions, the curvature of the cost across the plane vanishes, but the cost rises
+    farther off.
+    """
+    variances, axes = np.linalg.eigh(formal[:3, :3])
+    along = np.append(axes[:, 2], 0.0)
+    # The other unknowns are assumed to change with this direction as the curvature says.
+    tied = formal @ along / variances[2]
+    inflation = found.errors.inflation(found.fit, found.fit.problem.slopes(found.fit.x) @ tied)
+    if inflation * np.sqrt(variances[2]) < _NONLINEAR * float(np.median(found.fit.problem.range_m)):
+        return sandwich
+    rest = np.eye(4) - np.outer(tied, along)
+    changed: Array = rest @ sandwich @ rest.T + _profile_stddev(found, along, inflation) ** 2 * np.outer(tied, tied)
+    return changed
+
+
+def _profile_stddev(found: _Found, along: Array, inflation: float) -> float:
+    """Return the distance along a direction (4,) at which the cost has risen by that of one standard deviation, metres.
+
+    The other unknowns are estimated anew at each distance.
+    """
+    num = len(found.fit.problem.range_m)
+    rows = np.linspace(0, num - 1, min(num, ENOUGH_TO_JUDGE)).astype(np.int64)
+    part = found.judged_by(inflation).subset(rows)
+    hold = np.vstack([part.prior, along / MIN_STDDEV_M])  # as a known bias is held
+    best = improve(part, found.fit.x)
+    allowed = part.cost(best) + 0.5 * len(rows) / num
+
+    def is_far(step: float) -> bool:
+        moved = best + step * along
+        held = replace(part, prior_mean=np.append(moved[:3], part.prior_mean[3]), prior=hold)
+        return held.cost(improve(held, moved)) > allowed
+
+    last = _PROFILE_STEPS_M[-1]
+    return float(max(next((step for step in _PROFILE_STEPS_M if is_far(sign * step)), last) for sign in (1, -1)))
+
+
+def _refuse_uncertain(covariance: Array, shape: PathShape, options: TrilaterationOptions) -> None:
+    variances, axes = np.linalg.eigh(covariance[:3, :3])
+    stddev = float(np.sqrt(variances[2]))
+    if stddev <= options.max_position_stddev_m:
+        return
+    length, width = shape.stddevs[:2]
+    if length <= options.max_position_stddev_m / 10:
+        why = f"the tag's positions lie within {length:.3g} m of each other"
+    elif width < NEARLY_STRAIGHT * length:
+        why = "the tag's positions lie on a line, and the anchor may be anywhere on a circle around that line"
+    elif np.argmax(np.abs(axes[:, 2] @ shape.axes)) == 2:  # the plane's normal is the nearest of the axes
+        why = "the anchor is near the plane of the tag's positions, and its distance from the plane is not determined"
+    else:
+        why = f"the tag's positions extend over {length:.3g} by {width:.3g} m only, or are too far away"
+    # Signs are normalized, so that rounding cannot change them, neither of the whole vector nor of a zero.
+    direction = ", ".join(f"{component:.2f}" for component in np.round(oriented(axes)[:, 2], 2) + 0.0)
+    raise GeometryError(
+        f"the position is not determined: {why} (stddev {min(stddev, _PROFILE_STEPS_M[-1]):.2g} m along {direction})"
+    )
+
+
+def _mirror(found: _Found, covariance: Array, centroid: Array, across: Array) -> Array | None:
+    """Return position and bias (4,) of the mirror image in the tag's positions, if it is a different one and fits."""
+    height = float((found.fit.x[:3] - centroid) @ across)
+    other = improve(found.fit.problem, found.fit.x - 2 * height * np.append(across, 0.0))
+    apart = (other - found.fit.x)[:3]
+    distance = float(np.linalg.norm(apart))
+    stddev = float(np.sqrt(apart @ covariance[:3, :3] @ apart)) / max(distance, 1e-12)
+    return other if distance > 2 * stddev and _gap(found, other) < MIN_COST_GAP else None
+
+
+def _gap(found: _Found, mirror: Array) -> float:
+    """Return the cost of the mirror image minus that of the fit, with common errors of the ranges accounted for.
+
+    The loss is bounded, so that outliers cost the same for both.
+    """
+    problem = found.fit.problem
+    inflation = found.errors.inflation(found.fit, problem.residuals_m(mirror) - found.fit.residuals_m)
+    judged = found.judged_by(inflation)
+    return judged.cost(mirror, GEMAN_MCCLURE) - judged.cost(found.fit.x, GEMAN_MCCLURE)
+
+
+def _unless_along_plane(direction: Array, across: Array) -> Array | None:
+    """Return the direction if it selects one of two mirror images, or None if it is along the plane between them."""
+    # A plane between two positions that are each as exact as a solver is has a normal with as many digits.
+    least = UNDETERMINED * float(np.linalg.norm(direction) * np.linalg.norm(across))
+    return direction if abs(direction @ across) > least else None

@@ -1,0 +1,280 @@
+"""Association of ranges with positions on the camera's path."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import InputError
+from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
+from rangesfm.options import AssociationOptions
+from rangesfm.util.files.photo_names import rows_of_photos
+from rangesfm.util.geometry.motion_prior import learn_motion
+from rangesfm.util.geometry.robust_statistics import robust_stddev
+from rangesfm.util.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
+from rangesfm.util.processes.threads import with_one_blas_thread
+
+# The early and the late half of a burst must agree to this many standard deviations for the camera to count as still.
+_MAX_STILL_DRIFT_STDDEVS = 2.0
+# A range this close in time to a keyframe, in seconds, counts as taken at it. At walking pace the difference is a tenth
+# of a millimetre.
+_SAME_TIME_S = 1e-4
+
+
+@with_one_blas_thread
+def associate(
+    log: RangeLog,
+    trajectory: Trajectory,
+    tag_in_cam_m: npt.ArrayLike,
+    *,
+    time_offset_s: float | Array = 0.0,
+    options: AssociationOptions = AssociationOptions(),
+    anchor_ids: Collection[str] | None = None,
+) -> RangeObservations:
+    """Find the camera pose at which each range was taken.
+
+    Between keyframes that are close in time, the camera's centre and rotation are interpolated by a motion model learnt
+    from the keyframes (``MotionPrior``). The standard deviations of the result include those of this interpolation and
+    of times that are recorded in coarse steps. Between keyframes further apart than
+    ``options.max_interpolation_gap_s``, a range belongs to the nearest keyframe, and only if it is within
+    ``max_time_difference_s`` of it, or the ranges themselves show that the camera stood still around its photos.
+
+    Args:
+        log: n ranges.
+        trajectory: keyframes; with times, unless the log names photos.
+        tag_in_cam_m: (3,) lever arm, the antenna in the camera (rig) frame, metres; (num_tags, 3) if the tags of
+            ``log.tag_ids`` have their own.
+        time_offset_s: image time = range time + offset; (n,) where the clocks drift.
+        anchor_ids: ranges to other anchors are kept with status UNKNOWN_ANCHOR; None: all anchors are wanted.
+
+    Returns:
+        All n ranges, each with a position on the path, or a status that says why it has none. Ranges between two
+        anchors or two tags have none.
+
+    Raises:
+        InputError: the log needs image times and there are none, or the log has more tags than lever arms.
+    """
+    status = np.full(len(log), RangeStatus.USED, dtype=np.int8)
+    if log.image_name is not None:
+        before = after = rows_of_photos(log.image_name, trajectory.image_names)
+        fraction = np.zeros(len(log))
+        status[before < 0] = RangeStatus.UNKNOWN_IMAGE
+    elif trajectory.timestamps_s is not None:
+        times = log.timestamp_s + time_offset_s if log.timestamp_s is not None else np.empty(0)
+        before, after, fraction = _places_by_time(log, times, trajectory.timestamps_s, options, status)
+    else:
+        raise InputError("the log has timestamps but the photos have none: give image times", log.source)
+    if anchor_ids is not None:
+        unwanted = [index for index, anchor_id in enumerate(log.anchor_ids) if anchor_id not in anchor_ids]
+        status[(status == RangeStatus.USED) & np.isin(log.anchor_index, unwanted)] = RangeStatus.UNKNOWN_ANCHOR
+    status[log.kind == RangeKind.ANCHOR_ANCHOR] = RangeStatus.ANCHOR_ANCHOR
+    status[log.kind == RangeKind.TAG_TAG] = RangeStatus.TAG_TAG
+    placed = np.isin(status, (RangeStatus.USED, RangeStatus.UNKNOWN_ANCHOR))
+    before, after = np.where(placed, before, -1), np.where(placed, after, -1)
+    fraction = np.where(placed, fraction, 0.0)
+    # The last row is for the tag index -1, which means no tag.
+    tags_in_cam_m = np.vstack([log.lever_arms(tag_in_cam_m), np.full(3, np.nan)])[log.tag_index]
+    centers, lever = np.full((len(log), 3), np.nan), np.full((len(log), 3), np.nan)
+    offsets, stddev, arm_stddev_m = np.zeros((len(log), 3)), np.zeros(len(log)), np.zeros(len(log))
+    on_path = places_on_path(
+        trajectory,
+        tags_in_cam_m[placed],
+        before[placed],
+        after[placed],
+        fraction[placed],
+        time_resolution_s=log.time_resolution_s,
+        options=options,
+    )
+    centers[placed], offsets[placed], stddev[placed] = on_path.centers, on_path.offsets, on_path.stddev
+    lever[placed], arm_stddev_m[placed] = on_path.arms_m, on_path.arm_stddev_m
+    return RangeObservations(log, status, before, after, fraction, centers, offsets, lever, stddev, arm_stddev_m)
+
+
+def is_too_long(gaps_s: npt.ArrayLike, options: AssociationOptions) -> Mask:
+    """Return which gaps between keyframes (n,) are too long for interpolation, with a tolerance for rounded times."""
+    return np.asarray(gaps_s) > options.max_interpolation_gap_s + ROUNDING_S
+
+
+@dataclass(frozen=True)
+class PlacesOnPath:
+    """Places of n moments on a camera's path.
+
+    Attributes:
+        centers: (n, 3) of the camera. offsets: (n, 3) of these from the straight lines between keyframes. stddev: (n,)
+            of each coordinate. All in model units.
+        arms_m: (n, 3) lever arms in the axes of the model's world. arm_stddev_m: (n,) of each coordinate.
+    """
+
+    centers: Array
+    offsets: Array
+    stddev: Array
+    arms_m: Array
+    arm_stddev_m: Array
+
+
+def places_on_path(
+    trajectory: Trajectory,
+    arms_in_cam_m: Array,
+    before: Indices,
+    after: Indices,
+    fraction: Array,
+    *,
+    time_resolution_s: float,
+    options: AssociationOptions,
+) -> PlacesOnPath:
+    """Return the places of n moments between keyframes, interpolated by a motion model if the keyframes have times.
+
+    Args:
+        arms_in_cam_m: (n, 3) lever arms.
+        before, after, fraction: (n,) keyframes, and the interpolation fraction of the later one.
+        time_resolution_s: step to which the moments were rounded.
+    """
+    num = len(before)
+    if trajectory.timestamps_s is None or len(trajectory) < 2:
+        arms_m = np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms_in_cam_m)
+        offsets, stddev, arm_stddev_m = np.zeros((num, 3)), np.zeros(num), np.zeros(num)
+    else:
+        is_bridged = ~is_too_long(np.diff(trajectory.timestamps_s), options)
+        arms_m, arm_stddev_m = _interpolated_lever_arms(trajectory, arms_in_cam_m, before, fraction, is_bridged)
+        offsets, stddev = _interpolated_centers(trajectory, before, fraction, is_bridged)
+        stddev = np.hypot(stddev, _timing_stddev(time_resolution_s, trajectory, before, after, fraction, options))
+    on_line = (1 - fraction)[:, None] * trajectory.centers[before] + fraction[:, None] * trajectory.centers[after]
+    return PlacesOnPath(on_line + offsets, offsets, stddev, arms_m, arm_stddev_m)
+
+
+def _places_by_time(
+    log: RangeLog, times: Array, keyframe_times: Array, options: AssociationOptions, status: npt.NDArray[np.int8]
+) -> tuple[Indices, Indices, Array]:
+    """Return the keyframes before and after each time, and the fraction of the later one.
+
+    ``status`` is changed where a range has no position on the path.
+    """
+    before, after, fraction, nearest = keyframes_around(times, keyframe_times)
+    gap, distance = keyframe_times[after] - keyframe_times[before], np.abs(times - keyframe_times[nearest])
+    inside = (times >= keyframe_times[0]) & (times <= keyframe_times[-1])
+
+    at_keyframe = distance <= options.max_time_difference_s
+    interpolated = inside & ~is_too_long(gap, options)
+    # Standing still is tested only at keyframes with a long gap on both sides; elsewhere poses are interpolated.
+    long_gap = np.concatenate([[True], is_too_long(np.diff(keyframe_times), options), [True]])
+    lonely = (log.kind == RangeKind.TAG_ANCHOR) & ~interpolated & (long_gap[:-1] & long_gap[1:])[nearest]
+    still = lonely & _camera_is_still(log, nearest, distance, times, lonely, keyframe_times)
+    same_time = distance <= min(_SAME_TIME_S, options.max_time_difference_s)
+    snapped = same_time | ((at_keyframe | still) & ~interpolated)
+
+    before, after = np.where(snapped, nearest, before), np.where(snapped, nearest, after)
+    fraction = np.where(snapped, 0.0, fraction)
+    no_place = ~(snapped | interpolated)
+    status[no_place] = np.where(inside[no_place], RangeStatus.NO_KEYFRAME_NEAR, RangeStatus.OUTSIDE_PATH)
+    return before, after, fraction
+
+
+def _camera_is_still(
+    log: RangeLog, nearest: Indices, distance: Array, times: Array, candidates: Mask, keyframe_times: Array
+) -> Mask:
+    """Return which ranges (n,) near an isolated photo were taken while the camera stood still at that photo.
+
+    In a stop-and-go survey, the ranges around each photo form a burst in which they do not change. The medians of the
+    early and the late half of every burst are compared. Their differences must not exceed what the noise within the
+    halves explains.
+    """
+    still = np.zeros(len(times), dtype=bool)
+    # Up to half of the median gap, a range is nearer to this photo than to the next one.
+    reach = 0.5 * float(np.median(np.diff(keyframe_times))) if len(keyframe_times) > 1 else np.inf
+    near = np.flatnonzero(candidates & (distance <= reach))
+    if len(near) < 8:
+        return still
+    key = nearest[near] * len(log.anchor_ids) + log.anchor_index[near]
+    order = near[np.lexsort((times[near], key))]
+    starts = np.flatnonzero(np.diff(np.sort(key), prepend=-1))
+    drifts, noises = [], []
+    for burst in np.split(log.range_m[order], starts[1:]):
+        if len(burst) >= 6:
+            early, late = np.array_split(burst, 2)
+            drifts.append((np.median(late) - np.median(early)) * np.sqrt(len(burst) / 4))
+            noises.append(robust_stddev(np.concatenate([_deviations(early), _deviations(late)])))
+    if not drifts:
+        return still
+    # The standard deviation of a median is 1.25 times that of a mean.
+    drift_stddev = robust_stddev(drifts)
+    noise_stddev = 1.25 * max(float(np.median(noises)), 1e-3)
+    still[near] = drift_stddev <= _MAX_STILL_DRIFT_STDDEVS * noise_stddev
+    return still
+
+
+def _deviations(values: Array) -> Array:
+    """Return the sorted absolute deviations from the median, without the 0 of the value that is the median itself.
+
+    Among few values that 0 would lower the estimated noise considerably.
+    """
+    return np.sort(np.abs(values - np.median(values)))[len(values) % 2 :]
+
+
+def _interpolated_centers(
+    trajectory: Trajectory, before: Indices, fraction: Array, is_bridged: Mask
+) -> tuple[Array, Array]:
+    """Return the offsets (n, 3) of the centres from the straight lines between keyframes, in model units.
+
+    Also returns the standard deviation (n,) of each coordinate.
+    """
+    assert trajectory.timestamps_s is not None, "a motion in time needs times"
+    motion = learn_motion(trajectory.timestamps_s, trajectory.centers, is_bridged)
+    offsets, stddev = np.zeros((len(before), 3)), np.full(len(before), motion.noise_stddev)
+    between = fraction > 0
+    offsets[between], stddev[between] = motion.beyond_chord(before[between], fraction[between])
+    return offsets, stddev
+
+
+def _interpolated_lever_arms(
+    trajectory: Trajectory, tags_in_cam_m: Array, before: Indices, fraction: Array, is_bridged: Mask
+) -> tuple[Array, Array]:
+    """Return the lever arms (n, 3) in the world, and the standard deviation (n,) of each coordinate, metres.
+
+    The rotation vectors from keyframe to keyframe, in the camera's frame, are summed up and treated as coordinates of a
+    motion. This is valid while successive rotations are small or have the same axis.
+    """
+    assert trajectory.timestamps_s is not None, "a motion in time needs times"
+    to_next = Rotation.from_matrix(np.swapaxes(trajectory.world_from_cam[:-1], 1, 2) @ trajectory.world_from_cam[1:])
+    turned = np.vstack([np.zeros((1, 3)), np.cumsum(to_next.as_rotvec(), axis=0)])
+    motion = learn_motion(trajectory.timestamps_s, turned, is_bridged)
+    stddev = np.full(len(before), motion.noise_stddev)
+    between = fraction > 0
+    beyond, stddev[between] = motion.beyond_chord(before[between], fraction[between])
+    arms = tags_in_cam_m.copy()
+    turns = fraction[between, None] * to_next.as_rotvec()[before[between]] + beyond
+    if len(turns):  # SciPy before 1.16 cannot make an empty set of rotations
+        arms[between] = Rotation.from_rotvec(turns).apply(arms[between])
+    # A rotation moves the end of the arm in two of the three directions.
+    stddev_m = np.sqrt(2 / 3) * stddev * np.linalg.norm(tags_in_cam_m, axis=1)
+    return np.einsum("nij,nj->ni", trajectory.world_from_cam[before], arms), stddev_m
+
+
+def _timing_stddev(
+    log_resolution_s: float,
+    trajectory: Trajectory,
+    before: Indices,
+    after: Indices,
+    fraction: Array,
+    options: AssociationOptions,
+) -> Array:
+    """Return the standard deviation (n,) of each coordinate due to rounded times of photos and ranges, in model units.
+
+    Uniform rounding to a step has the standard deviation step / sqrt(12). It is independent for each time.
+    """
+    times, centers = trajectory.timestamps_s, trajectory.centers
+    log_stddev_s, photo_stddev_s = log_resolution_s / np.sqrt(12), trajectory.time_resolution_s / np.sqrt(12)
+    if times is None or len(times) < 2 or not log_stddev_s + photo_stddev_s > 0:
+        return np.zeros(len(before))
+    gaps = np.diff(times)
+    # Across a long gap ranges are used only if the camera stood still.
+    speeds = np.where(is_too_long(gaps, options), 0, np.linalg.norm(np.diff(centers, axis=0), axis=1) / gaps)
+    around = np.concatenate([[0.0], speeds, [0.0]])
+    speed = np.where(before == after, np.maximum(around[before], around[before + 1]), around[before + 1])
+    photo_share = np.where(before == after, 1.0, np.hypot(1 - fraction, fraction))
+    return np.asarray(speed / np.sqrt(3) * np.hypot(log_stddev_s, photo_share * photo_stddev_s))

@@ -1,0 +1,355 @@
+"""Robust fit of observations to the path at one time offset, with the offset's uncertainty and the drift of the clocks.
+
+The observations are ranges here; ``rangesfm.measurements.positions.clock`` fits the coordinates of positions in the
+same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from scipy import special
+
+from rangesfm.arrays import Array, Indices, rows_by_key
+from rangesfm.measurements.ranges.clock.search import MIN_COVERAGE, AnyObserved, Observed, PathSamples, TimedRanges
+from rangesfm.measurements.ranges.clock.squares import fit_squares, residual_stddev
+from rangesfm.measurements.ranges.errors.noise import STRETCH_S
+from rangesfm.util.geometry.numerics import (
+    MAX_NUM_ROUNDS,
+    NEGLIGIBLE_STDDEVS,
+    NORMAL_95,
+    SIGNIFICANT_STDDEVS,
+    UNDETERMINED,
+)
+
+# Ranges to one anchor within this time count as one independent range, because a carried camera hardly moves in it.
+_CELL_S = 1.0
+SEPARATION_S = 0.5
+"""Offsets that are nearer to each other are one, and no step of a descent is longer."""
+# A descent is given up if its residuals are at least twice a rival's, and the logarithm of the odds exceeds this.
+_FAR_BEHIND, _HOPELESS = float(np.log(2)), 30.0
+# Standard deviation of the bias that all ranges share because of the tag's delay.
+_RANGE_BIAS_STDDEV_M = 0.05
+# Smallest number of blocks of time whose errors count as independent.
+_MIN_NUM_BLOCKS = 12
+# The path explains the ranges if their gain in likelihood is this many standard deviations above 0, with blocks of time
+# as independent samples. For a log of another walk, the best of some hundred offsets reaches 6, by Student's
+# distribution with a dozen blocks.
+_MIN_GAIN_STDDEVS = 7.0
+
+
+class Timing(NamedTuple):
+    """Uncertainty of the time offset, and the drift of the clocks.
+
+    Attributes:
+        stddev_s: standard deviation of the offset; infinite if the motion does not determine it.
+        drift: gain of the camera's clock on the radio's, seconds per second.
+        drift_stddev: standard deviation of the drift.
+    """
+
+    stddev_s: float
+    drift: float
+    drift_stddev: float
+
+
+class RobustFit(Protocol):
+    """Robust fit of n numbers by linear unknowns.
+
+    Attributes:
+        weights: (n,) in [0, 1]. scale: metres per model unit; infinite if it is not determined.
+        num_unknowns: their number. weighted_residuals: (n,) measured minus fitted, times the roots of the weights.
+        basis: (n, p) orthonormal weighted columns of all unknowns.
+    """
+
+    @property
+    def weights(self) -> Array: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def num_unknowns(self) -> int: ...
+    @property
+    def weighted_residuals(self) -> Array: ...
+    @property
+    def basis(self) -> Array: ...
+
+    def unexplained(self, values: Array) -> Array:
+        """Return weighted changes of the numbers (n, k) without the parts that the unknowns can explain."""
+        ...
+
+
+FitAt = Callable[[AnyObserved, PathSamples, float, float], "OffsetFit"]
+"""Fit of observations at an offset, given the metres per model unit (infinity leaves the lever arm out)."""
+
+
+@dataclass(frozen=True)
+class OffsetFit:
+    """Fit of observations to the path at one time offset. Each of them is one of n numbers, or several: coordinates.
+
+    Attributes:
+        offset_s: image time minus the time of the observations.
+        observed: those on the path.
+        solved: fit of the n numbers by the other unknowns.
+        residuals_m: (n,) residuals of that fit, enlarged to account for its number of unknowns.
+        num_spare: number of independent observations beyond the unknowns.
+        deviations_m: (n,) deviations from the median of all that are alike, such as the ranges to one anchor.
+        rates: (n,) derivative of each predicted number by the offset, m/s.
+    """
+
+    offset_s: float
+    observed: Observed
+    solved: RobustFit
+    residuals_m: Array
+    num_spare: int
+    deviations_m: Array
+    rates: Array
+
+    @classmethod
+    def from_solution(
+        cls,
+        offset_s: float,
+        observed: Observed,
+        measured_m: Array,
+        alike: Indices,
+        solved: RobustFit,
+        residuals_m: Array,
+        rates: Array,
+    ) -> OffsetFit:
+        """Make a fit from its solution.
+
+        Args:
+            measured_m: (n,) observed numbers. alike: (n,) index of the series that each belongs to, such as its anchor.
+            residuals_m: (n,) measured minus fitted.
+        """
+        deviations = measured_m.copy()
+        for rows in rows_by_key(alike):
+            deviations[rows] -= np.median(deviations[rows])
+        times_s = np.repeat(observed.times_s, len(measured_m) // max(len(observed.times_s), 1))
+        cells = np.floor(times_s / _CELL_S).astype(np.int64) * (alike.max(initial=0) + 1) + alike
+        num_cells = len(np.unique(cells))
+        num_spare = num_cells - solved.num_unknowns - 1
+        residuals = residuals_m * np.sqrt(num_cells / max(num_spare, 0.5))
+        return cls(offset_s, observed, solved, residuals, num_spare, deviations, rates)
+
+    @property
+    def _num_each(self) -> int:
+        return len(self.residuals_m) // max(len(self.observed.times_s), 1)
+
+    @property
+    def times_s(self) -> Array:
+        """Times of the numbers (n,)."""
+        return np.repeat(self.observed.times_s, self._num_each)
+
+    @property
+    def weights(self) -> Array:
+        """Robust weights of the observations."""
+        return self.solved.weights[:: self._num_each]
+
+    @property
+    def residual_stddev_m(self) -> float:
+        return residual_stddev(self.residuals_m)
+
+    @property
+    def is_testable(self) -> bool:
+        """Return whether there are enough ranges to tell a fit from a coincidence."""
+        return self.num_spare >= self.solved.num_unknowns
+
+    def losses(self, stddev_m: float | None = None) -> Array:
+        """Return the negative log-likelihood of each residual (n,), up to a constant.
+
+        Args:
+            stddev_m: of the residuals; None: their own.
+        """
+        return _losses(self.residuals_m, self.residual_stddev_m if stddev_m is None else stddev_m)
+
+    @cached_property
+    def gains(self) -> Array:
+        """Gain in each range's log-likelihood over a camera that stands still (n,)."""
+        return _losses(self.deviations_m, residual_stddev(self.deviations_m)) - self.losses()
+
+    @property
+    def score(self) -> float:
+        """Mean gain, which is about the logarithm of the ratio of the deviations' size to the residuals'."""
+        return float(self.gains.mean())
+
+    @property
+    def num_independent(self) -> float:
+        """Number of ranges with independent errors that carry the same information.
+
+        It is found from the variation of the losses between blocks of time, which is larger for correlated errors.
+        """
+        losses = self.losses()
+        variance = _variance_of_mean(losses, self.times_s)
+        return min(self.num_spare, float(np.var(losses)) / max(variance, 1e-300))
+
+    def explains(self) -> bool:
+        """Return whether the path explains the ranges better than no motion at all."""
+        least = _MIN_GAIN_STDDEVS * np.sqrt(_variance_of_mean(self.gains, self.times_s))
+        return bool(self.score > least)
+
+    def is_hopeless_beside(self, rival: OffsetFit) -> bool:
+        """Return whether its residuals are so much larger than a rival's that further descent makes no difference."""
+        behind = rival.score - self.score
+        return behind > _FAR_BEHIND and behind * min(self.num_independent, rival.num_independent) > _HOPELESS
+
+    def timing(self) -> Timing:
+        """Return the drift, and standard deviations that account for residuals correlated within blocks of time."""
+        times = self.times_s - self.times_s.mean()
+        own = self.solved.unexplained(np.stack([self.rates, self.rates * times], axis=1))
+        if not _is_determined(own[:, 0], self.rates):
+            return Timing(np.inf, 0.0, np.inf)
+        residuals = self.solved.weighted_residuals
+        change = np.linalg.lstsq(own, residuals, rcond=None)[0]
+        alone = self._variances(own[:, :1], residuals, times)
+        both = self._variances(own, residuals - own @ change, times)
+        return Timing(float(np.sqrt(alone[0])), float(change[1]), float(np.sqrt(both[1])))
+
+    def _variances(self, own: Array, residuals: Array, times: Array) -> Array:
+        """Return the variances (k,) of unknowns with columns ``own`` (n, k), from noise and a bias of all ranges."""
+        # The correlation time is not known. The variance is therefore the mean of the variances with blocks of one, two
+        # and four stretches; short logs have the smallest number of blocks, half of it, and twice as many.
+        usual = max(_MIN_NUM_BLOCKS, float(np.ptp(times)) / (2 * STRETCH_S))
+        blocks = [_blocks(times, round(num)) for num in (usual / 2, usual, 2 * usual)]
+        by_chance = _jackknife_variances(own, residuals, self.solved, blocks)
+        by_bias = np.linalg.lstsq(own, _RANGE_BIAS_STDDEV_M * np.sqrt(self.solved.weights), rcond=None)[0]
+        return np.asarray(np.mean(by_chance, axis=0) + by_bias**2)
+
+
+def fit_at_offset(ranges: TimedRanges, path: PathSamples, offset_s: float, scale: float = np.inf) -> OffsetFit:
+    """Fit the ranges that are on the path at one offset.
+
+    Args:
+        scale: metres per model unit, for the lever arm; infinity leaves the lever arm out.
+    """
+    ranges = ranges.take(path.knows(ranges.times_s + offset_s))
+    points, velocities = path.tag(ranges.times_s + offset_s, ranges.tag, scale)
+    squares = fit_squares(points, ranges.range_m, ranges.anchor)
+    rates = np.einsum("ni,ni->n", squares.gradient, velocities)
+    return OffsetFit.from_solution(offset_s, ranges, ranges.range_m, ranges.anchor, squares, squares.residuals_m, rates)
+
+
+def refine_offset(
+    observed: AnyObserved,
+    path: PathSamples,
+    offset_s: float,
+    rival: OffsetFit | None = None,
+    fit_at: FitAt[Any] = fit_at_offset,
+) -> OffsetFit:
+    """Refine an offset by Gauss-Newton steps to the nearest one that fits the observations best.
+
+    Args:
+        observed: ranges, or what else ``fit_at`` fits, that are (nearly) all on the path at the given offset.
+        path: the path.
+        offset_s: the offset to start from.
+        rival: the refinement stops early if it is far behind this fit; None: there is none.
+    """
+    # The lever arm comes in only after the scale has been estimated.
+    found = fit_at(observed, path, offset_s, fit_at(observed, path, offset_s, np.inf).solved.scale)
+    for _ in range(MAX_NUM_ROUNDS):
+        if rival is not None and found.is_hopeless_beside(rival):
+            break
+        own = found.solved.unexplained(found.rates[:, None])[:, 0]
+        if not _is_determined(own, found.rates):
+            break
+        step_s = float(own @ found.solved.weighted_residuals / (own @ own))
+        if abs(step_s) * np.linalg.norm(own) < NEGLIGIBLE_STDDEVS * found.residual_stddev_m:
+            break
+        offset_s = found.offset_s + float(np.clip(step_s, -SEPARATION_S, SEPARATION_S))
+        if np.mean(path.knows(observed.times_s + offset_s)) < MIN_COVERAGE:
+            break
+        found = fit_at(observed, path, offset_s, found.solved.scale)
+    return found
+
+
+def _losses(errors_m: Array, stddev_m: float) -> Array:
+    """Return the negative log-likelihoods (n,) of errors by a Cauchy distribution.
+
+    Errors that are twice as large, as is their standard deviation, lose log 2.
+    """
+    return np.asarray(np.log(stddev_m) + np.log1p((errors_m / stddev_m) ** 2))
+
+
+def _variance_of_mean(values: Array, times: Array) -> float:
+    """Return the variance of the mean of n values that are correlated within blocks of time."""
+    sums = np.bincount(_blocks(times, max(_MIN_NUM_BLOCKS, int(np.ptp(times) / STRETCH_S))), values - values.mean())
+    return float(sums @ sums) / len(values) ** 2 * len(sums) / max(len(sums) - 1, 1)
+
+
+def _is_determined(own: Array, rates: Array) -> bool:
+    """Return whether the offset changes the ranges in a way that the other unknowns cannot explain."""
+    return bool(own @ own > UNDETERMINED**2 * (rates @ rates))
+
+
+def _blocks(times: Array, num_blocks: int) -> Indices:
+    """Return the index of each range's block of time (n,); empty blocks are not counted."""
+    length_s = max(float(np.ptp(times)) / num_blocks, 1e-9)
+    return np.unique(np.minimum((times - times.min()) // length_s, num_blocks - 1), return_inverse=True)[1]
+
+
+def _jackknife_variances(own: Array, residuals: Array, solved: RobustFit, blocks: Sequence[Indices]) -> list[Array]:
+    """Return the variances (k,) of an M-estimate with residuals correlated within blocks, for each set of blocks.
+
+    This is the delete-one-block jackknife, with one Newton step of all unknowns of the fit for each block (Bell and
+    McCaffrey, Survey Methodology 2002). Sums of residuals over blocks, without the step, are too small where a block's
+    own ranges pull the fit; on short logs they are half as large. Because there are few blocks, the standard deviation
+    is enlarged by the ratio of Student's quantile to the Gaussian one.
+
+    Args:
+        own: (n, k) columns of the unknowns, without the parts that other unknowns explain.
+        residuals: (n,) weighted residuals of the fit ``solved``, metres.
+        solved: the fit.
+        blocks: divisions, each the index (n,) of each range's block.
+    """
+    sizes = np.linalg.norm(own, axis=0)
+    columns = np.column_stack([solved.basis, own / sizes])
+    curving = (2 * solved.weights - 1)[:, None]
+    curvature = columns.T @ (curving * columns)
+
+    def variances(block: Indices) -> Array:
+        changes = []
+        for rows in np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1]):
+            some = columns[rows]
+            left = curvature - some.T @ (curving[rows] * some)
+            if np.linalg.eigvalsh(left)[0] < UNDETERMINED**2:  # the other blocks do not determine all unknowns
+                return np.full(len(sizes), np.inf)
+            changes.append(np.linalg.solve(left, some.T @ residuals[rows])[-len(sizes) :] / sizes)
+        num = len(changes)
+        quantile = float(special.stdtrit(num - 1, 0.975) / special.ndtri(0.975)) if num > 1 else np.inf
+        return np.asarray(quantile**2 * (num - 1) / num * np.sum(np.square(changes), axis=0))
+
+    return [variances(block) for block in blocks]
+
+
+def fit_clocks(ranges: TimedRanges, path: PathSamples, offset_s: float) -> tuple[OffsetFit, Timing, float, float]:
+    """Refine an offset, and if the ranges show a significant drift, offset and drift together.
+
+    Returns:
+        The fit, with the drift removed from the times of its ranges. The uncertainty of the offset, with the drift that
+        is left. The drift, in seconds per second, or 0 if it is not significant. The radio's time at which the offset
+        is valid.
+    """
+    reference_s = float(ranges.times_s.mean())
+    fit = refine_offset(ranges, path, offset_s)
+    timing, followed, least_stddevs = fit.timing(), 0.0, SIGNIFICANT_STDDEVS
+    for _ in range(MAX_NUM_ROUNDS):
+        if not abs(timing.drift) > least_stddevs * timing.drift_stddev:
+            break
+        followed, least_stddevs = followed + timing.drift, NEGLIGIBLE_STDDEVS
+        # The times become those of a radio clock that runs at the rate of the camera's.
+        times_s = ranges.times_s + followed * (ranges.times_s - reference_s)
+        fit = refine_offset(ranges._replace(times_s=times_s), path, fit.offset_s)
+        timing = fit.timing()
+    return fit, timing, followed, reference_s
+
+
+def drift_note(drift: float, stddev: float, times_s: Array) -> str:
+    """Return a message for the user about a drift that was found."""
+    half_span_s = float(np.ptp(times_s)) / 2
+    return (
+        f"the clocks drift: the camera's gains {1e6 * drift:+.0f} ppm on the radio's (within "
+        f"{1e6 * NORMAL_95 * stddev:.0f} ppm, 95 %); the drift is corrected, and the time offset at the end of the log "
+        f"differs by {drift * half_span_s:+.3f} s from that in its middle"
+    )

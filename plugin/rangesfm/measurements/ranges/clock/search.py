@@ -1,0 +1,351 @@
+"""Search over all time offsets: the fit of the ranges at every offset, computed at once by correlation.
+
+The sums in the normal equations of the linear fit (see ``squares``) are correlations in time of the ranges with
+products of |c|^2, c and 1 along the path. Fast Fourier transforms therefore give the best fit at all offsets in one
+pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.ndimage import maximum_filter1d
+
+from rangesfm.arrays import Array, Indices, Mask, rows_by_key
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.clock.offset import CostCurve
+from rangesfm.measurements.ranges.clock.squares import MIN_RANGE_M
+from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeStatus
+from rangesfm.options import AssociationOptions
+from rangesfm.util.geometry.similarity import rounding_of
+from rangesfm.util.geometry.trajectory import Trajectory
+
+# Time between samples of the path, and between offsets: a twentieth of the time in which a walker's motion changes.
+# Linear interpolation between samples is off by less than a millimetre at an acceleration of 3 m/s^2.
+_STEP_S = 0.05
+# Largest number of samples, and of offsets; if path and log together last more than seven hours, the step is longer.
+_MAX_NUM_STEPS = 500_000
+MIN_COVERAGE = 0.5
+"""Fraction of the largest possible number of ranges on the path; an offset that puts fewer there is not tried."""
+# Number of offsets in the curve for the report that are taken from all, and of those nearest to the best one.
+_NUM_SHOWN = 200
+
+
+class Observed(Protocol):
+    """What was observed at n times, such as ranges."""
+
+    @property
+    def times_s(self) -> Array:
+        """(n,) times on the clock of the observing system."""
+        ...
+
+    def take(self: AnyObserved, rows: Indices | Mask) -> AnyObserved:
+        """Return some of the observations."""
+        ...
+
+
+AnyObserved = TypeVar("AnyObserved", bound=Observed)
+
+
+class TimedRanges(NamedTuple):
+    """n ranges: times on the radio's clock, ranges in metres, and indices of anchor and tag."""
+
+    times_s: Array
+    range_m: Array
+    anchor: Indices
+    tag: Indices
+
+    def take(self, rows: Indices | Mask) -> TimedRanges:
+        return TimedRanges(self.times_s[rows], self.range_m[rows], self.anchor[rows], self.tag[rows])
+
+
+@dataclass(frozen=True)
+class PathSamples:
+    """m camera poses, evenly spaced in time.
+
+    Attributes:
+        start_s: time of the first pose, camera's clock.
+        step_s: time between poses.
+        centers: (m, 3) camera centres, model units; 0 where unknown.
+        tag_from_center: (num_tags, m, 3) lever arms in the axes of the world, metres.
+        is_known: (m,) whether the pose is known.
+    """
+
+    start_s: float
+    step_s: float
+    centers: Array
+    tag_from_center: Array
+    is_known: Mask
+
+    def __len__(self) -> int:
+        return len(self.is_known)
+
+    def knows(self, times_s: Array) -> Mask:
+        """Return whether the pose is known at each of the times (n,)."""
+        place = (times_s - self.start_s) / self.step_s
+        inside = (place >= 0) & (place < len(self) - 1)
+        before = np.where(inside, place, 0).astype(np.int64)
+        return np.asarray(inside & self.is_known[before] & self.is_known[np.minimum(before + 1, len(self) - 1)])
+
+    def tag(self, times_s: Array, tag: Indices, scale: float) -> tuple[Array, Array]:
+        """Return positions and velocities of tags' antennas at times at which the pose is known.
+
+        Args:
+            times_s: (n,) times, camera's clock.
+            tag: (n,) index of the tag at each time.
+            scale: metres per model unit; infinity leaves the lever arm out.
+
+        Returns:
+            (n, 3) positions in model units, and (n, 3) velocities in model units per second.
+        """
+        place = (times_s - self.start_s) / self.step_s
+        before = np.clip(place, 0, len(self) - 2).astype(np.int64)
+        points = self.centers + self.tag_from_center / scale
+        here = points[tag, before]
+        step = points[tag, before + 1] - here
+        return here + (place - before)[:, None] * step, step / self.step_s
+
+
+def moving_path(trajectory: Trajectory, tags_in_cam_m: Array, options: AssociationOptions) -> PathSamples:
+    """Sample the path where poses are interpolated between keyframes.
+
+    Args:
+        tags_in_cam_m: (num_tags, 3) lever arms, metres.
+    """
+    assert trajectory.timestamps_s is not None, "a path in time needs times"
+    start_s = float(trajectory.timestamps_s[0])
+    span_s = float(trajectory.timestamps_s[-1]) - start_s
+    step_s = max(_STEP_S, span_s / _MAX_NUM_STEPS)
+    times = start_s + step_s * np.arange(int(span_s / step_s) + 1)
+    probe = RangeLog.from_arrays(["probe"] * len(times), np.ones(len(times)), timestamp_s=times)
+    # With a negative tolerance, a sample next to a keyframe is interpolated like all others.
+    options = options.model_copy(update={"max_time_difference_s": -1.0})
+    by_tag = [associate(probe, trajectory, tag_in_cam_m, options=options) for tag_in_cam_m in tags_in_cam_m]
+    places = by_tag[0]
+    is_known = (places.status == RangeStatus.USED) & (places.before != places.after)
+    known = is_known[:, None]
+    tag_from_center = np.stack([np.where(known, places_of_tag.tag_from_center, 0.0) for places_of_tag in by_tag])
+    return PathSamples(start_s, step_s, np.where(known, places.centers, 0.0), tag_from_center, is_known)
+
+
+def on_path(observed: AnyObserved, path: PathSamples, offset_s: float, max_num: int) -> AnyObserved:
+    """Return the first observations that are on the path at an offset, at most ``max_num``."""
+    return observed.take(np.flatnonzero(path.knows(observed.times_s + offset_s))[:max_num])
+
+
+@dataclass(frozen=True)
+class OffsetCurve(CostCurve):
+    """Cost and score of m offsets that put a large enough fraction of the ranges on the path.
+
+    Attributes:
+        scores: (m,) natural logarithm of the ratio of the ranges' own variation to their residuals; 0 if the path
+            explains nothing.
+    """
+
+    scores: Array
+
+    def around(self, best_s: float) -> CostCurve:
+        """Return a curve for the report: the best offset of each interval, and those nearest to the best one of all."""
+        fine = np.argsort(np.abs(self.offsets_s - best_s))[:_NUM_SHOWN]
+        stretches = np.array_split(np.arange(len(self.offsets_s)), min(_NUM_SHOWN, len(self.offsets_s)))
+        coarse = [rows[np.argmin(self.costs_m[rows])] for rows in stretches]
+        shown = np.unique(np.concatenate([fine, coarse]))
+        return CostCurve(self.offsets_s[shown], self.costs_m[shown])
+
+    def peaks(self, separation_s: float, max_num: int) -> list[float]:
+        """Return the offsets whose score is the highest within ``separation_s``, the best first."""
+        if len(self.offsets_s) < 2:
+            return list(map(float, self.offsets_s))
+        step_s = float(np.median(np.diff(self.offsets_s)))
+        highest = maximum_filter1d(self.scores, 2 * round(separation_s / step_s) + 1)
+        peaks = np.flatnonzero(self.scores == highest)
+        best = peaks[np.argsort(-self.scores[peaks], kind="stable")[:max_num]]
+        return list(map(float, self.offsets_s[best]))
+
+
+def scan_offsets(ranges: TimedRanges, path: PathSamples, weights: Array | None = None) -> OffsetCurve:
+    """Compute cost and score of every offset at which log and path overlap, without the lever arm.
+
+    The lever arm makes little difference at this resolution.
+
+    Args:
+        ranges: n ranges in any order.
+        path: a path with at least one known pose.
+        weights: (n,) weights of the ranges; None: equal weights.
+    """
+    weights = np.ones(len(ranges.range_m)) if weights is None else weights
+    return scan_parts(ranges.times_s, path, lambda rows: _scan(ranges.take(rows), weights[rows], path))
+
+
+def scan_parts(times_s: Array, path: PathSamples, scan: Callable[[Indices], Scanned]) -> OffsetCurve:
+    """Join what was computed for the parts of a log, without the offsets that put few observations on the path.
+
+    Args:
+        times_s: (n,) of the observations. scan: returns the result for some of them.
+    """
+    scanned: list[Scanned] = []
+    most = 0.0
+    for rows in sorted(_parts(times_s, len(path) * path.step_s), key=len, reverse=True):
+        if len(rows) < MIN_COVERAGE * most:
+            break
+        scanned.append(scan(rows))
+        most = max(most, float(scanned[-1].num_on_path.max()))
+    num_on_path, offsets, variation, residual = (np.concatenate(column) for column in zip(*scanned))
+    tried = np.flatnonzero(num_on_path >= max(1.0, MIN_COVERAGE * most))
+    order = tried[np.argsort(offsets[tried], kind="stable")]
+    floor = 1e-12 * max(float(variation.max()), 1e-300)
+    left, whole = np.maximum(residual[order], floor), np.maximum(variation[order], floor)
+    costs = np.sqrt(left / np.maximum(num_on_path[order], 1.0))
+    return OffsetCurve(offsets[order], costs, 0.5 * np.log(whole / left))
+
+
+def _parts(times: Array, path_span_s: float) -> list[Indices]:
+    """Split the rows of the log at pauses longer than the path, because no offset puts both sides on the path.
+
+    A clock that starts at zero and is set to the date later therefore causes no huge search.
+    """
+    order = np.argsort(times, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(times[order]) > path_span_s) + 1)
+
+
+class Scanned(NamedTuple):
+    """Sums over the observations on the path at m offsets, with the best fit at each.
+
+    Attributes:
+        num_on_path: (m,) sums of weights. offsets_s: (m,).
+        variation, residual: (m,) sums of squares of what is to be explained, and of what is left of it, square metres.
+    """
+
+    num_on_path: Array
+    offsets_s: Array
+    variation: Array
+    residual: Array
+
+
+class Cells(NamedTuple):
+    """The times of n observations as cells of a grid that samples of the path share, to correlate them.
+
+    Attributes:
+        cell: (n,) index of each observation's cell. stride: every so many samples are on the grid.
+        correlate: correlations of samples with cells. offsets_s: (m,) of these.
+    """
+
+    cell: Indices
+    stride: int
+    correlate: Correlation
+    offsets_s: Array
+
+    @classmethod
+    def from_times(cls, times_s: Array, path: PathSamples) -> Cells:
+        """Lay a grid that is as fine as the samples of the path, or coarser for very long logs."""
+        first_s, last_s = float(times_s.min()), float(times_s.max())
+        span_s = len(path) * path.step_s + last_s - first_s
+        stride = max(1, round(span_s / (_MAX_NUM_STEPS * path.step_s)))
+        step_s, num = stride * path.step_s, len(range(0, len(path), stride))
+        cell = np.rint((times_s - first_s) / step_s).astype(np.int64)
+        correlate = Correlation(num, int(cell.max()) + 1)
+        offsets = path.start_s - first_s + step_s * np.arange(1.0 - correlate.num_cells, num)
+        return cls(cell, stride, correlate, offsets)
+
+    def transform(self, values: Array) -> npt.NDArray[np.complex128]:
+        """Return the transform of the sums of (n,) values in the cells."""
+        sums = np.bincount(self.cell, values, minlength=self.correlate.num_cells)
+        return self.correlate.transform(sums.astype(np.float64))
+
+
+def _scan(ranges: TimedRanges, weights: Array, path: PathSamples) -> Scanned:
+    """Return the result for one part of the log."""
+    cells = Cells.from_times(ranges.times_s, path)
+    columns = centred_columns(path, cells.stride)
+    pairs = combinations_with_replacement(range(columns.shape[1]), 2)
+    products = {(i, j): cells.correlate.transform(columns[:, i] * columns[:, j]) for i, j in pairs}
+
+    sums = np.zeros((5, cells.correlate.num_offsets))
+    for rows in rows_by_key(ranges.anchor):
+        of_anchor = cells._replace(cell=cells.cell[rows])
+        sums += _sums_of_anchor(ranges.range_m[rows], weights[rows], of_anchor, products)
+    num, variation, without, column, cross = sums
+    scale_squared = np.maximum(cross, 0.0) / np.maximum(column, 1e-12)
+    residual = without - 2 * scale_squared * cross + scale_squared**2 * column
+    return Scanned(num, cells.offsets_s, variation, residual)
+
+
+def centred_columns(path: PathSamples, stride: int) -> Array:
+    """Return the columns (m, 5) in which the squared range is linear: |c|^2, c and 1, with c centred and scaled.
+
+    Rows off the path are 0.
+    """
+    known = path.is_known[::stride, None]
+    num_known = max(int(np.count_nonzero(known)), 1)
+    centers = path.centers[::stride]
+    least = rounding_of(centers)
+    centers = np.where(known, centers - centers.sum(axis=0) / num_known, 0.0)
+    spread = float(np.sqrt(np.sum(centers**2) / num_known))
+    centers = centers / spread if spread > least else np.zeros_like(centers)
+    return np.column_stack([np.sum(centers**2, axis=1, keepdims=True), centers, known])
+
+
+class Correlation:
+    """Correlations in time of cells of the log with samples of the path, at every shift at which they overlap."""
+
+    def __init__(self, num_samples: int, num_cells: int):
+        self.num_samples, self.num_cells = num_samples, num_cells
+        self.num_offsets = num_samples + num_cells - 1
+        self._size = next_fast_len(self.num_offsets, real=True)
+
+    def transform(self, values: Array) -> npt.NDArray[np.complex128]:
+        return np.asarray(rfft(values, self._size))
+
+    def __call__(self, samples: npt.NDArray[np.complex128], cells: npt.NDArray[np.complex128]) -> Array:
+        """Return the correlation (num_offsets,) from both transforms.
+
+        At the first offset, the last cell is on the first sample.
+        """
+        around = irfft(samples * np.conj(cells), self._size)
+        return np.concatenate([around[self._size - self.num_cells + 1 :], around[: self.num_samples]])
+
+
+def _sums_of_anchor(
+    range_m: Array,
+    weights: Array,
+    cells: Cells,
+    products: dict[tuple[int, int], npt.NDArray[np.complex128]],
+) -> Array:
+    """Return five weighted sums over the ranges of one anchor on the path (5, num_offsets).
+
+    They are the sum of weights; the squared deviation from the anchor's mean; its part that c and 1 do not explain; the
+    squared part of the column |c|^2 that c and 1 do not explain; and the product of both unexplained parts.
+    """
+    squared = range_m**2 - np.median(range_m**2)
+    # Division by the derivative of rho^2 converts residuals back to metres.
+    weight = weights / (2 * np.maximum(range_m, MIN_RANGE_M)) ** 2
+
+    correlate = cells.correlate
+    own_weights, weighted = cells.transform(weight), cells.transform(weight * squared)
+    ones = max(products)[0]  # the last of the columns, from 0
+    normal = np.empty((correlate.num_offsets, ones + 1, ones + 1))
+    for (i, j), product in products.items():
+        normal[:, i, j] = normal[:, j, i] = correlate(product, own_weights)
+    right = np.stack([correlate(products[i, ones], weighted) for i in range(ones + 1)], axis=1)
+    total = correlate(products[ones, ones], cells.transform(weight * squared**2))
+    num = correlate(products[ones, ones], cells.transform(weights))
+
+    # The anchor's own unknowns are eliminated, and the unexplained parts are summed over the anchors.
+    own = normal[:, 1:, 1:] + (1e-6 * normal[:, ones, ones] + 1e-9 * weight.sum())[:, None, None] * np.eye(ones)
+    solved = np.linalg.solve(own, np.stack([normal[:, 1:, 0], right[:, 1:]], axis=2))
+    return np.stack(
+        [
+            num,
+            np.maximum(total - right[:, ones] ** 2 / own[:, -1, -1], 0.0),
+            total - np.einsum("mi,mi->m", right[:, 1:], solved[:, :, 1]),
+            normal[:, 0, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 0]),
+            right[:, 0] - np.einsum("mi,mi->m", normal[:, 1:, 0], solved[:, :, 1]),
+        ]
+    )

@@ -1,0 +1,121 @@
+"""Noise of ranges: its components in bins of ranges, with their sizes in the population of radios, or as learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.measurements.ranges.errors.components import COMPONENTS, LEARNT_CURVE, OtherError
+from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
+from rangesfm.measurements.ranges.errors.range_bins import RangeBins
+from rangesfm.solver.bending import BENDS
+from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes
+
+# With more noise than usual all other components may be larger too, to this power: an old radio with five times the
+# noise reads 7 % too long, while the others are right to a percent.
+_WIDENING_POWER = 1.5
+
+
+@dataclass(frozen=True)
+class LearnedErrors(Noise):
+    """Errors of c bins of ranges.
+
+    Attributes:
+        bins: of the ranges.
+        of_range: (n,) bin of each range; -1 for a range that did not take part.
+        unlikeliness: -2 times the logarithm of the prior probability of these standard deviations.
+    """
+
+    bins: RangeBins
+    of_range: Indices
+    unlikeliness: float = 0.0
+
+    @classmethod
+    def from_noise(cls, noise: Noise, bins: RangeBins) -> LearnedErrors:
+        """Return the errors of bins."""
+        return cls(noise.names, noise.stddevs, noise.covariances_m2, bins, bins.of_range)
+
+    def subset(self, rows: Indices) -> LearnedErrors:
+        """Return the errors of some of the ranges."""
+        return replace(self, of_range=self.of_range[rows])
+
+    def spread(self, rows: Indices, num: int) -> LearnedErrors:
+        """Return the errors as ``rows`` of ``num`` ranges; the others do not take part."""
+        of_range = np.full(num, -1, dtype=np.int64)
+        of_range[rows] = self.of_range
+        return replace(self, of_range=of_range)
+
+
+def radio_components(
+    bins: RangeBins,
+    curve_stddev_m: Array | None = None,
+    ruled_out: Collection[str] = (),
+    others_m2: Mapping[OtherError, Array] | None = None,
+) -> tuple[Component, ...]:
+    """Return the components of the errors of c bins of ranges, without those of the map.
+
+    Args:
+        curve_stddev_m: (n,) of a learnt error curve that was subtracted; None if none was.
+        ruled_out: names of components that the user knows to be absent.
+        others_m2: (c, c) covariances of further errors, by name, which are not learnt.
+    """
+    # With one tag, its own bias is the common bias.
+    left_out = {*ruled_out, *(() if np.ptp(bins.tag_index) else ("tag_bias",))}
+    of_anchor, is_calibrated = np.outer(bins.noisiness, bins.noisiness), curve_stddev_m is not None
+    found = [
+        Component(
+            each.name,
+            each.correlation(bins) * (of_anchor if each.is_of_anchor else 1.0),
+            each.median_if(is_calibrated),
+            each.spread,
+        )
+        for each in COMPONENTS
+        if each.name not in left_out
+    ]
+    known = dict(others_m2 or {})
+    if curve_stddev_m is not None:
+        stddev = bins.mean(curve_stddev_m)
+        smooth = next(each for each in COMPONENTS if each.name == "curve")
+        known[LEARNT_CURVE] = np.outer(stddev, stddev) * smooth.correlation(bins)
+    return (*found, *(Component(name, covariance) for name, covariance in known.items()))
+
+
+def widened(components: Sequence[Component], noise_m: float) -> tuple[Component, ...]:
+    """Return the components of the errors of ranges with this noise, of which a noisier radio than usual has more."""
+    larger = max(1.0, noise_m / START_STDDEV_M) ** (2 * _WIDENING_POWER)
+    # Bending does not depend on the radio, and the noise is measured itself.
+    return tuple(
+        replace(each, alike=larger * each.alike) if each.spread > 0 and each.name not in (*BENDS, "white") else each
+        for each in components
+    )
+
+
+def learn_errors(
+    components: Sequence[Component],
+    bins: RangeBins,
+    off_m: Array,
+    design: Array,
+    prior_design: Array,
+    noise_m: float,
+    most_unusual: float = np.inf,
+    near: LearnedErrors | None = None,
+) -> LearnedErrors:
+    """Learn the sizes of the components of the errors of c bins, as ``learnt_sizes``.
+
+    Args:
+        components: of a radio with usual noise.
+        off_m, design, prior_design: (c,), (c, p), (r, p), without any bias.
+        noise_m: standard deviation of single ranges.
+        most_unusual: largest standard deviation of a radio's error above its median, in spreads over radios. A map may
+            bend by any amount.
+        near: errors of nearly the same problem, to start from.
+    """
+    given = widened(components, noise_m)
+    most = {each.name: most_unusual for each in given if each.name not in BENDS}
+    sizes = learnt_sizes(given, off_m, design, prior_design, most, None if near is None else near.stddev_of_component)
+    off = [np.log(sizes[each.name] / each.median) / each.spread for each in given if each.spread > 0]
+    learned = LearnedErrors.from_noise(noise_of_sizes(given, sizes, len(bins)), bins)
+    return replace(learned, unlikeliness=float(np.sum(np.square(off))))

@@ -1,0 +1,147 @@
+"""What the log of a radio measures: ranges to anchors, and lengths between anchors that ranged to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.measurements.kind import MapState, Measurements
+from rangesfm.measurements.lengths.cost import Lengths
+from rangesfm.measurements.points import NamedPoints
+from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.measurements.ranges.cost import Ranges, antenna_places
+from rangesfm.measurements.ranges.errors.noise import shared_stddev
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
+from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
+from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.source import MapToFit, Source
+from rangesfm.options import RefineOptions
+from rangesfm.util.geometry.similarity import Similarity
+from rangesfm.util.geometry.trajectory import Trajectory
+
+# Standard deviation of the median of normally distributed values over that of their mean: sqrt(pi / 2).
+_MEDIAN_OVER_MEAN = 1.2533
+
+
+def ranges_of_map(
+    trajectory: Trajectory,
+    observations: RangeObservations,
+    metric_from_sfm: Similarity,
+    tag_in_cam_m: npt.ArrayLike,
+    anchors: Sequence[AnchorEstimate],
+    errors: RangeErrors,
+    options: RefineOptions,
+) -> Ranges:
+    """Return the ranges of a log on a metric map; arguments as for ``refine_with_ranges``."""
+    places, tags_in_cam_m = antenna_places(trajectory, observations, metric_from_sfm, tag_in_cam_m)
+    rows = observations.placed_rows
+    return Ranges(
+        observations,
+        places,
+        tags_in_cam_m,
+        tuple(anchors),
+        errors.subset(rows),
+        np.zeros((len(observations.log), 0)),
+        options,
+        metric_from_sfm.scale,
+    )
+
+
+@dataclass(frozen=True)
+class RadioLog(Source):
+    """The ranges of a log on a metric map."""
+
+    ranges: Ranges
+
+    @property
+    def placed_points(self) -> Iterable[str]:
+        """Names of the anchors with a position."""
+        return (each.anchor_id for each in self.ranges.anchors if np.isfinite(each.position_m).all())
+
+    @property
+    def places_map(self) -> bool:
+        """True if anchors are surveyed."""
+        return any(np.isfinite(each.prior_position_stddev_m) for each in self.ranges.anchors)
+
+    def measurements(self, at: MapToFit) -> Iterator[Measurements]:
+        """Yield the ranges to anchors, and the lengths between anchors, if there are any."""
+        ranges = self.ranges
+        if len(ranges.rows):
+            ranges = ranges.begun(MapState(at.poses, ranges.blocks))
+            yield ranges
+        if len((by_radio := _between_anchors(ranges, at.points)).ends):
+            yield by_radio
+
+
+def _between_anchors(ranges: Ranges, points: NamedPoints) -> Lengths:
+    """Return the lengths between anchors that ranged to each other."""
+    anchors, used_m = ranges.anchors, ranges.errors.stddev_m
+    found = lengths_by_radio(
+        ranges.observations.log,
+        float(np.median(used_m)) if len(used_m) else 0.0,
+        np.array([anchor.prior_bias_m for anchor in anchors]),
+        np.array([anchor.prior_bias_stddev_m for anchor in anchors]),
+        common_bias_stddev_m=0.0,
+    )
+    ends = [tuple(anchors[k].anchor_id for k in pair) for pair in found.anchor_pair.tolist()]
+    rows = [row for row, pair in enumerate(ends) if points.anchors.issuperset(pair)]
+    return Lengths(
+        tuple((ends[row][0], ends[row][1]) for row in rows),
+        points,
+        found.distance_m[rows],
+        found.stddev_m[rows],
+        {},
+        bias_stddev_m=ranges.errors.common_bias_stddev_m,
+        loss=ranges.errors.loss,
+    )
+
+
+class LengthsByRadio(NamedTuple):
+    """Lengths between k pairs of anchors.
+
+    Attributes:
+        anchor_pair: (k, 2) indices of the two anchors. distance_m, stddev_m: (k,) length and its standard deviation.
+    """
+
+    anchor_pair: Indices
+    distance_m: Array
+    stddev_m: Array
+
+
+def lengths_by_radio(
+    log: RangeLog, noise_m: float, bias_m: Array, bias_stddev_m: Array, common_bias_stddev_m: float
+) -> LengthsByRadio:
+    """Return one length for each pair of anchors that ranged: the median of their ranges in both directions.
+
+    All ranges of a pair share the error from the same delays and reflections, so that many are hardly better than one.
+    A bias belongs to an anchor's ranges with the tag. Ranges between two anchors get the mean of their two biases.
+
+    Args:
+        noise_m: standard deviation of a range for which the log gives none.
+        bias_m, bias_stddev_m: (num_anchors,) known bias of each anchor's ranges, and its standard deviation.
+        common_bias_stddev_m: standard deviation of the bias that all ranges between anchors share.
+    """
+    ranges = log.peer_ranges(RangeKind.ANCHOR_ANCHOR)
+    range_m, given = log.range_m[ranges.rows], log.range_stddev_m[ranges.rows]
+    pairs, index = np.unique(np.sort(ranges.ends, axis=1), axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    count = np.bincount(index, minlength=len(pairs))
+    noise = np.where(np.isfinite(given), given, noise_m)
+    medians = np.array([np.median(range_m[index == k]) for k in range(len(pairs))])
+    mean_square = np.bincount(index, noise**2, len(pairs)) / count
+    shared = np.bincount(index, shared_stddev(log)[ranges.rows], len(pairs)) / count
+    first, second = pairs.reshape(-1, 2).T
+    variance = _MEDIAN_OVER_MEAN**2 * mean_square / count + shared**2 + common_bias_stddev_m**2
+    variance += bias_stddev_m[first] ** 2 + bias_stddev_m[second] ** 2
+    corrected_m = medians - (bias_m[first] + bias_m[second]) / 2
+    return LengthsByRadio(pairs.reshape(-1, 2), corrected_m, np.sqrt(variance))
+
+
+def ranges_of(kinds: Sequence[Measurements], given: Ranges) -> Ranges:
+    """Return the ranges among the measurements of a map; those that were given if none takes part."""
+    return next((kind for kind in kinds if isinstance(kind, Ranges)), given)

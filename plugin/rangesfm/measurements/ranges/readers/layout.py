@@ -1,0 +1,479 @@
+"""Layout of a table of text, found from its first rows: separator, header row, and the form of the cells.
+
+Logs in which every value comes with its name are tables, too: JSON, ``rostopic echo``, ``anchor=A1 range=2.34``, and
+GSI files of surveying instruments.
+"""
+
+from __future__ import annotations
+
+import ast
+import csv
+import json
+import re
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import InputError
+from rangesfm.measurements.ranges.readers.gsi import gsi_records, is_gsi
+from rangesfm.measurements.ranges.readers.times import CIVIL_TIME, TIME_OF_DAY, spelt_date, time_in_front
+from rangesfm.measurements.ranges.readers.vocabulary import LENGTHS, TIMES, words_of
+from rangesfm.util.files.folders import IMAGE_EXTENSIONS
+from rangesfm.util.files.text_tables import MAX_NUMBER, TextTable, read_head, read_text
+
+# fmt: off
+MISSING = (
+    "", "nan", "-nan", "inf", "-inf", "none", "null", "nil", "na", "n/a", "#n/a", "-", "--",
+    "timeout", "error", "err", "fail", "failed", "invalid", "lost",
+)
+# fmt: on
+"""Texts in small letters of a cell that holds no number."""
+
+_SEPARATORS = "\t;|, "  # the comma and the blank come last, because numbers may contain commas and times blanks
+_NUM_ROWS = 1000  # rows from which the layout is found
+_MOST_OF_LIST = 64  # lines of a list that somebody wrote
+_MAX_NUM_WORDS = 20  # lines of text before the table
+_MAX_SHARE_OF_WORDS = 0.02  # lines of text inside the table, as a share of all
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", re.ASCII)
+# Numbers whose thousands are set apart: 2,600,000.5, 2.600.000,5, and 2'600'000.5 or with blanks.
+_THOUSANDS = {
+    ",": re.compile(r"[-+]?\d{1,3}(?:,\d{3})+\.\d+", re.ASCII),
+    ".": re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+", re.ASCII),
+    "'\u2019 \xa0\u202f": re.compile(r"[-+]?\d{1,3}(?:['\u2019 \xa0\u202f]\d{3})+(?:[.,]\d+)?", re.ASCII),
+}
+_GROUPED = re.compile(r"[-+]?\d[\d,.'\u2019 \xa0\u202f]*", re.ASCII)
+_WITH_UNIT = re.compile(rf"({_DECIMAL_COMMA.pattern}|{_NUMBER.pattern}) ?([A-Za-z]+)", re.ASCII)
+_DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}", re.ASCII)
+_UNITS = {*TIMES, *LENGTHS, "dbm"} - {"d", "h"}  # 1d may be an id
+
+NamedValues = dict[str, str]
+_BLOCK = "\n---\n"  # end of a message of rostopic echo
+_NAMED = re.compile(r"(?<![\w.:/])([A-Za-z]\w*)(?: ?= ?|: +)(\"[^\"]*\"|[^\s,;\[\]{}]+)", re.ASCII)
+_KEY = re.compile(r"([A-Za-z_]\w*):(?: +(.*))?", re.ASCII)
+# Smallest share of lines or blocks with named values, and of lines with JSON, in a file of records. Boards print other
+# lines beside JSON.
+_MIN_SHARE_NAMED, _MIN_SHARE_JSON = 0.9, 0.5
+
+
+@dataclass(frozen=True)
+class Cure:
+    """Conversion of the cells of a column to the usual form; a cell that has another form is left as it is.
+
+    Attributes:
+        unit: unit after each number, which is removed.
+        thousands: characters that set thousands apart, which are removed; "" if there are none.
+        commas: whether numbers have decimal commas.
+        are_dates: whether the cells are dates in another form than 2026-01-31.
+    """
+
+    unit: str = ""
+    thousands: str = ""
+    commas: bool = False
+    are_dates: bool = False
+
+    def __call__(self, cell: str) -> str:
+        if self.are_dates:
+            return spelt_date(cell) or cell
+        found = _WITH_UNIT.fullmatch(cell) if self.unit else None
+        number = found[1] if found and found[2] == self.unit else cell
+        if self.thousands and _GROUPED.fullmatch(number):
+            number = re.sub(f"[{re.escape(self.thousands)}]", "", number).replace(",", ".")
+        return number.replace(",", ".") if self.commas and _DECIMAL_COMMA.fullmatch(number) else number
+
+
+@dataclass(frozen=True)
+class ColumnSample:
+    """A column with its name and its first cells.
+
+    Attributes:
+        name: name of the column.
+        cells: its first cells.
+        unit: unit after each of its numbers, "" if there is none.
+        cure: conversion of its cells, which has been applied to ``cells``; None if none is needed.
+    """
+
+    name: str
+    cells: tuple[str, ...]
+    unit: str = ""
+    cure: Cure | None = None
+
+    @cached_property
+    def words(self) -> list[str]:
+        return words_of(f"{self.name} {self.unit}")
+
+    @cached_property
+    def numbers(self) -> Array:
+        """Values of the cells that are numbers of a size with which one can calculate."""
+        values = np.array([float(cell) for cell in self.cells if _NUMBER.fullmatch(cell)], np.float64)
+        return values[np.abs(values) <= MAX_NUMBER]
+
+    @cached_property
+    def filled(self) -> list[str]:
+        return [cell for cell in self.cells if cell.lower() not in MISSING]
+
+    @cached_property
+    def kind(self) -> str:
+        """Kind of the cells that are not empty: "numbers", "times" (civil times), "dates", "text" or "nothing"."""
+        patterns = {"numbers": (_NUMBER,), "times": (CIVIL_TIME, TIME_OF_DAY), "dates": (_DATE,)}
+        for kind, those in patterns.items():
+            if self.filled and all(any(pattern.fullmatch(cell) for pattern in those) for cell in self.filled):
+                return kind
+        return "text" if self.filled else "nothing"
+
+    @cached_property
+    def is_without_zone(self) -> bool:
+        """Whether the cells are civil times some of which do not say their zone."""
+        return self.kind == "times" and not all(
+            (match := CIVIL_TIME.fullmatch(cell)) and match[5] for cell in self.filled
+        )
+
+    @cached_property
+    def is_whole(self) -> bool:
+        return self.kind == "numbers" and bool(np.all(self.numbers == np.round(self.numbers)))
+
+    @cached_property
+    def num_distinct(self) -> int:
+        return len(set(self.cells))
+
+    @cached_property
+    def names_photos(self) -> bool:
+        return bool(self.cells) and all(cell.lower().endswith(IMAGE_EXTENSIONS) for cell in self.cells)
+
+    def cured(self) -> ColumnSample:
+        """Return the column with numbers and dates in the usual form: decimal points, no units, 2026-01-31."""
+        if self.filled and all(map(spelt_date, self.filled)):
+            return self._with(Cure(are_dates=True))
+        units = {match[2] if (match := _WITH_UNIT.fullmatch(cell)) else "" for cell in self.filled}
+        unit = next(iter(units)) if len(units) == 1 else ""
+        cure = Cure(unit if unit.lower() in _UNITS else "")
+        cells = [*map(cure, self.filled)]
+        apart = (marks for marks, pattern in _THOUSANDS.items() if any(map(pattern.fullmatch, cells)))
+        cure = replace(cure, thousands=next(apart, ""), commas=any(map(_DECIMAL_COMMA.fullmatch, cells)))
+        return self if cure == Cure() else self._with(cure)
+
+    def _with(self, cure: Cure) -> ColumnSample:
+        return replace(self, cells=tuple(map(cure, self.cells)), unit=cure.unit, cure=cure)
+
+    def __str__(self) -> str:
+        if self.kind == "numbers" and len(self.numbers):
+            return f"{self.name} ({self.numbers.min():.10g} to {self.numbers.max():.10g})"
+        return f"{self.name} ({self.kind}{'' if self.kind == 'nothing' else f', {self.cells[0]!r}'})"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Layout of a table of text.
+
+    Attributes:
+        columns: the columns with the cells of the first rows.
+        has_names: whether the file names its columns.
+        read_cells: reads all rows as they are in the file, with lines for the user about them. The argument is that of
+            ``read``.
+        are_records: whether the rows are records, in which values may be missing.
+    """
+
+    columns: tuple[ColumnSample, ...]
+    has_names: bool
+    read_cells: Callable[[bool], tuple[TextTable, list[str]]]
+    are_records: bool = False
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit after the numbers of each column, by the column's name."""
+        return {column.name: column.unit for column in self.columns}
+
+    def read(self, *, every_row: bool = False) -> tuple[TextTable, list[str]]:
+        """Read all rows, with lines for the user about them.
+
+        Args:
+            every_row: whether a line that is not a row of the table is an error. Otherwise a few are left out.
+
+        Raises:
+            InputError: lines are not rows of the table.
+        """
+        table, notes = self.read_cells(every_row)
+        cures = {column.name: column.cure for column in self.columns if column.cure}
+        cured = {name: [*map(cure, table.text(name, empty=""))] for name, cure in cures.items()}
+        notes += ["numbers have decimal commas"] if any(cure.commas for cure in cures.values()) else []
+        return replace(table, cells={**table.cells, **cured}), notes
+
+
+def layout_without_header(path: Path, header: Sequence[str], separator: str) -> Layout:
+    """Return the layout of a file without a header row that is known to have these columns."""
+    columns = tuple(ColumnSample(name, ()) for name in header)
+    return Layout(columns, True, lambda every_row: _read_rows(path, header, separator, 0, (), every_row))
+
+
+def find_layout(path: Path, separator: str = "") -> Layout | None:
+    """Find the layout of a file; None if it has no table."""
+    if table := _read_records(path):
+        first_rows = (ColumnSample(name, tuple(table.text(name, empty="")[:_NUM_ROWS])) for name in table.columns)
+        return Layout(tuple(column.cured() for column in first_rows), True, lambda _: (table, []), True)
+    lines = read_head(path).split("\n")
+    # The last line may be cut off, where the beginning ends or the recording did, but not in a short list.
+    whole = lines if len(lines) <= _MOST_OF_LIST else lines[:-1]
+    numbered = [(number, line) for number, line in enumerate(whole, 1) if line.strip()]
+    content = [(number, line) for number, line in numbered if not _is_comment(line)][:_NUM_ROWS]
+    split = next(filter(None, (_split(content, one) for one in separator or _SEPARATORS)), None)
+    if split is None:
+        return None
+    rows, separator = split
+    num = Counter(map(len, rows)).most_common(1)[0][0]
+    first = next(k for k, row in enumerate(rows) if len(row) == num)
+    if first and len(rows[first - 1]) == num - 1 and not any(row[-1] for row in rows[first:] if len(row) == num):
+        first -= 1  # the rows end in a separator and the header does not
+    elif first and len(rows[first - 1]) == num + 1 and not rows[first - 1][-1]:
+        first -= 1  # the header ends in a separator and the rows do not
+        rows[first] = rows[first][:-1]
+    while separator == " " and _is_title(rows[first:], num):
+        first += 1
+    body = [row for row in rows[first:] if len(row) == num]
+    names, num_skipped = None, content[first][0] - 1
+    below = body[1:] if len(rows[first]) == num else body
+    again = [row for row in below if row != rows[first]]  # in joined files the header row is repeated
+    if _is_header(rows[first], again) or _is_header(rows[first], again[1:]):
+        names, num_skipped, body = rows[first], content[first][0], again
+        if len(body) > 1 and len(names) == num and _is_second_header(body[0], body[1:]):
+            names, num_skipped = [" ".join(both) for both in zip(names, body[0])], content[first + 1][0]
+            body = body[1:]
+    elif comments := [line for number, line in numbered if number < content[first][0] and _is_comment(line)]:
+        cells = _cells(comments[-1].lstrip("#%/ \t"), separator)
+        names = cells if len(cells) == num and not any(map(_NUMBER.fullmatch, cells)) else None
+    if not body:
+        return None
+    header = tuple(_unique(names or [str(k + 1) for k in range(num)], num))
+    columns = (ColumnSample(name, tuple(row[k] for row in body)) for k, name in enumerate(header))
+    header_row = rows[first] if num_skipped >= content[first][0] else ()
+    return Layout(
+        tuple(column if separator == "," and "," in "".join(column.cells) else column.cured() for column in columns),
+        names is not None,
+        lambda every_row: _read_rows(path, header, separator, num_skipped, header_row, every_row),
+    )
+
+
+def _read_rows(
+    path: Path, header: Sequence[str], separator: str, num_skipped: int, names: Sequence[str], every_row: bool
+) -> tuple[TextTable, list[str]]:
+    """Read all rows without empty ones. A few other lines (text, a truncated line, a repeated header) are left out.
+
+    A note says how many, or the first of them is an error if ``every_row`` is true.
+    """
+    numbered = enumerate(read_text(path).split("\n")[num_skipped:], num_skipped + 1)
+    content = [(line, _cells(text, separator)) for line, text in numbered if text.strip() and not _is_comment(text)]
+    content = [(line, row) for line, row in content if any(row)]
+    rows = [(line, row) for line, row in content if len(row) == len(header) and row != names]
+    odd = [(line, row) for line, row in content if len(row) != len(header)]
+    if odd and (every_row or len(odd) > 1 + _MAX_SHARE_OF_WORDS * len(content)):
+        line, row = odd[0]
+        raise InputError(f"has {len(row)} cell{'s' * (len(row) != 1)}, the header row has {len(header)}", path, line)
+    lost = f"{len(odd)} lines that are not rows of the table are left out, the first is line {odd[0][0]}" if odd else ""
+    columns = list(zip(*(row for _, row in rows))) or [()] * len(header)
+    cells = {name: [*column] for name, column in zip(header, columns)}
+    return TextTable(path, tuple(header), np.array([line for line, _ in rows], np.int64), cells), [lost] if lost else []
+
+
+def _is_comment(line: str) -> bool:
+    """Return whether a line is a comment of Python, MATLAB or C; rostopic's ``%time`` is a name, not a comment."""
+    return line.lstrip().startswith(("#", "% ", "%%", "//"))
+
+
+def _split(content: list[tuple[int, str]], separator: str) -> tuple[list[list[str]], str] | None:
+    """Return the cells of all rows and the separator, or None if most rows do not have the same number of cells."""
+    rows = [_cells(line, separator) for _, line in content]
+    if not rows or (separator == "," and sum(_has_decimal_commas(line) for _, line in content) > len(rows) / 2):
+        return None
+    num, count = Counter(map(len, rows)).most_common(1)[0]
+    return (rows, separator) if num > 1 and count >= max(2, len(rows) - _MAX_NUM_WORDS, len(rows) / 2) else None
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """Return whether all commas of a line are decimal ones, of numbers that blanks set apart."""
+    numbers = sum(_DECIMAL_COMMA.fullmatch(word) is not None for word in line.split())
+    return numbers > 1 and numbers == line.count(",")
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(separator)]
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+    except csv.Error:
+        return [line]
+
+
+def _is_header(row: list[str], rows: list[list[str]]) -> bool:
+    """Return whether a row has words where those below it have numbers or times, and no values of its own there.
+
+    Whole numbers may be names, as ids of anchors are, if another cell of the row is a word.
+    """
+    below = [ColumnSample("", tuple(cells)).cured() for cells in zip(*rows)]
+    cells = [ColumnSample("", (cell,)).cured() for cell in row]
+    if not rows:
+        return all(cell.kind == "text" for cell in cells)
+    of_values = [cell for cell, column in zip(cells, below) if column.kind in ("numbers", "times")]
+    values = [cell.cells[0] for cell in of_values if cell.kind in ("numbers", "times")]
+    words = [cell for cell in cells if cell.kind == "text" and not any(map(str.isdigit, cell.cells[0]))]
+    may_be_names = all(map(str.isdigit, values)) and bool(words)
+    return any(cell.kind == "text" for cell in of_values) and (not values or may_be_names)
+
+
+def _is_second_header(row: list[str], rows: list[list[str]]) -> bool:
+    """Return whether a row below the header holds units, or more of the names."""
+    return _is_header(row, rows) and not any(map(_NUMBER.fullmatch, row))
+
+
+def _is_title(rows: list[list[str]], num: int) -> bool:
+    """Return whether the first of some rows is a line of text that has as many words as the table has columns."""
+    body = [row for row in rows if len(row) == num]
+    return (
+        len(body) > 2
+        and len(rows[0]) == len(rows[1]) == num
+        and _is_header(body[0], body[2:])
+        and _is_second_header(body[1], body[2:])
+        and not {word for cell in body[1] for word in words_of(cell)} <= _UNITS
+    )
+
+
+def _unique(names: list[str], num: int) -> list[str]:
+    filled = [name or f"column {k + 1}" for k, name in enumerate([*names, *[""] * (num - len(names))])]
+    return [name if filled.index(name) == k else f"{name} ({k + 1})" for k, name in enumerate(filled)]
+
+
+def _read_records(path: Path) -> TextTable | None:
+    """Read a file of records as a table, or return None if it is not one.
+
+    A record that holds several ranges gives a row for each. A cell is empty if its record has no such value.
+    """
+    head = read_head(path).lstrip()
+    if is_gsi(head):
+        numbered = [*gsi_records(read_text(path, errors="replace"))]
+    elif head.startswith(("{", "[{")) or _share_json(head) > _MIN_SHARE_JSON:
+        numbered = list(_json_records(read_text(path)))
+    elif _share_named(head) > _MIN_SHARE_NAMED:
+        text = read_text(path, errors="replace")
+        numbered = list(_blocks(text) if _BLOCK in text else _named_records(text))
+    else:
+        return None
+    names = tuple(dict.fromkeys(name for _, record in numbered for name in record))
+    cells = {name: [record.get(name, "") for _, record in numbered] for name in names}
+    return TextTable(path, names, np.array([line for line, _ in numbered], np.int64), cells) if names else None
+
+
+def _share_named(head: str) -> float:
+    """Return the share of complete lines or blocks that hold at least two named values."""
+    units = [unit for _, unit in _units(head)][:-1]
+    return sum(len(_NAMED.findall(unit)) > 1 for unit in units) / len(units) if units else 0.0
+
+
+def _share_json(head: str) -> float:
+    """Return the share of complete lines that end in a JSON object, whatever is in front of it."""
+    rows = [row for row in head.split("\n")[:-1] if row.strip()]
+    return sum(any(True for _ in _json_records(row)) for row in rows) / len(rows) if rows and "{" in head else 0.0
+
+
+def _units(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a text, or its blocks if it has any, each with the number of its first line."""
+    line, end = 1, _BLOCK if _BLOCK in text else "\n"
+    for unit in text.split(end):
+        if unit.strip():
+            yield line, unit
+        line += unit.count("\n") + end.count("\n")
+
+
+def _named_records(text: str) -> Iterator[tuple[int, NamedValues]]:
+    """Yield the record of each line or block, with its line number.
+
+    A time without a name comes first, as "time". A name that is repeated gets a number.
+    """
+    for line, unit in _units(text):
+        time = CIVIL_TIME.search(unit) or TIME_OF_DAY.search(unit)
+        record, num = {"time": time[0]} if time else {}, Counter[str]()
+        for name, value in _NAMED.findall(unit):
+            num[name] += 1
+            record[name if num[name] == 1 else f"{name}.{num[name]}"] = value.strip('"')
+        yield line, record
+
+
+def _blocks(text: str) -> Iterator[tuple[int, NamedValues]]:
+    for line, unit in _units(text):
+        lines = [(len(row) - len(row.lstrip()), row.strip()) for row in unit.split("\n") if row.strip("- \t")]
+        yield from ((line, record) for record in _flat(_nested(lines)))
+
+
+def _nested(lines: Sequence[tuple[int, str]]) -> Any:
+    """Return the content of indented lines of YAML, as far as printed messages use it."""
+    indent, first = lines[0] if lines else (0, "")
+    is_list = first.startswith("- ") or first == "-"
+    if not is_list and not _KEY.fullmatch(first):
+        return _value(first)
+    # The items of a list may have the same indentation as the list's key.
+    starts = [k for k, (at, text) in enumerate(lines) if at == indent and (is_list or not text.startswith("-"))]
+    parts = [lines[k:stop] for k, stop in zip(starts, [*starts[1:], len(lines)])]
+    if is_list:
+        return [_nested([(at + 2, text[2:]) for at, text in part[:1] if text[2:]] + [*part[1:]]) for part in parts]
+    keys = [(_KEY.fullmatch(part[0][1]), part[1:]) for part in parts]
+    return {key[1]: _value(key[2]) if key[2] else _nested(inner) for key, inner in keys if key}
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text) if text.startswith("[") else text.strip("'\"")
+    except (ValueError, RecursionError):
+        return text
+
+
+def _json_records(text: str) -> Iterator[tuple[int, NamedValues]]:
+    """Yield each record with its line number. A time in front of an object is in its records as "received_time".
+
+    Objects may also be written as Python writes them, with single quotes.
+    """
+    decoder, at, line, counted = json.JSONDecoder(), 0, 1, 0
+    while (begin := text.find("{", at)) >= 0:
+        line, counted = line + text.count("\n", counted, begin), begin
+        time = time_in_front(text[at:begin].rpartition("\n")[2])
+        try:
+            if text.startswith("{'", begin):
+                end = (text.find("\n", begin) + 1 or len(text) + 1) - 1
+                value, at = _python_literal(text[begin:end].rstrip()), end
+            else:
+                value, at = decoder.raw_decode(text, begin)
+        except (ValueError, SyntaxError, MemoryError, RecursionError):  # a truncated line, or not a record
+            at = begin + 1
+            continue
+        records = _flat(value) if isinstance(value, dict) else []
+        yield from ((line, {**record, "received_time": time} if time else record) for record in records)
+
+
+def _python_literal(text: str) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SyntaxWarning)  # of escapes in the texts
+        return ast.literal_eval(text)
+
+
+def _flat(value: Any) -> list[NamedValues]:
+    """Return a record for each object in the value's lists, with the values outside of lists, or else one record."""
+    common, each = _common_and_each(value, "")
+    return [{**common, **record} for record in each] or [common]
+
+
+def _common_and_each(value: Any, name: str) -> tuple[NamedValues, list[NamedValues]]:
+    if isinstance(value, list) and value and all(isinstance(inner, (dict, list)) for inner in value):
+        found = [_common_and_each(inner, name) for inner in value]
+        return {}, [{**common, **record} for common, each in found for record in each or [{}]]
+    if not isinstance(value, (dict, list)):
+        return {name: "null" if value is None else str(value)}, []
+    within = f"{name}." if name else ""
+    inner = value.items() if isinstance(value, dict) else enumerate(value)
+    found = [_common_and_each(item, f"{within}{key}") for key, item in inner]
+    whole = {key: cell for common, _ in found for key, cell in common.items()}
+    return whole, [record for _, each in found for record in each]

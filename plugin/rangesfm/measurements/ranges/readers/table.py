@@ -1,0 +1,242 @@
+"""Readers of tables: with columns named by the user, columns of a known data set, or columns that are recognized.
+
+The canonical CSV is ``timestamp_s,anchor_id,range_m[,tag_id,range_stddev_m,los]``. ``image_name`` may replace
+``timestamp_s``; if both are present, the time is used.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import islice, permutations
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.errors import InputError, printable
+from rangesfm.measurements.ranges.range_log import DEFAULT_TAG_ID, RangeLog
+from rangesfm.measurements.ranges.readers.columns import QUANTITIES, STAMPS, RangeColumns, read_columns
+from rangesfm.measurements.ranges.readers.guess import Guess, described, guess_columns
+from rangesfm.measurements.ranges.readers.layout import Layout, find_layout, layout_without_header
+from rangesfm.measurements.ranges.readers.reader import EndpointRoles, Reader, ReadOptions
+from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.text_tables import FOUND, header_names, read_head, write_user_table
+
+_BY_TIME = RangeColumns(
+    required={"timestamp": "timestamp_s", "anchor_id": "anchor_id", "range": "range_m"},
+    optional={"tag_id": "tag_id", "range_stddev": "range_stddev_m", "los": "los"},
+    is_strict=True,
+)
+_BY_IMAGE = replace(_BY_TIME, required={"image_name": "image_name", "anchor_id": "anchor_id", "range": "range_m"})
+_PRESETS = {
+    "starloc": {"timestamp": "time_s", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
+    "miluv": {"timestamp": "timestamp", "range": "range", "tag_id": "from_id", "anchor_id": "to_id"},
+    "uwb_init": {"timestamp": "t", "range": "range", "tag_id": "ID_Tag", "anchor_id": "ID_Anchor"},
+    "inrol": {"timestamp": "timestamp", "range": "r", "anchor_id": "anchor_id"},
+}
+_INROLS_COLUMNS = ("index", "timestamp", "anchor_id", "r")
+_INROLS_COMMENT = re.compile(
+    r"\s{0,99}#[ \t]{0,9}index[ \t]{1,9}timestamp[ \t]{1,9}anchor_id[ \t]{1,9}r[ \t]{0,9}(?:\n|$)"
+)
+_ID_IN_NAME = re.compile(r"(?:.*[^0-9A-Za-z])?([A-Za-z]{0,2}\d{1,3}|(?=[A-F]*\d)[0-9A-F]{4})", re.ASCII)
+_MOST_COMMANDS = 4  # commands for columns of which nothing is known
+_SPAN = re.compile(r"(\D*)(\d{1,4})-(\D*)(\d{1,4})", re.ASCII)
+_POSITIONS_ONLY = (
+    "holds positions that the radio computed and not the ranges they came from; "
+    "record the ranges themselves (DWM1001: the command lec or les instead of lep)"
+)
+_TDOA = (
+    "holds differences of arrival times (TDoA), which are no ranges between a tag and an anchor; "
+    "record two-way ranging instead"
+)
+# Logs of radios that hold no ranges, and what they hold instead. Positions may stand beside ranges, and are the reason
+# only if nothing in the log can be the ranges.
+_NO_RANGES = (
+    (re.compile(r'\btdoa\b|\btdoa_|"tdoa|\bidA\b.{0,99}\bidB\b', re.ASCII | re.IGNORECASE), _TDOA),
+    (re.compile(r'"tagId".{0,2000}"(?:tagData|coordinates|anchorData)"', re.ASCII | re.DOTALL), _POSITIONS_ONLY),
+    (re.compile(r"(?<![0-9A-Za-z])POS[,\[]-?\d", re.ASCII), _POSITIONS_ONLY),
+    (re.compile(r'"(?:POS|pos|position)"\s*:\s*[{\[]|"est_pos"', re.ASCII), _POSITIONS_ONLY),
+)
+
+
+def _anchor_of_file(path: Path) -> str:
+    """Return the anchor id in a file name: A5 in ``run_3_A5.csv``, or else the whole name without its ending."""
+    stem = path.name.split(".")[0]
+    found = _ID_IN_NAME.fullmatch(stem)
+    return found[1] if found else stem
+
+
+def table_reader(path: Path, options: ReadOptions) -> Reader:
+    """Return the reader of a table whose columns are recognized by names and values.
+
+    Raises:
+        InputError: the columns are not known for sure. The advice gives what was found, the closest guess and the
+            command to type.
+    """
+    layout = find_layout(path, options.separator or "")
+    guess = None if layout is None else guess_columns(layout)
+    if layout is None or guess is None or guess.missing or guess.doubts:
+        raise _question(path, options, layout, guess)
+    notes = tuple(_notes(path, layout, guess))
+    columns = RangeColumns({**guess.columns}, {}, guess.wide, _anchor_of_file(path), layout, notes=notes)
+    return replace(
+        TABLE, read=lambda path, options: read_columns(path, columns, options, TABLE.name), roles=guess.roles
+    )
+
+
+def _notes(path: Path, layout: Layout, guess: Guess) -> Iterable[str]:
+    said = ", ".join(f"{quantity} = {name}" for quantity, name in guess.columns.items())
+    by_values = "" if layout.has_names else " (by their numbers and values: the table has no names)"
+    yield f"columns taken: {said}{by_values}"
+    yield from guess.notes
+    if "anchor_id" not in guess.columns and not guess.wide:
+        yield f"no column gives the anchor: it is named '{_anchor_of_file(path)}' after the file"
+
+
+def _question(path: Path, options: ReadOptions, layout: Layout | None, guess: Guess | None) -> InputError:
+    head = read_head(path)
+    reasons = _NO_RANGES if guess is None or "range" in guess.missing else _NO_RANGES[:1]
+    if instead := next((what for pattern, what in reasons if pattern.search(head)), None):
+        return InputError(f"the log {instead}", path)
+    if layout is None or guess is None:
+        first_line = printable(head.strip().split("\n")[0])
+        return InputError(f"neither a known log format nor a table; it begins with '{first_line}'", path)
+    found = f"found: {len(layout.columns)} columns: {', '.join(described(layout.columns))}"
+    closest = ", ".join(f"{quantity} = {name}" for quantity, name in guess.told.items()) or "none"
+    why = "; ".join([*(f"no column seems to be the {missing}" for missing in guess.missing), *guess.doubts])
+    commands = [options.changed(columns=columns).command(path) for columns in _possible_columns(layout, guess)]
+    last = "perhaps" if guess.missing else "if that is right"
+    nothing = f"no other column of numbers can be the {' or the '.join(guess.missing)}, which a log needs"
+    return InputError(
+        "a table whose columns are not known for sure",
+        path,
+        advice=[
+            found,
+            f"closest guess: {closest}",
+            f"not sure: {why}",
+            *([f"{last}: {command}" for command in commands] or [nothing]),
+        ],
+    )
+
+
+def _possible_columns(layout: Layout, guess: Guess) -> Iterable[dict[str, str]]:
+    """Yield the columns of a guess, with a few columns of numbers in the place of those that it misses."""
+    taken = guess.told.values()
+    free = [column.name for column in layout.columns if column.kind == "numbers" and column.name not in taken]
+    for names in islice(permutations(free, len(guess.missing)), _MOST_COMMANDS):
+        yield {**guess.told, **dict(zip(guess.missing, names))}
+
+
+def _recognizes(format: str, head: str) -> bool:
+    if format == "inrol":
+        return _INROLS_COMMENT.match(head) is not None
+    return set(_PRESETS[format].values()) <= set(header_names(head))
+
+
+def _read(path: Path, options: ReadOptions, *, format: str) -> RangeLog:
+    """Read a table by the columns of a preset and those that the user named."""
+    told = {**_PRESETS.get(format, {}), **options.columns}
+    for quantity in (key.partition(":")[0] for key in told):
+        if quantity not in QUANTITIES:
+            message = f"quantity in columns is '{quantity}', expected one of {', '.join(QUANTITIES)}"
+            raise InputError(message, path)
+    if not {"timestamp", "image_name"} & set(told):
+        raise InputError("columns must name range, timestamp (or image_name) and anchor_id where there is one", path)
+    wide = _wide(told, path)
+    columns = {key: name for key, name in told.items() if not key.startswith("range:")}
+    layout = find_layout(path, options.separator or "") if format == MAPPED.name else None
+    if format == "inrol":
+        layout = layout_without_header(path, _INROLS_COLUMNS, " ")
+    elif layout is not None and not {*columns.values(), *wide} <= layout.units.keys():
+        layout = None
+    third_message = {}
+    if "range" not in columns and not wide:
+        names = [*layout.units] if layout else header_names(read_head(path), options.separator or FOUND)
+        stamps = {stamp: columns.get(stamp, stamp) for stamp in STAMPS}
+        if not {*(stamps[stamp] for stamp in STAMPS[:4])} <= set(names):
+            wanted, found = ", ".join(STAMPS[:4]), printable(", ".join(names))
+            raise InputError(f"columns name neither range nor the time stamps {wanted}; found {found}", path)
+        columns = {**{stamp: stamps[stamp] for stamp in STAMPS[:4]}, **columns}
+        third_message = {stamp: stamps[stamp] for stamp in STAMPS[4:]}
+    return read_columns(
+        path, RangeColumns(columns, third_message, wide, _anchor_of_file(path), layout), options, format
+    )
+
+
+def _wide(told: Mapping[str, str], path: Path) -> dict[str, tuple[str, str]]:
+    """Return the columns that belong to one anchor and one tag each, with the ids of these.
+
+    The user gives them one by one, as ``range:A1=d1``, or many at once, as ``range:0-7:T0-T2=2-25``.
+    """
+    wide: dict[str, tuple[str, str]] = {}
+    for key, name in told.items():
+        quantity, _, ids = key.partition(":")
+        if quantity == "range" and ids:
+            anchors, tags = (_spanned(part) for part in (ids.partition(":")[0], ids.partition(":")[2]))
+            names = _spanned(name) if len(anchors) * len(tags) > 1 else [name]
+            if len(names) != len(anchors) * len(tags):
+                expected = f"{len(anchors)} x {len(tags)}"
+                raise InputError(f"columns: {key} names {len(names)} columns, expected {expected}, tags in turn", path)
+            wide |= dict(zip(names, ((anchor, tag) for anchor in anchors for tag in tags)))
+    return wide
+
+
+def _spanned(text: str) -> list[str]:
+    """Return the items of a span: T0, T1, T2 for T0-T2."""
+    span = _SPAN.fullmatch(text)
+    if span is None or span[3] not in ("", span[1]) or int(span[4]) < int(span[2]):
+        return [text]
+    return [f"{span[1]}{number}" for number in range(int(span[2]), int(span[4]) + 1)]
+
+
+def write_ranges_csv(log: RangeLog, path: AnyPath) -> None:
+    """Write a log as canonical CSV; optional columns are written only if the log has values for them.
+
+    For a range between two anchors or two tags, the other end is in the column of the tag or of the anchor.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    columns: dict[str, Iterable[str]] = {}
+    if log.timestamp_s is not None:
+        columns["timestamp_s"] = map(repr, log.timestamp_s.tolist())
+    else:
+        columns["image_name"] = log.image_name or ()
+    tag_id, columns["anchor_id"] = log.end_ids()
+    columns["range_m"] = map(repr, log.range_m.tolist())
+    if set(tag_id) != {DEFAULT_TAG_ID}:
+        columns["tag_id"] = tag_id
+    if not np.all(np.isnan(log.range_stddev_m)):
+        columns["range_stddev_m"] = ("" if np.isnan(stddev) else repr(stddev) for stddev in log.range_stddev_m.tolist())
+    if np.any(log.los >= 0):
+        columns["los"] = ("" if los < 0 else str(los) for los in log.los)
+    write_user_table(Path(path), [*columns], zip(*columns.values()))
+
+
+def _recognizes_canonical(head: str) -> bool:
+    names = {*header_names(head)}
+    return {"anchor_id", "range_m"} <= names and not names.isdisjoint({"timestamp_s", "image_name"})
+
+
+def _read_canonical(path: Path, options: ReadOptions) -> RangeLog:
+    if options.columns or options.timestamp_unit not in (None, "s"):
+        raise InputError("the canonical CSV has fixed columns, with times in seconds; use format 'mapped'", path)
+    names = header_names(read_head(path), options.separator or FOUND)
+    columns = _BY_IMAGE if "image_name" in names and "timestamp_s" not in names else _BY_TIME
+    return read_columns(path, columns, options.changed(timestamp_unit=None), CANONICAL.name)
+
+
+CANONICAL = Reader("canonical", _recognizes_canonical, _read_canonical)
+PRESETS = tuple(
+    Reader(
+        name,
+        partial(_recognizes, name),
+        partial(_read, format=name),
+        roles=EndpointRoles.ASKER_AND_ASKED if "from_id" in preset.values() else EndpointRoles.TAG_AND_ANCHOR,
+    )
+    for name, preset in _PRESETS.items()
+)
+MAPPED = Reader("mapped", lambda head: False, partial(_read, format="mapped"))
+TABLE = Reader("table", lambda head: False, partial(_read, format="table"))

@@ -1,0 +1,167 @@
+"""Times in logs, in seconds, including those that a logging program writes in front of the radio's output."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.errors import InputError
+from rangesfm.measurements.ranges.readers.reader import ReadOptions
+from rangesfm.measurements.ranges.twr import SECONDS_PER_STAMP
+from rangesfm.util.files.clock_times import are_seconds_since_1970
+
+SECONDS_PER_UNIT = {**SECONDS_PER_STAMP, "min": 60.0, "h": 3600.0, "d": 86400.0}
+DATE_ORDERS = ("dmy", "mdy")
+CIVIL_UNITS = ("iso", *DATE_ORDERS)
+CIVIL_TIME = re.compile(
+    r"((?:\d{4}[-/.]\d\d?[-/.]\d\d?)|(?:\d\d?[-/.]\d\d?[-/.]\d{4}))[T _]"
+    r"(\d\d?):(\d\d(?::\d\d(?:[.,]\d{1,18})?)?)(?: ?([AP])M)? ?(Z|UTC|[+-]\d\d(?::?\d\d)?(?!\d))?",
+    re.ASCII | re.IGNORECASE,
+)
+TIME_OF_DAY = re.compile(r"(?<![\d:])([01]?\d|2[0-3]):([0-5]\d):([0-5]\d(?:[.,]\d{1,18})?)(?![\d:])", re.ASCII)
+_COMPACT = re.compile(  # 20260131T120000.5Z, 20260131120000500
+    r"((?:19|20)\d\d)(0[1-9]|1[0-2])([0-2]\d|3[01])[T_ -]?"
+    r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)(?:[.,]?(\d{1,9}))?(Z?)",
+    re.ASCII,
+)
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_WITH_MONTH = re.compile(
+    rf"(\d\d?)[- ]({'|'.join(_MONTHS)})[a-z]{{0,6}}[- ](\d{{4}})(?=$|[T _])", re.ASCII | re.IGNORECASE
+)
+_AS_EXIF = re.compile(r"(\d{4}):(\d\d):(\d\d)(?=[T ]\d\d?:)", re.ASCII)  # 2026:01:31 12:00:00
+_NUMBER = re.compile(r"(?<![\w.+-])-?\d{1,19}(?:\.\d{1,18})?(?![\w.-]|:\d)", re.ASCII)
+_DAY_S = 86400.0
+# The size of a time since 1970 tells its unit: 1e11 s are three thousand years, and 1e11 ms are three years.
+_UNIT_ABOVE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+
+
+def unit_by_digits(value: float) -> str | None:
+    """Return the unit of a number if it is a time since 1970, or None if it is too small for ms, us or ns."""
+    return next((unit for above, unit in _UNIT_ABOVE if abs(value) > above), None)
+
+
+def spelt_date(text: str) -> str | None:
+    """Convert a date of digits alone, with colons as in EXIF, or with the month in words to 2026-01-31; else None."""
+    if compact := _COMPACT.fullmatch(text):
+        year, month, day, hour, minute, second, fraction, zone = compact.groups()
+        return f"{year}-{month}-{day}T{hour}:{minute}:{second}.{fraction or 0}{zone}"
+    if exif := _AS_EXIF.match(text):
+        return f"{exif[1]}-{exif[2]}-{exif[3]}{text[exif.end() :]}"
+    if named := _WITH_MONTH.match(text):
+        return f"{named[3]}-{_MONTHS.index(named[2].lower()) + 1:02}-{named[1]:>02}{text[named.end() :]}"
+    return None
+
+
+def date_order(dates: Sequence[str]) -> str | None:
+    """Return the order of day, month and year in dates: "ymd", "dmy" or "mdy", or None if it is ambiguous."""
+    first, second = (max(int(re.split("[-/.]", date)[k]) for date in dates) for k in (0, 1))
+    if first > 31:
+        return "ymd"
+    return "dmy" if first > 12 or "." in dates[0] else "mdy" if second > 12 else None
+
+
+def _seconds_from_civil(text: str, order: str) -> float:
+    """Return the seconds since 1970 of a date and time, in UTC if it has no zone; ValueError if it is not one."""
+    match = CIVIL_TIME.fullmatch(text)
+    if match is None:
+        raise ValueError(text)
+    date, hour, rest, half, zone = match.groups()
+    year, month, day = (field for _, field in sorted(zip(map("ymd".index, order), re.split("[-/.]", date))))
+    hour = int(hour) if half is None else int(hour) % 12 + 12 * (half in "pP")
+    seconds = float(np.datetime64(f"{year}-{month:>02}-{day:>02}T{hour:02}:{rest.replace(',', '.')}", "us").astype(int))
+    seconds *= 1e-6
+    if zone is None or zone.upper() in ("Z", "UTC"):
+        return seconds
+    hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)
+    return seconds - (-1 if zone[0] == "-" else 1) * (hours * 3600.0 + minutes * 60.0)
+
+
+def time_in_front(text: str) -> str | None:
+    """Return the civil time in a text, or else the number if there is nothing beside it but marks such as brackets.
+
+    A whole number counts only if it is a time since 1970; others number the lines.
+    """
+    if civil := CIVIL_TIME.search(text) or TIME_OF_DAY.search(text):
+        return civil[0]
+    number = _NUMBER.search(text)
+    if number is None or re.search("[A-Za-z0-9]", text.replace(number[0], "", 1)):
+        return None
+    is_time = "." in number[0] or unit_by_digits(float(number[0])) or are_seconds_since_1970(float(number[0]))
+    return number[0] if is_time else None
+
+
+class CivilClock:
+    """Reader of successive civil times; times of day without a date continue after midnight."""
+
+    def __init__(self, order: str = "ymd") -> None:
+        self._order = order
+        self._days = 0
+        self._last_of_day_s = 0.0
+
+    def seconds(self, text: str) -> float:
+        """Return the seconds since 1970, or for a time of day since the midnight before the first one.
+
+        Raises:
+            ValueError: the text is neither a date and time nor a time of day.
+        """
+        of_day = TIME_OF_DAY.fullmatch(text)
+        if of_day is None:
+            return _seconds_from_civil(text, self._order)
+        seconds = int(of_day[1]) * 3600.0 + int(of_day[2]) * 60.0 + float(of_day[3].replace(",", "."))
+        if seconds < self._last_of_day_s - _DAY_S / 2:
+            self._days += 1
+        self._last_of_day_s = seconds
+        return self._days * _DAY_S + seconds
+
+
+class HostClock:
+    """Reader of the times in one log, each from the text before a range."""
+
+    def __init__(self, path: Path, options: ReadOptions):
+        self._path = path
+        self._unit = options.timestamp_unit
+        self._civil = CivilClock(self._unit if self._unit in DATE_ORDERS else "ymd")
+
+    def find_seconds(self, prefix: str) -> float | None:
+        """Return the time in a text in seconds, or None without one.
+
+        It may be ISO 8601, a time of day, or a number of seconds, ms, us or ns.
+        """
+        is_civil = self._unit in CIVIL_UNITS
+        if (is_civil or self._unit is None) and (civil := self._find_civil(prefix)):
+            try:
+                return self._civil.seconds(civil)
+            except ValueError:
+                return None
+        number = _NUMBER.search(prefix)
+        if number is None or is_civil:
+            return None
+        value = float(number[0])
+        return value * SECONDS_PER_UNIT[self._unit or unit_by_digits(value) or "s"]
+
+    def _find_civil(self, prefix: str) -> str | None:
+        """Return the civil time in a text; of a date whose order is not known, only the time of day."""
+        dated = CIVIL_TIME.search(prefix)
+        if dated and (self._unit in DATE_ORDERS or date_order([dated[1]]) == "ymd"):
+            return dated[0]
+        of_day = TIME_OF_DAY.search(prefix)
+        return of_day and of_day[0]
+
+    def seconds(self, prefix: str, line: int) -> float:
+        """Return the time in a text in seconds.
+
+        Raises:
+            InputError: the text has no time.
+        """
+        seconds = self.find_seconds(prefix)
+        if seconds is None:
+            raise InputError(
+                "no time before the range; this radio prints no times, so record the log with the host's time at the "
+                "beginning of each line (seconds, ms, us or ns, or 2026-01-31T12:00:00.000Z)",
+                self._path,
+                line,
+            )
+        return seconds

@@ -1,0 +1,242 @@
+"""Mapping of photos to unscaled models by the options of a survey, with checks before the long work."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from rangesfm.colmap.model_files import read_model
+from rangesfm.colmap.passthrough import apply_options
+from rangesfm.colmap.reprojection import wrong_axes
+from rangesfm.diagnostics.preflight import (
+    check_units,
+    notes_before_work,
+    notes_on_gaps,
+    notes_on_model,
+    notes_on_silence,
+    notes_on_times,
+)
+from rangesfm.errors import InputError
+from rangesfm.export import check_formats
+from rangesfm.measurements.lengths.locate_lengths import check_ends
+from rangesfm.pipeline.place_of_result import refuse_to_overwrite
+from rangesfm.pipeline.place_ranges import check_times
+from rangesfm.progress import Journal
+from rangesfm.result.result_folder import RESULT_NAMES, places_for_photos
+from rangesfm.sfm.image_times import ImageTimes, find_image_times, list_images
+from rangesfm.sfm.keyframes import select_keyframes
+from rangesfm.sfm.mapping import pipeline_options
+from rangesfm.sfm.reconstruct import reconstruct_in
+from rangesfm.sfm.rigs import read_rigs
+from rangesfm.sfm.tags import find_tags
+from rangesfm.sfm.unpublished import UnpublishedReconstruction
+from rangesfm.survey.inputs import read_ranging_inputs
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.sources.extract import TIMES_NAME, earlier_photos, take_photos
+from rangesfm.survey.sources.source import is_source
+from rangesfm.survey.survey_run import SurveyRun
+from rangesfm.util.files.atomic import sole_writer
+from rangesfm.util.geometry.trajectory import Trajectory
+
+
+def begin_run(survey: Survey, journal: Journal) -> SurveyRun:
+    """Read and check all inputs but the photos, so that errors are found before the long work begins.
+
+    Raises:
+        InputError: a format, an option or a file is wrong.
+    """
+    check_formats(survey.export.formats)
+    with survey.source.naming_lines():
+        apply_options(pycolmap.BundleAdjustmentOptions(), survey.refine.bundle_adjustment, "refine.bundle_adjustment")
+    refuse_to_overwrite(survey)
+    inputs = read_ranging_inputs(survey)
+    check_units(survey, inputs)
+    journal.note(*inputs.assumed)
+    journal.warn(*inputs.notes, *notes_before_work(survey, inputs))
+    return SurveyRun(survey, inputs, journal)
+
+
+def checked_keyframes(run: SurveyRun) -> tuple[tuple[str, ...], ImageTimes | None]:
+    """Return the keyframes and their times, after checking that these fit those of ranges and reference.
+
+    Raises:
+        InputError: they do not.
+    """
+    keyframes, times = find_keyframes(run.survey, run.journal, log_names_photos=not run.inputs.needs_times)
+    n, timestamps_s = len(keyframes), None if times is None else times.timestamps_s
+    nowhere = Trajectory(np.arange(n), keyframes, timestamps_s, np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+    check_times(run, nowhere)
+    check_taped_ends(run, keyframes if run.survey.images.rig_config is None else list_images(run.survey.photos_path))
+    tell_of_times(run, times)
+    return keyframes, times
+
+
+def check_taped_ends(run: SurveyRun, photos: Collection[str]) -> None:
+    """Check that the ends of taped distances are among these photos, markers, tags or anchors; raises InputError."""
+    may_be_tags = run.survey.markers.dictionary is not None
+    check_ends(run.inputs.tape, photos, run.inputs.log.anchor_ids, may_be_tags=may_be_tags)
+
+
+def tell_of_times(run: SurveyRun, times: ImageTimes | None) -> None:
+    """Warn of oddities in the times of the photos, and in both clocks if no time offset is given."""
+    radio_s, options = run.inputs.log.timestamp_s, run.survey.ranges
+    if times is None or radio_s is None:
+        return
+    run.journal.warn(*notes_on_gaps(times.timestamps_s, options.max_interpolation_gap_s))
+    at_s, is_given = radio_s + (options.time_offset_s or 0.0), options.time_offset_s is not None
+    run.journal.warn(*notes_on_silence(at_s, times.timestamps_s, is_one_clock=is_given))
+    if not is_given:
+        run.journal.warn(*notes_on_times(radio_s, times.timestamps_s))
+
+
+def read_registered(path: Path, journal: Journal) -> pycolmap.Reconstruction:
+    """Read a given COLMAP model and warn of what is wrong with it.
+
+    Raises:
+        InputError: it cannot be read, has no registered images, or its axes are not as in COLMAP.
+    """
+    model = read_model(path)
+    if not model.num_reg_images():
+        raise InputError("the model has no registered images", path)
+    if (said := wrong_axes(model)) is not None:
+        raise InputError(said, path)
+    journal.warn(*notes_on_model(model))
+    return model
+
+
+def with_photos_in_folder(survey: Survey, journal: Journal, *, restart: bool = False) -> Survey:
+    """Extract the photos of a video or a bag into the output folder, and return the survey with these photos.
+
+    If the bag has a camera calibration and the survey has none, that is used. Photos that an earlier run extracted are
+    used again unless ``restart`` is true. A survey of a folder of photos is returned unchanged.
+
+    Raises:
+        InputError: the source cannot be read, or times are given for it.
+    """
+    path = survey.images.path
+    if path is None or not is_source(path):
+        return survey
+    if survey.images.times is not None:
+        raise InputError("its images have their own times, expected no [images] times", path)
+    rate_hz, topic = survey.images.extraction_rate_hz, survey.images.topic
+    places = places_for_photos(survey.output.path)
+    with journal.stage("photos"):
+        taken_before = (place for place in places if earlier_photos(path, place, rate_hz=rate_hz, topic=topic))
+        folder = places[0] if restart else next(taken_before, places[0])
+        taken = take_photos(path, folder, rate_hz=rate_hz, topic=topic, progress=journal.progress, restart=restart)
+    journal.note(*taken.notes)
+    values: dict[str, Any] = {"images.path": folder, "images.times": folder / TIMES_NAME}
+    given = survey.camera
+    if taken.camera is not None and given.model is None and given.params is None and not given.others:
+        values["camera.model"], values["camera.params"] = taken.camera
+    return survey.changed(values)
+
+
+def find_keyframes(
+    survey: Survey, journal: Journal, *, log_names_photos: bool | None = None
+) -> tuple[tuple[str, ...], ImageTimes | None]:
+    """Return the keyframes and their times; None in place of times, and order by name, where times are not needed.
+
+    Of the photos that a rig took at the same time, only one is returned, that of the reference camera if there is one.
+
+    Args:
+        survey: options.
+        journal: for warnings about times.
+        log_names_photos: whether the log names photos in place of times; then photos without a time are kept. None:
+            there is no log.
+
+    Raises:
+        InputError: times are needed and cannot be found.
+    """
+    folder = survey.photos_path
+    with journal.timed("keyframes"):
+        frames = read_rigs(survey.images.rig_config).frames(list_images(folder))
+        names = tuple(frames)
+        image_times = None
+        with nullcontext() if survey.images.times or log_names_photos is False else suppress(InputError):
+            image_times = find_image_times(
+                folder,
+                names,
+                survey.images.times,
+                frames,
+                rate_hz=survey.images.rate_hz,
+                columns=survey.images.times_columns,
+                unit=survey.images.times_unit,
+            )
+        if image_times is None or (log_names_photos and not survey.images.times and image_times.num_left_out):
+            return select_keyframes(names, survey.images), None
+        keyframes = select_keyframes(image_times, survey.images)
+        journal.note(*image_times.assumed)
+        journal.warn(*image_times.notes)
+        return keyframes, image_times.subset(keyframes)
+
+
+def with_tags(run: SurveyRun, names: Sequence[str]) -> SurveyRun:
+    """Add the printed tags found in photos to the inputs, if tags are to be looked for.
+
+    Raises:
+        InputError: no tags were found, and nothing else is measured in metres.
+    """
+    survey, inputs, journal = run.survey, run.inputs, run.journal
+    wanted = survey.markers
+    if wanted.dictionary is None:
+        return run
+    folder = survey.photos_path
+    with journal.stage("tags"):
+        found = find_tags(folder, names, wanted.dictionary, journal.progress)
+    if not found.markers:
+        message = (
+            f"no tag of {wanted.dictionary} in {len(names)} photos: is it another dictionary ([markers] dictionary)?"
+        )
+        if not len(inputs.log) and survey.scale.distances is None and survey.points.path is None:
+            raise InputError(message, folder)
+        journal.warn(message)
+    journal.progress.message(f"tags: {len(found.tags)} of {wanted.dictionary} in {found.num_photos} photos")
+    sides = () if wanted.side_m is None else found.sides(wanted.side_m, wanted.side_stddev_m)
+    tape, positions = inputs.tape.with_more(sides, found.markers), inputs.positions
+    return replace(run, inputs=replace(inputs, tape=tape, positions=positions.with_more_markers(found.markers)))
+
+
+def map_keyframes(
+    survey: Survey,
+    keyframes: tuple[str, ...],
+    journal: Journal,
+    restart: bool,
+    *,
+    deferred: bool,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """Map the keyframes into ``sparse`` and return the models ``sparse/0``, ``sparse/1``, ...
+
+    Args:
+        survey: options.
+        keyframes: names of the photos.
+        journal: for stages, times and warnings.
+        restart: whether to do all steps again.
+        deferred: whether to keep an earlier reconstruction in its place until the new result is complete.
+    """
+    rigs = read_rigs(survey.images.rig_config)
+    frames = rigs.frames(list_images(survey.photos_path))
+    photos = [photo for keyframe in keyframes for photo in frames[keyframe]]
+    camera, mapper, seed = survey.camera, survey.mapper, survey.output.seed
+    with survey.source.naming_lines():
+        pipeline_options(camera, mapper, seed)  # so that bad options are refused before anything is written
+        with (
+            sole_writer(survey.output.path) as output,
+            UnpublishedReconstruction(output, journal.progress, restart=restart) as unpublished,
+        ):
+            summary = reconstruct_in(unpublished, survey.photos_path, photos, camera, mapper, rigs, seed)
+            if deferred:
+                unpublished.defer()
+            else:
+                unpublished.publish([output.path / name for name in RESULT_NAMES])
+    journal.seconds.update({**summary.earlier_seconds, **summary.seconds})
+    if summary.num_registered < summary.num_keyframes:
+        which = "the model" if len(summary.models) == 1 else f"the largest of {len(summary.models)} models"
+        journal.warn(f"{summary.num_registered} of {summary.num_keyframes} keyframes are in {which}")
+    return summary.models

@@ -1,0 +1,163 @@
+"""A finished survey as the plan of another one like it: what that would determine, and what to change next time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.arrays import Array
+from rangesfm.errors import GeometryError, InputError
+from rangesfm.estimation.scale.scale_verdict import CALIBRATE
+from rangesfm.export.metric_map import colored_points, level_axes, up_in_world
+from rangesfm.measurements.ranges.anchors.anchor import Anchor
+from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.range_observations import RangeStatus
+from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.planning.advice import advise, best_words
+from rangesfm.planning.expected import expect
+from rangesfm.planning.planned import PlannedSurvey
+from rangesfm.result.model_path import path_in_result
+from rangesfm.result.result_folder import read_result_folder
+from rangesfm.result.result_tables import RangesAsUsed
+from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.geometry.georeference import Georeference
+from rangesfm.util.geometry.trajectory import Trajectory, is_one_after_the_other
+
+# Assumed rate of photos without times.
+_PHOTO_RATE_HZ = 2.0
+# Shares of the points between which the room is: some points are seen through windows, or wrong.
+_MOST_OF_POINTS = (0.01, 0.99)
+# Largest number of points of the map that are tried as places for anchors.
+_NUM_SURFACES = 500
+# A map without a place in a site has no coordinates that anybody knows: these are about its first photo.
+_AXES, _LEVEL = " (metres right of, ahead of and above the first photo)", " above the first photo"
+# An anchor on a wall is in front of it: distance of the wall behind it, metres.
+_BEHIND_M = 0.05
+
+
+def plan_of_result(path: AnyPath) -> PlannedSurvey:
+    """Return the plan of a survey with the path, the anchors and the number of ranges of a finished one.
+
+    Path and anchors are those of the result's map, and the errors of the radio are those that the run has learnt. For a
+    map in the frame of the first camera, up is the mean upward direction of the photos.
+
+    Raises:
+        InputError: the folder is not a result, or has no metric model or no used ranges.
+    """
+    folder = read_result_folder(Path(path))
+    model, ranges = folder.read_metric_model(), folder.read(RangesAsUsed)
+    if model is None or ranges is None or not ranges.is_used.any():
+        raise InputError("has no metric model or no used ranges, expected a finished result", path)
+    trajectory = path_in_result(model, folder)
+    if not is_one_after_the_other(trajectory):
+        expected = "expected the result of one survey"
+        raise InputError(f"two of its photos have the same time, as in a map of several cameras, {expected}", path)
+    used = np.array(ranges.anchor_id, dtype=str)[ranges.is_used]
+    (arm,) = folder.lever_arms_m(ranges.tag_id[:1])
+    stddevs = {name: anchor.stddev_m or 0.0 for name, anchor in folder.summary.anchors.items()}
+    heard = {name: np.array(at) for name, at in folder.anchor_positions_m.items() if name in set(used.tolist())}
+    anchors = [Anchor(name, at, stddevs[name]) for name, at in heard.items()]
+    is_known = any(anchor.surveyed_position_m is not None for anchor in folder.summary.anchors.values())
+    frame, stddevs_m = _frame(folder.summary.frame, is_known=is_known), folder.summary.scale.error_stddevs
+    on_earth = folder.summary.georeference
+    site = Site(georeference=None if on_earth is None else on_earth.georeference)
+    return _planned(trajectory, colored_points(model)[0], anchors, frame, arm, len(used), stddevs_m, site)
+
+
+def with_advice(metric: MetricResult, tag_in_cam_m: Array, georeference: Georeference | None) -> MetricResult:
+    """Add advice on what to change next time, where the scale or the place is doubtful.
+
+    Args:
+        metric: the result.
+        tag_in_cam_m: (num_tags, 3) lever arms.
+        georeference: of the site; None without one.
+    """
+    doubtful = metric.estimate.verdict == "doubtful", metric.place is not None and metric.place.verdict == "doubtful"
+    if metric.estimate.method == "two-candidate":  # another survey would not make its scale more certain
+        return metric
+    observations = metric.observations
+    used = observations.has_place & (observations.status < RangeStatus.OUTLIER)
+    if not any(doubtful) or not used.any() or not is_one_after_the_other(metric.trajectory):
+        return metric
+    log, estimate = observations.log, metric.estimate
+    heard = {log.anchor_ids[k] for k in np.unique(log.anchor_index[used])}
+    anchors = [
+        Anchor(a.anchor_id, a.position_m, a.position_stddev_m)
+        for a in metric.anchors
+        if a.anchor_id in heard and np.isfinite(a.position_m).all()
+    ]
+    is_known = any(anchor.prior_position_m is not None for anchor in metric.anchors)
+    trajectory = metric.trajectory.as_in(metric.final)
+    arm = tag_in_cam_m[max(int(log.tag_index[used][0]), 0)]
+    try:
+        frame, learned = _frame(estimate.frame, is_known=is_known), estimate.errors.learned
+        stddevs = {} if learned is None else learned.stddev_of_component
+        points_m = colored_points(metric.final)[0]
+        site = Site(georeference=georeference)
+        planned = _planned(trajectory, points_m, anchors, frame, arm, int(used.sum()), stddevs, site)
+        expected = expect(planned)
+    except (InputError, GeometryError):  # the upward direction is unknown, or a survey like this one would be refused
+        return metric
+    words = best_words(advise(expected), for_scale=doubtful[0], for_place=doubtful[1])
+    is_computed = any(each.startswith(CALIBRATE) for each in words)
+    before = [each for each in estimate.advice if not (is_computed and each.startswith(CALIBRATE))]
+    return replace(metric, estimate=replace(estimate, advice=tuple(dict.fromkeys((*before, *words)))))
+
+
+def _planned(
+    trajectory: Trajectory,
+    points_m: Array,
+    anchors: Sequence[Anchor],
+    frame: str,
+    tag_in_cam_m: Array,
+    num_ranges: int,
+    component_stddevs: Mapping[str, float],
+    site: Site,
+) -> PlannedSurvey:
+    """Return the plan with z up, inside what the photos show, and with assumed times where the photos have none.
+
+    Args:
+        points_m: (n, 3) points of the map.
+    """
+    is_site = frame == "site"
+    level = np.eye(3) if is_site else level_axes(trajectory, up_in_world(trajectory, "auto"))
+    times = np.arange(len(trajectory)) / _PHOTO_RATE_HZ if trajectory.timestamps_s is None else trajectory.timestamps_s
+    planned = PlannedSurvey(
+        trajectory=replace(trajectory.transformed(1.0, level, np.zeros(3)), timestamps_s=times),
+        anchors=tuple(replace(a, position_m=level @ np.array(a.position_m)) for a in anchors),
+        anchor_frame=frame,
+        rate_hz=1.0,
+        tag_in_cam_m=tuple(tag_in_cam_m.tolist()),
+        component_stddevs=component_stddevs,
+        site=site if is_site else Site(),
+        axes="" if is_site else _AXES,
+        level="" if is_site else _LEVEL,
+    )
+    return _inside(planned.ranging(num_ranges), points_m @ level.T)
+
+
+def _inside(planned: PlannedSurvey, points_m: Array) -> PlannedSurvey:
+    """Return the plan inside what the photos show, with anchors where they show something to fix them to.
+
+    Nobody can say what is outside or above path, anchors and points (n, 3): whether there is room, or a ceiling.
+    """
+    low, high = np.quantile(points_m, _MOST_OF_POINTS, axis=0) if len(points_m) else planned.places_m[:2]
+    places = np.vstack([planned.places_m, [low, high]])
+    (left, front, lowest), (right, back, highest) = places.min(axis=0) - _BEHIND_M, places.max(axis=0) + _BEHIND_M
+    corners = np.array([[left, front], [right, front], [right, back], [left, back], [left, front]])
+    surfaces_m = points_m[np.all((points_m >= low) & (points_m <= high), axis=1)] if len(points_m) else points_m
+    some = np.linspace(0, len(surfaces_m) - 1, min(len(surfaces_m), _NUM_SURFACES)).astype(np.int64)
+    return replace(
+        planned,
+        walls_m=(corners,),
+        walls_are="edge of what the photos show",
+        heights_m=(lowest, highest),
+        allowed_m=surfaces_m[some] if len(some) else planned.anchors_m,
+    )
+
+
+def _frame(frame: str, *, is_known: bool) -> str:
+    return "site" if frame == "site" else "first_camera" if is_known else "unknown"

@@ -1,0 +1,325 @@
+"""Records and tables of a result, made from what the stages found.
+
+``rangesfm.result`` has them as plain data, so that reading a result loads none of the stages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Mask, median, rms
+from rangesfm.diagnostics.mistake_words import CHECKED_KINDS, mistake_in_words
+from rangesfm.diagnostics.scale_bound import scale_bound
+from rangesfm.errors import number_text
+from rangesfm.measurements.lengths.locate_lengths import locate_distances
+from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
+from rangesfm.measurements.positions.known_marks import locate_points
+from rangesfm.measurements.ranges.range_log import RangeKind
+from rangesfm.measurements.ranges.range_observations import USED, RangeStatus
+from rangesfm.pipeline.join_models import ModelVerdict
+from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.result import entries
+from rangesfm.result.result_tables import (
+    CenterCovariances,
+    LoopPairs,
+    PhotoTimes,
+    RangesAsUsed,
+    ScaleCandidates,
+    ScaleConsensus,
+    TableFile,
+    TagCorners,
+    TimeOffsetCurve,
+)
+from rangesfm.result.summary import ResultSummary
+from rangesfm.solver.mistakes import RISK, finite
+from rangesfm.util.geometry.similarity import IDENTITY, Similarity
+
+# A length disagrees with the map beyond this number of standard deviations, which chance exceeds in one of 370 cases.
+_DISAGREES = 3.0
+
+
+def summary_of(found: MetricResult, **others: Any) -> ResultSummary:
+    """Return the content of ``result.json``.
+
+    Args:
+        found: what the stages found.
+        others: entries that do not follow from it, from ``georeference`` on, and ``distances`` and ``comparison``.
+    """
+    estimate, diagnosis = found.estimate, found.diagnosis
+    return ResultSummary(
+        scale=entries.ScaleEntry.model_validate(estimate),
+        place=None if found.place is None else entries.PlaceEntry.model_validate(found.place),
+        metric_from_sfm=_similarity(estimate.metric_from_sfm),
+        frame="site" if estimate.frame == "site" else "first_camera",
+        map=entries.MapEntry(num_photos=found.final.num_reg_images(), num_points3D=found.final.num_points3D()),
+        anchors={anchor.anchor_id: entries.AnchorEntry.model_validate(anchor) for anchor in found.anchors},
+        time_offset=_time_offset(found),
+        ranges=_ranges(found),
+        check_ranges=_check_ranges(found),
+        refine=_refinement(found),
+        loops=_loops(found),
+        points=points_entry(found),
+        tests=tuple(map(entries.MistakeEntry.model_validate, diagnosis.tests if diagnosis else ())),
+        reliability=_reliability(found),
+        models=tuple(_model(model, estimate.metric_from_sfm) for model in found.models),
+        **_entries_of_kinds(found),
+        **others,
+    )
+
+
+def _entries_of_kinds(found: MetricResult) -> dict[str, Any]:
+    """Return the own entries of the kinds of measurement, by name."""
+    on_map = found.all_measured
+    of_kinds = {} if on_map is None else {kind.kind: kind.entry(on_map) for kind in on_map.kinds}
+    return {name: entry for name, entry in of_kinds.items() if entry}
+
+
+def _similarity(similarity: Similarity) -> entries.SimilarityEntry:
+    return entries.SimilarityEntry(
+        scale=similarity.scale,
+        rotation_xyzw=Rotation.from_matrix(similarity.rotation).as_quat().tolist(),
+        translation_m=similarity.translation.tolist(),
+    )
+
+
+def _model(model: ModelVerdict, metric_from_joined: Similarity) -> entries.ModelEntry:
+    refused = {"value": None, "stddev_empirical": None, "interval_95": None, "verdict": "refused"}
+    joined = model.joined_from_sfm
+    return entries.ModelEntry(
+        name=model.name,
+        num_images=model.num_images,
+        joined=joined is not None,
+        reason=model.reason or None,
+        scale=entries.ModelScaleEntry.model_validate(model.estimate or {**refused, "reasons": [model.reason]}),
+        metric_from_sfm=None if joined is None else _similarity(metric_from_joined @ joined),
+    )
+
+
+def _time_offset(found: MetricResult) -> entries.TimeOffsetEntry:
+    offset, given_s = found.time_offset, found.time_offset_s
+    if offset is None:
+        stddev_s = None if given_s is None else 0.0
+        return entries.TimeOffsetEntry(value_s=given_s, stddev_s=stddev_s, estimated=False, note=None)
+    in_ppm = {"drift_ppm": 1e6 * offset.drift, "drift_stddev_ppm": 1e6 * offset.drift_stddev}
+    return entries.TimeOffsetEntry.model_validate({**vars(offset), **in_ppm, "estimated": True})
+
+
+def _ranges(found: MetricResult) -> entries.RangesEntry:
+    kind, used = found.observations.log.kind, np.isin(found.observations.status, USED)
+
+    def residuals(rows: Mask) -> dict[str, Any]:
+        chosen = found.residuals_m[used & rows]
+        nums = {"num": rows.sum(), "num_used": (used & rows).sum(), "num_rejected": (~used & rows).sum()}
+        return {**nums, "rms_m": rms(chosen), "median_abs_m": median(np.abs(chosen))}
+
+    others = {RangeKind.ANCHOR_ANCHOR: "num_anchor_anchor", RangeKind.TAG_TAG: "num_tag_tag"}
+    return entries.RangesEntry.model_validate(
+        {
+            **residuals(kind == RangeKind.TAG_ANCHOR),
+            **{name: np.count_nonzero(kind == other) for other, name in others.items()},
+            "per_anchor": {id_: residuals(rows) for id_, rows in _by_anchor(found, kind == RangeKind.TAG_ANCHOR)},
+        }
+    )
+
+
+def _check_ranges(found: MetricResult) -> entries.CheckRangesEntry:
+    held_out = found.observations.status == RangeStatus.CHECK
+
+    def residuals(rows: Mask) -> dict[str, Any]:
+        chosen = found.residuals_m[rows & np.isfinite(found.residuals_m)]
+        return {"num": len(chosen), "rms_m": rms(chosen), "median_m": median(chosen)}
+
+    per_anchor = {id_: residuals(rows) for id_, rows in _by_anchor(found, held_out) if rows.any()}
+    return entries.CheckRangesEntry.model_validate({**residuals(held_out), "per_anchor": per_anchor})
+
+
+def _by_anchor(found: MetricResult, chosen: Mask) -> Iterator[tuple[str, Mask]]:
+    """Yield the id of each anchor and the mask (n,) of the chosen ranges to it."""
+    log = found.observations.log
+    for k, anchor_id in enumerate(log.anchor_ids):
+        yield anchor_id, chosen & (log.anchor_index == k)
+
+
+def _loops(found: MetricResult) -> entries.LoopsEntry | None:
+    loops = found.loops
+    if loops is None:
+        return None
+    return entries.LoopsEntry(
+        num_proposed=loops.num_proposed,
+        num_verified=loops.num_verified,
+        num_closed=len(loops.closed),
+        num_contradicted=len(loops.contradicted),
+        moved_m=loops.moved_m(found.trajectory.as_in(found.final)),
+    )
+
+
+def _refinement(found: MetricResult) -> entries.RefineEntry | None:
+    summary = found.refinement
+    if summary is None:
+        return None
+    tag_ids, covariance = found.observations.log.tag_ids, summary.covariance
+    others = {
+        "kept": not found.why_broken,
+        "why_not_kept": found.why_broken,
+        "iterations": summary.num_iterations,
+        "keyframe_graph_steps": summary.num_graph_steps,
+        "correlation_inflation": summary.errors.inflation,
+        "converged": summary.converged,
+        "scale_value": found.refined_scale,
+        "relative_scale_stddev": None if covariance is None else covariance.relative_scale_stddev,
+        "tag_in_cam_m": dict(zip(tag_ids, summary.tags_in_cam_m, strict=True)),
+        "time_offset_change_s": summary.time_shift_s,
+    }
+    return entries.RefineEntry.model_validate({**vars(summary), **others})
+
+
+def _reliability(found: MetricResult) -> entries.ReliabilityEntry | None:
+    """Return the entry; None where no mistakes were tested."""
+    diagnosis = found.diagnosis
+    if diagnosis is None or not diagnosis.hidden:
+        return None
+    bound, limited_by = scale_bound(found.estimate.uncertainty, diagnosis.hidden)
+    is_found = any(test.rejected for test in diagnosis.tests)
+    given = [test for test in diagnosis.tests if test.name in CHECKED_KINDS and test.is_checked is False]
+    return entries.ReliabilityEntry(
+        scale_within=None if is_found else finite(float(np.expm1(bound))),
+        risk=RISK,
+        limited_by=limited_by,
+        unchecked=tuple(mistake_in_words(test.name, test.subject) for test in given),
+    )
+
+
+def points_entry(found: MetricResult) -> entries.PointsEntry | None:
+    """Return control and check points in the final map; None without any, or where the map is not in the site."""
+    known = found.positions.points
+    if known is None or found.estimate.frame != "site":
+        return None
+    located = locate_points(known, found.final, found.trajectory.as_in(found.final))
+    places = dict(zip(located.names, located.predicted_m(IDENTITY), strict=True))
+    rows = []
+    for point in known.points:
+        at = places.get(point.name)
+        off = None if at is None else at - point.position_m
+        rows.append(
+            entries.PointRow(
+                marker=point.name,
+                kind=point.kind,
+                known_m=point.position_m.tolist(),
+                stddev_m=point.stddev_m,
+                estimated_m=None if at is None else at.tolist(),
+                residual_m=None if off is None else off.tolist(),
+                distance_m=None if off is None else float(np.linalg.norm(off)),
+            )
+        )
+    return entries.PointsEntry(control=_rmse(rows, CONTROL), check=_rmse(rows, CHECK), points=tuple(rows))
+
+
+def _rmse(rows: Sequence[entries.PointRow], kind: str) -> entries.PointErrors3d:
+    off = np.array([row.residual_m for row in rows if row.kind == kind and row.residual_m is not None])
+    if not len(off):
+        return entries.PointErrors3d(num=0, rmse_m=None, rmse_3d_m=None)
+    squares = np.mean(off**2, axis=0)
+    return entries.PointErrors3d(num=len(off), rmse_m=np.sqrt(squares).tolist(), rmse_3d_m=math.sqrt(squares.sum()))
+
+
+def distance_rows(found: MetricResult) -> list[entries.DistanceRow]:
+    """Return a row for each measured length, in the order of its file; empty without any."""
+    if not found.tape.distances:
+        return []
+    located = locate_distances(found.tape, found.final, [anchor.anchor_id for anchor in found.anchors])
+    lengths_m = located.lengths_m(1.0, np.array([anchor.position_m for anchor in found.anchors]).reshape(-1, 3))
+    return [
+        entries.DistanceRow(
+            from_=taped.ends[0],
+            to=taped.ends[1],
+            kind=taped.kind,
+            measured_m=taped.distance_m,
+            stddev_m=taped.stddev_m,
+            estimated_m=length_m,
+            residual_m=length_m - taped.distance_m,
+        )
+        for taped, length_m in zip(found.tape.distances, lengths_m.tolist(), strict=True)
+    ]
+
+
+def disagreements(rows: Iterable[entries.DistanceRow], relative_scale_stddev: float, bending: float) -> Iterator[str]:
+    """Yield a line for each length that differs from the map by more than tape, scale and bending explain.
+
+    For a control length the uncertainty of the scale is not counted, because it has taken part in the scale.
+
+    Args:
+        relative_scale_stddev: relative standard deviation of the scale.
+        bending: relative standard deviation by which the scale varies from place to place.
+    """
+    for row in rows:
+        of_scale = relative_scale_stddev if row.kind == CHECK else 0.0
+        stddev_m = math.hypot(row.stddev_m, of_scale * row.measured_m, bending * row.measured_m)
+        if row.kind != LEFT_OUT and row.residual_m is not None and abs(row.residual_m) > _DISAGREES * stddev_m:
+            yield (
+                f"{row.kind} distance from {row.from_} to {row.to}: {row.estimated_m:.3f} m in the map, "
+                f"{row.measured_m:.3f} m by tape ({number_text(row.residual_m, '+.3f')} m, expected within "
+                f"{_DISAGREES * stddev_m:.3f} m)"
+            )
+
+
+def tables_of(found: MetricResult) -> Iterator[TableFile]:
+    """Yield the tables of a result; some are left out where it has nothing for them."""
+    times = found.trajectory.timestamps_s
+    if times is not None:
+        yield PhotoTimes(found.trajectory.image_names, times)
+    by_photo = found.center_covariance_m2
+    if by_photo:
+        rows, columns = np.triu_indices(3)
+        yield CenterCovariances(tuple(by_photo), *np.array(list(by_photo.values()))[:, rows, columns].T)
+    if found.loops is not None:
+        kinds = {"closed": found.loops.closed, "contradicted": found.loops.contradicted}
+        pairs = [(*pair, kind) for kind, of_kind in kinds.items() for pair in of_kind]
+        yield LoopPairs(*(zip(*pairs) if pairs else ((), (), ())))
+    curve = None if found.time_offset is None else found.time_offset.curve
+    if curve is not None:
+        yield TimeOffsetCurve(curve.offsets_s, curve.costs_m)
+    markers = found.tape.found_markers
+    if markers:
+        names = [name for name, marker in markers.items() for _ in marker.image_names]
+        photos = [name for marker in markers.values() for name in marker.image_names]
+        pixels = np.concatenate([marker.pixels for marker in markers.values()])
+        yield TagCorners(tuple(names), tuple(photos), *pixels.T)
+    if len(found.observations.log):
+        yield ranges_as_used(found)
+        diagnostics, log = found.diagnostics, found.observations.log
+        rows = diagnostics.candidate_rows
+        times = np.full(len(rows), np.nan) if log.timestamp_s is None else log.timestamp_s[rows]
+        anchor_ids = tuple(log.anchor_ids[k] for k in log.anchor_index[rows])
+        yield ScaleCandidates(times, anchor_ids, *diagnostics.candidates.T)
+        yield ScaleConsensus(diagnostics.curve_scales, diagnostics.num_agreeing.astype(np.float64))
+
+
+def ranges_as_used(found: MetricResult) -> RangesAsUsed:
+    """Return the table of all ranges."""
+    observations, log = found.observations, found.observations.log
+    unknown = np.full(len(log), np.nan)
+    has_say = np.isin(observations.status, (*USED, RangeStatus.OUTLIER))
+    labels = {int(status): status.label for status in RangeStatus}
+    names = (*found.trajectory.image_names, "")
+    tag_ids, anchor_ids = log.end_ids()
+    return RangesAsUsed(
+        timestamp_s=unknown if log.timestamp_s is None else log.timestamp_s,
+        image_name=("",) * len(log) if log.image_name is None else log.image_name,
+        anchor_id=tuple(anchor_ids),
+        tag_id=tuple(tag_ids),
+        range_m=log.range_m,
+        range_stddev_m=found.range_stddev_m,
+        keyframe_before=tuple(names[i] for i in observations.before),
+        keyframe_after=tuple(names[i] for i in observations.after),
+        weight=np.where(observations.before >= 0, observations.fraction, np.nan),
+        predicted_scaled_m=found.predicted_scaled_m,
+        predicted_refined_m=unknown if found.kept_refinement is None else found.kept_refinement.predicted_m,
+        residual_m=found.residuals_m,
+        robust_weight=np.where(has_say, found.weights, np.nan),
+        status=tuple(labels[status] for status in observations.status.tolist()),
+    )

@@ -1,0 +1,161 @@
+"""Results of a finished run: all files of the result folder, the report, and a summary for the terminal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+
+from rangesfm.comparison.with_reference import format_table, papers_table, reference_in_frame
+from rangesfm.errors import BAD_INPUT, InputError
+from rangesfm.export import COVARIANCE_FORMATS, MetricMap, export_map, write_model
+from rangesfm.measurements.lengths.lengths_on_map import BENDING
+from rangesfm.pipeline.metric_result import MetricResult
+from rangesfm.pipeline.result_records import disagreements, distance_rows, summary_of, tables_of
+from rangesfm.report import write_report_of
+from rangesfm.report.content import Content
+from rangesfm.result.entries import ComparisonRow
+from rangesfm.result.joint_covariance import write_map_errors
+from rangesfm.result.places import recorded_path, recorded_settings
+from rangesfm.result.result_folder import REFERENCE_NAME, REPORT_NAME, new_result, read_result_folder
+from rangesfm.result.summary import ResultSummary
+from rangesfm.sfm.steps import DATABASE_NAME
+from rangesfm.solver.installation_checks import recorded_versions
+from rangesfm.survey.input_hashes import input_hashes
+from rangesfm.survey.inputs import RangingInputs
+from rangesfm.survey.settings import Survey
+from rangesfm.survey.survey_run import SurveyRun
+from rangesfm.util.files.atomic import path_of
+from rangesfm.util.geometry.georeference import Georeference
+from rangesfm.util.geometry.reference import write_reference
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Outcome of a run. Its files are read by ``read_result_folder``.
+
+    Attributes:
+        lines: summary for the user.
+    """
+
+    output_path: Path
+    summary: ResultSummary
+    lines: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Return the summary for the user."""
+        return "\n".join(self.lines)
+
+
+def write_results(run: SurveyRun, metric: MetricResult) -> RunResult:
+    """Write all files of the result, with ``result.json`` last, and the report.
+
+    Raises:
+        InputError: a format of [export] cannot be written, but everything else has been; or a file that a result would
+            replace was not written by this tool, and nothing has been written.
+    """
+    survey, inputs, journal = run.survey, run.inputs, run.journal
+    if not metric.center_covariance_m2 and (left_out := set(COVARIANCE_FORMATS) & set(survey.export.formats)):
+        journal.warn(f"without covariances of the poses there is no {', '.join(sorted(left_out))}")
+    distances = distance_rows(metric)
+    disagreeing = tuple(disagreements(distances, metric.estimate.uncertainty.empirical, BENDING))
+    journal.warn(*disagreeing)
+    metric = metric.doubted(disagreeing)
+    folder = survey.output.path
+    with new_result(folder, survey.images.path) as staged:
+        with journal.stage("results"):
+            comparison = _comparison(inputs, metric, staged)
+            # The georeference of the anchors is that of the map, if the map is in their frame.
+            georeference = inputs.site.georeference if metric.estimate.frame == "site" else None
+            not_exported = _write_models_and_tables(survey, metric, staged, georeference)
+        summary = summary_of(
+            metric,
+            distances=distances,
+            **({"comparison": comparison} if comparison else {}),
+            georeference=georeference,
+            versions=recorded_versions(),
+            settings=recorded_settings(survey),
+            inputs=[{**one, "path": recorded_path(path_of(one["path"]), folder)} for one in input_hashes(survey)],
+            seconds=journal.all_seconds(),
+            computed=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            warnings=journal.warnings,
+            notes=journal.notes,
+        )
+        summary.write(staged / summary.NAME)
+        if survey.report.enabled:
+            with journal.stage("report"):
+                content = Content(read_result_folder(staged), images_path=survey.images.path, home=folder)
+                write_report_of(content, staged)
+    lines = [*summary.lines(folder, format_table(comparison, summary.frame) if comparison else None)]
+    if survey.report.enabled:
+        lines.append(f"report: {folder / REPORT_NAME}")
+    if not_exported is not None:
+        raise not_exported
+    return RunResult(folder, summary, tuple(lines))
+
+
+def _comparison(inputs: RangingInputs, metric: MetricResult, folder: Path) -> tuple[ComparisonRow, ...]:
+    """Return the comparison with the reference, empty without one; write the reference in the frame of the map."""
+    if inputs.reference is None:
+        return ()
+    frame = metric.estimate.frame
+    scaled = metric.trajectory.as_in(metric.scaled)
+    refined = None if metric.kept_refinement is None else metric.trajectory.as_in(metric.final)
+    loops_open = None if metric.loops is None else metric.loops.before
+    rows = papers_table(scaled, refined, inputs.reference, frame=frame, loops_open=loops_open)
+    in_frame = reference_in_frame(refined or scaled, inputs.reference, frame=frame)
+    if in_frame is not None:
+        write_reference(in_frame, folder / REFERENCE_NAME)
+    return rows
+
+
+def _write_models_and_tables(
+    survey: Survey, found: MetricResult, folder: Path, georeference: Georeference | None
+) -> InputError | None:
+    """Write the models, the tables and the export formats of a result into a new folder.
+
+    Formats that this result cannot have (points or covariances without any) are left out.
+
+    Args:
+        folder: to write into.
+        georeference: of the result's frame; None without one.
+
+    Returns:
+        The error of a format that cannot be written, for a warning; None if all were written. Models and tables are
+        complete in either case.
+
+    Raises:
+        RangesfmError: something else failed, such as a full disk.
+    """
+    write_model(found.scaled, folder / "sparse_scaled" / "0")
+    if found.refined is not None:
+        write_model(found.final, folder / "sparse_metric" / "0")
+    for table in tables_of(found):
+        table.write(folder)
+    if found.map_errors is not None:
+        write_map_errors(found.map_errors, folder)
+    map_ = MetricMap(
+        found.final,
+        timestamps_s=found.trajectory.times_by_name,
+        anchors_m={a.anchor_id: a.position_m for a in found.anchors if np.isfinite(a.position_m).all()},
+        metric_from_sfm=found.estimate.metric_from_sfm,
+        relative_scale_stddev=found.estimate.uncertainty.empirical,
+        images_path=survey.images.path,
+        database_path=survey.output.path / DATABASE_NAME,
+        is_site=found.estimate.frame == "site",
+        upward=found.upward,
+        georeference=georeference,
+        center_covariance_m2=found.center_covariance_m2,
+    )
+    impossible = [] if found.final.num_points3D() else ["ply"]
+    impossible += [] if found.center_covariance_m2 else COVARIANCE_FORMATS
+    formats = tuple(name for name in survey.export.formats if name not in impossible)
+    try:
+        export_map(map_, folder, survey.export.changed(formats=formats))
+    except InputError as error:
+        if error.exit_status != BAD_INPUT:  # a full disk, on which the rest of the result cannot be written either
+            raise
+        return error
+    return None

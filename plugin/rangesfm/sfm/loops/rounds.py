@@ -1,0 +1,102 @@
+"""Rounds of finding and closing loops: a map whose loops are closed proposes more of them, and judges them better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+from rangesfm.arrays import Indices
+from rangesfm.sfm.loop_database import Pair
+from rangesfm.sfm.loops.loop_finder import LoopFinder
+from rangesfm.sfm.loops.resection import Loop
+
+MAX_NUM_PAIRS = 5
+"""Pairs that one photo proposes at most in a round. Sequential matching pairs a photo with 10 neighbours by default."""
+
+MAX_NUM_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class TriedPairs:
+    """Pairs of photos in all rounds.
+
+    Attributes:
+        proposed: by the maps. verified: those of them that match.
+        closed: those of these that were used. contradicted: those that the last map with its measurements contradicts.
+    """
+
+    proposed: frozenset[Pair] = frozenset()
+    verified: frozenset[Pair] = frozenset()
+    closed: frozenset[Pair] = frozenset()
+    contradicted: frozenset[Pair] = frozenset()
+
+
+_Map = TypeVar("_Map", bound="MapWithLoops")
+
+
+class MapWithLoops(Protocol):
+    """A refined map whose loops can be closed."""
+
+    def find(self, tried: TriedPairs) -> tuple[list[Loop], TriedPairs]:
+        """Return the loops that are found in this map beside those closed before, as ``find_in``."""
+
+    def with_closed(self: _Map, loops: Sequence[Loop], tried: TriedPairs) -> _Map | None:
+        """Return the map refined with loops; None if it broke.
+
+        Args:
+            loops: that were found last. tried: all pairs, these loops among the closed ones.
+        """
+
+
+def close_in_rounds(refined: _Map) -> tuple[_Map, TriedPairs]:
+    """Close the loops of a map, and return the last map with the pairs of all rounds.
+
+    The test of a loop takes the errors of the map for small. A map that is bent by metres contradicts true loops until
+    others have straightened it. Only where loops contradict the map, another round tests them again in the next map,
+    which may propose more. It ends where nothing new is found.
+    """
+    tried = TriedPairs()
+    for _ in range(MAX_NUM_ROUNDS):
+        loops, tried = refined.find(tried)
+        closed = replace(tried, closed=tried.closed.union(loop.image_ids for loop in loops))
+        if not loops or (after := refined.with_closed(loops, closed)) is None:
+            break
+        refined, tried = after, closed
+        if not tried.contradicted:
+            break
+    return refined, tried
+
+
+def find_in(
+    finder: LoopFinder,
+    match: Callable[[list[Pair]], Mapping[Pair, Indices]],
+    known: Mapping[int, Set[int]],
+    tried: TriedPairs,
+    alike: Callable[[Mapping[int, Set[int]]], list[Pair]] = lambda _: [],
+) -> tuple[list[Loop], TriedPairs]:
+    """Return the loops that match and fit the map, and all pairs that have been tried with those of this round.
+
+    Args:
+        finder: of loops in the map.
+        match: returns the matches (m, 2) of those of some pairs that are verified.
+        known: ids of the photos that each photo was matched with by the mapping, by its id.
+        tried: pairs of the rounds before. Those that the map contradicted are tried again.
+        alike: returns pairs of photos that look alike, given for each photo, by its id, those that it is not to be
+            paired with: they were matched with it, or the map predicts that they see the same. It is asked once.
+    """
+    matched = {id_: set(others) for id_, others in known.items()}
+    for first, second in tried.proposed:
+        matched.setdefault(first, set()).add(second)
+        matched.setdefault(second, set()).add(first)
+    proposed = set(finder.propose(matched, max_num=MAX_NUM_PAIRS))
+    if not tried.proposed:
+        proposed.update(alike(finder.predicted(matched)))
+    verified = match(sorted(proposed | tried.contradicted))
+    loops, contradicted = finder.tested(verified)
+    return loops, TriedPairs(
+        tried.proposed.union(proposed),
+        tried.verified.union(verified),
+        tried.closed,
+        tried.contradicted.union(contradicted).difference(loop.image_ids for loop in loops),
+    )

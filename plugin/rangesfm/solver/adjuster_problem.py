@@ -1,0 +1,355 @@
+"""A bundle adjuster's problem: adding residuals, solving, and its Jacobian as a sparse matrix."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csc_array, csr_array
+
+from rangesfm.arrays import Array, Indices, rows_by_key
+from rangesfm.solver.installation_checks import check_compatibility
+from rangesfm.util.processes.threads import num_threads
+
+if TYPE_CHECKING:
+    import pyceres
+    import pycolmap
+
+_NUM_POSE_PARAMS = 7
+_NUM_POSE_COLUMNS = 6
+MAX_NUM_SHARED = _NUM_POSE_COLUMNS
+"""Largest size of a block of numbers that all ranges share: as many as a pose has columns."""
+# Objects that residuals refer to. The problem refers to its adjuster, so only a weak key lets both be freed in the end.
+_used_by_adjuster: weakref.WeakKeyDictionary[pycolmap.CeresBundleAdjuster, list[Any]] = weakref.WeakKeyDictionary()
+
+
+def add_residual_block(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    cost: pyceres.CostFunction,
+    loss: pyceres.LossFunction | None,
+    blocks: Sequence[Array],
+) -> None:
+    """Add a residual to a bundle adjuster's problem, with correct lifetimes and constant poses.
+
+    ``adjuster.problem.add_residual_block`` has two traps. There, cost, loss and blocks live only as long as the Python
+    object ``problem``, and solving without it reads freed memory; here they live as long as the adjuster. And a pose
+    that
+    the adjuster holds constant is part of its reprojection costs, not of the problem: there, a range would add it as a
+    free block without a manifold, which then moves on its own; here it is held constant, as is the pose of a frame
+    without observations.
+
+    Args:
+        adjuster: from ``pycolmap.create_default_ceres_bundle_adjuster``.
+        cost: its blocks must have the sizes and the order of ``blocks``.
+        loss: None for least squares.
+        blocks: float64, contiguous and writeable arrays, which the solver changes in place.
+
+    Raises:
+        ValueError: a block is not such an array, is given twice, or does not have the size that the cost expects.
+    """
+    for block in blocks:
+        if block.dtype != np.float64 or not block.flags.carray:
+            raise ValueError("the solver works in place: a block must be a contiguous, writeable float64 array")
+    if len({block.__array_interface__["data"][0] for block in blocks}) < len(blocks):
+        raise ValueError("a block is given twice: the blocks of one residual must be different ones")
+    problem = adjuster.problem
+    held = [b for b in blocks if b.size == _NUM_POSE_PARAMS and not problem.has_parameter_block(b)]
+    problem.add_residual_block(cost, loss, list(blocks))
+    for pose in held:
+        problem.set_parameter_block_constant(pose)
+    _used_by_adjuster.setdefault(adjuster, []).append((cost, loss, blocks))
+
+
+def add_normal_prior(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    block: Array,
+    mean: npt.ArrayLike,
+    stddev: npt.ArrayLike,
+    covariance: Array | None = None,
+) -> None:
+    """Add a prior for each of the n numbers of a block, as the residual ``(x - mean) / stddev``.
+
+    Args:
+        adjuster: as in ``add_residual_block``.
+        block: (n,) without a manifold, such as an anchor, a range bias or a lever arm.
+        mean: (n,) in the block's unit.
+        stddev: one for all, or (n,), positive, in the block's unit.
+        covariance: (n, n) of further errors, square units; None: there are none.
+
+    Raises:
+        ValueError: a value is not finite, or a standard deviation is not positive, or a shape is wrong.
+    """
+    means, stddevs = np.asarray(mean, dtype=np.float64), np.broadcast_to(stddev, block.shape)
+    variances = np.square(stddevs)
+    is_right = np.isfinite(means) & (stddevs > 0) & (variances > 0) & np.isfinite(variances)
+    if means.shape != block.shape or not is_right.all():
+        raise ValueError(
+            f"a prior of mean {mean!r} and stddev {stddev!r}, expected finite and positive for each number"
+        )
+    check_compatibility()
+    import pyceres
+
+    of_all = np.diag(variances) if covariance is None else np.diag(variances) + covariance
+    cost = pyceres.factors.NormalPrior(means, of_all)
+    add_residual_block(adjuster, cost, None, [block])
+
+
+def keep_from_elimination(adjuster: pycolmap.CeresBundleAdjuster, block: Array, point: Array) -> None:
+    """Make Ceres eliminate only the 3-D points, with its fastest kernels; to call for each free anchor, bias etc.
+
+    Ceres eliminates a set of blocks no two of which share a residual, first those with few neighbours. It has fast
+    kernels if all blocks of the set have one size and all others another size. Without this function it takes an anchor
+    for one of the points, and eliminating it couples all poses with ranges to it. So the block is tied to a point by
+    residuals that are always zero. It also gets as many columns as a pose, of which the last are zero, because of the
+    one size.
+
+    Args:
+        adjuster: as in ``add_residual_block``.
+        block: part of the problem, not constant, of at most 6 numbers.
+        point: block of a 3-D point seen by fewer images than ``block`` has neighbours; it may hold several ties.
+    """
+    check_compatibility()
+    from rangesfm import _cpp
+
+    add_residual_block(adjuster, _cpp.zero_tie_cost(size_a=len(block), size_b=len(point)), None, [block, point])
+    if not adjuster.problem.has_manifold(block):
+        manifold = _cpp.padded_manifold(size=len(block), tangent_size=_NUM_POSE_COLUMNS)
+        adjuster.problem.set_manifold(block, manifold)
+        _used_by_adjuster[adjuster].append(manifold)
+
+
+@dataclass(frozen=True)
+class PlacedRanges:
+    """n ranges, each at one keyframe (``before == after``) or between two.
+
+    Attributes:
+        range_m: (n,) measured ranges, positive.
+        stddev_m: (n,) standard deviation of the noise, positive.
+        before, after: (n,) indices of keyframes in ``RangeBlocks.poses``.
+        weight: (n,) interpolation fraction from 0 (at ``before``) to 1 (at ``after``).
+        offset_in_world_m: (n, 3) difference of a curved path from the straight line.
+        anchor_index: (n,) indices in ``RangeBlocks.anchors``.
+        tag_index: (n,) indices in ``RangeBlocks.tags_in_cam``.
+        interval_s: (n,) time from ``before`` to ``after``; needed only for a time shift.
+        share: (n,) weight besides the noise, positive; None: 1.
+        loadings_m: (n, k) change of each range by each number of ``RangeBlocks.shared``; None: there are none.
+    """
+
+    range_m: Array
+    stddev_m: Array
+    before: Indices
+    after: Indices
+    weight: Array
+    offset_in_world_m: Array
+    anchor_index: Indices
+    tag_index: Indices
+    interval_s: Array | None = None
+    share: Array | None = None
+    loadings_m: Array | None = None
+
+
+@dataclass(frozen=True)
+class RangeBlocks:
+    """The parameter blocks of ranges; the solver changes them in place.
+
+    Attributes:
+        poses: rig_from_world (7,) of each keyframe.
+        anchors: (3,) position of each anchor in the world.
+        biases: (1,) of each anchor, by which its ranges are too long.
+        tags_in_cam: (3,) antenna of each tag in the rig frame; parameter blocks only if ``lever_arms_are_free``.
+        lever_arms_are_free: whether the tags' lever arms are estimated.
+        time_shift: (1,) seconds by which the ranges were taken later than assumed; None: not estimated. It affects
+            ranges between two keyframes, also those with a weight of 0 or 1.
+        amplitude: (1,) excess of short ranges at distance 0; given exactly if ``short_range_length_m`` is.
+        shared: numbers that all ranges share, together as many as ``PlacedRanges.loadings_m`` has columns, in blocks of
+            at most ``MAX_NUM_SHARED``.
+    """
+
+    poses: Sequence[Array]
+    anchors: Sequence[Array]
+    biases: Sequence[Array]
+    tags_in_cam: Sequence[Array]
+    lever_arms_are_free: bool = False
+    time_shift: Array | None = None
+    amplitude: Array | None = None
+    shared: Sequence[Array] = ()
+
+
+def add_ranges(
+    adjuster: pycolmap.CeresBundleAdjuster,
+    ranges: PlacedRanges,
+    blocks: RangeBlocks,
+    *,
+    short_range_length_m: float | None = None,
+    loss_scale: float = math.inf,
+    loss_is_bounded: bool = False,
+) -> Indices:
+    """Add ranges to a bundle adjuster's problem; ranges of one place, anchor and tag form one residual block.
+
+    The solver's work grows with the number of blocks and of pairs of blocks that share a residual, and much less with
+    the number of residuals in a block. Adding a block takes some microseconds. A robust loss acts on each range
+    separately.
+
+    Args:
+        adjuster: as in ``add_residual_block``, which describes lifetimes and constant poses.
+        ranges: n, in any order.
+        blocks: those without any range do not become part of the problem.
+        short_range_length_m, loss_scale, loss_is_bounded: as in ``range_cost``.
+
+    Returns:
+        (n,) index of each range's residual among the problem's.
+
+    Raises:
+        ValueError: as in ``range_cost`` and ``add_residual_block``; or a time shift is given without intervals, or only
+            one of amplitude and ``short_range_length_m``.
+        SolverError: see ``check_compatibility``.
+    """
+    if (blocks.amplitude is None) != (short_range_length_m is None):
+        raise ValueError("of short_range_length_m and its amplitude one is given without the other")
+    if blocks.time_shift is not None and ranges.interval_s is None:
+        raise ValueError("a time shift needs interval_s, the time between the keyframes of each range")
+    check_compatibility()
+    first = adjuster.problem.num_residuals()
+    model = {
+        "short_range_length_m": short_range_length_m,
+        "loss_scale": loss_scale,
+        "loss_is_bounded": loss_is_bounded,
+    }
+    groups = rows_by_key(ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index)
+    for rows in groups:
+        cost = _cost(ranges, rows, blocks, model)
+        add_residual_block(adjuster, cost, None, _blocks_of_group(ranges, int(rows[0]), blocks))
+    return np.asarray(first + np.argsort(np.concatenate([np.zeros(0, dtype=np.int64), *groups])))
+
+
+def _cost(ranges: PlacedRanges, rows: Indices, blocks: RangeBlocks, model: Mapping[str, Any]) -> pyceres.CostFunction:
+    from rangesfm import _cpp
+
+    measured = {
+        "range_m": ranges.range_m[rows],
+        "stddev_m": ranges.stddev_m[rows],
+        "share": np.ones(len(rows)) if ranges.share is None else ranges.share[rows],
+        "loadings_m": None if ranges.loadings_m is None else ranges.loadings_m[rows],
+        "tag_in_cam_m": None if blocks.lever_arms_are_free else blocks.tags_in_cam[ranges.tag_index[rows[0]]],
+        **model,
+    }
+    if ranges.before[rows[0]] == ranges.after[rows[0]]:
+        return _cpp.range_cost(**measured)
+    return _cpp.interpolated_range_cost(
+        **measured,
+        weight=ranges.weight[rows],
+        offset_in_world_m=ranges.offset_in_world_m[rows],
+        interval_s=None if blocks.time_shift is None else ranges.interval_s[rows[0]],  # type: ignore[index]
+    )
+
+
+def _blocks_of_group(ranges: PlacedRanges, row: int, blocks: RangeBlocks) -> list[Array]:
+    """Return the parameter blocks of a group in the order of its cost."""
+    before, after, anchor, tag = (
+        int(index[row]) for index in (ranges.before, ranges.after, ranges.anchor_index, ranges.tag_index)
+    )
+    found = [blocks.poses[before]]
+    if before != after:
+        found.append(blocks.poses[after])
+    found += [blocks.anchors[anchor], blocks.biases[anchor]]
+    if blocks.lever_arms_are_free:
+        found.append(blocks.tags_in_cam[tag])
+    if blocks.time_shift is not None and before != after:
+        found.append(blocks.time_shift)
+    if blocks.amplitude is not None:
+        found.append(blocks.amplitude)
+    return [*found, *blocks.shared]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the solver.
+
+    Attributes:
+        is_successful: whether the parameters changed. trust_region_radius: with which the step was computed.
+        cost: after the step. gain: decrease of the cost. expected_gain: decrease if all residuals were linear.
+    """
+
+    is_successful: bool
+    trust_region_radius: float
+    cost: float
+    gain: float
+    expected_gain: float
+
+
+def solve_adjuster(adjuster: pycolmap.CeresBundleAdjuster, is_enough: Callable[[Step], bool]) -> Any:
+    """Solve like ``adjuster.solve``, and ask after each step whether to stop.
+
+    Args:
+        is_enough: called after each step, with the parameters updated; True ends the solution. Its exceptions end the
+            solution too and are raised here.
+
+    Returns:
+        the summary of Ceres, a ``pyceres.SolverSummary``.
+    """
+    check_compatibility()
+    import pyceres
+
+    class AfterStep(pyceres.IterationCallback):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__()
+            self.radius = 0.0
+            self.error: BaseException | None = None
+
+        def __call__(self, summary: Any) -> Any:
+            # An exception must not pass through the solver.
+            try:
+                gain, share = summary.cost_change, summary.relative_decrease
+                expected = gain / share if share else 0.0
+                step = Step(summary.step_is_successful, self.radius, summary.cost, gain, expected)
+                self.radius = summary.trust_region_radius
+                if summary.iteration == 0 or not is_enough(step):
+                    return pyceres.CallbackReturnType.SOLVER_CONTINUE
+                return pyceres.CallbackReturnType.SOLVER_TERMINATE_SUCCESSFULLY
+            except BaseException as error:
+                self.error = error
+                return pyceres.CallbackReturnType.SOLVER_ABORT
+
+    after_step, summary = AfterStep(), pyceres.SolverSummary()
+    options = pyceres.SolverOptions(adjuster.options.ceres.create_solver_options(adjuster.config, adjuster.problem))
+    options.callbacks, options.update_state_every_iteration = [after_step], True
+    pyceres.solve(options, adjuster.problem, summary)
+    if after_step.error is not None:
+        raise after_step.error
+    return summary
+
+
+def num_columns(problem: Any, block: Array) -> int:
+    """Return a block's number of columns in ``tangent_jacobian``: its tangent size without padding."""
+    return min(int(problem.parameter_block_tangent_size(block)), len(block))
+
+
+def tangent_jacobian(problem: Any, blocks: Sequence[Array]) -> csc_array:
+    """Return the Jacobian, (num_residuals, sum of ``num_columns``), with robust losses, in the order of the blocks.
+
+    Args:
+        problem: of an adjuster.
+        blocks: non-constant blocks of the problem; all other blocks are taken as constant.
+    """
+    import pyceres
+
+    options = pyceres.EvaluateOptions()
+    options.set_parameter_blocks(list(blocks))
+    options.num_threads = num_threads()  # one thread computes an entry, so their number changes no result
+    jacobian = problem.evaluate_jacobian(options)
+    _, columns, values = jacobian.to_tuple()
+    sizes = np.array([problem.parameter_block_tangent_size(block) for block in blocks], dtype=np.int64)
+    wanted = np.minimum(sizes, [len(block) for block in blocks])
+    is_padding = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes) >= np.repeat(wanted, sizes)
+    place = np.empty(len(is_padding), dtype=columns.dtype)
+    place[np.argsort(is_padding, kind="stable")] = np.arange(len(place))  # padding goes to the end, where it is cut off
+    shape = jacobian.num_rows, jacobian.num_cols
+    by_column = csr_array((values, place[columns], jacobian.rows), shape=shape).tocsc()
+    starts = by_column.indptr[: wanted.sum() + 1]
+    entries = slice(starts[-1])  # a view of the entries, which take most of the memory of a large map
+    return csc_array((by_column.data[entries], by_column.indices[entries], starts), shape=(shape[0], wanted.sum()))

@@ -1,0 +1,377 @@
+"""Covariances of a bundle adjustment with ranges: of poses, anchors, biases and scale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+from scipy.sparse import csr_array, diags_array
+
+from rangesfm.arrays import Array, Indices, Mask
+from rangesfm.errors import GeometryError
+from rangesfm.solver.linear_solver import factor
+from rangesfm.solver.nested_dissection import NestedFactor, SingularError
+from rangesfm.solver.normal_equations import HALF_A_REVOLUTION, BlockColumns, NormalEquations, address, rotation_of
+from rangesfm.solver.part_errors import PartSteps, map_errors
+from rangesfm.util.geometry.map_errors import MapErrors
+from rangesfm.util.geometry.numerics import UNDETERMINED
+from rangesfm.util.geometry.rotations import cross_matrices
+from rangesfm.util.geometry.similarity import similarity_motions
+
+# Smallest pivot of the normal equations, with their diagonal scaled to 1, for a direction to count as determined.
+_MIN_PIVOT = 1e-13
+
+
+@dataclass(frozen=True)
+class ResidualErrors:
+    """Errors of residuals that are not independent with the problem's standard deviation.
+
+    Attributes:
+        rows: (k,) indices of these residuals in the problem; they are no reprojection errors.
+        by_error: (k, m) sparse derivatives by m errors, in standard deviations of the residuals.
+        covariance: (m, m) of these errors, which replace those of the residuals.
+        exact: indices of residuals without errors: priors of errors that ``covariance`` has already.
+        variance_of_others: variance of all other residuals that are no reprojection errors, such as priors.
+    """
+
+    rows: Indices
+    by_error: csr_array
+    covariance: Array
+    exact: Indices
+    variance_of_others: float = 1.0
+
+
+@dataclass(frozen=True)
+class JointCovariance:
+    """Covariances of everything that a problem estimates, from its joint normal equations.
+
+    Attributes:
+        frame_ids: (n,) registered frames, ascending.
+        rig_from_world: (n, 6, 6) of a rotation from the left (rotation vector, rad) and the translation (metres).
+        centers: (n, 3, 3) of the rig frames' origins in the world, square metres.
+        anchors: (num_anchors, 3, 3) square metres.
+        others: (k, k) of each other block, in its unit.
+        similarity: (7, 7) of the map as a whole: logarithm of the scale, turn (rad) and shift (m) about the middle of
+            the firm frames' centres, for the best similarity between their true and estimated centres.
+        num_free_directions: number of motions of the whole map that change no residual (7 without ranges and gauge).
+            Along these, covariances are those of the map that moves least (inner constraints). Constant blocks have
+            covariance 0.
+        errors: joint errors of frames, cameras, sensors of rigs and anchors.
+    """
+
+    frame_ids: Indices
+    rig_from_world: Array
+    centers: Array
+    anchors: Array
+    others: tuple[Array, ...]
+    similarity: Array
+    num_free_directions: int
+    errors: MapErrors
+
+    @property
+    def relative_scale_stddev(self) -> float:
+        """Relative standard deviation of every length in the map that is due to the scale."""
+        return float(np.sqrt(self.similarity[0, 0]))
+
+
+def joint_covariance(
+    equations: NormalEquations,
+    *,
+    anchors: Sequence[Array] = (),
+    others: Sequence[Array] = (),
+    residual_stddev: float = 1.0,
+    errors: ResidualErrors | None = None,
+    anchor_ids: Sequence[str] | None = None,
+    refined_params: Mapping[int, Sequence[int]] | None = None,
+    firm_frame_ids: Indices | None = None,
+) -> JointCovariance:
+    """Compute covariances to first order: the inverse of the normal equations J^T J.
+
+    If the covariance S of the residuals is not the identity, the result is (J^T J)^-1 J^T S J (J^T J)^-1.
+
+    Args:
+        anchors, others: blocks of the problem, as ``NormalEquations.of`` had them.
+        residual_stddev: standard deviation of the residuals: 1 if they are in standard deviations.
+        errors: of residuals that are not independent; None: all are.
+        anchor_ids: names of the anchors in the map's errors; None: their indices.
+        refined_params: indices of the adjusted parameters of each camera, by the camera's id; cameras that are missing
+            here are adjusted as a whole or not at all.
+        firm_frame_ids: of the frames that are the map as a whole; None: all.
+
+    Raises:
+        GeometryError: a block is not determined by the residuals, or next to rounding the map as a whole is not.
+    """
+    columns, variance = equations.columns, residual_stddev**2
+    equations, inverse, spread, blocks = _solved(equations, errors)
+    turns = [2.0 * np.sqrt(variance * np.trace(columns.covariance(pose, blocks)[:3, :3])) for pose in columns.poses]
+    if np.median(turns) > HALF_A_REVOLUTION and not inverse.free.shape[1]:
+        equations, inverse, spread, blocks = _solved(equations.with_turns_bounded(residual_stddev), errors)
+    size, num_free_directions = inverse.free.shape
+    frames = columns.frames
+    poses = np.array([variance * columns.covariance(pose, blocks) for pose in columns.poses]).reshape(-1, 6, 6)
+    turn = np.diag([2.0, 2, 2, 1, 1, 1])  # Ceres turns by twice its step
+    to_center = np.array([_center_from_step(pose) for pose in columns.poses]).reshape(-1, 3, 6)
+    names = list(map(str, range(len(anchors)))) if anchor_ids is None else anchor_ids
+    parts = [*_parts(equations, dict(zip(names, anchors, strict=True)), refined_params or {})]
+    is_firm = np.ones(len(frames), dtype=bool) if firm_frame_ids is None else np.isin(frames, firm_frame_ids)
+    by_similarity = _similarity_gradients(columns, is_firm, size)
+    similarity = np.full((7, 7), np.nan)
+    if np.count_nonzero(is_firm) > 1:
+        solution = inverse.solve(by_similarity)
+        similarity = variance * solution.T @ spread.times(solution)
+        if np.any(np.diag(similarity) < 0):  # as where a solver has thrown points and photos far apart
+            raise GeometryError(
+                "rounding leaves nothing of how well the map's scale and place are known: no covariance"
+            )
+    return JointCovariance(
+        frame_ids=frames,
+        rig_from_world=turn @ poses @ turn,
+        centers=to_center @ poses @ np.swapaxes(to_center, 1, 2),
+        anchors=np.array([variance * columns.covariance(anchor, blocks) for anchor in anchors]).reshape(-1, 3, 3),
+        others=tuple(variance * columns.covariance(block, blocks) for block in others),
+        similarity=similarity,
+        num_free_directions=num_free_directions,
+        errors=map_errors(
+            parts,
+            size,
+            lambda right: variance * inverse.solve(spread.times(inverse.solve(right))),
+            lambda start: variance * blocks[columns.index_at(start)],
+            by_similarity[:, 0],
+            float(np.sqrt(similarity[0, 0])),
+        ),
+    )
+
+
+class PhotosAlone:
+    """First-order errors of poses from the photos alone: their covariance, and their distance from the minimum."""
+
+    def __init__(self, equations: NormalEquations, residual_stddev: float) -> None:
+        """Take the photos' part of normal equations.
+
+        Args:
+            residual_stddev: standard deviation of a reprojection error's coordinate.
+
+        Raises:
+            GeometryError: the photos do not determine the map up to a similarity.
+        """
+        seen = equations.seen_blocks
+        self._rows = equations.columns.of_blocks(seen)
+        self._columns, self._stddev = equations.columns.subset(seen), residual_stddev
+        self._gradient = equations.gradient[self._rows]
+        _, self._inverse = _held_if_loose(equations, self._inverse_of)
+
+    def _inverse_of(self, equations: NormalEquations) -> _Inverse:
+        rows = self._rows
+        return _Inverse(equations.of_photos[rows][:, rows], equations.free_of_photos[rows], self._columns)
+
+    def of_functions(self, frame_ids: Indices, by_turn: Array, by_center: Array) -> tuple[Array, Array]:
+        """Return the errors of functions that do not depend on the place and the size of the map.
+
+        Args:
+            frame_ids: (k,). by_turn, by_center: (c, k, 3) derivatives by a turn of each frame's rig in its own frame,
+                and by a shift of the rig's origin.
+
+        Returns:
+            (c, c) covariance, and (c,) change of the functions if the map moves to the minimum of the photos alone.
+        """
+        columns, gradients = self._columns, np.zeros((len(self._gradient), len(by_turn)))
+        pose_of_frame = dict(zip(columns.frames.tolist(), columns.poses, strict=True))
+        for k, frame_id in enumerate(frame_ids.tolist()):
+            pose = pose_of_frame[frame_id]
+            if (index := columns.index_of.get(address(pose))) is not None:
+                # Ceres turns on the left of the rotation, and by twice its step.
+                by_step = by_center[:, k] @ _center_from_step(pose)
+                by_step[:, :3] -= 2.0 * by_turn[:, k]
+                gradients[columns.span(index)] = by_step.T
+        solution = self._inverse.solve(gradients)
+        return self._stddev**2 * gradients.T @ solution, -solution.T @ self._gradient
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """J^T S J for the residuals' covariance S: ``independent + by_error @ covariance @ by_error.T``.
+
+    It is a sum, as the normal equations are, since a difference of the two would leave negative variances where
+    residuals that err together determine nearly everything.
+    """
+
+    independent: Array | csr_array
+    by_error: csr_array
+    covariance: Array
+
+    @classmethod
+    def of(cls, equations: NormalEquations, errors: ResidualErrors | None) -> _Spread:
+        others, size = equations.others, len(equations.gradient)
+        if errors is None:
+            return cls(equations.of_photos + others.T @ others, csr_array((size, 0)), np.zeros((0, 0)))
+        rows, is_alone = errors.rows - equations.num_reprojections, np.ones(others.shape[0], dtype=bool)
+        is_alone[rows] = is_alone[errors.exact - equations.num_reprojections] = False
+        alone = csr_array(others[is_alone])
+        independent = equations.of_photos + errors.variance_of_others * (alone.T @ alone)
+        return cls(independent, csr_array(others[rows].T @ errors.by_error), errors.covariance)
+
+    def times(self, right: Array) -> Array:
+        """Return the product with a matrix (size, k)."""
+        return np.asarray(self.independent @ right + self.by_error @ (self.covariance @ (self.by_error.T @ right)))
+
+
+class _Inverse:
+    """Pseudo-inverse of normal equations, orthogonal to the free motions.
+
+    Attributes:
+        free: (size, k) orthonormal basis of the free motions.
+    """
+
+    free: Array
+
+    def __init__(self, normal: Array | csr_array, free: Array, columns: BlockColumns) -> None:
+        """Factor normal equations.
+
+        Args:
+            normal: (size, size). free: (size, k) basis of the free motions. columns: of the equations.
+
+        Raises:
+            GeometryError: a block is not determined.
+        """
+        self.free = linalg.orth(free) if free.shape[1] else free
+        self._scale = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))[:, None]
+        # Fixing as many coordinates as there are free motions makes the matrix regular; any suitable choice will do.
+        held = np.zeros(len(self._scale))
+        held[linalg.qr(self.free.T, mode="r", pivoting=True)[1][: free.shape[1]]] = 1.0
+        self._starts = columns.starts
+        self._factor = _factored(self._scaled(normal) + diags_array(held), columns)
+
+    def _scaled(self, matrix: Array | csr_array) -> Array | csr_array:
+        return diags_array(self._scale[:, 0]) @ matrix @ diags_array(self._scale[:, 0])
+
+    def solve(self, right: Array) -> Array:
+        """Solve for a right side (size, k)."""
+        return self._off_free(self._solve_regular(self._off_free(right)))
+
+    def _solve_regular(self, right: Array) -> Array:
+        return np.asarray(self._scale * self._factor.solve(self._scale * right))
+
+    def _off_free(self, right: Array) -> Array:
+        return np.asarray(right - self.free @ (self.free.T @ right))
+
+    def diagonal_blocks(self, spread: _Spread) -> list[Array]:
+        """Return the blocks on the diagonal of inverse @ spread @ inverse."""
+        free = self.free
+        blocks = self._factor.blocks_of_sandwich(self._scaled(spread.independent))
+        # The same without the free motions, from the product of this matrix with them.
+        of_free = self._solve_regular(np.asarray(spread.independent @ self._solve_regular(free)))
+        of_free -= 0.5 * free @ (free.T @ of_free)
+        by_error = self.solve(spread.by_error.toarray())
+        of_errors = by_error @ spread.covariance
+        return [
+            self._scale[rows] * block * self._scale[rows].T
+            - of_free[rows] @ free[rows].T
+            - free[rows] @ of_free[rows].T
+            + of_errors[rows] @ by_error[rows].T
+            for block, rows in zip(blocks, map(slice, self._starts[:-1], self._starts[1:]), strict=True)
+        ]
+
+
+def _solved(
+    equations: NormalEquations, errors: ResidualErrors | None
+) -> tuple[NormalEquations, _Inverse, _Spread, list[Array]]:
+    """Return the equations, perhaps with loose poses held, their inverse, the spread, and the blocks' covariances."""
+    equations, inverse = _held_if_loose(equations, _joint_inverse)
+    spread = _Spread.of(equations, errors)
+    blocks = inverse.diagonal_blocks(spread)
+    if any(np.any(np.diag(block) < 0) for block in blocks):  # a pose is so loose that rounding leaves no digit of it
+        equations = equations.with_loose_poses_held()
+        inverse, spread = _joint_inverse(equations), _Spread.of(equations, errors)
+        blocks = inverse.diagonal_blocks(spread)
+    return equations, inverse, spread, blocks
+
+
+def _held_if_loose(
+    equations: NormalEquations, inverse_of: Callable[[NormalEquations], _Inverse]
+) -> tuple[NormalEquations, _Inverse]:
+    """Return the equations and their inverse, with loose poses held if they are not determined otherwise."""
+    try:
+        return equations, inverse_of(equations)
+    except GeometryError:
+        held = equations.with_loose_poses_held()
+        return held, inverse_of(held)
+
+
+def _joint_inverse(equations: NormalEquations) -> _Inverse:
+    of_all = equations.of_photos + equations.others.T @ equations.others
+    return _Inverse(of_all, equations.free, equations.columns)
+
+
+def _factored(normal: Array | csr_array, columns: BlockColumns) -> NestedFactor:
+    may_be_last = np.array([kind not in ("pose", "point") for kind in columns.kinds], dtype=bool)
+    try:
+        found = factor(normal, columns.starts, may_be_last)
+    except SingularError as error:
+        raise _not_determined(columns, error.column) from error
+    worst = int(np.argmin(found.pivots))
+    if not found.pivots[worst] > _MIN_PIVOT:
+        raise _not_determined(columns, worst)
+    return found
+
+
+def _not_determined(columns: BlockColumns, column: int) -> GeometryError:
+    return GeometryError(f"the residuals do not determine the problem's {columns.name(column)}: no covariance")
+
+
+def _similarity_gradients(columns: BlockColumns, is_firm: Mask, num_rows: int) -> Array:
+    """Return (num_rows, 7) gradients of the similarity that fits the errors of firm centres by least squares."""
+    poses = [pose for pose, counts in zip(columns.poses, is_firm, strict=True) if counts]
+    centers = np.array([-rotation_of(pose).T @ pose[4:] for pose in poses])
+    motions = similarity_motions(centers - centers.mean(axis=0))
+    # Lengths and angles get one unit. The turn about a straight path is not determined and is left out.
+    size = float(np.linalg.norm(centers - centers.mean(axis=0)) / np.sqrt(len(centers))) or 1.0
+    unit = np.array([size] * 4 + [1.0] * 3)
+    in_lengths = np.einsum("nik,nij->kj", motions, motions) / np.outer(unit, unit)
+    # The turn about a straight path is not determined.
+    to_similarity = np.linalg.pinv(in_lengths, rcond=UNDETERMINED**2, hermitian=True) / np.outer(unit, unit)
+    gradients = np.zeros((num_rows, 7))
+    for pose, motion in zip(poses, motions, strict=True):
+        index = columns.index_of.get(address(pose))
+        if index is not None:
+            gradients[columns.span(index)] = _center_from_step(pose).T @ motion @ to_similarity
+    return gradients
+
+
+def _parts(
+    equations: NormalEquations, anchors: Mapping[str, Array], refined_params: Mapping[int, Sequence[int]]
+) -> Iterator[PartSteps]:
+    """Yield the parts of the map that places of points depend on."""
+    columns, reconstruction, size_m = equations.columns, equations.reconstruction, equations.size_m
+
+    def start(block: Array) -> int | None:
+        index = columns.index_of.get(address(block))
+        return None if index is None else int(columns.starts[index])
+
+    turn_and_shift = np.repeat([size_m, 1.0], 3)
+    for frame_id, pose in zip(columns.frames.tolist(), columns.poses, strict=True):
+        turn = np.column_stack([-2.0 * rotation_of(pose).T, np.zeros((3, 3))])  # Ceres turns by twice its step
+        by_step = np.vstack([turn, _center_from_step(pose)])
+        yield PartSteps("frame", frame_id, start(pose), by_step, turn_and_shift)
+    for rig in reconstruction.rigs.values():
+        for sensor, sensor_pose in rig.non_ref_sensors.items():
+            if sensor_pose is not None:
+                at = start(sensor_pose.params)
+                yield PartSteps("sensor", sensor.id, at, np.diag([2.0, 2, 2, 1, 1, 1]), turn_and_shift)
+    num_params = max((len(camera.params) for camera in reconstruction.cameras.values()), default=0)
+    for camera_id, camera in reconstruction.cameras.items():
+        by_step = np.eye(num_params)[:, list(refined_params.get(camera_id, range(len(camera.params))))]
+        index = columns.index_of.get(address(camera.params))
+        if index is not None and by_step.shape[1] != columns.starts[index + 1] - columns.starts[index]:
+            raise ValueError(f"camera {camera_id} is adjusted in part: expected the numbers of these parameters")
+        unit = np.full(num_params, size_m / camera.mean_focal_length())
+        yield PartSteps("camera", camera_id, start(camera.params), by_step, unit)
+    for anchor_id, position in anchors.items():
+        yield PartSteps("anchor", anchor_id, start(position), np.eye(3), np.ones(3))
+
+
+def _center_from_step(pose: Array) -> Array:
+    """Return the (3, 6) derivative of the centre -R^T t by a step in Ceres' tangent space, which turns by twice it."""
+    rotation = rotation_of(pose)
+    return -rotation.T @ np.column_stack([2.0 * cross_matrices(pose[4:]), np.eye(3)])

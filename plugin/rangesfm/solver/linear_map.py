@@ -1,0 +1,201 @@
+"""The linear Gaussian problem of a map: its best estimate, and estimates of mistakes in it (Baarda; Teunissen).
+
+Let e be the residuals of observations and priors, A their derivatives by the unknowns and H those by the numbers of a
+mistake, all whitened by the residuals' covariance, and e and H projected off A. The size of the mistake is estimated as
+(H'H)^-1 H'e (Teunissen, Network Quality Control, 2024). The statistic is T = e'H (H'H)^-1 H'e; without a mistake it is
+chi-square distributed with as many degrees of freedom as H has columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy import special
+from scipy.linalg import solve_triangular
+
+from rangesfm.arrays import Array, Indices
+from rangesfm.util.geometry.numerics import ROUNDING, UNDETERMINED
+
+FALSE_ALARM_RATE = 0.02
+"""Share of surveys without any mistake in which one is named, or a correct length or point is set aside."""
+NUM_SUSPECTS = 3
+"""Number of measurements for which it is tried what the others say without them, the most deviating first."""
+# Baarda's significance level of a single test, and the probability that it misses a mistake of the smallest size.
+_ALPHA, _BETA = 0.001, 0.2
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Position of each unknown of a model in the parameter vector; -1 for an unknown that is not estimated.
+
+    The order is: for each model in turn, the logarithm of the scale and the frame (6: turn, shift); then the anchors
+    (3 each); then the biases.
+    """
+
+    scale: int
+    frame: int
+    anchor: Indices
+    bias: Indices
+    num: int
+
+    @property
+    def of_map(self) -> list[int]:
+        """Columns of the map as a whole: the logarithm of the scale and, if estimated, the turn and the shift."""
+        return [self.scale, *(range(self.frame, self.frame + 6) if self.frame >= 0 else ())]
+
+    def map_step(self, step: Array) -> Array:
+        """Return the (7,) step of the map as a whole in one (p,) of all unknowns; 0 where it is not estimated."""
+        of_map = np.zeros(7)
+        of_map[: len(self.of_map)] = step[self.of_map]
+        return of_map
+
+    def placement(self, covariance: Array) -> Array | None:
+        """Return the part (7, 7) of the map as a whole of a (p, p) covariance; None if its place is not estimated."""
+        return None if self.frame < 0 else np.asarray(covariance[np.ix_(self.of_map, self.of_map)])
+
+
+@dataclass(frozen=True)
+class LinearMap:
+    """Linear equations of c observations and r priors for p unknowns of a map, about the map's state.
+
+    Attributes:
+        residual_m: (c,) predicted minus measured, without any bias.
+        design: (c, p) derivatives of the residuals by the unknowns.
+        prior_residual, prior_design: (r,), (r, p) the same for the priors, in standard deviations.
+        columns: position of each unknown; the first is the logarithm of the scale.
+    """
+
+    residual_m: Array
+    design: Array
+    prior_residual: Array
+    prior_design: Array
+    columns: Columns
+
+    def solved(self, covariance_m2: Array) -> Solved:
+        """Return the solution for residuals with this (c, c) covariance."""
+        return Solved(covariance_m2, self.design, self.residual_m, self.prior_design, self.prior_residual)
+
+
+@dataclass(frozen=True)
+class EstimatedMistake:
+    """A mistake of k numbers, as estimated.
+
+    Attributes:
+        sizes: (k,). root: (k, j) root of their covariance, without directions that the residuals do not show.
+        statistic: chi-square distributed with j degrees of freedom where no such mistake was made.
+        by_unknowns: (p, k) change of the estimate by the mistake.
+        basis: (c + r, j) orthonormal basis of the effect, whitened and projected.
+        smallest_detectable: minimal detectable bias in the worst direction; inf: it cannot be detected.
+        effect_on_log_scale: largest effect of an undetected mistake of that size.
+    """
+
+    sizes: Array
+    root: Array
+    statistic: float
+    by_unknowns: Array
+    basis: Array
+    smallest_detectable: float
+    effect_on_log_scale: float
+
+    @property
+    def num(self) -> int:
+        """Degrees of freedom of the statistic."""
+        return int(self.root.shape[1])
+
+    @property
+    def is_seen(self) -> bool:
+        """True if the residuals show the mistake in every direction."""
+        return self.num == len(self.sizes)
+
+    @property
+    def stddevs(self) -> Array:
+        """(k,) standard deviations of the sizes; inf if a direction is hidden."""
+        return np.linalg.norm(self.root, axis=1) if self.is_seen else np.full(len(self.sizes), np.inf)
+
+
+class Solved:
+    """The decompositions of a linear problem with given errors, which its estimate and all mistakes in it share.
+
+    Attributes:
+        covariance: (p, p) of the estimate; a direction that nothing determines has a huge variance.
+        residual: (c + r,) whitened residuals that the unknowns leave.
+    """
+
+    def __init__(
+        self,
+        covariance_m2: Array,
+        design: Array,
+        residual_m: Array,
+        prior_design: Array | None = None,
+        prior_residual: Array | None = None,
+    ):
+        prior_design = np.zeros((0, design.shape[1])) if prior_design is None else prior_design
+        prior_residual = np.zeros(len(prior_design)) if prior_residual is None else prior_residual
+        self.num_priors = len(prior_residual)
+        self.lower = np.linalg.cholesky(regular(covariance_m2))
+        whitened = self.whitened(design, prior_design)
+        lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-100)
+        basis, values, turns = np.linalg.svd(whitened / lengths, full_matrices=False)
+        determined, root = np.maximum(values, UNDETERMINED), turns.T / lengths[:, None]
+        self.covariance = root / determined**2 @ root.T
+        self._basis, self._gains = basis[:, values > UNDETERMINED], root * (values / determined**2) @ basis.T
+        self._whole = self.whitened(residual_m[:, None], prior_residual[:, None])
+        self.residual = self.left(self._whole)[:, 0]
+
+    def whitened(self, observations: Array, priors: Array) -> Array:
+        """Return effects (c, k) on observations and (r, k) on priors, in standard deviations."""
+        return np.vstack([solve_triangular(self.lower, observations, lower=True), priors])
+
+    def left(self, whitened: Array) -> Array:
+        """Return what the unknowns cannot explain of whitened effects (c + r, k)."""
+        left: Array = whitened - self._basis @ (self._basis.T @ whitened)
+        return left
+
+    @property
+    def step(self) -> Array:
+        """(p,) step from the state to the likeliest one."""
+        return self.by_unknowns(self._whole)[:, 0]
+
+    def by_unknowns(self, whitened: Array) -> Array:
+        """Return the (p, k) change of the estimate by whitened effects (c + r, k) on the residuals."""
+        return np.asarray(-self._gains @ whitened)
+
+    @property
+    def gains(self) -> tuple[Array, Array]:
+        """(p, c) and (p, r) change of the estimate per unit of each measurement and prior."""
+        num = len(self.lower)
+        return solve_triangular(self.lower, self._gains[:, :num].T, lower=True, trans=1).T, self._gains[:, num:]
+
+    def mistake(self, columns: Array, priors: Array | None = None) -> EstimatedMistake:
+        """Estimate a mistake of k numbers by its effects (c, k) on the residuals and (r, k) on those of priors."""
+        priors = np.zeros((self.num_priors, columns.shape[1])) if priors is None else priors
+        whitened = self.whitened(columns, priors)
+        return self.estimated(whitened, self.left(whitened), self.by_unknowns(whitened))
+
+    def estimated(self, whitened: Array, left: Array, by_unknowns: Array) -> EstimatedMistake:
+        """Estimate a mistake, given its whitened effect (c + r, k), what is left of it, and the change by it."""
+        lengths = np.maximum(np.linalg.norm(whitened, axis=0), 1e-12)
+        basis, values, turns = np.linalg.svd(left / lengths, full_matrices=False)
+        # Of an effect with a smaller squared share the unknowns leave only rounding.
+        shown = values**2 > UNDETERMINED
+        basis, root = basis[:, shown], turns[shown].T / values[shown] / lengths[:, None]
+        pulls, smallest, effect = basis.T @ self.residual, np.inf, np.inf
+        if shown.all():
+            # The mistake with the largest effect among those that are just detectable.
+            size = float(np.sqrt(noncentrality(len(shown))))
+            smallest = size * float(np.linalg.norm(root, 2) if len(root) > 1 else abs(root[0, 0]))
+            effect = size * float(np.linalg.norm(by_unknowns[:1] @ root))
+        return EstimatedMistake(root @ pulls, root, float(pulls @ pulls), by_unknowns, basis, smallest, effect)
+
+
+@cache
+def noncentrality(num: int) -> float:
+    """Return the noncentrality at which a mistake of ``num`` numbers is found (Baarda's lambda_0)."""
+    return float(special.chndtrinc(special.chdtri(num, _ALPHA), num, _BETA))
+
+
+def regular(covariance: Array) -> Array:
+    """Return a covariance that is positive definite in spite of rounding."""
+    return np.asarray(covariance + ROUNDING * np.trace(covariance) * np.eye(len(covariance)))

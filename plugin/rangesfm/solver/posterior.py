@@ -1,0 +1,315 @@
+"""The posterior of a map by measurements of all kinds together (sections 6 and 7 of ``model.md``).
+
+All are linear equations of the motions of the map as a whole, and of anchors: e = A x + noise. The noise of a kind is
+its own; the bending of the map is that of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag, cho_factor, cho_solve
+
+from rangesfm.arrays import Array, Mask
+from rangesfm.solver.bending import BENDS, Bending, MapBending
+from rangesfm.solver.linear_map import Columns, EstimatedMistake, LinearMap, regular
+from rangesfm.solver.noise import Component, Noise, learnt_sizes, noise_of_sizes, usual_sizes
+from rangesfm.util.geometry.numerics import NORMAL_95, SIGNIFICANT_STDDEVS
+
+MAX_NUM_OBSERVATIONS = 450
+"""Largest number of observations of a map: learning their errors takes some twenty inversions of their covariance."""
+GIVEN = "given"
+"""Effect of priors; not a component of the noise."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """c observations of one kind, single ones or means of groups, linearised at a state of a map.
+
+    Attributes:
+        kind: its name.
+        columns: unknowns on which they depend. design: (c, p) derivatives by these.
+        residual_m: (c,) predicted minus measured.
+        by_pose: (c, 6 n) derivatives by the poses of the path: turns in their own frames, and shifts in the frame and
+            in the unit in which ``MapBending`` has the path.
+        components: of their errors, without the bending of the map.
+        alone_m2: (c, c) covariance as if each single one erred independently.
+        is_used: (c,) whether they take part in the estimate; the others are only tested or predicted.
+        prior_residual, prior_design: (r,), (r, p) of priors on the unknowns, in standard deviations.
+    """
+
+    kind: str
+    columns: Columns
+    design: Array
+    residual_m: Array
+    by_pose: Array
+    components: tuple[Component, ...]
+    alone_m2: Array
+    is_used: Mask
+    prior_residual: Array = field(default_factory=lambda: np.zeros(0))
+    prior_design: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+@dataclass(frozen=True)
+class ScaleByKind:
+    """The scale by one kind of measurement alone, in metres per SfM unit.
+
+    Attributes:
+        value: middle of its interval. stddev: with all error components; inf where the scale is not determined.
+    """
+
+    value: float
+    stddev: float
+
+
+@dataclass(frozen=True)
+class ScaleUncertainty:
+    """Relative standard deviations of the scale, by their causes.
+
+    Attributes:
+        formal: from the Jacobian, as if all measurements erred independently (Cramer-Rao bound).
+        components: standard deviation due to each component of the errors, by its name.
+    """
+
+    formal: float
+    components: dict[str, float]
+
+    @property
+    def empirical(self) -> float:
+        """Realistic standard deviation: all components together, and never less than the formal one."""
+        return max(float(np.linalg.norm(list(self.components.values()))), self.formal)
+
+    def beside(self, name: str, stddev: float) -> ScaleUncertainty:
+        """Return a copy with more of one component, added in quadrature."""
+        return replace(
+            self, components={**self.components, name: float(np.hypot(self.components.get(name, 0), stddev))}
+        )
+
+    def about(self, value: float) -> ScaleByKind:
+        """Return an estimate with its standard deviation."""
+        return ScaleByKind(value, value * self.empirical)
+
+    @property
+    def interval_95(self) -> tuple[float, float]:
+        """Bounds, with 95 % probability, of the logarithm of the true scale divided by the estimate."""
+        return -self.half_width_95, self.half_width_95
+
+    @property
+    def half_width_95(self) -> float:
+        """Half the width of the 95 % interval, in the logarithm of the scale."""
+        return NORMAL_95 * self.empirical
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What is known of a map as a whole and of its anchors.
+
+    Attributes:
+        uncertainty: of the scale.
+        columns: the p unknowns. covariance: (p, p) of these.
+        step: (p,) from the state at which the map is to the estimate, to which everything else refers.
+        gains: (c,) change of the scale's logarithm per metre of each observation that is used.
+    """
+
+    uncertainty: ScaleUncertainty
+    columns: Columns
+    covariance: Array
+    step: Array
+    gains: Array
+
+    @property
+    def placement(self) -> Array | None:
+        """(7, 7) covariance of the scale's logarithm, a turn and a shift; None if the map's place is not estimated."""
+        return self.columns.placement(self.covariance)
+
+    @property
+    def place(self) -> Array:
+        """(7, 7) the same covariance, of a map that is placed."""
+        assert self.placement is not None, "the map is placed"
+        return self.placement
+
+    @classmethod
+    def best(cls, linear: LinearMap, noise: Noise, formal: float) -> Posterior:
+        """Return the posterior with the best weights for the errors (Gauss and Markov).
+
+        Args:
+            formal: relative standard deviation of the scale, as if all observations erred independently.
+        """
+        best = linear.solved(noise.covariance_m2)
+        of_observations, of_priors = best.gains
+        components = noise.effects(of_observations[0])
+        if (given := float(np.linalg.norm(of_priors[0]))) > 0:
+            components[GIVEN] = given
+        uncertainty = ScaleUncertainty(formal, components)
+        return cls(uncertainty, linear.columns, best.covariance, best.step, of_observations[0])
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """The linear equations of all kinds of observations, one below the other, and of the priors.
+
+    Attributes:
+        linear: the equations; residuals are those of the map as the photos alone would have it.
+        rows: of each kind, by its name.
+        components: of the errors. sizes: of these, by name.
+        bending: of the map, in all observations.
+        alone_m2, is_used: as of ``Observations``.
+    """
+
+    linear: LinearMap
+    rows: Mapping[str, slice]
+    components: tuple[Component, ...]
+    sizes: Mapping[str, float]
+    bending: Bending
+    alone_m2: Array
+    is_used: Mask
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Errors of all observations."""
+        return noise_of_sizes(self.components, self.sizes, len(self.is_used))
+
+    def without(self, kind: str, name: str) -> JointProblem:
+        """Return the problem without one component of the errors of a kind."""
+        rows = self.rows[kind]
+        kept = (each for each in self.components if each.name != name or not each.alike[rows].any())
+        return replace(self, components=tuple(kept))
+
+    def of_kind(self, kind: str, of_used: Array) -> Array:
+        """Return the (c,) numbers of one kind from those of all observations that are used; 0 for the others."""
+        of_all = np.zeros(len(self.is_used))
+        of_all[self.is_used] = of_used
+        return of_all[self.rows[kind]]
+
+    def size_of(self, kind: str) -> Array:
+        """Return the column (c, 1) of a mistake by which all observations of a kind have the map too small."""
+        column = np.zeros((len(self.is_used), 1))
+        column[self.rows[kind], 0] = self.linear.design[self.rows[kind], self.linear.columns.scale]
+        return column
+
+    def noise_of(self, kind: str) -> Noise:
+        """Return the errors of the observations of one kind, with those of the map."""
+        found = self.noise.of_rows(self.rows[kind])
+        return found.only(*(name for name, of in zip(found.names, found.covariances_m2, strict=True) if of.any()))
+
+    @property
+    def bending_factor(self) -> float:
+        """Return the learnt bending over the bending expected from the photos' residuals; 1 if that is unknown."""
+        expected_m = float(np.sqrt(np.trace(self.bending.formal_m2) / len(self.is_used)))
+        return self.noise.stddev_of_component["bending"] / expected_m if expected_m > 0 else 1.0
+
+    def learnt(self, mistake: Array | None = None, most_unusual: float = np.inf) -> JointProblem:
+        """Return the problem with the sizes of the errors that the observations show.
+
+        Args:
+            mistake: (c, m) columns of a mistake. It explains what it can, as the errors that it causes would otherwise
+                be taken for noise, in which it then hides.
+            most_unusual: largest size of a component above its median, in spreads over surveys.
+        """
+        used, linear = self.is_used, self.linear
+        columns = np.zeros((len(used), 0)) if mistake is None else mistake
+        # Kinds that contradict each other by more than maps bend are mistaken, which must not pass for bending.
+        most_bent = np.inf if len(self.rows) == 1 else SIGNIFICANT_STDDEVS
+        components = self.components
+        if not used.all():
+            at = np.ix_(used, used)
+            components = tuple(
+                replace(each, alike=each.alike[at], tied={name: of[at] for name, of in each.tied.items()})
+                for each in components
+            )
+        sizes = learnt_sizes(
+            components,
+            -linear.residual_m[used],
+            np.hstack([linear.design[used], columns[used]]),
+            np.pad(linear.prior_design, ((0, 0), (0, columns.shape[1]))),
+            {name: min(most_unusual, most_bent) if name in BENDS else most_unusual for name in self.sizes},
+        )
+        return replace(self, sizes=sizes)
+
+    def among(self, rows: Mask) -> tuple[LinearMap, Noise]:
+        """Return the equations and the errors of some of the observations."""
+        linear = replace(self.linear, residual_m=self.linear.residual_m[rows], design=self.linear.design[rows])
+        return linear, self.noise.of_rows(rows)
+
+    def mistake(self, columns: Array) -> EstimatedMistake:
+        """Estimate a mistake that changes what is measured by (c, m) ``columns`` times its m numbers.
+
+        Observations that it changes are taken into the equations, whether they take part or not.
+        """
+        rows = self.is_used | np.any(columns != 0, axis=1)
+        linear, noise = self.among(rows)
+        return linear.solved(noise.covariance_m2).mistake(-columns[rows])
+
+    def posterior(self, *, is_refined: bool = False, formal: float | None = None) -> Posterior:
+        """Return what all observations say of the map.
+
+        Args:
+            is_refined: whether the photos let the map bend in its fit.
+            formal: as of ``Posterior.best``; None: it is computed.
+        """
+        at, (linear, noise) = np.ix_(self.is_used, self.is_used), self.among(self.is_used)
+        if formal is None:
+            alone_m2 = self.alone_m2 + self.bending.formal_m2 if is_refined else self.alone_m2
+            formal = float(np.sqrt(linear.solved(alone_m2[at]).covariance[0, 0]))
+        return Posterior.best(linear, noise, formal)
+
+    def predicted_m2(self, kind: str, covariance: Array) -> Array:
+        """Return the (c, c) covariance of the errors of unused functions of the map, after all that is observed.
+
+        Universal kriging: Rasmussen and Williams, "Gaussian processes for machine learning", 2006, eq. 2.42.
+
+        Args:
+            covariance: (p, p) of the unknowns.
+        """
+        used, rows, linear, noise_m2 = self.is_used, self.rows[kind], self.linear, self.noise.covariance_m2
+        across = noise_m2[rows][:, used]
+        factor = cho_factor(regular(noise_m2[np.ix_(used, used)]))
+        left = linear.design[rows] - across @ cho_solve(factor, linear.design[used])
+        return np.asarray(noise_m2[rows, rows] - across @ cho_solve(factor, across.T) + left @ covariance @ left.T)
+
+
+def joined(observations: Sequence[Observations], bending: MapBending) -> JointProblem:
+    """Join observations of all kinds on one map, with the usual sizes of their errors.
+
+    Args:
+        bending: of the map.
+    """
+    columns = max((each.columns for each in observations), key=lambda each: each.num)
+    ends = np.cumsum([len(each.residual_m) for each in observations])
+    num = int(ends[-1])
+    rows = {
+        each.kind: slice(int(end) - len(each.residual_m), int(end))
+        for each, end in zip(observations, ends, strict=True)
+    }
+    bent = bending.of_functions(np.vstack([each.by_pose for each in observations]), frame_is_free=columns.frame >= 0)
+    own = (part.among(rows[each.kind], num) for each in observations for part in each.components)
+    components = (*own, *bent.parts)
+    linear = LinearMap(
+        np.concatenate([each.residual_m for each in observations]) + bent.shift_m,
+        np.vstack([_in_columns(each.design, each.columns, columns) for each in observations]),
+        np.concatenate([each.prior_residual for each in observations]),
+        np.vstack([_in_columns(each.prior_design, each.columns, columns) for each in observations]),
+        columns,
+    )
+    return JointProblem(
+        linear,
+        rows,
+        components,
+        usual_sizes(components),
+        bent,
+        np.asarray(block_diag(*(each.alone_m2 for each in observations))),
+        np.concatenate([each.is_used for each in observations]),
+    )
+
+
+def _in_columns(design: Array, own: Columns, columns: Columns) -> Array:
+    """Return derivatives by all unknowns; kinds without anchors have those by the map as a whole."""
+    widened = np.zeros((len(design), columns.num))
+    if not len(design) or own.num == columns.num:
+        return design if len(design) else widened
+    of_map = columns.of_map[: len(own.of_map)]
+    widened[:, of_map] = design[:, : len(of_map)]
+    return widened

@@ -1,0 +1,1 @@
+"""What is not about surveys: numbers and geometry, files, processes."""

@@ -1,0 +1,269 @@
+"""Reference: known camera poses for comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rangesfm.arrays import Array
+from rangesfm.errors import InputError, printable
+from rangesfm.options import COORDINATE_M, TIME_S
+from rangesfm.util.files.clock_times import span_text
+from rangesfm.util.files.contents import AnyPath
+from rangesfm.util.files.photo_names import rows_of_photos
+from rangesfm.util.files.text_tables import (
+    FOUND,
+    TextTable,
+    guess_separator,
+    has_columns,
+    header_names,
+    read_head,
+    read_table,
+    read_text,
+    repeated,
+    write_table,
+)
+from rangesfm.util.geometry.trajectory import ROUNDING_S, Trajectory, keyframes_around
+
+POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
+QUATERNION_TOLERANCE = 1e-2
+MAX_TIME_DIFFERENCE_S = 0.01
+"""A sample this close in time is used without interpolation; at 1 m/s it is off by a centimetre at most."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """n known camera poses, by photo or by time; exactly one of names and times is given.
+
+    Attributes:
+        positions_m: (n, 3) projection centres in the reference's frame, metres.
+        image_names: names of the n photos, or None.
+        timestamps_s: (n,) times on the camera's clock, strictly increasing, or None.
+        world_from_cam: (n, 3, 3) rotations of COLMAP's camera frame (x right, y down, z forward), or None.
+        notes: lines for the user about how the file was read.
+    """
+
+    positions_m: Array
+    image_names: tuple[str, ...] | None = None
+    timestamps_s: Array | None = None
+    world_from_cam: Array | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.image_names is None) == (self.timestamps_s is None):
+            raise ValueError("a reference has either image names or timestamps")
+        if self.timestamps_s is not None and not np.all(np.diff(self.timestamps_s) > 0):
+            raise ValueError("timestamps increase strictly")
+
+    def __len__(self) -> int:
+        return len(self.positions_m)
+
+    def positions_at(self, trajectory: Trajectory, max_gap_s: float = 0.05) -> tuple[Array, Array | None]:
+        """Return the reference poses of a trajectory's keyframes; see ``poses``.
+
+        Raises:
+            InputError: the reference is by time and the trajectory has no times.
+        """
+        if self.image_names is None and trajectory.timestamps_s is None:
+            raise InputError("the reference is by time, but the photos have no times (images.csv)")
+        return self.poses(trajectory.image_names, trajectory.timestamps_s, max_gap_s)
+
+    def poses(
+        self, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float
+    ) -> tuple[Array, Array | None]:
+        """Return the reference poses of n photos, or at n times if the reference is by time.
+
+        Poses by photo are found by name. Poses by time are interpolated linearly (rotations on the shortest arc)
+        between two samples at most ``max_gap_s`` apart. In longer gaps and at the ends, the nearest sample is taken if
+        it is within MAX_TIME_DIFFERENCE_S.
+
+        Args:
+            image_names: n photos; needed if the reference is by photo.
+            times_s: (n,) times on the camera's clock; needed if the reference is by time.
+
+        Returns:
+            (n, 3) positions in metres and (n, 3, 3) rotations, NaN where unknown; rotations are None if the reference
+            has none.
+        """
+        if self.image_names is not None:
+            assert image_names is not None
+            return self._at_index(rows_of_photos(image_names, self.image_names))
+        assert times_s is not None
+        assert self.timestamps_s is not None
+        known = self.timestamps_s
+        before, after, fraction, nearest = keyframes_around(times_s, known)
+        nearest[np.abs(times_s - known[nearest]) > MAX_TIME_DIFFERENCE_S] = -1
+        positions, rotations = self._at_index(nearest)
+
+        gap = known[after] - known[before]
+        between = (gap > 0) & (gap <= max_gap_s + ROUNDING_S) & (times_s >= known[before]) & (times_s <= known[after])
+        fraction = fraction[between, None]
+        start_m, end_m = self.positions_m[before[between]], self.positions_m[after[between]]
+        positions[between] = (1 - fraction) * start_m + fraction * end_m
+        if rotations is not None and between.any():
+            assert self.world_from_cam is not None
+            start, end = (Rotation.from_matrix(self.world_from_cam[index[between]]) for index in (before, after))
+            turned = start * Rotation.from_rotvec(fraction * (start.inv() * end).as_rotvec())
+            rotations[between] = turned.as_matrix()
+        return positions, rotations
+
+    def why_nothing_is_known(
+        self, of: str, image_names: Sequence[str] | None, times_s: Array | None, max_gap_s: float = 0.05
+    ) -> str:
+        """Return a one-line message that explains why no keyframe or range is at a known position.
+
+        Args:
+            of: "keyframes" or "ranges", with their ``image_names`` and ``times_s``.
+        """
+        why = f"none of the {of} is at a known position: "
+        if len(self) == 0 or not len(image_names or ()) + len([] if times_s is None else times_s):
+            return f"{why}there are {len(self)} known positions, or no {of}"
+        if self.image_names is not None:
+            assert image_names is not None
+            known, first = printable(self.image_names[0]), printable(image_names[0])
+            return f"{why}the first known position is of photo '{known}', the first of the {of} of photo '{first}'"
+        assert self.timestamps_s is not None
+        assert times_s is not None
+        spacing = np.diff(self.timestamps_s)
+        return (
+            f"{why}positions are known from {span_text(self.timestamps_s[0], self.timestamps_s[-1])}"
+            + (f", {np.median(spacing):.3f} s apart" if len(spacing) else "")
+            + f", the {of} are from {span_text(times_s.min(), times_s.max())}; positions are interpolated between "
+            f"known times at most {max_gap_s:g} s apart"
+        )
+
+    def _at_index(self, index: npt.NDArray[np.int64]) -> tuple[Array, Array | None]:
+        rotations = None if self.world_from_cam is None else _rows(self.world_from_cam, index)
+        return _rows(self.positions_m, index), rotations
+
+
+def is_reference_file(head: str) -> bool:
+    """Return whether a file with this beginning is a reference: positions by photo or time, or a TUM trajectory."""
+    names = header_names(head)
+    if is_tum_row(names):
+        return abs(float(np.linalg.norm([float(name) for name in names[-4:]])) - 1.0) <= QUATERNION_TOLERANCE
+    return any(has_columns(head, [key, *POSITION_COLUMNS]) for key in ("image_name", "timestamp_s"))
+
+
+def read_reference(path: AnyPath) -> Reference:
+    """Read ``reference.csv`` or a TUM trajectory.
+
+    The CSV file has a header row: ``image_name`` or ``timestamp_s``, then ``x_m,y_m,z_m`` and optionally
+    ``qx,qy,qz,qw`` (world from camera). A TUM file has no header row, and lines of ``timestamp tx ty tz qx qy qz qw``,
+    separated by blanks.
+
+    Raises:
+        InputError: the file is not valid; the error gives the line if it is known.
+    """
+    path = Path(path)
+    names = header_names(read_head(path))
+    if path.suffix == ".tum" or is_tum_row(names):
+        return _from_table(tum_table(path), "timestamp_s")
+    if names and not {"image_name", "timestamp_s"} & set(names):
+        found = printable(", ".join(names))
+        raise InputError(f"no column image_name or timestamp_s; found {found}; expected one of them", path)
+    key = "image_name" if "image_name" in names else "timestamp_s"
+    return _from_table(read_table(path, [key, *POSITION_COLUMNS], QUATERNION_COLUMNS, separator=FOUND), key)
+
+
+def write_reference(reference: Reference, path: Path) -> Path:
+    """Write a ``reference.csv`` that ``read_reference`` reads, and return its path."""
+    columns = [np.asarray(reference.positions_m)]
+    names: tuple[str, ...] = POSITION_COLUMNS
+    if reference.world_from_cam is not None:
+        columns.append(Rotation.from_matrix(reference.world_from_cam).as_quat())
+        names += QUATERNION_COLUMNS
+    is_by_image = reference.image_names is not None
+    keys = reference.image_names or [f"{time:.9f}" for time in np.asarray(reference.timestamps_s)]
+    rows = ([key, *(f"{value:.9f}" for value in row)] for key, row in zip(keys, np.hstack(columns)))
+    write_table(path, ["image_name" if is_by_image else "timestamp_s", *names], rows)
+    return path
+
+
+def is_tum_row(cells: Sequence[str]) -> bool:
+    """Return whether a row holds a TUM pose rather than names."""
+    try:
+        return len([float(cell) for cell in cells]) == 1 + len(POSITION_COLUMNS) + len(QUATERNION_COLUMNS)
+    except ValueError:
+        return False
+
+
+def tum_table(path: Path) -> TextTable:
+    """Read the lines of a TUM trajectory as a table.
+
+    Raises:
+        InputError: a line does not have eight cells, or there is none.
+    """
+    columns = ("timestamp_s", *POSITION_COLUMNS, *QUATERNION_COLUMNS)
+    numbered = enumerate(read_text(path).split("\n"), start=1)
+    texts = [(line, text) for line, text in numbered if text.strip() and not text.lstrip().startswith("#")]
+    separator = guess_separator(texts[0][1]) if texts else " "
+    rows = [(line, text.split(None if separator == " " else separator)) for line, text in texts]
+    if not rows:
+        raise InputError("no pose in the file, expected lines of timestamp tx ty tz qx qy qz qw", path)
+    for line, cells in rows:
+        if len(cells) != len(columns):
+            expected = f"{len(columns)} (timestamp tx ty tz qx qy qz qw, separated by blanks)"
+            raise InputError(f"{len(cells)} numbers, expected {expected}", path, line)
+    lines = np.array([line for line, _ in rows], dtype=np.int64)
+    return TextTable(path, columns, lines, {name: [cells[i] for _, cells in rows] for i, name in enumerate(columns)})
+
+
+def _from_table(table: TextTable, key: str) -> Reference:
+    if len(table) == 0:
+        raise InputError("no pose in the file, only its header row", table.path)
+    table, notes = _with_positions(table)
+    positions = np.column_stack([table.numbers(column, bounds=COORDINATE_M) for column in POSITION_COLUMNS])
+    rotations = _rotations(table)
+    if again := repeated(table.text(key) if key == "image_name" else table.numbers(key, bounds=TIME_S).tolist()):
+        raise table.error(again[0], key, "each one once")
+    if key == "image_name":
+        return Reference(positions, image_names=tuple(table.text(key)), world_from_cam=rotations, notes=notes)
+    times = table.numbers(key, bounds=TIME_S)
+    order = np.argsort(times)
+    turns = None if rotations is None else rotations[order]
+    return Reference(positions[order], timestamps_s=times[order], world_from_cam=turns, notes=notes)
+
+
+def _with_positions(table: TextTable) -> tuple[TextTable, tuple[str, ...]]:
+    """Return the rows that have a position, with a note if others are left out."""
+    places = [table.numbers(column, empty=np.nan, missing=("", "nan", "null")) for column in POSITION_COLUMNS]
+    has_place = [not all(map(math.isnan, place)) for place in zip(*places, strict=True)]
+    if all(has_place):
+        return table, ()
+    if not any(has_place):
+        raise InputError(f"holds no position in any of {len(table)} rows", table.path)
+    note = f"{table.path.name}: {has_place.count(False)} of {len(table)} rows have no position and are left out"
+    return table.where(has_place), (note,)
+
+
+def _rotations(table: TextTable) -> Array | None:
+    missing = [column for column in QUATERNION_COLUMNS if column not in table]
+    if len(missing) == len(QUATERNION_COLUMNS):
+        return None
+    if missing:
+        raise InputError(
+            f"no column {missing[0]}; expected all of {', '.join(QUATERNION_COLUMNS)}, or none", table.path
+        )
+    quaternions = np.column_stack([table.numbers(column) for column in QUATERNION_COLUMNS])
+    lengths = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)
+    if len(wrong):
+        message = f"the quaternion qx,qy,qz,qw has length {lengths[wrong[0]]:.4g}, expected 1"
+        raise InputError(message, table.path, int(table.line[wrong[0]]))
+    rotations: Array = Rotation.from_quat(quaternions).as_matrix()
+    return rotations
+
+
+def _rows(values: Array, index: npt.NDArray[np.int64]) -> Array:
+    """Return rows of ``values`` by index, and NaN for an index of -1."""
+    rows = np.full((len(index), *values.shape[1:]), np.nan)
+    rows[index >= 0] = values[index[index >= 0]]
+    return rows

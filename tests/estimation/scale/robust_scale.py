@@ -1,0 +1,13 @@
+"""The scale estimate by the robust weights alone, from which it is moved to that by the best weights."""
+
+from __future__ import annotations
+
+from rangesfm.estimation.scale.scale_by_ranges import RangeScale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.util.geometry.similarity import Similarity
+
+
+def metric_from_sfm_by_robust_weights(estimate: ScaleEstimate) -> Similarity:
+    ranges = estimate.find(RangeScale)
+    assert ranges is not None
+    return ranges.placed

@@ -1,0 +1,161 @@
+"""The stated uncertainty of the scale is honest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from rangesfm.demo.simulated_radio import Radio
+from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.errors.components import CLOCKS
+from rangesfm.options import RangeModelOptions, ScaleOptions
+from rangesfm.solver.bending import Bending
+from rangesfm.solver.posterior import ScaleUncertainty
+from rangesfm.util.geometry.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from tests.estimation.scale.conftest import MakeSurvey, Survey
+
+Array = npt.NDArray[np.float64]
+
+WITHOUT_BIASES = RangeModelOptions(range_bias_stddev_m=0.0, common_bias_stddev_m=0.0)
+FAR_ANCHORS_M = {"A": (9.0, 2.0, 2.5), "B": (-9.0, 1.0, 0.4), "C": (0.5, 9.0, 3.0), "D": (1.0, -9.0, 0.2)}
+IN_TIME = ("white", "time", "place", "view")
+
+
+@dataclass(frozen=True)
+class Rigid:
+    """The bending of a map that is known not to be bent."""
+
+    path: Trajectory
+
+    def of_functions(self, by_pose: Array, *, frame_is_free: bool) -> Bending:
+        return Bending((), np.zeros((len(by_pose), len(by_pose))), np.zeros(len(by_pose)))
+
+
+def drifting_errors(survey: Survey, stddev: float, memory_s: float, seed: int) -> Array:
+    """(n,) errors of each anchor that come and go over some seconds."""
+    log = survey.simulated.log
+    assert log.timestamp_s is not None
+    rng = np.random.default_rng(seed)
+    errors = np.zeros(len(log))
+    for k in range(len(log.anchor_ids)):
+        rows = np.flatnonzero(log.anchor_index == k)
+        keep = np.exp(-np.diff(log.timestamp_s[rows]) / memory_s)
+        errors[rows[0]] = rng.standard_normal()
+        for before, after, kept in zip(rows[:-1], rows[1:], keep, strict=True):
+            errors[after] = kept * errors[before] + np.sqrt(1 - kept**2) * rng.standard_normal()
+    return stddev * errors
+
+
+def in_time(uncertainty: ScaleUncertainty) -> float:
+    """Return the uncertainty from all errors that change over time."""
+    return float(np.linalg.norm([uncertainty.components.get(name, 0.0) for name in IN_TIME]))
+
+
+def test_with_independent_errors_the_formal_stddev_is_the_scatter(make_survey: MakeSurvey) -> None:
+    surveys = [make_survey(anchors_m=FAR_ANCHORS_M, radio=Radio(range_stddev_m=0.1), seed=seed) for seed in range(32)]
+    estimates = [
+        survey.scale("first_camera", "ABCD", range_model=WITHOUT_BIASES, bending=Rigid(survey.trajectory))
+        for survey in surveys
+    ]
+    errors = [survey.relative_error(estimate) for survey, estimate in zip(surveys, estimates, strict=True)]
+    formal = float(np.median([estimate.uncertainty.formal for estimate in estimates]))
+    assert np.std(errors) / formal == pytest.approx(1.0, abs=0.25)
+    seen = float(np.median([in_time(estimate.uncertainty) for estimate in estimates]))
+    assert 1.0 < seen / formal < 1.5
+
+
+def test_with_errors_that_last_the_stddev_grows_and_is_the_scatter(make_survey: MakeSurvey) -> None:
+    errors, formals, seen = [], [], []
+    for seed in range(20):
+        survey = make_survey(anchors_m=FAR_ANCHORS_M, num_keyframes=100, seed=seed)
+        log = survey.log_with(survey.simulated.distance_m + drifting_errors(survey, 0.1, 4.0, seed))
+        estimate = survey.scale("first_camera", "ABCD", log, range_model=WITHOUT_BIASES)
+        errors.append(survey.relative_error(estimate))
+        formals.append(estimate.uncertainty.formal)
+        seen.append(in_time(estimate.uncertainty))
+    # About ten ranges in a row, at 2.5 a second, have correlated errors.
+    assert np.median(seen) > 1.5 * np.median(formals)
+    assert np.std(errors) > 1.5 * np.median(formals)
+    assert np.std(errors) / np.median(seen) == pytest.approx(1.0, abs=0.4)
+
+
+def test_the_components_add_as_variances_and_are_never_less_than_the_formal_stddev() -> None:
+    assert ScaleUncertainty(0.001, {"a": 0.003, "b": 0.004}).empirical == pytest.approx(0.005)
+    assert ScaleUncertainty(0.01, {"a": 0.003}).empirical == 0.01
+    assert ScaleUncertainty(0.001, {"a": 0.003, "b": 0.004}).half_width_95 == pytest.approx(1.96 * 0.005)
+
+
+def test_four_times_the_ranges_halve_what_is_noise(make_survey: MakeSurvey) -> None:
+    few, many = (
+        make_survey(anchors_m=FAR_ANCHORS_M, radio=Radio(range_stddev_m=0.1), num_epochs=num).scale(
+            "first_camera", "ABCD", range_model=WITHOUT_BIASES
+        )
+        for num in (2, 8)
+    )
+    assert many.uncertainty.formal / few.uncertainty.formal == pytest.approx(0.5, rel=0.2)
+    assert many.uncertainty.components["white"] < 0.8 * few.uncertainty.components["white"]
+
+
+def test_an_error_curve_that_nobody_knows_widens_the_interval_and_a_known_one_hardly(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=Radio(range_stddev_m=0.03), num_epochs=5)
+    log = survey.simulated.log
+    calibrated = replace(log, shared_stddev_m=np.full(len(log), 0.005))
+    unknown, known = (survey.scale("unknown", (), each).uncertainty for each in (log, calibrated))
+    assert known.components["curve"] < 0.7 * unknown.components["curve"]
+    assert known.components["learnt_curve"] < known.components["curve"]
+    assert known.half_width_95 < unknown.half_width_95
+
+
+def test_biases_that_are_ruled_out_are_no_part_of_it(make_survey: MakeSurvey) -> None:
+    survey = make_survey(radio=Radio(range_stddev_m=0.05))
+    assert "bias" in survey.scale("first_camera", "ABCDE").uncertainty.components
+    without = survey.scale("first_camera", "ABCDE", range_model=WITHOUT_BIASES).uncertainty.components
+    assert not {"bias", "common_bias"} & set(without)
+
+
+def test_a_map_that_bends_is_not_known_as_well_as_one_that_does_not(make_survey: MakeSurvey) -> None:
+    survey = make_survey(anchors_m=FAR_ANCHORS_M, radio=Radio(range_stddev_m=0.03), num_keyframes=100, num_epochs=3)
+    along = np.linspace(0, 1, 100)
+    bend_m = 0.4 * np.column_stack([np.sin(7 * along), np.cos(5 * along), 0.3 * np.sin(11 * along)])
+    path = survey.trajectory
+    bent = replace(survey, trajectory=replace(path, centers=path.centers + bend_m / survey.site_from_sfm.scale))
+    options = ScaleOptions(max_relative_stddev=0.5)
+    true, wrong = (each.scale("first_camera", "ABCD", options=options) for each in (survey, bent))
+    assert true.errors.learned is not None
+    assert wrong.errors.learned is not None
+    stddevs = [dict(zip(e.errors.learned.names, e.errors.learned.stddevs, strict=True)) for e in (true, wrong)]  # type: ignore[union-attr]
+    assert stddevs[1]["bending"] > 5 * stddevs[0]["bending"]
+    assert wrong.uncertainty.half_width_95 > 1.5 * true.uncertainty.half_width_95
+    assert abs(bent.relative_error(wrong)) < wrong.uncertainty.half_width_95
+
+
+def test_what_the_clocks_leave_open_is_part_of_scale_and_place(make_survey: MakeSurvey) -> None:
+    survey, stddev_s = make_survey(), 0.5
+    anchors = survey.anchors("site", survey.anchors_m)
+
+    def estimate(time_offset_s: float, stddev_s: float) -> ScaleEstimate:
+        placed = associate(survey.simulated.log, survey.trajectory, survey.tag_in_cam_m, time_offset_s=time_offset_s)
+        placed = replace(placed, time_offset_stddev_s=stddev_s)
+        return initialize_scale(placed, survey.trajectory, anchors, anchor_frame="site")
+
+    right, off, told = estimate(0.0, 0.0), estimate(stddev_s, 0.0), estimate(stddev_s, stddev_s)
+    assert CLOCKS not in off.uncertainty.components
+    assert told.uncertainty.components[CLOCKS] > 0
+    # Half a second later, the whole map is turned along its loop.
+    between = off.metric_from_sfm.rotation @ right.metric_from_sfm.rotation.T
+    turn_rad = np.arccos((np.trace(between) - 1) / 2)
+    assert turn_rad > 4 * heading_stddev_rad(off)
+    assert turn_rad < 2 * heading_stddev_rad(told)
+
+
+def heading_stddev_rad(estimate: ScaleEstimate) -> float:
+    assert estimate.placement is not None
+    return float(np.sqrt(estimate.placement[3, 3]))

@@ -1,0 +1,70 @@
+"""The photos tell how far a map may be bent, and for a path without points a random walk does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.simulated.model import SyntheticModel, synthetic_model
+from tests.simulated.path import loop_path
+
+from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model
+from rangesfm.options import CameraOptions, RefineOptions
+from rangesfm.solver.bending import MapBending, WalkBending
+from rangesfm.util.geometry.trajectory import Trajectory, trajectory_from_reconstruction
+
+NUM = 16
+
+
+def simulated(pixel_stddev: float) -> SyntheticModel:
+    path = loop_path(float(NUM))
+    times = np.arange(NUM, dtype=np.float64)
+    return synthetic_model(
+        times,
+        path.centers(times),
+        path.world_from_cam(times),
+        num_observations=100,
+        max_track_length=4,
+        pixel_stddev=pixel_stddev,
+    )
+
+
+def bending_of(model: pycolmap.Reconstruction, options: RefineOptions | None = None) -> MapBending:
+    trajectory = trajectory_from_reconstruction(model)
+    return bending_of_model(model, trajectory, CameraOptions(refine_intrinsics=False), options or RefineOptions(), 1)
+
+
+def along_x(path: Trajectory) -> np.typing.NDArray[np.float64]:
+    """(n, 6 n) derivatives of each centre's x by turns and shifts of all poses."""
+    by_pose = np.zeros((len(path), len(path), 6))
+    by_pose[np.arange(len(path)), np.arange(len(path)), 3] = 1.0
+    return by_pose.reshape(len(path), -1)
+
+
+def test_a_mappers_model_is_at_the_minimum_of_its_photos_and_a_refined_map_need_not_be() -> None:
+    model = simulated(pixel_stddev=1.0).reconstruction
+    bending = bending_of(model)
+    assert isinstance(bending, PhotoBending)
+    by_pose = along_x(bending.path)
+    at_minimum = bending.of_functions(by_pose, frame_is_free=True)
+    np.testing.assert_array_equal(at_minimum.shift_m, 0.0)
+    elsewhere = replace(bending, is_at_optimum=False).of_functions(by_pose, frame_is_free=True)
+    assert np.abs(elsewhere.shift_m).max() > 1e-4
+    np.testing.assert_allclose(elsewhere.formal_m2, at_minimum.formal_m2)
+
+
+def test_twice_the_noise_bends_twice_as_far() -> None:
+    once, twice = (bending_of(simulated(pixel_stddev=stddev).reconstruction) for stddev in (0.5, 1.0))
+    assert isinstance(once, PhotoBending)
+    by_pose = along_x(once.path)
+    stddevs = [np.sqrt(np.diag(each.of_functions(by_pose, frame_is_free=True).formal_m2)) for each in (once, twice)]
+    assert np.median(stddevs[1] / stddevs[0]) == pytest.approx(2.0, rel=0.2)
+
+
+def test_a_path_without_points_walks() -> None:
+    model = simulated(pixel_stddev=0.0).reconstruction
+    for point_id in list(model.points3D):
+        model.delete_point3D(point_id)
+    assert isinstance(bending_of(model), WalkBending)

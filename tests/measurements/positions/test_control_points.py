@@ -1,0 +1,99 @@
+"""Control points are read from the canonical CSV, from other tables and from ODM's list, and mistakes are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rangesfm.errors import InputError
+from rangesfm.measurements.positions.control_point_file import read_control_points
+from rangesfm.measurements.positions.control_points import ControlPoints
+from rangesfm.measurements.ranges.readers.lists import UnclearListError
+from rangesfm.options import PointOptions
+
+
+def read(folder: Path, text: str, markers: str | None = None, **options: object) -> ControlPoints:
+    """Write a file and read it."""
+    path, markers_path = folder / "points.txt", folder / "markers.csv"
+    path.write_text(text)
+    if markers is not None:
+        markers_path.write_text(f"marker,image_name,x_px,y_px\n{markers}")
+    found = read_control_points(PointOptions().changed(path=path, **options), None if markers is None else markers_path)
+    assert found is not None
+    return found
+
+
+def test_the_canonical_table_has_coordinates_stddevs_and_kinds(tmp_path: Path) -> None:
+    found = read(
+        tmp_path,
+        "marker,x_m,y_m,z_m,stddev_m,kind\nA,1,2,3,0.02,control\nB,4,5,6,,check\nC,7,8,9,0.01,\n",
+        "A,a.jpg,1,2\nB,a.jpg,3,4\n",
+    )
+    assert [(p.name, p.stddev_m, p.kind, p.line) for p in found.points] == [
+        ("A", 0.02, "control", 2),
+        ("B", 0.01, "check", 3),
+        ("C", 0.01, "control", 4),
+    ]
+    np.testing.assert_array_equal(found.positions_m, [[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+    assert found.stddevs_are_given
+    assert list(found.markers) == ["A", "B"]
+
+
+def test_a_surveyors_table_is_recognised_by_its_columns(tmp_path: Path) -> None:
+    found = read(tmp_path, "Punkt;Ost [mm];Nord [mm];Höhe [mm];kind\n7;1000;2000;-500;check\n8;0;0;0;control\n")
+    assert [(p.name, p.kind) for p in found.points] == [("7", "check"), ("8", "control")]
+    np.testing.assert_array_equal(found.positions_m, [[1, 2, -0.5], [0, 0, 0]])
+    assert not found.stddevs_are_given
+
+
+def test_columns_can_be_named_and_unclear_ones_are_asked_for_by_the_flags_of_points(tmp_path: Path) -> None:
+    text = "a,b,c,d\nP,1,2,3\nQ,4,5,6\n"
+    found = read(tmp_path, text, columns={"marker": "a", "x": "b", "y": "c", "z": "d"})
+    assert [p.name for p in found.points] == ["P", "Q"]
+    with pytest.raises(UnclearListError) as error:
+        read(tmp_path, "point,north,east,up,h\nP,1,2,3,4\nQ,4,5,6,5\n")
+    assert "a table of points whose columns are not known for sure" in str(error.value)
+    assert any("--point_columns marker=point," in choice for choice in map(str, error.value.choices))
+
+
+@pytest.mark.parametrize(
+    ("first_line", "crs"),
+    [
+        ("EPSG:32632", "EPSG:32632"),
+        ("WGS84 UTM 32N", "EPSG:32632"),
+        ("WGS84 UTM 33S", "EPSG:32733"),
+        ("+proj=utm +zone=10 +ellps=WGS84 +datum=WGS84 +units=m +no_defs", None),
+    ],
+)
+def test_the_list_of_odm_has_coordinates_pixels_and_a_coordinate_system(
+    tmp_path: Path, first_line: str, crs: str | None
+) -> None:
+    text = f"{first_line}\n500 600 70.5 10 20 a.jpg north\n500 600 70.5 30 40 b.jpg north\n501 600 71 5 6 a.jpg\n"
+    found = read(tmp_path, f"{text}501 600 71 7 8 b.jpg\n")
+    assert found.crs == (crs or first_line)
+    assert [p.name for p in found.points] == ["north", "point 2"]
+    np.testing.assert_array_equal(found.positions_m, [[500, 600, 70.5], [501, 600, 71]])
+    assert found.markers["point 2"].image_names == ("a.jpg", "b.jpg")
+    np.testing.assert_array_equal(found.markers["north"].pixels, [[10, 20], [30, 40]])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "the file is empty, expected a table with marker,x_m,y_m,z_m"),
+        ("marker,x_m,y_m,z_m\n", "names no point, expected one per line"),
+        ("marker,x_m,y_m,z_m\nA,1,2,3\nA,1,2,3\n", "points.txt:3: marker is 'A', expected each point once"),
+        ("marker,x_m,y_m,z_m,kind\nA,1,2,3,held\n", "points.txt:2: kind is 'held', expected control or check"),
+        ("marker,x_m,y_m,z_m\nA,1,,3\n", "points.txt:2: y_m is empty, expected"),
+        ("marker,x_m,y_m,z_m,stddev_m\nA,1,2,3,-1\n", "points.txt:2: stddev_m is -1, expected"),
+        ("EPSG:32632\n1 2 3 4 5 a.jpg\n1 2 three 4 5 a.jpg\n", "points.txt:3: is no line of a point, expected geo_x"),
+        ("EPSG:32632\n1 2 3 4 5 a.jpg P\n1 2 4 4 5 b.jpg P\n", "points.txt:3: point P has other coordinates than in"),
+        ("EPSG:32632\n1 2 3 4 5 a.jpg P\n1 2 3 4 6 a.jpg P\n", "points.txt:3: point P is twice in a.jpg"),
+    ],
+)
+def test_a_mistake_in_the_file_is_named_with_its_line(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError) as error:
+        read(tmp_path, text)
+    assert said in str(error.value)

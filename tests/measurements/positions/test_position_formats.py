@@ -1,0 +1,306 @@
+"""Positions are read from tables, TUM trajectories, NMEA, RTKLIB and Marvelmind, and mistakes are named."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from tests.known import known
+
+from rangesfm.errors import InputError
+from rangesfm.measurements.positions.position_formats import read_positions
+from rangesfm.measurements.positions.position_log import GEOGRAPHIC, PositionLog
+from rangesfm.measurements.positions.true_positions import read_true_positions
+from rangesfm.measurements.ranges.readers.lists import UnclearListError
+from rangesfm.options import PositionOptions
+
+DAY_S = datetime(2024, 3, 1, tzinfo=timezone.utc).timestamp()
+
+
+def read(folder: Path, text: str, **options: object) -> PositionLog:
+    """Write a file and read it."""
+    path = folder / "positions.txt"
+    path.write_text(text)
+    found = read_positions(PositionOptions().changed(path=path, **options))
+    assert found is not None
+    return found
+
+
+def nmea(*bodies: str) -> str:
+    """Return sentences with their checksums."""
+    sums = (f"{reduce(lambda total, letter: total ^ ord(letter), body, 0):02X}" for body in bodies)
+    return "".join(f"${body}*{total}\r\n" for body, total in zip(bodies, sums, strict=True))
+
+
+def test_the_canonical_table_is_read_in_the_order_of_time(tmp_path: Path) -> None:
+    found = read(tmp_path, "timestamp_s,x_m,y_m,z_m,stddev_m\n2,4,5,6,0.1\n1,1,2,3,0.2\n2,9,9,9,0.1\n")
+    assert found.timestamp_s is not None
+    np.testing.assert_array_equal(found.timestamp_s, [1, 2])
+    np.testing.assert_array_equal(found.position_m, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(found.covariance_m2, [0.04 * np.eye(3), 0.01 * np.eye(3)])
+    np.testing.assert_array_equal(found.line, [3, 2])
+    assert found.notes == ("positions.txt: 1 of 3 positions have the time of an earlier one and are left out",)
+
+
+def test_positions_by_photo_may_have_a_covariance(tmp_path: Path) -> None:
+    names = "image_name,x_m,y_m,z_m,cov_xx_m2,cov_xy_m2,cov_xz_m2,cov_yy_m2,cov_yz_m2,cov_zz_m2"
+    found = read(tmp_path, f"{names}\na.jpg,1,2,3,4,1,0,5,0,6\nb.jpg,1,2,3,,,,,,\n")
+    assert found.image_name == ("a.jpg", "b.jpg")
+    np.testing.assert_array_equal(found.covariance_m2[0], [[4, 1, 0], [1, 5, 0], [0, 0, 6]])
+    assert np.isnan(found.covariance_m2[1]).all()
+
+
+def test_a_table_of_a_positioning_system_is_recognised_by_its_columns(tmp_path: Path) -> None:
+    rows = "".join(f"{1000 * k},T1,{100 * k},{200 * k},{5 * k}\n" for k in range(30))
+    found = read(tmp_path, f"timestamp (ms),tag_id,pos_x (mm),pos_y (mm),pos_z (mm)\n{rows}")
+    assert found.timestamp_s is not None
+    np.testing.assert_allclose(found.timestamp_s, np.arange(30.0))
+    np.testing.assert_allclose(found.position_m[2], [0.2, 0.4, 0.01])
+    with pytest.raises(InputError, match=r"has positions of several tags \(T1, T2\): say which it is"):
+        read(tmp_path, "timestamp_s,tag_id,x,y,z\n1,T1,1,2,3\n2,T2,1,2,3\n")
+    two = "timestamp_s,tag_id,x,y,z\n1,T1,1,2,3\n2,T2,4,5,6\n"
+    np.testing.assert_array_equal(read(tmp_path, two, tag_id="T2").position_m, [[4, 5, 6]])
+
+
+def test_a_tum_trajectory_gives_its_positions(tmp_path: Path) -> None:
+    found = read(tmp_path, "1.0 1 2 3 0 0 0 1\n2.0 4 5 6 0 0 0 1\n")
+    assert (found.format, found.crs) == ("tum", None)
+    np.testing.assert_array_equal(found.position_m, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_nmea_gives_ellipsoidal_heights_utc_and_stddevs(tmp_path: Path) -> None:
+    text = nmea(
+        "GPRMC,235959.00,A,4717.11399,N,00833.91590,E,0.0,0.0,290224,,,A",
+        "GPGST,235959.00,1.0,,,,0.02,0.03,0.05",
+        "GPGGA,235959.00,4717.11399,N,00833.91590,E,4,12,0.7,499.6,M,48.0,M,,",
+        "GPGGA,000001.50,4717.11400,N,00833.91590,W,1,12,0.7,499.6,M,48.0,M,,",
+        "GPGGA,000002.50,,,,,0,00,,,M,,M,,",
+    )
+    found = read(tmp_path, f"{text}$GPGGA,000003.00,broken*00\n")
+    assert (found.format, found.crs) == ("nmea", GEOGRAPHIC)
+    assert found.timestamp_s is not None
+    np.testing.assert_allclose(found.timestamp_s, [DAY_S - 1, DAY_S + 1.5])
+    np.testing.assert_allclose(found.position_m[0], [8 + 33.9159 / 60, 47 + 17.11399 / 60, 547.6])
+    assert found.position_m[1, 0] < 0
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance_m2[0])), [0.03, 0.02, 0.05])
+    assert found.covariance_m2[1, 0, 0] == pytest.approx(9.0)
+    assert found.notes == ("positions.txt: 1 broken sentences are left out",)
+
+
+def test_a_solution_of_rtklib_has_covariances_east_north_up(tmp_path: Path) -> None:
+    names = (
+        "%  GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio"
+    )
+    row = "2024/03/01 00:00:05.500 47.06 -1.35 84.8 1 9 0.02 0.01 0.05 -0.01 0.002 0.003 0.0"
+    found = read(tmp_path, f"% program : RTKLIB\n{names}\n{row}\n")
+    assert (found.format, found.crs) == ("rtklib", GEOGRAPHIC)
+    assert found.timestamp_s is not None
+    np.testing.assert_allclose(found.timestamp_s, [DAY_S + 5.5])
+    np.testing.assert_allclose(found.position_m, [[-1.35, 47.06, 84.8]])
+    np.testing.assert_allclose(
+        found.covariance_m2[0], [[1e-4, -1e-4, 4e-6], [-1e-4, 4e-4, 9e-6], [4e-6, 9e-6, 25e-4]], atol=1e-12
+    )
+    assert "GPS time, which is ahead of UTC" in found.notes[0]
+    with pytest.raises(InputError, match=r"positions.txt:2: is no row of an RTKLIB solution"):
+        read(tmp_path, f"{names}\n2024/03/01 00:00:05.500 47.06 -1.35\n")
+
+
+def test_a_log_of_marvelminds_dashboard_is_read(tmp_path: Path) -> None:
+    rows = "".join(f"{1700000000000 + 100 * k},100,{100 * k},5,1.0{k},2.0,0.5,1,3.2,2,4.1\n" for k in range(3))
+    found = read(tmp_path, rows)
+    assert found.format == "marvelmind"
+    assert found.timestamp_s is not None
+    np.testing.assert_allclose(np.diff(found.timestamp_s), 0.1, atol=1e-6)
+    np.testing.assert_allclose(found.position_m[:, 0], [1.0, 1.01, 1.02])
+
+
+@pytest.mark.parametrize("system", ["CARTESIAN", "WGS84"])
+def test_pose_priors_of_a_database_are_positions_of_its_photos(tmp_path: Path, system: str) -> None:
+    path = tmp_path / "database.db"
+    with pycolmap.Database.open(path) as database:
+        camera = pycolmap.Camera(model="PINHOLE", width=10, height=10, params=[10, 10, 5, 5])
+        camera_id = database.write_camera(camera)
+        for k in range(3):
+            image = pycolmap.Image(name=f"{k}.jpg", camera_id=camera_id)
+            image_id = database.write_image(image)
+            image.image_id = image_id
+            prior = pycolmap.PosePrior(
+                position=[47.0 + k, 8.0, 400.0],
+                position_covariance=0.01 * np.eye(3),
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.__members__[system],
+                corr_data_id=image.data_id,
+            )
+            database.write_pose_prior(prior)
+    before = path.read_bytes()
+    found = read_positions(PositionOptions().changed(path=path))
+    assert found is not None
+    assert found.image_name == ("0.jpg", "1.jpg", "2.jpg")
+    is_geographic = system == "WGS84"
+    assert found.crs == (GEOGRAPHIC if is_geographic else None)
+    np.testing.assert_array_equal(found.position_m[1], [8, 48, 400] if is_geographic else [48, 8, 400])
+    assert np.isnan(found.covariance_m2).all() == is_geographic
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "said"),
+    [
+        ("", {}, "the file is empty, expected a table with timestamp_s or image_name"),
+        ("timestamp_s,x_m,y_m,z_m\n", {}, "holds no position (read as table)"),
+        ("timestamp_s,x_m,y_m,z_m\n1,2,three,4\n", {}, "positions.txt:2: y_m is 'three', expected"),
+        ("timestamp_s,x_m,y_m,z_m,stddev_m\n1,2,3,4,-1\n", {}, "positions.txt:2: stddev_m is -1, expected"),
+        ("1 2 3\n", {"format": "rtk"}, "unknown format of positions 'rtk'; the nearest is 'rtklib'"),
+        ("1 2 3\n", {"format": "rtklib"}, "has no header row of an RTKLIB solution"),
+    ],
+)
+def test_a_mistake_in_positions_is_named(tmp_path: Path, text: str, options: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError) as error:
+        read(tmp_path, text, **options)
+    assert said in str(error.value)
+
+
+def test_unclear_columns_are_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(UnclearListError, match="a table of positions whose columns are not known for sure") as error:
+        read(tmp_path, "time,a,b,c\n1,2,3,4\n2,3,4,5\n")
+    told = [str(choice) for choice in error.value.choices]
+    assert told == ["if a, b, c are x, y, z, add --position_columns timestamp=time,x=a,y=b,z=c"]
+
+
+ROWS = [(1403636579763555584 + 100_000_000 * k, 3.0 + 0.25 * k, -1.5 * k, 1.5 + 0.125 * k) for k in range(30)]
+EUROC = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+    "b_w_RS_S_z [rad s^-1]"
+)
+# A header, a row with the time t in ns, the time s in seconds and the place x, y, z, and the cells that come after.
+TRAJECTORIES = {
+    "EuRoC": (EUROC, "{t},{x},{y},{z},0.6,0.0,0.8,0.0,0.1,0.2,0.3,0,0,0"),
+    "VINS": ("", "{t},{x},{y},{z},0.6,0.0,0.8,0.0,0.1,0.2,0.3,"),
+    "MCD": ("num t x y z qx qy qz qw", "{k} {s} {x} {y} {z} 0.0 0.8 0.0 0.6"),
+    "DWM1001": ("Time,POSX,POSY,POSZ", "{s},{x},{y},{z}"),
+    "ROS": (
+        "time,pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,pose.orientation.y,"
+        "pose.orientation.z,pose.orientation.w,twist.linear.x,twist.linear.y,twist.linear.z",
+        "{s},{x},{y},{z},0,0,0,1,0.1,0.2,0.3",
+    ),
+    "TUM with commas": ("", "{s},{x},{y},{z},0.0,0.6,0.0,0.8"),
+    "plain": ("", "{s} {x} {y} {z}"),
+    "transform": ("timestamp;tx;ty;tz", "{s};{x};{y};{z}"),
+}
+
+
+@pytest.mark.parametrize("name", TRAJECTORIES)
+def test_trajectories_of_other_programs_give_their_positions(tmp_path: Path, name: str) -> None:
+    header, row = TRAJECTORIES[name]
+    rows = [row.format(k=k, t=t, s=f"{t / 1e9:.6f}", x=x, y=y, z=z) for k, (t, x, y, z) in enumerate(ROWS)]
+    path = tmp_path / "positions.txt"
+    found = read(tmp_path, "\n".join([header] * bool(header) + rows) + "\n")
+    np.testing.assert_allclose(known(found.timestamp_s), [t / 1e9 for t, *_ in ROWS], atol=1e-6)
+    np.testing.assert_array_equal(found.position_m, [place for _, *place in ROWS])
+    reference = read_true_positions(path)
+    np.testing.assert_array_equal(reference.positions_m, found.position_m)
+    np.testing.assert_array_equal(known(reference.timestamps_s), known(found.timestamp_s))
+
+
+PHOTOS = [f"DJI_{k:04}.JPG" for k in range(5)]
+PLACES = [[9.0 + 1e-6 * k, 46.95 - 2e-6 * k, 430.5 + k] for k in range(5)]
+
+
+def by_photo(row: str) -> str:
+    return "".join(
+        row.format(photo=photo, label=photo[:-4], x=x, y=y, z=z) + "\n"
+        for photo, (x, y, z) in zip(PHOTOS, PLACES, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "crs"),
+    [
+        ("EPSG:4326\n" + by_photo("{photo} {x} {y} {z}"), "EPSG:4326"),
+        ("EPSG:4326\n" + by_photo("{photo} {x} {y} {z} 10 0 -90 0.02 0.04"), "EPSG:4326"),
+        ("+proj=utm +zone=32 +datum=WGS84\n" + by_photo("{photo}\t{x}\t{y}\t{z}"), "+proj=utm +zone=32 +datum=WGS84"),
+        (
+            "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll\n" + by_photo("{label},{x},{y},{z},0,0,0"),
+            GEOGRAPHIC,
+        ),
+        (
+            '# CoordinateSystem: GEOGCS["WGS 84",DATUM["x",AUTHORITY["EPSG","6326"]],AUTHORITY["EPSG","4326"]]\n'
+            "#Label,X/Longitude,Y/Latitude,Z/Altitude\n" + by_photo("{label},{x},{y},{z}"),
+            "EPSG:4326",
+        ),
+        ("SourceFile,Longitude,Latitude,Altitude\n" + by_photo("{photo},{x},{y},{z}"), GEOGRAPHIC),
+    ],
+)
+def test_positions_of_photos_keep_their_coordinate_system(tmp_path: Path, text: str, crs: str) -> None:
+    found = read(tmp_path, text)
+    assert found.crs == crs
+    assert [name[:8] for name in known(found.image_name)] == [photo[:8] for photo in PHOTOS]
+    np.testing.assert_array_equal(found.position_m, PLACES)
+    if "0.02" in text:
+        np.testing.assert_allclose(found.covariance_m2, np.tile(np.diag([4e-4, 4e-4, 16e-4]), (5, 1, 1)))
+
+
+def test_columns_by_number_do_not_drop_the_coordinate_system_of_the_first_line(tmp_path: Path) -> None:
+    text = "EPSG:4326\n" + by_photo("{photo} {x} {y} {z}")
+    found = read(tmp_path, text, columns={"image_name": "1", "x": "2", "y": "3", "z": "4"})
+    assert found.crs == "EPSG:4326"
+    np.testing.assert_array_equal(found.position_m, PLACES)
+
+
+def test_local_metres_under_a_heading_for_both_are_no_degrees(tmp_path: Path) -> None:
+    found = read(tmp_path, "#Label,X/Longitude,Y/Latitude,Z/Altitude\na,1.5,2.5,0.5\nb,8.5,12.5,0.5\n")
+    assert found.crs is None
+
+
+def test_ranges_without_names_are_not_taken_for_positions(tmp_path: Path) -> None:
+    with pytest.raises(UnclearListError, match="a table of positions whose columns are not known for sure"):
+        read(tmp_path, "".join(f"{0.5 * k} 2 {5 + k % 3} {4.25 + 0.1 * k}\n" for k in range(20)))
+
+
+def test_photos_with_large_coordinates_are_asked_about_with_whole_commands(tmp_path: Path) -> None:
+    with pytest.raises(UnclearListError) as error:
+        read(tmp_path, "".join(f"{photo} {2e6 + k} {1e6 - k} {400 + k}\n" for k, photo in enumerate(PHOTOS)))
+    assert [choice.flags for choice in error.value.choices] == [
+        ("--position_columns", "image_name=1,x=2,y=3,z=4"),
+        ("--position_columns", "image_name=1,x=3,y=2,z=4"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("header", "lost"),
+    [
+        ("timestamp_s,x_m,y_m,z_m", "2.0,nan,nan,nan"),
+        ("timestamp_s,x_m,y_m,z_m", "2.0,,,"),
+        ("Time,POSX,POSY,POSZ", "2.0,null,null,null"),
+        ("timestamp_s,x_m,y_m,z_m,quality", "2.0,0,0,0,0"),
+        ("t,Longitude,Latitude,Height", "2.0,0,0,0"),
+    ],
+)
+def test_rows_without_a_fix_are_counted_and_left_out(tmp_path: Path, header: str, lost: str) -> None:
+    more = ",4" * (header.count(",") - 3)
+    rows = [f"{k}.0,{8 + 1e-5 * k},{47 + 1e-5 * k},3{more}" if k != 2 else lost for k in range(6)]
+    found = read(tmp_path, "\n".join([header, *rows]) + "\n")
+    assert known(found.timestamp_s).tolist() == [0.0, 1.0, 3.0, 4.0, 5.0]
+    assert np.isfinite(found.position_m).all()
+    assert "positions.txt: 1 of 6 rows have no position (no fix) and are left out" in found.notes
+
+
+def test_a_true_trajectory_may_have_gaps(tmp_path: Path) -> None:
+    for name, text in (
+        ("a.csv", "timestamp_s,x_m,y_m,z_m\n0,1,2,3\n1,nan,nan,nan\n2,4,5,6\n"),
+        ("a.tum", "0 1 2 3 0 0 0 1\n1 nan nan nan 0 0 0 1\n2 4 5 6 0 0 0 1\n"),
+    ):
+        (tmp_path / name).write_text(text)
+        found = read_true_positions(tmp_path / name)
+        assert known(found.timestamps_s).tolist() == [0.0, 2.0]
+        assert found.notes == (f"{name}: 1 of 3 rows have no position and are left out",)
+
+
+def test_true_positions_in_degrees_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "geo.txt").write_text("EPSG:4326\n" + by_photo("{photo} {x} {y} {z}"))
+    with pytest.raises(InputError, match=r"geo\.txt: the positions are in EPSG:4326, expected metres"):
+        read_true_positions(tmp_path / "geo.txt")

@@ -1,0 +1,363 @@
+"""Residuals in pycolmap's bundle adjustment."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import pyceres
+import pycolmap
+import pytest
+
+from rangesfm.solver import (
+    PlacedRanges,
+    RangeBlocks,
+    add_normal_prior,
+    add_ranges,
+    add_residual_block,
+    distance_cost,
+    keep_from_elimination,
+    range_cost,
+    tangent_jacobian,
+)
+
+if TYPE_CHECKING:
+    from tests.solver.conftest import AdjusterOf, PoseBlock
+
+Array = npt.NDArray[np.float64]
+
+TAG_IN_CAM_M = np.array([-0.0012, -0.0900, -0.0663])
+ANCHOR_IN_WORLD_M = np.array([3.0, -2.0, 1.0])
+START_ERROR_M = np.array([0.3, 0.2, -0.1])
+
+
+def cost_of(problem: pyceres.Problem) -> float:
+    return 0.5 * float(np.sum(np.square(problem.evaluate_residuals())))
+
+
+@pytest.mark.parametrize(
+    "anchor_in_world",
+    [np.zeros(3, dtype=np.float32), np.zeros((3, 3))[:, 0], np.broadcast_to(0.0, 3), np.zeros(2)],
+    ids=["float32", "a column", "read-only", "too short"],
+)
+def test_blocks_that_the_solver_cannot_work_on_in_place_are_refused(
+    reconstruction: pycolmap.Reconstruction, anchor_in_world: Array, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    adjuster = adjuster_of(reconstruction)
+    num_residuals = adjuster.problem.num_residuals()
+    cost = range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+    with pytest.raises(ValueError, match=r"in place|num_dims"):
+        add_residual_block(adjuster, cost, None, [pose_block(reconstruction, 1), anchor_in_world, np.zeros(1)])
+    assert adjuster.problem.num_residuals() == num_residuals
+
+
+def test_a_block_given_twice_is_refused(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    # Given the same block twice, Ceres would abort the process.
+    adjuster, pose = adjuster_of(reconstruction), pose_block(reconstruction, 1)
+    cost = distance_cost(distance_m=1.0, stddev_m=0.1, a_in_cam_m=[0, 0, 0], b_in_cam_m=[1, 0, 0])
+    with pytest.raises(ValueError, match="given twice"):
+        add_residual_block(adjuster, cost, None, [pose, pose_block(reconstruction, 1)])
+
+
+def test_a_normal_prior_is_off_by_its_stddevs(reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf) -> None:
+    problem = (adjuster := adjuster_of(reconstruction)).problem
+    block, bias = np.array([1.2, 1.0, 7.0]), np.array([1e-9])
+    add_normal_prior(adjuster, block, mean=[1.0, 2.0, 3.0], stddev=[0.1, 0.5, 2.0])
+    add_normal_prior(adjuster, bias, mean=[0.0], stddev=1e-9)
+    assert problem.evaluate_residuals()[-4:] == pytest.approx([2.0, -2.0, 2.0, 1.0], rel=1e-12)
+    jacobian = tangent_jacobian(problem, [block, bias]).toarray()
+    np.testing.assert_allclose(jacobian[-4:], np.diag([10.0, 2.0, 0.5, 1e9]), rtol=1e-12)
+
+
+def test_further_errors_widen_a_normal_prior(reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf) -> None:
+    problem = (adjuster := adjuster_of(reconstruction)).problem
+    off, further = np.array([0.3, -0.1, 0.2]), np.array([[0.09, 0.02, 0], [0.02, 0.04, 0], [0, 0, 0]])
+    add_normal_prior(adjuster, off.copy(), np.zeros(3), 0.1, further)
+    squared = off @ np.linalg.solve(further + 0.01 * np.eye(3), off)
+    assert np.sum(np.square(problem.evaluate_residuals()[-3:])) == pytest.approx(squared, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("mean", "stddev"),
+    [
+        ([1.0, 2.0, 3.0], [1.0, 1.0]),
+        ([1.0], 1.0),
+        ([], 1.0),
+        ([1.0, 2.0], 0.0),
+        ([1.0, 2.0], [1.0, -1.0]),
+        ([1.0, np.nan], 1.0),
+        ([1.0, 2.0], np.inf),
+    ],
+)
+def test_a_normal_prior_that_means_nothing_is_refused(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, mean: list[float], stddev: float | list[float]
+) -> None:
+    # Given such a prior, Ceres would abort the process.
+    with pytest.raises(ValueError, match=r"prior of|broadcast"):
+        add_normal_prior(adjuster_of(reconstruction), np.zeros(2), mean, stddev)
+
+
+def test_a_range_adds_half_its_squared_residual_to_the_bundle_adjustments_cost(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    adjuster = adjuster_of(reconstruction)
+    before = cost_of(adjuster.problem)
+    blocks = [pose_block(reconstruction, 1), np.array([3.0, -2.0, 1.0]), np.zeros(1)]
+    cost = range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+    expected = 0.5 * cost.evaluate(*blocks)[0].item() ** 2
+    add_residual_block(adjuster, cost, None, blocks)
+    assert cost_of(adjuster.problem) - before == pytest.approx(expected)
+
+
+def test_a_cauchy_loss_tames_an_outlier_in_pycolmaps_solver(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    adjuster = adjuster_of(reconstruction)
+    blocks = [pose_block(reconstruction, 1), np.array([3.0, -2.0, 1.0]), np.zeros(1)]
+    cost = range_cost(range_m=100.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+    squared = cost.evaluate(*blocks)[0].item() ** 2
+    add_residual_block(adjuster, cost, pyceres.CauchyLoss(2.0), blocks)
+    summary = adjuster.solve()
+    assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
+    expected = 0.5 * 2.0**2 * np.log1p(squared / 2.0**2)
+    assert summary.ceres_summary.initial_cost == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_ranges_pull_an_unscaled_model_to_its_scale(
+    reconstruction: pycolmap.Reconstruction, num_threads: int, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    rng = np.random.default_rng(0)
+    anchors = rng.uniform(-8.0, 8.0, (4, 3))
+    truth = {
+        i: np.array(reconstruction.frame(i).rig_from_world.inverse().translation)  # type: ignore[union-attr]
+        for i in reconstruction.reg_frame_ids()
+    }
+    reconstruction.transform(pycolmap.Sim3d(1.05, pycolmap.Rotation3d(), np.zeros(3)))
+    adjuster = adjuster_of(reconstruction, num_threads=num_threads)
+    for (frame_id, center), anchor in itertools.product(truth.items(), anchors):
+        distance = float(np.linalg.norm(center - anchor))
+        cost = range_cost(range_m=distance, tag_in_cam_m=[0, 0, 0], stddev_m=0.01)
+        bias = np.zeros(1)
+        add_residual_block(adjuster, cost, None, [pose_block(reconstruction, frame_id), anchor, bias])
+        adjuster.problem.set_parameter_block_constant(anchor)
+        adjuster.problem.set_parameter_block_constant(bias)
+    assert adjuster.solve().is_solution_usable()
+    for frame_id, center in truth.items():
+        rig_from_world = reconstruction.frame(frame_id).rig_from_world
+        assert rig_from_world is not None
+        assert rig_from_world.inverse().translation == pytest.approx(center, abs=1e-5)
+
+
+def test_a_pose_that_the_adjuster_holds_stays_where_it_is(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    pose = pose_block(reconstruction, 1)
+    before = pose.copy()
+    adjuster = adjuster_of(reconstruction, constant_frame_id=1)
+    cost = range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.01)
+    add_residual_block(adjuster, cost, None, [pose, np.array([3.0, -2.0, 1.0]), np.zeros(1)])
+    adjuster.solve()
+    np.testing.assert_array_equal(pose, before)
+
+
+@pytest.mark.parametrize("hold", [True, False])
+def test_a_pose_that_the_adjuster_holds_is_no_part_of_its_problem_until_a_range_makes_it_one(
+    reconstruction: pycolmap.Reconstruction, hold: bool, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    """This is why ``add_residual_block`` exists, shown on the bare problem; the test fails if pycolmap changes it."""
+    pose = pose_block(reconstruction, 1)
+    before = pose.copy()
+    adjuster = adjuster_of(reconstruction, constant_frame_id=1)
+    problem = adjuster.problem
+    assert not problem.has_parameter_block(pose)
+    cost = range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.01)
+    problem.add_residual_block(cost, None, [pose, np.array([3.0, -2.0, 1.0]), np.zeros(1)])
+    assert not problem.is_parameter_block_constant(pose)
+    assert not problem.has_manifold(pose)
+    if hold:
+        problem.set_parameter_block_constant(pose)
+    adjuster.solve()
+    assert np.array_equal(pose, before) == hold
+
+
+@pytest.mark.parametrize(
+    ("kept", "structure"), [(True, "2,3,6"), (False, "d,d,d")], ids=["kept from elimination", "left alone"]
+)
+def test_a_free_anchor_and_bias_leave_the_solver_its_kernels_where_kept_from_elimination(
+    reconstruction: pycolmap.Reconstruction, kept: bool, structure: str, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    adjuster, anchor, bias = adjuster_with_free_anchor(reconstruction, adjuster_of, pose_block)
+    if kept:
+        keep_from_elimination(adjuster, anchor, next(iter(reconstruction.points3D.values())).xyz)
+        keep_from_elimination(adjuster, bias, next(iter(reconstruction.points3D.values())).xyz)
+    summary = adjuster.solve()
+    assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
+    assert summary.ceres_summary.schur_structure_used == structure
+
+
+def test_what_is_kept_from_elimination_ends_at_the_same_place(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    ends = []
+    for kept in (True, False):
+        copy = pycolmap.Reconstruction(reconstruction)
+        adjuster, anchor, bias = adjuster_with_free_anchor(copy, adjuster_of, pose_block)
+        if kept:
+            keep_from_elimination(adjuster, anchor, next(iter(copy.points3D.values())).xyz)
+            keep_from_elimination(adjuster, bias, next(iter(copy.points3D.values())).xyz)
+        adjuster.solve()
+        ends.append(np.concatenate([anchor, bias]))
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+    assert np.linalg.norm(ends[0][:3] - ANCHOR_IN_WORLD_M) < 1e-4
+
+
+def adjuster_with_free_anchor(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> tuple[pycolmap.CeresBundleAdjuster, Array, Array]:
+    """Return an adjuster with exact ranges to an anchor that starts at a wrong position; the anchor and its bias."""
+    adjuster, anchor, bias = adjuster_of(reconstruction), ANCHOR_IN_WORLD_M + START_ERROR_M, np.zeros(1)
+    for frame_id in reconstruction.reg_frame_ids():
+        pose = pose_block(reconstruction, frame_id)
+        unbiased = range_cost(range_m=1.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=1.0)
+        distance = unbiased.evaluate(pose, ANCHOR_IN_WORLD_M, bias)[0].item() + 1.0
+        cost = range_cost(range_m=distance, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+        add_residual_block(adjuster, cost, None, [pose, anchor, bias])
+    add_normal_prior(adjuster, bias, mean=[0.0], stddev=0.1)
+    adjuster.options.ceres.solver_options.linear_solver_type = pyceres.LinearSolverType.SPARSE_SCHUR
+    return adjuster, anchor, bias
+
+
+LIFETIMES = """
+    {imports}
+    import gc, itertools
+    import numpy as np
+    from rangesfm import solver
+    from rangesfm.solver import adjuster_problem
+
+    def make():
+        reconstruction = pycolmap.synthesize_dataset(
+            pycolmap.SyntheticDatasetOptions(
+                num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=3, num_points3D=30
+            )
+        )
+        config = pycolmap.BundleAdjustmentConfig()
+        for image_id in reconstruction.reg_image_ids():
+            config.add_image(image_id)
+        options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+        options.ceres.solver_options.max_num_iterations = 2
+        adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+        residuals = []
+        for frame_id in reconstruction.reg_frame_ids():
+            cost = solver.range_cost(range_m=1.0, tag_in_cam_m=[0, 0, 0], stddev_m=1.0)
+            loss = pyceres.CauchyLoss(1.0)
+            blocks = [reconstruction.frame(frame_id).rig_from_world.params, np.ones(3), np.zeros(1)]
+            solver.add_residual_block(adjuster, cost, loss, blocks)
+            residuals.append((cost, loss, blocks))
+            point = next(iter(reconstruction.points3D.values())).xyz
+            solver.keep_from_elimination(adjuster, blocks[1], point)
+        poses = [reconstruction.frame(frame_id).rig_from_world.params for frame_id in reconstruction.reg_frame_ids()]
+        rows = np.arange(4)
+        ranges = solver.PlacedRanges(
+            range_m=np.ones(4), stddev_m=np.ones(4), before=rows % 2, after=rows % 2 + rows // 2, weight=rows / 4,
+            offset_in_world_m=np.zeros((4, 3)), anchor_index=0 * rows, tag_index=0 * rows,
+        )
+        many = solver.RangeBlocks(poses, [np.ones(3)], [np.zeros(1)], [np.zeros(3)], lever_arms_are_free=True)
+        solver.add_ranges(adjuster, ranges, many, loss_scale=1.0)
+        residuals.append((ranges, many))
+        return dict(adjuster=adjuster, problem=adjuster.problem, reconstruction=reconstruction, residuals=residuals)
+
+    for order in itertools.permutations(("adjuster", "problem", "reconstruction", "residuals")):
+        held = make()
+        for name in order:
+            del held[name]
+            gc.collect()
+            make()  # takes and scribbles over whatever memory became free
+            if "adjuster" in held:
+                assert held["adjuster"].solve().is_solution_usable(), (order, name)
+            elif "problem" in held:
+                assert np.all(np.isfinite(held["problem"].evaluate_residuals())), (order, name)
+    gc.collect()
+    assert not adjuster_problem._used_by_adjuster, "adjusters that nobody refers to are still there"
+"""
+
+
+@pytest.mark.parametrize("first", ["pycolmap", "pyceres"])
+def test_references_may_be_dropped_in_any_order(first: str) -> None:
+    # In a process of its own, because a failure here would abort the process.
+    imports = "import pycolmap, pyceres" if first == "pycolmap" else "import pyceres, pycolmap"
+    script = textwrap.dedent(LIFETIMES).format(imports=imports)
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)
+    assert run.returncode == 0, run.stderr[-2000:]
+
+
+def empty_adjuster() -> pycolmap.CeresBundleAdjuster:
+    """Return a bundle adjuster of nothing, to which residuals may be added."""
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, pycolmap.Reconstruction())
+
+
+def unturned(*translation: float) -> Array:
+    """Return the block of a pose without rotation, whose centre is minus the translation."""
+    return np.array([0.0, 0, 0, 1, *translation])
+
+
+@pytest.mark.parametrize("stddev", [1e-200, 1e200])
+def test_a_prior_whose_variance_no_number_can_hold_is_refused(stddev: float) -> None:
+    with (
+        np.errstate(over="ignore"),
+        pytest.raises(ValueError, match=r"^a prior of mean \[1.0, 2.0\] and stddev 1e.200, expected finite and pos"),
+    ):
+        add_normal_prior(empty_adjuster(), np.zeros(2), [1.0, 2.0], stddev)
+
+
+def placed(before: int, after: int) -> PlacedRanges:
+    """Return three ranges, of which those in rows 0 and 2 are at one place, with all that they may have."""
+    return PlacedRanges(
+        range_m=np.array([3.0, 99.0, 4.0]),
+        stddev_m=np.array([0.5, 99.0, 0.25]),
+        before=np.array([before, 0, before]),
+        after=np.array([after, 0, after]),
+        weight=np.array([0.25, 0.9, 0.5]),
+        offset_in_world_m=np.array([[0.0, 0, 0], [9, 9, 9], [-0.5, 0, 0]]),
+        anchor_index=np.array([1, 0, 1]),
+        tag_index=np.array([1, 0, 1]),
+        interval_s=np.array([0.5, 99.0, 0.5]),
+        share=np.array([4.0, 99.0, 9.0]),
+        loadings_m=np.array([[0.1, 0.0], [9.0, 9.0], [0.0, 0.2]]),
+    )
+
+
+def blocks_with_all() -> RangeBlocks:
+    """Return blocks of everything; all poses and tags are on the x axis, on which anchor 1 is at 10 m."""
+    return RangeBlocks(
+        poses=[unturned(9, 9, 9), unturned(-1, 0, 0), unturned(-5, 0, 0)],  # at x = 1 and x = 5
+        anchors=[np.full(3, 9.0), np.array([10.0, 0, 0])],
+        biases=[np.array([9.0]), np.array([0.3])],
+        tags_in_cam=[np.full(3, 9.0), np.array([2.0, 0, 0])],
+        time_shift=np.array([0.125]),
+        amplitude=np.array([0.6]),
+        shared=[np.array([1.0, 2.0])],
+    )
+
+
+def test_ranges_that_lack_a_part_of_their_model_are_refused() -> None:
+    ranges, blocks = placed(1, 2), blocks_with_all()
+    of_short = "^of short_range_length_m and its amplitude one is given without the other$"
+    with pytest.raises(ValueError, match=of_short):
+        add_ranges(empty_adjuster(), ranges, replace(blocks, amplitude=None), short_range_length_m=2.0)
+    with pytest.raises(ValueError, match=of_short):
+        add_ranges(empty_adjuster(), ranges, blocks)
+    of_shift = "^a time shift needs interval_s, the time between the keyframes of each range$"
+    with pytest.raises(ValueError, match=of_shift):
+        add_ranges(empty_adjuster(), replace(ranges, interval_s=None), blocks, short_range_length_m=2.0)

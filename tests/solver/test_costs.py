@@ -1,0 +1,328 @@
+"""The compiled cost functions, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import pyceres
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangesfm._cpp import padded_manifold, zero_tie_cost
+from rangesfm.solver import (
+    add_residual_block,
+    direction_cost,
+    distance_cost,
+    inertial_cost,
+    interpolated_range_cost,
+    joint_prior_cost,
+    range_cost,
+)
+
+if TYPE_CHECKING:
+    from tests.solver.conftest import AdjusterOf, PoseBlock
+
+Array = npt.NDArray[np.float64]
+
+TAG_IN_CAM_M = np.array([-0.0012, -0.0900, -0.0663])
+
+
+def random_pose(rng: np.random.Generator, extent: float) -> Array:
+    rotation = Rotation.random(random_state=rng.integers(2**31))
+    return np.concatenate([rotation.as_quat(), rng.normal(0.0, extent, 3)])
+
+
+def moved(block: Array, step: Array) -> Array:
+    """Return a block after a step in its tangent space.
+
+    Poses move as on COLMAP's manifold (Eigen's quaternions): Ceres turns by twice the step's length, from the left.
+    """
+    if block.size != 7:
+        return block + step
+    rotation = Rotation.from_rotvec(2.0 * step[:3]) * Rotation.from_quat(block[:4])
+    return np.concatenate([rotation.as_quat(), block[4:] + step[3:]])
+
+
+def tangent_jacobian(function: Callable[[Array], Array], block: Array, step_size: float) -> Array:
+    """Central differences of a function of a block, in the block's tangent space."""
+    num_columns = 6 if block.size == 7 else block.size
+    steps = step_size * np.eye(num_columns)
+    return np.stack(
+        [(function(moved(block, step)) - function(moved(block, -step))) / (2 * step_size) for step in steps], axis=1
+    )
+
+
+def tangent_basis(block: Array) -> Array:
+    """(block.size, tangent size) derivative of a block by a step in its tangent space, at step zero."""
+    if block.size != 7:
+        return np.eye(block.size)
+    x, y, z, w = block[:4]
+    basis = np.zeros((7, 6))
+    basis[:4, :3] = [[w, z, -y], [-z, w, x], [y, -x, w], [-x, -y, -z]]
+    basis[4:, 3:] = np.eye(3)
+    return basis
+
+
+COSTS: dict[str, Callable[[np.random.Generator], tuple[pyceres.CostFunction, list[Array]]]] = {
+    "range": lambda rng: (
+        range_cost(range_m=rng.uniform(1, 10), tag_in_cam_m=TAG_IN_CAM_M, stddev_m=rng.uniform(0.05, 0.5)),
+        [random_pose(rng, 5.0), rng.normal(0, 5, 3), rng.normal(0, 1, 1)],
+    ),
+    "interpolated": lambda rng: (
+        interpolated_range_cost(
+            range_m=rng.uniform(1, 10),
+            tag_in_cam_m=TAG_IN_CAM_M,
+            weight=rng.uniform(),
+            offset_in_world_m=rng.normal(0, 0.1, 3),
+            stddev_m=0.1,
+        ),
+        [random_pose(rng, 5.0), random_pose(rng, 5.0), rng.normal(0, 5, 3), rng.normal(0, 1, 1)],
+    ),
+    "everything free between keyframes": lambda rng: (
+        interpolated_range_cost(
+            range_m=rng.uniform(1, 10, 4),
+            tag_in_cam_m=None,
+            weight=rng.uniform(size=4),
+            offset_in_world_m=rng.normal(0, 0.1, (4, 3)),
+            stddev_m=rng.uniform(0.05, 0.5, 4),
+            interval_s=0.7,
+            short_range_length_m=20.0,
+            loss_scale=20.0,
+        ),
+        [
+            *(random_pose(rng, 5.0) for _ in range(2)),
+            *(rng.normal(0, 0.3, size) + offset for size, offset in ((3, 5), (1, 0), (3, 0), (1, 0), (1, 0))),
+        ],
+    ),
+    "everything free at a keyframe": lambda rng: (
+        range_cost(
+            range_m=rng.uniform(1, 10, 3),
+            tag_in_cam_m=None,
+            stddev_m=0.2,
+            short_range_length_m=20.0,
+            loss_scale=5.0,
+            loss_is_bounded=True,
+        ),
+        [random_pose(rng, 2.0), rng.normal(5, 1, 3), *(rng.normal(0, 0.3, size) for size in (1, 3, 1))],
+    ),
+    "distance between cameras": lambda rng: (
+        distance_cost(
+            distance_m=3.0, stddev_m=0.01, a_in_cam_m=rng.normal(0, 1, 3), b_in_cam_m=rng.normal(0, 1, 3), has_bias=True
+        ),
+        [random_pose(rng, 5.0), random_pose(rng, 5.0), rng.normal(0, 1, 1)],
+    ),
+    "distance from a camera": lambda rng: (
+        distance_cost(distance_m=3.0, stddev_m=0.01, b_in_cam_m=rng.normal(0, 1, 3)),
+        [rng.normal(0, 5, 3), random_pose(rng, 5.0)],
+    ),
+    "distance between points": lambda rng: (
+        distance_cost(distance_m=3.0, stddev_m=1.0, loss_scale=20.0),
+        [rng.normal(0, 5, 3), rng.normal(0, 5, 3)],
+    ),
+    "direction": lambda rng: (
+        direction_cost(
+            direction_in_world=rng.normal(0, 1, 3),
+            direction_in_cam=rng.normal(0, 1, 3),
+            stddev_rad=rng.uniform(0.01, 1),
+        ),
+        [random_pose(rng, 5.0)],
+    ),
+    "joint_prior": lambda rng: (
+        joint_prior_cost(mean=rng.normal(0, 1, 4), whitening=rng.normal(0, 1, (4, 4))),
+        [rng.normal(0, 1, 1) for _ in range(4)],
+    ),
+    "joint prior of large blocks": lambda rng: (
+        joint_prior_cost(mean=rng.normal(0, 1, (2, 3)), whitening=rng.normal(0, 1, (4, 6))),
+        [rng.normal(0, 1, 3) for _ in range(2)],
+    ),
+    "inertial": lambda rng: (
+        inertial_cost(
+            interval_s=0.8,
+            turn=Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
+            speed=rng.normal(0, 1, 3),
+            shift=rng.normal(0, 1, 3),
+            at=rng.normal(0, 0.1, 13),
+            by_sensor=rng.normal(0, 1, (9, 13)),
+            whitening=rng.normal(0, 1, (9, 9)),
+            rig_from_imu=Rotation.random(random_state=rng.integers(2**31)).as_matrix(),
+            loss_scale=5.0,
+        ),
+        [
+            *(random_pose(rng, 1.0) for _ in range(2)),
+            *(
+                rng.normal(0, size, num)
+                for num, size in ((3, 1), (3, 1), (3, 10), (6, 0.1), (6, 0.1), (1, 0.1), (6, 0.3))
+            ),
+        ],
+    ),
+    "zero_tie": lambda rng: (zero_tie_cost(size_a=3, size_b=1), [rng.normal(0, 1, 3), rng.normal(0, 1, 1)]),
+}
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_jacobians_are_the_finite_differences_of_the_residuals(name: str) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        cost, blocks = COSTS[name](rng)
+        jacobians = cost.evaluate(*blocks)[1]
+        for i, block in enumerate(blocks):
+
+            def residuals(moved_block: Array, i: int = i) -> Array:
+                return np.ravel(cost.evaluate(*blocks[:i], moved_block, *blocks[i + 1 :])[0])  # noqa: B023
+
+            expected = tangent_jacobian(residuals, block, step_size=1e-6)
+            assert jacobians[i] @ tangent_basis(block) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+def test_jacobian_in_pycolmaps_problem_is_the_finite_difference_on_its_manifold(
+    reconstruction: pycolmap.Reconstruction, adjuster_of: AdjusterOf, pose_block: PoseBlock
+) -> None:
+    adjuster = adjuster_of(reconstruction)
+    anchor_in_world, range_bias = np.array([3.0, -2.0, 1.0]), np.array([0.1])
+    pose = pose_block(reconstruction, 1)
+    cost = range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+    add_residual_block(adjuster, cost, None, [pose, anchor_in_world, range_bias])
+    options = pyceres.EvaluateOptions()
+    options.set_parameter_blocks([pose, anchor_in_world, range_bias])
+    jacobian = adjuster.problem.evaluate_jacobian(options)
+
+    row = np.zeros(jacobian.num_cols)
+    first, last = jacobian.rows[-2:]  # the range was added last
+    row[jacobian.cols[first:last]] = jacobian.values[first:last]
+
+    def residual(moved_pose: Array) -> Array:
+        return np.ravel(cost.evaluate(moved_pose, anchor_in_world, range_bias)[0])
+
+    expected = tangent_jacobian(residual, pose.copy(), step_size=1e-6)
+    assert row[:6] == pytest.approx(expected.ravel(), rel=1e-6, abs=1e-6)
+    assert len(row) == 6 + 3 + 1
+
+
+def test_residual_is_the_hand_computed_one() -> None:
+    # The camera is at (1, 2.5, 0), turned by 90 degrees about z; the tag is half a metre along its x axis, at (1, 2,
+    # 0), 5 m from the anchor. The bias of 0.25 m adds to the predicted range: that is 2.5 stddevs of 0.1 m more than
+    # the 5 m measured.
+    cost = range_cost(range_m=5.0, tag_in_cam_m=[0.5, 0.0, 0.0], stddev_m=0.1)
+    pose = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5), 2.5, -1.0, 0.0])
+    residuals, _ = cost.evaluate(pose, np.array([4.0, 6.0, 0.0]), np.array([0.25]))
+    assert residuals.item() == pytest.approx(2.5, abs=1e-12)
+
+
+def test_pose_block_is_colmaps_own(reconstruction: pycolmap.Reconstruction) -> None:
+    rig_from_world = reconstruction.frame(1).rig_from_world
+    assert rig_from_world is not None
+    tag_in_world = rig_from_world.inverse() * TAG_IN_CAM_M
+    anchor_in_world = np.array([3.0, -2.0, 1.0])
+    expected = np.linalg.norm(tag_in_world - anchor_in_world) - 4.0
+    cost = range_cost(range_m=4.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=1.0)
+    residuals, _ = cost.evaluate(rig_from_world.params, anchor_in_world, np.zeros(1))
+    assert residuals.item() == pytest.approx(expected, abs=1e-12)
+
+
+def test_tag_on_the_anchor_gives_finite_numbers() -> None:
+    cost = range_cost(range_m=0.5, tag_in_cam_m=[0, 0, 0], stddev_m=0.1)
+    residuals, jacobians = cost.evaluate(np.array([0, 0, 0, 1.0, 0, 0, 0]), np.zeros(3), np.zeros(1))
+    assert residuals.item() == pytest.approx(-5.0)
+    assert all(np.all(np.isfinite(jacobian)) for jacobian in jacobians)
+
+
+GOOD_RANGE = {"range_m": 4.0, "tag_in_cam_m": [0.0, 0.0, 0.0], "stddev_m": 0.1}
+GOOD_BETWEEN = {**GOOD_RANGE, "weight": 0.5, "offset_in_world_m": [0.0, 0.0, 0.0]}
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"range_m": 0.0}, "range_m"),
+        ({"range_m": -1.0}, "range_m"),
+        ({"range_m": float("nan")}, "range_m"),
+        ({"range_m": float("inf")}, "range_m"),
+        ({"stddev_m": 0.0}, "stddev_m"),
+        ({"stddev_m": -0.1}, "stddev_m"),
+        ({"stddev_m": float("nan")}, "stddev_m"),
+        ({"share": 0.0}, "share"),
+        ({"tag_in_cam_m": [0.0, 0.0]}, "3 numbers"),
+        ({"tag_in_cam_m": [[0.0, 0.0, 0.0]]}, "one dimension"),
+        ({"tag_in_cam_m": 0.0}, "one dimension"),
+        ({"tag_in_cam_m": [0.0, float("nan"), 0.0]}, "finite"),
+        ({"weight": -0.01}, "from 0 to 1"),
+        ({"weight": 1.01}, "from 0 to 1"),
+        ({"weight": float("nan")}, "finite"),
+        ({"offset_in_world_m": [float("inf"), 0.0, 0.0]}, "finite"),
+    ],
+)
+def test_values_that_mean_nothing_are_refused(bad: dict[str, float | list[float]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        interpolated_range_cost(**{**GOOD_BETWEEN, **bad})  # type: ignore[arg-type]
+    if bad.keys() <= GOOD_RANGE.keys():
+        with pytest.raises(ValueError, match=message):
+            range_cost(**{**GOOD_RANGE, **bad})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"range_m": []}, "range_m has 1 dimensions and 0 numbers"),
+        ({"range_m": [[4.0]]}, "range_m has 2 dimensions"),
+        ({"range_m": [4.0, -1.0]}, "range_m"),
+        ({"range_m": [4.0, 5.0], "stddev_m": [0.1, 0.1, 0.1]}, "stddev_m has .* one for each of 2 ranges"),
+        ({"range_m": [4.0, 5.0], "stddev_m": [0.1, 0.0]}, "stddev_m"),
+        ({"range_m": [4.0, 5.0], "share": [1.0, float("inf")]}, "share"),
+        ({"range_m": [4.0, 5.0], "weight": [0.1, 1.2]}, "from 0 to 1"),
+        ({"range_m": [4.0, 5.0], "offset_in_world_m": [[0, 0, 0]]}, "3 for each of 2 ranges"),
+        ({"interval_s": 0.0}, "interval_s"),
+        ({"offset_in_world_m": [0.0, 1.0]}, "offset_in_world_m has .* 3 numbers"),
+        ({"short_range_length_m": 0.0}, "short_range_length_m"),
+        ({"short_range_length_m": float("inf")}, "short_range_length_m"),
+        ({"loss_scale": 0.0}, "loss_scale"),
+        ({"loss_scale": -np.inf}, "loss_scale"),
+        ({"loss_scale": np.nan}, "loss_scale"),
+    ],
+)
+def test_models_and_many_ranges_that_mean_nothing_are_refused(bad: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        interpolated_range_cost(**{**GOOD_BETWEEN, **bad})
+
+
+def test_no_outlier_raises_a_bounded_loss_beyond_the_square_of_its_scale() -> None:
+    cost = range_cost(range_m=[1.0, 500.0], tag_in_cam_m=[0, 0, 0], stddev_m=0.1, loss_scale=3.0, loss_is_bounded=True)
+    at_origin = np.array([0, 0, 0, 1.0, 0, 0, 0])
+    residuals = cost.evaluate(at_origin, np.array([100.0, 0, 0]), np.zeros(1))[0].ravel()
+    assert residuals == pytest.approx([3.0, -3.0], rel=1e-4)
+
+
+def test_a_joint_prior_knows_what_its_numbers_share() -> None:
+    own, common = 0.5, 2.0
+    covariance = own**2 * np.eye(3) + common**2
+    cost = joint_prior_cost(mean=[1.0, 2.0, 3.0], whitening=np.linalg.inv(np.linalg.cholesky(covariance)))
+    together, apart = np.array([1.0, 1.0, 1.0]), np.array([1.0, -1.0, 0.0])
+    for off in (together, apart):
+        residuals = cost.evaluate(*(np.array([1.0, 2.0, 3.0]) + off)[:, None])[0].ravel()
+        assert residuals @ residuals == pytest.approx(off @ np.linalg.solve(covariance, off))
+
+
+def test_priors_and_ties_of_impossible_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match="direction_in_cam is zero"):
+        direction_cost(direction_in_world=[0, 0, 1], direction_in_cam=[0, 0, 0], stddev_rad=0.1)
+    with pytest.raises(ValueError, match="more than 0"):
+        direction_cost(direction_in_world=[0, 0, 1], direction_in_cam=[0, 0, 1], stddev_rad=0.0)
+    with pytest.raises(ValueError, match="rows of 2 numbers"):
+        joint_prior_cost(mean=[1.0, 2.0], whitening=np.eye(3))
+    with pytest.raises(ValueError, match="whitening is nan"):
+        joint_prior_cost(mean=[1.0], whitening=[[np.nan]])
+    with pytest.raises(ValueError, match="mean has 0 dimensions"):
+        joint_prior_cost(mean=1.0, whitening=[[1.0]])
+    with pytest.raises(ValueError, match="size_b"):
+        zero_tie_cost(size_a=3, size_b=0)
+    with pytest.raises(ValueError, match="at least the block's size"):
+        padded_manifold(size=7, tangent_size=6)
+    with pytest.raises(ValueError, match="a_in_cam_m"):
+        distance_cost(distance_m=1.0, stddev_m=0.1, a_in_cam_m=[0.0, 0.0])
+    with pytest.raises(ValueError, match="distance_m"):
+        distance_cost(distance_m=0.0, stddev_m=0.1)
+    with pytest.raises(ValueError, match="loss_scale"):
+        distance_cost(distance_m=1.0, stddev_m=0.1, loss_scale=0.0)

@@ -1,0 +1,629 @@
+"""Covariances of the joint problem, against the inverse of all normal equations and against simulated surveys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+from tests.simulated.model import synthetic_model
+from tests.simulated.path import look_at, orbit_path
+
+from rangesfm.errors import GeometryError
+from rangesfm.solver import (
+    PlacedRanges,
+    RangeBlocks,
+    add_normal_prior,
+    add_ranges,
+    add_residual_block,
+    distance_cost,
+    keep_from_elimination,
+    range_cost,
+    tangent_jacobian,
+)
+from rangesfm.solver.covariance import JointCovariance, PhotosAlone, ResidualErrors, joint_covariance
+from rangesfm.solver.normal_equations import BlockColumns, NormalEquations
+from rangesfm.util.geometry.similarity import IDENTITY, similarity_motions
+from rangesfm.util.geometry.trajectory import pose_of
+
+Array = npt.NDArray[np.float64]
+
+NUM_FRAMES = 8
+ANCHORS_M = np.array([[2.0, 1.0, 3.0], [-3.0, 2.0, -2.0], [1.0, -4.0, 2.0], [-1.0, 0.5, -3.0]])
+TAG_IN_CAM_M = np.array([0.05, -0.1, 0.02])
+RANGE_STDDEV_M = 0.02
+BIAS_STDDEV_M = 0.01
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A bundle adjustment with ranges from every frame to every anchor."""
+
+    reconstruction: pycolmap.Reconstruction
+    adjuster: pycolmap.CeresBundleAdjuster
+    anchors: list[Array]
+    biases: list[Array]
+    num_reprojections: int
+
+    @property
+    def problem(self) -> Any:
+        return self.adjuster.problem
+
+    @property
+    def poses(self) -> list[Array]:
+        frames = sorted(self.reconstruction.reg_frame_ids())
+        return [pose_of(self.reconstruction.frame(i)).params for i in frames]
+
+    def covariance(self, **given: Any) -> JointCovariance:
+        """Return the covariance of all, with its own anchors and biases where no others are given."""
+        blocks = {"anchors": self.anchors, "others": self.biases, **given}
+        equations = NormalEquations.of(
+            self.problem, self.reconstruction, self.num_reprojections, blocks["anchors"], blocks["others"]
+        )
+        return joint_covariance(equations, **blocks)
+
+
+def model(seed: int = 0, num_frames: int = NUM_FRAMES) -> pycolmap.Reconstruction:
+    times = np.arange(num_frames, dtype=np.float64)
+    path = orbit_path(1.4 * num_frames)
+    return synthetic_model(
+        times,
+        path.centers(times),
+        path.world_from_cam(times),
+        num_observations=30,
+        pixel_stddev=1.0,
+        metric_from_sfm=IDENTITY,
+        seed=seed,
+    ).reconstruction
+
+
+def bundle_adjuster(reconstruction: pycolmap.Reconstruction, *, hold_first: bool) -> pycolmap.CeresBundleAdjuster:
+    options = pycolmap.BundleAdjustmentOptions(
+        print_summary=False, refine_focal_length=False, refine_extra_params=False
+    )
+    solver = options.ceres.solver_options
+    solver.num_threads = 1
+    solver.initial_trust_region_radius = 1e8
+    solver.function_tolerance = solver.gradient_tolerance = solver.parameter_tolerance = 1e-10
+    options.ceres.solver_options = solver
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.UNSPECIFIED)
+    if hold_first:
+        config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+
+
+def joint(
+    reconstruction: pycolmap.Reconstruction,
+    *,
+    hold_first: bool = False,
+    num_anchors: int = len(ANCHORS_M),
+    hold_anchors: bool = False,
+    range_errors_m: Array | None = None,
+) -> Joint:
+    adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
+    anchors, biases = list(ANCHORS_M[:num_anchors].copy()), [np.zeros(1) for _ in ANCHORS_M]
+    survey = Joint(reconstruction, adjuster, anchors, biases, adjuster.problem.num_residuals())
+    frame, anchor = (index.ravel() for index in np.meshgrid(np.arange(len(survey.poses)), np.arange(num_anchors)))
+    path = orbit_path(1.4 * len(survey.poses))
+    times = np.arange(len(survey.poses), dtype=np.float64)
+    tags = path.centers(times) + path.world_from_cam(times) @ TAG_IN_CAM_M
+    distances = np.linalg.norm(tags[frame] - ANCHORS_M[anchor], axis=1)
+    ranges = PlacedRanges(
+        range_m=distances + (0.0 if range_errors_m is None else range_errors_m[anchor, frame]),
+        stddev_m=np.full(len(frame), RANGE_STDDEV_M),
+        before=frame,
+        after=frame,
+        weight=np.zeros(len(frame)),
+        offset_in_world_m=np.zeros((len(frame), 3)),
+        anchor_index=anchor,
+        tag_index=np.zeros(len(frame), dtype=np.int64),
+    )
+    add_ranges(adjuster, ranges, RangeBlocks(survey.poses, survey.anchors, survey.biases, [TAG_IN_CAM_M]))
+    for position, bias in zip(survey.anchors, survey.biases, strict=False):
+        add_normal_prior(adjuster, bias, mean=[0.0], stddev=BIAS_STDDEV_M)
+        if hold_anchors:
+            survey.problem.set_parameter_block_constant(position)
+    return survey
+
+
+def covariance_of_all(problem: Any, blocks: Sequence[Array]) -> Array:
+    """Return the inverse of the whole normal equations."""
+    jacobian = tangent_jacobian(problem, blocks).toarray()
+    covariance: Array = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)
+    return covariance
+
+
+def variable(survey: Joint) -> list[Array]:
+    blocks = [*survey.poses, *survey.anchors, *survey.biases, *(p.xyz for p in survey.reconstruction.points3D.values())]
+    problem = survey.problem
+    return [b for b in blocks if problem.has_parameter_block(b) and not problem.is_parameter_block_constant(b)]
+
+
+def test_it_is_the_same_of_blocks_that_are_kept_from_elimination() -> None:
+    free, kept = joint(model(), hold_first=True), joint(model(), hold_first=True)
+    for block in (*kept.anchors, *kept.biases):
+        keep_from_elimination(kept.adjuster, block, next(iter(kept.reconstruction.points3D.values())).xyz)
+    expected, found = (one.covariance() for one in (free, kept))
+    np.testing.assert_allclose(found.anchors, expected.anchors, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.others, expected.others, rtol=1e-6)
+    np.testing.assert_allclose(found.centers, expected.centers, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("hold_anchors", [False, True], ids=["anchors free", "anchors held"])
+def test_it_is_the_inverse_of_all_normal_equations(hold_anchors: bool) -> None:
+    survey = joint(model(), hold_first=not hold_anchors, hold_anchors=hold_anchors)
+    found = survey.covariance(residual_stddev=2.0)
+    expected = 4.0 * covariance_of_all(survey.problem, variable(survey))
+    assert found.num_free_directions == 0
+    first = 0 if hold_anchors else 1
+    turn = np.diag([2.0, 2, 2, 1, 1, 1])
+    for i in range(first, NUM_FRAMES):
+        rows = slice(6 * (i - first), 6 * (i - first) + 6)
+        assert found.rig_from_world[i] == pytest.approx(turn @ expected[rows, rows] @ turn, rel=1e-5, abs=1e-12)
+    start = 6 * (NUM_FRAMES - first)
+    if hold_anchors:
+        assert np.all(found.anchors == 0)
+    else:
+        assert np.all(found.rig_from_world[0] == 0)
+        for k in range(len(ANCHORS_M)):
+            rows = slice(start + 3 * k, start + 3 * k + 3)
+            assert found.anchors[k] == pytest.approx(expected[rows, rows], rel=1e-5)
+        start += 3 * len(ANCHORS_M)
+    biases = [expected[start + k, start + k] for k in range(len(ANCHORS_M))]
+    assert np.ravel(found.others) == pytest.approx(biases, rel=1e-5)
+
+
+def test_residuals_that_err_together_count_as_their_covariance_says() -> None:
+    survey = joint(model(), hold_first=True)
+    num_ranges = NUM_FRAMES * len(ANCHORS_M)
+    num = survey.problem.num_residuals()
+    rows = np.arange(num - len(survey.biases) - num_ranges, num - len(survey.biases))
+    rng = np.random.default_rng(0)
+    # Each range has an error of its own with a variance of 1.7, and there are three errors that all share.
+    by_error = np.hstack([np.eye(num_ranges), rng.standard_normal((num_ranges, 3))])
+    of_errors = np.diag(np.concatenate([np.full(num_ranges, 1.7), np.ones(3)]))
+    errors = ResidualErrors(rows, csr_array(by_error), of_errors, np.arange(num - 1, num))
+    found = survey.covariance(errors=errors)
+    jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
+    of_residuals = np.eye(num)
+    of_residuals[np.ix_(rows, rows)] = by_error @ of_errors @ by_error.T
+    of_residuals[-1, -1] = 0.0  # a prior without error
+    gain = covariance_of_all(survey.problem, variable(survey)) @ jacobian.T
+    expected = gain @ of_residuals @ gain.T
+    first = 6 * (NUM_FRAMES - 1)
+    np.testing.assert_allclose(found.anchors[0], expected[first : first + 3, first : first + 3], rtol=1e-5)
+    np.testing.assert_allclose(np.diag(found.rig_from_world[1])[3:], np.diag(expected)[3:6], rtol=1e-5)
+    alone = survey.covariance()
+    assert found.relative_scale_stddev > 1.1 * alone.relative_scale_stddev
+
+
+def test_centers_err_as_their_poses_do() -> None:
+    survey = joint(model(), hold_anchors=True)
+    found = survey.covariance()
+    rng = np.random.default_rng(0)
+    rotation, translation = Rotation.from_quat(survey.poses[3][:4]), survey.poses[3][4:]
+    steps = rng.multivariate_normal(np.zeros(6), 1e-4 * found.rig_from_world[3], 20000)
+    turned = Rotation.from_rotvec(steps[:, :3]) * rotation
+    centers = -turned.inv().apply(translation + steps[:, 3:])
+    assert np.cov(centers.T) == pytest.approx(
+        1e-4 * found.centers[3], rel=0.1, abs=0.02 * 1e-4 * found.centers[3].max()
+    )
+
+
+@pytest.mark.parametrize(("num_anchors", "num_free"), [(0, 7), (1, 3), (2, 1), (3, 0)])
+def test_motions_of_the_map_that_nothing_holds_are_counted(num_anchors: int, num_free: int) -> None:
+    survey = joint(model(), num_anchors=num_anchors, hold_anchors=True)
+    biases = survey.biases[:num_anchors]
+    found = survey.covariance(others=biases)
+    assert found.num_free_directions == num_free
+    assert np.all(np.linalg.eigvalsh(found.centers) > -1e-12)
+
+
+def test_a_free_map_errs_least_under_inner_constraints() -> None:
+    """The covariance is the pseudo-inverse of the normal equations reduced by the points."""
+    survey = joint(model(), num_anchors=1)
+    found = survey.covariance(others=survey.biases[:1])
+    jacobian = tangent_jacobian(survey.problem, variable(survey)).toarray()
+    normal, kept = jacobian.T @ jacobian, 6 * NUM_FRAMES + 4
+    coupling = normal[:kept, kept:]
+    reduced = normal[:kept, :kept] - coupling @ np.linalg.solve(normal[kept:, kept:], coupling.T)
+    values, vectors = np.linalg.eigh(reduced)
+    assert found.num_free_directions == 6  # all but the scale
+    assert values[6] > 1e3 * abs(values[5])
+    expected = vectors[:, 6:] / values[6:] @ vectors[:, 6:].T
+    assert found.anchors[0] == pytest.approx(expected[-4:-1, -4:-1], rel=1e-3, abs=1e-9)
+
+
+def test_it_agrees_with_colmaps_own_where_there_are_no_ranges() -> None:
+    reconstruction = model()
+    adjuster = bundle_adjuster(reconstruction, hold_first=True)
+    frames = sorted(reconstruction.reg_frame_ids())
+    other = pose_of(reconstruction.frame(frames[4])).params
+    adjuster.problem.set_parameter_block_constant(other)  # this pose and the first, which is held, fix the scale
+    found = joint_covariance(NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals()))
+    options = pycolmap.BACovarianceOptions(damping=0.0)
+    theirs = pycolmap.estimate_ba_covariance_from_problem(options, reconstruction, adjuster.problem)
+    assert theirs is not None
+    for index in (1, 6):
+        (data,) = reconstruction.frame(frames[index]).image_ids
+        expected = theirs.get_cam_cov_from_world(data.id)
+        turn = np.diag([2.0, 2, 2, 1, 1, 1])
+        assert found.rig_from_world[index] == pytest.approx(turn @ expected @ turn, rel=1e-5, abs=1e-12)
+
+
+def test_two_points_with_a_taped_distance_are_eliminated_together() -> None:
+    survey = joint(model(), hold_anchors=True)
+    first, second = (point.xyz for point in list(survey.reconstruction.points3D.values())[:2])
+    distance = float(np.linalg.norm(first - second))
+    tape = distance_cost(distance_m=distance, stddev_m=1e-4)
+    add_residual_block(survey.adjuster, tape, None, [first, second])
+    found = survey.covariance()
+    expected = covariance_of_all(survey.problem, variable(survey))
+    turn = np.diag([2.0, 2, 2, 1, 1, 1])
+    assert found.rig_from_world[2] == pytest.approx(turn @ expected[12:18, 12:18] @ turn, rel=1e-5, abs=1e-12)
+
+
+def test_large_problems_are_solved_sparsely_with_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = joint(model(num_frames=20), hold_anchors=True)
+    answers = []
+    for dense_from in (0.0, 1.0):
+        monkeypatch.setattr("rangesfm.solver.linear_solver._DENSE_FROM", dense_from)
+        monkeypatch.setattr("rangesfm.solver.nested_dissection._MAX_LEAF", 3)
+        answers.append(survey.covariance())
+    assert answers[0].rig_from_world == pytest.approx(answers[1].rig_from_world, rel=1e-6, abs=1e-12)
+    assert answers[0].relative_scale_stddev == pytest.approx(answers[1].relative_scale_stddev, rel=1e-6)
+
+
+def test_a_block_that_nobody_named_is_an_error() -> None:
+    survey = joint(model(), hold_anchors=True)
+    with pytest.raises(ValueError, match="the problem has"):
+        survey.covariance(others=())
+
+
+def test_an_anchor_that_its_ranges_do_not_determine_is_named() -> None:
+    survey = joint(model(), hold_anchors=True)
+    lonely = np.array([1.0, 2.0, 3.0])
+    cost = range_cost(range_m=3.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+    add_residual_block(survey.adjuster, cost, None, [survey.poses[0], lonely, survey.biases[0]])
+    with pytest.raises(GeometryError, match="do not determine the problem's anchor number 0"):
+        survey.covariance(anchors=[*survey.anchors, lonely])
+
+
+def test_surveys_err_as_the_covariance_says() -> None:
+    """Monte Carlo: the normalized squared errors of solved surveys average 1."""
+    rng = np.random.default_rng(7)
+    times = np.arange(NUM_FRAMES, dtype=np.float64)
+    truth = orbit_path(1.4 * NUM_FRAMES).centers(times)
+    motions = similarity_motions(truth - truth.mean(axis=0)).reshape(-1, 7)
+    centers, anchors, scales, maps = [], [], [], []
+    for seed in range(60):
+        noise = RANGE_STDDEV_M * rng.standard_normal((len(ANCHORS_M), NUM_FRAMES))
+        biases = BIAS_STDDEV_M * rng.standard_normal((len(ANCHORS_M), 1))
+        survey = joint(model(seed), hold_first=True, range_errors_m=noise + biases)
+        assert survey.adjuster.solve().is_solution_usable()
+        found = survey.covariance()
+        now = np.array([-Rotation.from_quat(pose[:4]).inv().apply(pose[4:]) for pose in survey.poses])
+        errors = now - truth
+        centers.append([e @ np.linalg.solve(c, e) / 3 for e, c in zip(errors[1:], found.centers[1:], strict=True)])
+        anchor_errors = np.array(survey.anchors) - ANCHORS_M
+        anchors.append([e @ np.linalg.solve(c, e) / 3 for e, c in zip(anchor_errors, found.anchors, strict=True)])
+        middle = truth - truth.mean(axis=0)
+        scales.append((np.sum(errors * middle) / np.sum(middle**2) / found.relative_scale_stddev) ** 2)
+        similarity = np.linalg.lstsq(motions, errors.ravel(), rcond=None)[0]
+        maps.append(similarity @ np.linalg.solve(found.similarity, similarity) / 7)
+    # 60 runs give about 180 degrees of freedom for each centre and anchor, 60 for the scale, and 420 for scale,
+    # rotation and translation.
+    assert np.mean(centers) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(anchors) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(scales) == pytest.approx(1.0, abs=0.4)
+    assert np.mean(maps) == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_motion_that_only_rounding_keeps_from_moving_nothing_is_none() -> None:
+    """A turn about the origin does not move an anchor there, even if rounding puts it 1e-17 m away."""
+    counts = []
+    for at in (np.zeros(3), np.array([1e-17, 2e-17, -1e-17])):
+        survey = joint(model(), num_anchors=0)
+        for block in (*survey.poses, *(point.xyz for point in survey.reconstruction.points3D.values())):
+            survey.problem.set_parameter_block_constant(block)
+        cost = range_cost(range_m=3.0, tag_in_cam_m=TAG_IN_CAM_M, stddev_m=0.1)
+        add_residual_block(survey.adjuster, cost, None, [survey.poses[0], at, survey.biases[0]])
+        survey.problem.set_parameter_block_constant(survey.biases[0])
+        found = survey.covariance(anchors=[at], others=survey.biases[:1])
+        counts.append(found.num_free_directions)
+    assert counts[0] == counts[1]
+
+
+def test_a_turn_about_a_straight_path_leaves_the_variances_of_places_right() -> None:
+    """Ranges of an antenna at the lens do not determine this turn, beside whose variance rounding left no digit."""
+    times = np.arange(30, dtype=np.float64)
+    centers = np.column_stack([0.3 * times - 4.5, 0.0 * times, 0.0 * times]) + np.array([60.0, 40.0, 20.0])
+    sway = np.column_stack([0.2 * np.sin(times), np.ones(30), 0.1 * np.cos(times)])
+    anchors = list(ANCHORS_M + np.array([60.0, 40.0, 20.0]))
+    found = []
+    for height_m in (1e-3, 0.3):  # a path that is bent by 0.3 m determines the turn
+        bent = centers + np.column_stack([np.zeros((30, 2)), height_m * np.sin(0.2 * times)])
+        made = synthetic_model(times, bent, look_at(bent, bent + sway), num_observations=40, metric_from_sfm=IDENTITY)
+        adjuster = bundle_adjuster(made.reconstruction, hold_first=False)
+        survey = Joint(made.reconstruction, adjuster, anchors, [np.zeros(1)], adjuster.problem.num_residuals())
+        for pose, center in zip(survey.poses, bent, strict=True):
+            for anchor in anchors:
+                range_m = float(np.linalg.norm(center - anchor))
+                cost = range_cost(range_m=range_m, tag_in_cam_m=np.zeros(3), stddev_m=RANGE_STDDEV_M)
+                add_residual_block(adjuster, cost, None, [pose, anchor, survey.biases[0]])
+        for block in (*anchors, *survey.biases):
+            survey.problem.set_parameter_block_constant(block)
+        found.append(survey.covariance())
+    stddevs_m = [np.sqrt(np.trace(each.centers, axis1=1, axis2=2)) for each in found]
+    np.testing.assert_allclose(stddevs_m[0], stddevs_m[1], rtol=0.25)
+    assert np.linalg.eigvalsh(found[0].centers).min() > 0
+    turns = [np.sqrt(np.linalg.eigvalsh(each.rig_from_world[:, :3, :3])[:, 2]) for each in found]
+    assert np.all(turns[0] < np.pi)
+    assert np.all(turns[1] < 0.1)
+
+
+def photos_alone(*, hold_first: bool = False) -> tuple[pycolmap.Reconstruction, pycolmap.CeresBundleAdjuster]:
+    """Return the model adjusted to its photos alone, without ranges, and its adjuster."""
+    reconstruction = model()
+    adjuster = bundle_adjuster(reconstruction, hold_first=hold_first)
+    adjuster.solve()
+    return reconstruction, adjuster
+
+
+def ratios(reconstruction: pycolmap.Reconstruction) -> tuple[Array, Array]:
+    """Return two logarithms of ratios of distances, and their derivative by the centres.
+
+    The distances are those of the second and of the last frame from the middle one, over that of the first frame. They
+    do not depend on the map's position, orientation or scale.
+    """
+    frames = sorted(reconstruction.reg_frame_ids())
+    centers = np.array([pose_of(reconstruction.frame(i)).inverse().translation for i in frames])
+    apart = centers - centers[4]
+    squares = np.sum(apart**2, axis=1)
+    found, slopes = [], np.zeros((2, len(centers), 3))
+    for row, k in enumerate((1, -1)):
+        found.append(0.5 * np.log(squares[k] / squares[0]))
+        slopes[row, k], slopes[row, 0] = apart[k] / squares[k], -apart[0] / squares[0]
+        slopes[row, 4] = apart[0] / squares[0] - apart[k] / squares[k]
+    return np.array(found), slopes
+
+
+@pytest.mark.parametrize("hold_first", [False, True])
+def test_what_photos_leave_open_is_the_inverse_of_all_their_normal_equations(hold_first: bool) -> None:
+    reconstruction, adjuster = photos_alone(hold_first=hold_first)
+    frames = np.array(sorted(reconstruction.reg_frame_ids()))
+    _, slopes = ratios(reconstruction)
+    equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
+    found, shift = PhotosAlone(equations, 0.7).of_functions(frames, np.zeros_like(slopes), slopes)
+    poses = [pose_of(reconstruction.frame(i)).params for i in frames.tolist()]
+    blocks = [*poses, *(point.xyz for point in reconstruction.points3D.values())]
+    is_free = [adjuster.problem.has_parameter_block(block) for block in blocks]
+    covariance = covariance_of_all(adjuster.problem, [b for b, free in zip(blocks, is_free, strict=True) if free])
+    gradient = np.zeros((len(covariance), 2))
+    for k, pose in enumerate(poses):
+        if is_free[k]:
+            rotation = Rotation.from_quat(pose[:4]).as_matrix()
+            x, y, z = 2 * pose[4:]
+            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+            by_step = -rotation.T @ np.hstack([cross, np.eye(3)])
+            column = 6 * (k - hold_first)
+            gradient[column : column + 6] = (slopes[:, k] @ by_step).T
+    np.testing.assert_allclose(found, 0.49 * gradient.T @ covariance @ gradient, rtol=1e-6)
+    assert np.abs(shift).max() < 1e-3 * np.sqrt(found.diagonal().min())
+
+
+def test_what_photos_leave_open_does_not_depend_on_the_world_of_the_map() -> None:
+    """Another world has other coordinates held to fix the free motions, and only rounding may show it."""
+    reconstruction, adjuster = photos_alone()
+    frames = np.array(sorted(reconstruction.reg_frame_ids()))
+    found = []
+    for seed in range(4):
+        _, slopes = ratios(reconstruction)
+        equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
+        found.append(PhotosAlone(equations, 1.0).of_functions(frames, np.zeros_like(slopes), slopes)[0])
+        rotation = pycolmap.Rotation3d(Rotation.random(rng=seed).as_quat())
+        reconstruction.transform(pycolmap.Sim3d(1.5, rotation, np.array([20.0, -5.0, 3.0])))
+    np.testing.assert_allclose(found, np.broadcast_to(found[0], np.shape(found)), rtol=1e-10)
+
+
+def test_photos_say_how_far_a_map_was_moved_from_where_they_have_it() -> None:
+    reconstruction, adjuster = photos_alone()
+    before, _ = ratios(reconstruction)
+    rng, frames = np.random.default_rng(1), np.array(sorted(reconstruction.reg_frame_ids()))
+    for frame in frames.tolist():
+        pose_of(reconstruction.frame(frame)).params[4:] += 1e-3 * rng.standard_normal(3)
+    after, slopes = ratios(reconstruction)
+    equations = NormalEquations.of(adjuster.problem, reconstruction, adjuster.problem.num_residuals())
+    _, shift = PhotosAlone(equations, 1.0).of_functions(frames, np.zeros_like(slopes), slopes)
+    np.testing.assert_allclose(shift, before - after, rtol=0.05)
+
+
+def test_priors_may_err_otherwise_than_the_residuals_of_photos() -> None:
+    """Priors that err less than their stddevs say make the centres more certain."""
+    survey = joint(model())
+    rows = np.zeros(0, dtype=np.int64)
+    nothing = csr_array((0, 1))
+    usual, better = (
+        survey.covariance(errors=ResidualErrors(rows, nothing, np.eye(1), rows, variance),
+        )
+        for variance in (1.0, 0.0)
+    )  # fmt: skip
+    plain = survey.covariance()
+    np.testing.assert_allclose(usual.centers, plain.centers, rtol=1e-9)
+    assert (np.trace(better.centers, axis1=1, axis2=2) < np.trace(usual.centers, axis1=1, axis2=2)).all()
+
+
+def test_an_anchor_whose_ranges_weigh_far_more_than_they_err_keeps_a_positive_variance() -> None:
+    """Its variance towards the frames is a millionth of the ranges' own, less than a difference of two can resolve."""
+    survey = joint(model(), hold_first=True, num_anchors=0)
+    anchor, bias, frames = np.array([500.0, 3.0, 1.0]), np.zeros(1), np.arange(NUM_FRAMES)
+    ranges = PlacedRanges(
+        range_m=np.linalg.norm(orbit_path(1.4 * NUM_FRAMES).centers(np.arange(8.0)) - anchor, axis=1),
+        stddev_m=np.full(NUM_FRAMES, 1e-5),
+        before=frames,
+        after=frames,
+        weight=np.zeros(NUM_FRAMES),
+        offset_in_world_m=np.zeros((NUM_FRAMES, 3)),
+        anchor_index=np.zeros(NUM_FRAMES, dtype=np.int64),
+        tag_index=np.zeros(NUM_FRAMES, dtype=np.int64),
+    )
+    rows = add_ranges(survey.adjuster, ranges, RangeBlocks(survey.poses, [anchor], [bias], [TAG_IN_CAM_M]))
+    survey.problem.set_parameter_block_constant(bias)
+    errors = ResidualErrors(rows, csr_array(np.ones((NUM_FRAMES, 1))), np.full((1, 1), 1e-8), np.zeros(0, dtype=int))
+    (found,) = survey.covariance(anchors=[anchor], others=[bias], errors=errors).anchors
+    blocks = variable(replace(survey, anchors=[anchor], biases=[bias]))
+    gain = np.linalg.pinv(tangent_jacobian(survey.problem, blocks).toarray())
+    of_residuals = np.eye(survey.problem.num_residuals())
+    of_residuals[np.ix_(rows, rows)] = 1e-8
+    expected = (gain @ of_residuals @ gain.T)[42:45, 42:45]
+    np.testing.assert_allclose(np.linalg.eigvalsh(found), np.linalg.eigvalsh(expected), rtol=0.05)
+
+
+def random_pose(seed: int) -> Array:
+    """Return a random pose as [qx qy qz qw tx ty tz]."""
+    return np.concatenate([Rotation.random(rng=seed).as_quat(), np.random.default_rng(seed).normal(size=3)])
+
+
+def after_step(pose: Array, step: Array) -> tuple[Rotation, Array]:
+    """Return world_from_rig and the centre after a step of Ceres, which turns on the left by twice its step."""
+    rotation = Rotation.from_rotvec(2.0 * step[:3]) * Rotation.from_quat(pose[:4])
+    return rotation.inv(), -rotation.inv().apply(pose[4:] + step[3:])
+
+
+def by_steps(of_step: Callable[[Array], Array]) -> Array:
+    """Return the derivative of a function of a pose's step."""
+    size = 1e-6
+    return np.array([(of_step(size * unit) - of_step(-size * unit)) / (2.0 * size) for unit in np.eye(6)]).T
+
+
+def columns_of(blocks: Sequence[tuple[str, Array, int]], poses: Sequence[Array]) -> BlockColumns:
+    """Return the columns of variable blocks with their numbers of columns; poses may be held."""
+    kinds, arrays, sizes = zip(*blocks, strict=True)
+    return BlockColumns._of_sizes(np.arange(len(poses)) + 1, list(poses), list(arrays), list(kinds), np.array(sizes))
+
+
+def model_of(sensors: Mapping[int, Array | None], cameras: Mapping[int, tuple[Array, float]]) -> Any:
+    """Return what covariances ask of a reconstruction: sensors' poses, and cameras by their focal length."""
+    of_rig = SimpleNamespace(
+        items=lambda: [
+            (SimpleNamespace(id=k), None if pose is None else SimpleNamespace(params=pose))
+            for k, pose in sensors.items()
+        ]
+    )
+    return SimpleNamespace(
+        rigs={1: SimpleNamespace(non_ref_sensors=of_rig)},
+        cameras={
+            k: SimpleNamespace(params=params, mean_focal_length=lambda focal=focal: focal)
+            for k, (params, focal) in cameras.items()
+        },
+    )
+
+
+def definite(size: int, seed: int = 0) -> Array:
+    """Return a random positive definite matrix."""
+    factor = np.random.default_rng(seed).normal(size=(size, 2 * size))
+    matrix: Array = factor @ factor.T
+    return matrix
+
+
+@dataclass(frozen=True)
+class Small:
+    """Normal equations of three poses, of which the second is held, with an anchor and a bias."""
+
+    poses: list[Array]
+    anchor: Array
+    bias: Array
+    equations: NormalEquations
+
+    @property
+    def normal(self) -> Array:
+        others = self.equations.others.toarray()
+        normal: Array = csr_array(self.equations.of_photos).toarray() + others.T @ others
+        return normal
+
+    @property
+    def by_center(self) -> list[Array]:
+        """Derivatives of the centres by all columns."""
+        slopes = [np.zeros((3, 16)) for _ in self.poses]
+        for k, columns in ((0, slice(6)), (2, slice(6, 12))):
+            slopes[k][:, columns] = by_steps(lambda step, k=k: after_step(self.poses[k], step)[1])  # type: ignore[misc]
+        return slopes
+
+
+def small() -> Small:
+    poses, anchor, bias = [random_pose(k) for k in range(3)], np.zeros(3), np.zeros(1)
+    blocks = [("pose", poses[0], 6), ("pose", poses[2], 6), ("anchor", anchor, 3), ("other", bias, 1)]
+    of_photos = np.zeros((16, 16))
+    of_photos[:12, :12] = definite(12)
+    rng = np.random.default_rng(1)
+    equations = NormalEquations(
+        reconstruction=model_of({}, {}),
+        columns=columns_of(blocks, poses),
+        of_photos=csr_array(of_photos),
+        gradient=np.concatenate([rng.normal(size=12), np.zeros(4)]),
+        others=csr_array(rng.normal(size=(9, 16))),
+        num_reprojections=20,
+        free=np.zeros((16, 0)),
+        free_of_photos=np.zeros((16, 0)),
+        size_m=2.0,
+    )
+    return Small(poses, anchor, bias, equations)
+
+
+@pytest.mark.parametrize("residual_stddev", [1.0, 0.5])
+def test_each_part_of_the_covariance_is_that_of_the_inverse(residual_stddev: float) -> None:
+    given = small()
+    found = joint_covariance(
+        given.equations, anchors=[given.anchor], others=[given.bias], residual_stddev=residual_stddev
+    )
+    expected = residual_stddev**2 * np.linalg.inv(given.normal)
+    turn = np.diag([2.0, 2, 2, 1, 1, 1])
+    of_poses = [turn @ expected[:6, :6] @ turn, np.zeros((6, 6)), turn @ expected[6:12, 6:12] @ turn]
+    np.testing.assert_allclose(found.rig_from_world, of_poses, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.centers, [s @ expected @ s.T for s in given.by_center], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.anchors, expected[None, 12:15, 12:15], rtol=1e-9)
+    np.testing.assert_allclose(found.others, expected[None, 15:, 15:], rtol=1e-9)
+    assert (found.frame_ids.tolist(), found.num_free_directions) == ([1, 2, 3], 0)
+    centers = np.array([-Rotation.from_quat(pose[:4]).inv().apply(pose[4:]) for pose in given.poses])
+    motions = similarity_motions(centers - centers.mean(axis=0)).reshape(9, 7)
+    fit = np.linalg.pinv(motions) @ np.vstack(given.by_center)
+    np.testing.assert_allclose(found.similarity, fit @ expected @ fit.T, rtol=1e-6, atol=1e-9)
+    assert found.relative_scale_stddev == pytest.approx(np.sqrt(found.similarity[0, 0]))
+    errors = found.errors
+    assert errors.scale_stddev == pytest.approx(found.relative_scale_stddev)
+    assert {kind: part.ids for kind, part in errors.parts.items()} == {"frame": (1, 2, 3), "anchor": ("0",)}
+    modes, of_anchor = errors.parts["frame"].modes[:, 3:], errors.parts["anchor"].modes[0]
+    for slopes, of_center in zip(given.by_center, modes, strict=True):
+        np.testing.assert_allclose(of_center @ of_center.T, slopes @ expected @ slopes.T, rtol=1e-5, atol=1e-8)
+        np.testing.assert_allclose(of_center @ of_anchor.T, slopes @ expected[:, 12:15], rtol=1e-5, atol=1e-8)
+    by_scale = expected[12:15] @ fit[0] / found.similarity[0, 0]
+    np.testing.assert_allclose(errors.parts["anchor"].by_scale, by_scale[None], rtol=1e-6, atol=1e-8)
+
+
+def test_functions_of_poses_err_as_the_photos_inverse_says() -> None:
+    given, rng = small(), np.random.default_rng(3)
+    of_photos = csr_array(given.equations.of_photos).toarray()[:12, :12]
+    by_turn, by_center = rng.normal(size=(2, 2, 3, 3))
+    found, shift = PhotosAlone(given.equations, 0.5).of_functions(np.array([3, 1, 2]), by_turn, by_center)
+    slopes = np.zeros((2, 12))
+    for k, (pose, columns) in enumerate(((2, slice(6, 12)), (0, slice(6)))):
+        before = Rotation.from_quat(given.poses[pose][:4])
+
+        def moved(step: Array, pose: int = pose, before: Rotation = before) -> Array:
+            world_from_rig, center = after_step(given.poses[pose], step)
+            return np.concatenate([(before * world_from_rig).as_rotvec(), center])
+
+        slopes[:, columns] = np.hstack([by_turn[:, k], by_center[:, k]]) @ by_steps(moved)
+    inverse = np.linalg.inv(of_photos)
+    np.testing.assert_allclose(found, 0.25 * slopes @ inverse @ slopes.T, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(shift, -slopes @ inverse @ given.equations.gradient[:12], rtol=1e-6, atol=1e-9)

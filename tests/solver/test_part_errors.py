@@ -1,0 +1,182 @@
+"""Shared modes of the errors of a map's parts, against the whole covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+from tests.solver.test_covariance import Joint, covariance_of_all, joint, model, variable
+
+from rangesfm.solver.covariance import JointCovariance
+from rangesfm.solver.part_errors import PartSteps, map_errors
+from rangesfm.util.geometry.map_errors import MapErrors, MapPointErrors
+
+Array = npt.NDArray[np.float64]
+
+
+def found_in(survey: Joint) -> JointCovariance:
+    return survey.covariance(anchor_ids=[f"A{k}" for k in range(len(survey.anchors))])
+
+
+def center_of(frame_id: int) -> MapPointErrors:
+    return MapPointErrors({("frame", frame_id): np.hstack([np.zeros((3, 3)), np.eye(3)])}, np.zeros((3, 3)))
+
+
+def anchor(anchor_id: str) -> MapPointErrors:
+    return MapPointErrors({("anchor", anchor_id): np.eye(3)}, np.zeros((3, 3)))
+
+
+def relative(errors: MapErrors, first: MapPointErrors, second: MapPointErrors) -> Array:
+    """Return the relative covariance as the problem has it, with its own uncertainty of the scale."""
+    return errors.relative(first, second, errors.scale_stddev)
+
+
+def centers_by_steps(survey: Joint, frames: range, num_columns: int) -> Array:
+    """(frames, 3, num_columns) derivatives of centres by the steps of Ceres; the first frame is held."""
+    slopes = np.zeros((len(frames), 3, num_columns))
+    for row, k in enumerate(frames):
+        pose = survey.poses[k]
+        rotation = Rotation.from_quat(pose[:4]).as_matrix()
+        x, y, z = 2 * pose[4:]
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        slopes[row, :, 6 * (k - 1) : 6 * k] = -rotation.T @ np.hstack([cross, np.eye(3)])
+    return slopes
+
+
+def test_two_points_err_relative_to_each_other_as_in_the_inverse_of_all_normal_equations() -> None:
+    survey = joint(model(), hold_first=True)
+    errors = found_in(survey).errors
+    whole = covariance_of_all(survey.problem, variable(survey))
+    frames = sorted(survey.reconstruction.reg_frame_ids())
+    slopes = centers_by_steps(survey, range(1, len(frames)), len(whole))
+    apart = slopes[4] - slopes[1]
+    expected = apart @ whole @ apart.T
+    found = relative(errors, center_of(frames[2]), center_of(frames[5]))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * expected.max())
+    to_anchor = -slopes[1]
+    first = 6 * (len(frames) - 1) + 3
+    to_anchor[:, first : first + 3] += np.eye(3)
+    expected = to_anchor @ whole @ to_anchor.T
+    found = relative(errors, center_of(frames[2]), anchor("A1"))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * expected.max())
+
+
+def test_what_is_held_has_no_errors() -> None:
+    survey = joint(model(), hold_first=True)
+    errors = found_in(survey).errors.parts["frame"]
+    first = errors.row_of[min(survey.reconstruction.reg_frame_ids())]
+    assert not errors.modes[first].any()
+    assert not errors.rests[first].any()
+
+
+def test_few_modes_leave_keyframes_about_as_certain_relative_to_each_other_as_they_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    survey = joint(model(num_frames=40), hold_anchors=True)
+    frames = sorted(survey.reconstruction.reg_frame_ids())
+    whole, few = found_in(survey).errors, _with_few_modes(survey, monkeypatch)
+    assert few.parts["frame"].modes.shape[2] == 40 < whole.parts["frame"].modes.shape[2]
+    pairs = [(a, b) for a in frames for b in frames if a < b]
+    stddevs = [np.sqrt([np.diag(relative(of, center_of(a), center_of(b))) for a, b in pairs]) for of in (whole, few)]
+    ratios = stddevs[1] / stddevs[0]
+    assert 0.85 < ratios.min() <= ratios.max() < 1.2
+    assert np.median(np.abs(np.log(ratios))) < 0.03
+
+
+def _with_few_modes(survey: Joint, monkeypatch: pytest.MonkeyPatch) -> MapErrors:
+    monkeypatch.setattr("rangesfm.solver.part_errors.MAX_NUM_MODES", 40)
+    return found_in(survey).errors
+
+
+def test_a_stated_uncertainty_of_the_scale_replaces_that_of_the_problem() -> None:
+    """A scale known exactly leaves what the map errs at that scale; one known worse widens long distances."""
+    survey = joint(model(), hold_first=True)
+    errors = found_in(survey).errors
+    frames = sorted(survey.reconstruction.reg_frame_ids())
+    first, last = center_of(frames[0]), center_of(frames[4])
+    own = errors.relative(first, last, errors.scale_stddev)
+    exact, wide = (errors.relative(first, last, stddev) for stddev in (0.0, 0.1))
+    assert np.linalg.eigvalsh(exact).min() > -1e-12
+    assert np.trace(exact) < np.trace(own) < np.trace(wide)
+    at = {frame: survey.poses[k] for k, frame in enumerate(frames)}
+    centers = [-Rotation.from_quat(at[f][:4]).inv().apply(at[f][4:]) for f in (frames[0], frames[4])]
+    along = (centers[1] - centers[0]) / np.linalg.norm(centers[1] - centers[0])
+    by_scale = np.sqrt(along @ (wide - exact) @ along) / 0.1
+    assert by_scale == pytest.approx(float(np.linalg.norm(centers[1] - centers[0])), rel=0.1)
+    assert np.sqrt(along @ wide @ along) == pytest.approx(0.1 * np.linalg.norm(centers[1] - centers[0]), rel=0.15)
+
+
+def test_the_same_problem_has_the_same_modes_each_time() -> None:
+    first, second = (found_in(joint(model(), hold_first=True)).errors for _ in range(2))
+    for kind, errors in first.parts.items():
+        assert np.array_equal(errors.modes, second.parts[kind].modes)
+
+
+def covariance_like(size: int, rank: int, seed: int = 0) -> Array:
+    """Return a random covariance matrix of a rank."""
+    factor = np.random.default_rng(seed).normal(size=(size, rank))
+    return factor @ factor.T
+
+
+def some_parts() -> list[PartSteps]:
+    """Return two frames around an anchor and a camera that is held; the first two columns belong to none of them."""
+    rng = np.random.default_rng(1)
+    return [
+        PartSteps("frame", 7, 5, rng.normal(size=(4, 3)), np.array([10.0, 10.0, 1.0, 1.0])),
+        PartSteps("anchor", "A", 2, np.diag([1.0, 2.0, 3.0]), np.ones(3)),
+        PartSteps("camera", 3, None, np.eye(2), np.array([0.1, 0.2])),
+        PartSteps("frame", 8, 8, rng.normal(size=(4, 3)), np.array([10.0, 10.0, 1.0, 1.0])),
+    ]
+
+
+def of_all_numbers(parts: list[PartSteps], covariance: Array) -> Array:
+    """Return the (size, numbers) derivatives of all numbers of all parts, part by part."""
+    steps = []
+    for part in parts:
+        slopes = np.zeros((len(covariance), len(part.unit)))
+        if part.start is not None:
+            slopes[part.start : part.start + part.by_step.shape[1]] = part.by_step.T
+        steps.append(slopes)
+    return np.hstack(steps)
+
+
+def errors_of(
+    parts: list[PartSteps], covariance: Array, of_scale: Array | None = None, scale_stddev: float = 0.0
+) -> MapErrors:
+    widths = {part.start: part.by_step.shape[1] for part in parts}
+    slopes = np.zeros(len(covariance)) if of_scale is None else of_scale
+    return map_errors(
+        parts,
+        len(covariance),
+        lambda right: covariance @ right,
+        lambda start: covariance[start : start + widths[start], start : start + widths[start]],
+        slopes,
+        scale_stddev,
+    )
+
+
+def test_the_modes_of_few_numbers_have_their_whole_covariance() -> None:
+    parts, covariance = some_parts(), covariance_like(11, 11)
+    found = errors_of(parts, covariance).parts
+    assert {kind: of.ids for kind, of in found.items()} == {"frame": (7, 8), "anchor": ("A",), "camera": (3,)}
+    modes = np.vstack([found["frame"].modes[0], found["anchor"].modes[0], found["camera"].modes[0]])
+    modes = np.vstack([modes, found["frame"].modes[1]])
+    steps = of_all_numbers(parts, covariance)
+    expected = steps.T @ covariance @ steps
+    np.testing.assert_allclose(modes @ modes.T, expected, rtol=0, atol=1e-8 * expected.max())
+    for of in found.values():
+        assert np.abs(of.rests).max() < 1e-8 * expected.max()
+
+
+def test_parts_change_with_the_scale_as_their_covariance_with_it_says() -> None:
+    parts, covariance = some_parts(), covariance_like(11, 11)
+    of_scale = np.random.default_rng(2).normal(size=11)
+    scale_stddev = float(np.sqrt(of_scale @ covariance @ of_scale))
+    errors = errors_of(parts, covariance, of_scale, scale_stddev)
+    assert errors.scale_stddev == scale_stddev
+    expected = of_all_numbers(parts, covariance).T @ covariance @ of_scale / scale_stddev**2
+    found = errors.parts
+    np.testing.assert_allclose(found["frame"].by_scale, [expected[:4], expected[9:]])
+    np.testing.assert_allclose(found["anchor"].by_scale, [expected[4:7]])
+    np.testing.assert_array_equal(found["camera"].by_scale, np.zeros((1, 2)))
