@@ -85,6 +85,8 @@ def convert_inrol(clone: Path, output: Path) -> Iterator[Path]:
             write(target / "groundtruth.csv", POSES, words(source / "cam_pose.txt"))
         if (source / "images.txt").is_file():
             copy_photos(source, target)
+        if (source / "imu.txt").is_file():
+            shutil.copyfile(source / "imu.txt", target / "imu.txt")
         cam_from_tag = np.linalg.inv(extrinsics["T_mocap_cam"]) @ extrinsics["T_mocap_tag"]
         camera = {
             "camera_model": "OPENCV",
