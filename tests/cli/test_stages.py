@@ -85,7 +85,7 @@ def test_quiet_run_prints_the_summary_alone(calls: Calls, capsys: pytest.Capture
 def test_demo_makes_a_survey_and_runs_it_against_the_truth(
     flags: list[str], maker: str, num_photos: int, calls: Calls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def make(folder: Path, *, num_photos: int, seed: int) -> SimpleNamespace:
+    def make(folder: Path, *, num_photos: int, seed: int, imu: bool) -> SimpleNamespace:
         folder.mkdir()
         (folder / "reference.csv").touch()
         survey_path = folder / "survey.toml"

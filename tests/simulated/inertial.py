@@ -8,10 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
+from rangesfm.demo.simulated_imu import Grade, simulate_imu
 from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.util.geometry.trajectory import Trajectory
 
-GRAVITY_M_S2 = 9.81
 CAM_FROM_IMU = Rotation.from_euler("zyx", (100.0, -20.0, 65.0), degrees=True).as_matrix()
 
 
@@ -66,30 +66,10 @@ def by_rover(seed: int = 0) -> Motion:
     return Motion(turns, places, frequencies_hz, rng.uniform(0, 6.28, (3, 12)))
 
 
-@dataclass(frozen=True)
-class Grade:
-    """Errors of a sensor.
-
-    Attributes:
-        gyro_noise, accel_noise: white noise, rad/s and m/s^2 per root of Hz.
-        gyro_bias, accel_bias: standard deviations of the zeros, rad/s and m/s^2. gyro_walk, accel_walk: of their random
-            walks after a second.
-        scale: standard deviation of the scale factor of each axis of the accelerometer; a tenth of it of the gyroscope.
-    """
-
-    gyro_noise: float
-    accel_noise: float
-    gyro_bias: float
-    accel_bias: float
-    gyro_walk: float
-    accel_walk: float
-    scale: float = 0.03
-
-
-PHONE = Grade(2e-4, 3e-3, 0.015, 0.1, 1e-5, 5e-4)
 TACTICAL = Grade(1e-5, 2e-4, 1e-3, 0.02, 1e-6, 5e-5)
 CONSTANT = Grade(2e-4, 3e-3, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The noise of a phone's sensor, and nothing else besides zeros that are always the same."""
+ZEROS = np.array([[0.01, -0.02, 0.015], [0.05, 0.02, -0.08]])
 
 
 def imu_log(
@@ -106,22 +86,11 @@ def imu_log(
     Args:
         offset_s: image time minus time of the log.
     """
-    rng = np.random.default_rng(seed)
     times_s = np.arange(0.0, until_s, 1 / rate_hz)
-    h = 1e-3
-    now = motion.world_from_imu(times_s)
-    gyro = (motion.world_from_imu(times_s - h).inv() * motion.world_from_imu(times_s + h)).as_rotvec() / (2 * h)
-    later, here, before = (motion.places_m(times_s + k * h) for k in (1, 0, -1))
-    force = now.inv().apply((later - 2 * here + before) / h**2 + np.array([0.0, 0.0, GRAVITY_M_S2]))
-    walked = rng.normal(size=(2, *gyro.shape)).cumsum(axis=1) / np.sqrt(rate_hz)
-    zeros, scales = rng.normal(size=(2, 2, 3))
-    gyro_zero = np.array([0.01, -0.02, 0.015]) if grade is CONSTANT else grade.gyro_bias * zeros[0]
-    accel_zero = np.array([0.05, 0.02, -0.08]) if grade is CONSTANT else grade.accel_bias * zeros[1]
-    noise = rng.normal(size=(2, *gyro.shape)) * np.sqrt(rate_hz)
-    gyro = (1 + 0.1 * grade.scale * scales[0]) * gyro + gyro_zero + grade.gyro_walk * walked[0]
-    force = (1 + grade.scale * scales[1]) * force + accel_zero + grade.accel_walk * walked[1]
-    gyro, force = gyro + grade.gyro_noise * noise[0], force + grade.accel_noise * noise[1]
-    return ImuLog(times_s - offset_s, gyro, force, "imu.csv")
+    log = simulate_imu(motion, times_s, rate_hz, grade, np.random.default_rng(seed))
+    gyro_zero, accel_zero = ZEROS if grade is CONSTANT else np.zeros((2, 3))
+    gyro_rad_s, accel_m_s2 = log.gyro_rad_s + gyro_zero, log.accel_m_s2 + accel_zero
+    return ImuLog(times_s - offset_s, gyro_rad_s, accel_m_s2, "imu.csv")
 
 
 def photos(

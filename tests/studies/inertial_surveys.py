@@ -28,10 +28,7 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.files import write_rows
 from tests.simulated.inertial import (
     CAM_FROM_IMU,
-    GRAVITY_M_S2,
-    PHONE,
     TACTICAL,
-    Grade,
     Motion,
     by_drone,
     by_hand,
@@ -41,6 +38,7 @@ from tests.simulated.inertial import (
 )
 
 from rangesfm.arrays import Array
+from rangesfm.demo.simulated_imu import GRAVITY_M_S2, PHONE, Grade
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.measurements.imu.formats import CANONICAL_COLUMNS, read_imu
 from rangesfm.measurements.imu.inertial_fit import InertialProblem

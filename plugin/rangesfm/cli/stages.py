@@ -47,7 +47,8 @@ def add_stages_commands(commands: Commands) -> None:
     demo.add_argument(
         "--num_photos", type=int, metavar="N", help="use the first N of the photos, 20 or more (default: all)"
     )
-    demo.add_argument("--seed", type=int, default=0, metavar="N", help="seed of radio and run (default: 0)")
+    demo.add_argument("--imu", action="store_true", help="with the log of a phone's inertial sensor on the camera, too")
+    demo.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the sensors and the run (default: 0)")
     demo.add_argument("--num_threads", type=int, metavar="N", help="number of threads; -1: one for each core")
     add_restart_argument(demo)
     reconstruct = commands.add("reconstruct", _reconstruct, "make an unscaled COLMAP model from photos")
@@ -110,7 +111,7 @@ def _demo(args: argparse.Namespace, progress: Progress) -> Outcome:
         raise InputError(f"--seed is {args.seed}, expected 0 or more")
     make = corridor.make_corridor_survey if args.scene == "corridor" else yard.make_demo_survey
     folder = Path(args.folder)
-    made = make(folder, num_photos=num_photos, seed=args.seed)
+    made = make(folder, num_photos=num_photos, seed=args.seed, imu=args.imu)
     overrides: dict[str, object] = {"output.seed": args.seed, "report.reference": folder / "reference.csv"}
     if args.num_threads is not None:
         overrides["mapper.num_threads"] = args.num_threads

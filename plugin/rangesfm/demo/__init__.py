@@ -1,1 +1,1 @@
-"""The demo survey: photos that ship with the package, and a simulated radio."""
+"""The demo survey: photos that ship with the package, and simulated sensors."""

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.demo.simulated_radio import CameraPath, Radio, simulate_ranges
-from rangesfm.demo.survey import TAG_IN_CAM_M, TIME_OFFSET_S, DemoSurvey, write_demo
+from rangesfm.demo.survey import TAG_IN_CAM_M, TIME_OFFSET_S, DemoSurvey, simulate_phone, write_demo
 from rangesfm.util.geometry.reference import Reference
 
 NUM_PHOTOS = 96
@@ -50,14 +50,15 @@ _RADIO = Radio(
 )
 
 
-def make_corridor_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: int = 0) -> DemoSurvey:
+def make_corridor_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: int = 0, imu: bool = False) -> DemoSurvey:
     """Write the survey into a folder; a folder that already holds the same survey is left as it is.
 
     Args:
         folder: a new or empty folder.
         num_photos: number of photos, from the first on. They are one second apart, and from the 80th on they show what
             the first ones show.
-        seed: seed of the errors of the radio.
+        seed: seed of the errors of the radio and of the inertial sensor.
+        imu: whether the camera has an inertial sensor.
 
     Raises:
         InputError: the folder holds something else or cannot be written to.
@@ -75,6 +76,7 @@ def make_corridor_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: in
         centers_m=centers[taken],
         world_from_cam=world_from_cam[taken],
         ranges=ranges,
+        imu=simulate_phone(times, centers, world_from_cam, seed) if imu else None,
     )
     x, y, z = (_ANCHOR_M - survey.centers_m[0]) @ survey.world_from_cam[0]
     rows = (f"{name},{time_s:.3f}" for name, time_s in zip(survey.image_names, survey.timestamps_s, strict=True))

@@ -11,15 +11,17 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
+from rangesfm.demo.simulated_imu import PHONE, OnCamera, imu_table, simulate_imu
 from rangesfm.demo.simulated_radio import CameraPath, Radio, SimulatedRanges, simulate_ranges
 from rangesfm.errors import InputError
+from rangesfm.measurements.imu.log import ImuLog
 from rangesfm.measurements.ranges.readers import write_ranges_csv
 from rangesfm.util.files.atomic import new_folder, sole_writer, write_text
 from rangesfm.util.files.output_folder import PRIVATE_NAME
@@ -57,6 +59,11 @@ _RADIO = Radio(
     resolution_m=0.001,
 )
 
+# A phone that is held across, with the lens on the left: its x is up, its y left, and its z towards the user.
+IMU_IN_CAM_M = (0.07, 0.03, -0.01)
+IMU_TIME_OFFSET_S = -0.42
+CAM_FROM_IMU = np.array([(0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)])
+_IMU_RATE_HZ = 100.0
 
 _EXPECTED = "expected a new or an empty folder, or one that holds the same demo"
 
@@ -66,12 +73,14 @@ class DemoSurvey:
     """The demo survey, with its true poses and ranges.
 
     Attributes:
-        folder: holds ``survey.toml``, ``images``, ``uwb.csv``, ``anchors.csv`` and ``reference.csv``.
+        folder: holds ``survey.toml``, ``images``, ``uwb.csv``, ``anchors.csv`` and ``reference.csv``, and ``imu.csv``
+            if there is an inertial sensor.
         image_names: n photos in time order.
         timestamps_s: (n,) times on the camera's clock, seconds since 1970.
         centers_m: (n, 3) projection centres in the site frame, metres.
         world_from_cam: (n, 3, 3) rotations.
         ranges: the log, on the radio's clock, with its true values.
+        imu: the log of an inertial sensor, on its clock; None without one.
     """
 
     folder: Path
@@ -80,25 +89,27 @@ class DemoSurvey:
     centers_m: Array
     world_from_cam: Array
     ranges: SimulatedRanges
+    imu: ImuLog | None = None
 
     @property
     def survey_path(self) -> Path:
         return self.folder / "survey.toml"
 
 
-def make_demo_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: int = 0) -> DemoSurvey:
+def make_demo_survey(folder: Path, *, num_photos: int = NUM_PHOTOS, seed: int = 0, imu: bool = False) -> DemoSurvey:
     """Write the demo survey into a folder; a folder that already holds the same survey is left as it is.
 
     Args:
         folder: a new or empty folder.
         num_photos: number of photos, from the first on. They are about one second apart, and all 40 go around the yard
             once.
-        seed: seed of the errors of the radio and of the surveyed anchors.
+        seed: seed of the errors of the radio, of the surveyed anchors and of the inertial sensor.
+        imu: whether the camera has an inertial sensor.
 
     Raises:
         InputError: the folder holds something else or cannot be written to.
     """
-    survey = _plan(folder, num_photos, seed)
+    survey = _plan(folder, num_photos, seed, imu)
     write_demo(
         survey,
         Reference(survey.centers_m, image_names=survey.image_names),
@@ -120,13 +131,16 @@ def write_demo(
 
     Args:
         reference: the truth, for ``reference.csv``.
-        survey_file: text of ``survey.toml``. files: texts of further files, by name.
+        survey_file: text of ``survey.toml``, without the inertial sensor. files: texts of further files, by name.
         take_photo: writes the photo with this number, from 0 on, to a path.
 
     Raises:
         InputError: the folder holds something else or cannot be written to.
     """
     folder = survey.folder
+    if survey.imu is not None:
+        survey_file += _IMU_TABLE
+        files = {**files, "imu.csv": imu_table(survey.imu)}
     if _is_there(survey, survey_file):
         return
     if folder.exists() and not folder.is_dir():
@@ -147,7 +161,7 @@ def write_demo(
         write_text(survey_file, survey.survey_path)
 
 
-def _plan(folder: Path, num_photos: int, seed: int) -> DemoSurvey:
+def _plan(folder: Path, num_photos: int, seed: int, imu: bool = False) -> DemoSurvey:
     """Return the survey with its true values; nothing is written."""
     with PATH_FILE.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))[: num_photos + 2 * NUM_ROWS_AROUND]
@@ -163,7 +177,23 @@ def _plan(folder: Path, num_photos: int, seed: int) -> DemoSurvey:
         centers_m=centers[taken] + CORNER_IN_SITE_M,
         world_from_cam=world_from_cam[taken],
         ranges=simulate_ranges(path, IN_YARD_M, TAG_IN_CAM_M, _RADIO, seed),
+        imu=simulate_phone(times, centers, world_from_cam, seed) if imu else None,
     )
+
+
+def simulate_phone(times_s: Array, centers_m: Array, world_from_cam: Array, seed: int) -> ImuLog:
+    """Return the log of a phone's inertial sensor on a camera with n poses, from the first to the last.
+
+    Args:
+        times_s: (n,) on the camera's clock. centers_m: (n, 3) in a world whose z is up. world_from_cam: (n, 3, 3).
+        seed: seed of the sensor's errors.
+    """
+    camera = CameraPath.through(times_s - times_s[0], centers_m, world_from_cam)
+    motion = OnCamera(camera, CAM_FROM_IMU, np.array(IMU_IN_CAM_M))
+    # Differences are taken around each sample: the spline ends at the first and the last pose.
+    samples_s = np.arange(1, int(camera.end_s * _IMU_RATE_HZ)) / _IMU_RATE_HZ
+    log = simulate_imu(motion, samples_s, _IMU_RATE_HZ, PHONE, np.random.default_rng([seed, 2]))
+    return replace(log, timestamp_s=times_s[0] + samples_s - IMU_TIME_OFFSET_S)
 
 
 def _is_there(survey: DemoSurvey, text: str) -> bool:
@@ -223,3 +253,10 @@ path = "out"
 
 def _listed(values: tuple[float, ...]) -> str:
     return ", ".join(f"{value:g}" for value in values)
+
+
+_IMU_TABLE = f"""
+[imu]
+path = "imu.csv"                # a phone's log; its clock and its axes are found
+imu_in_cam_m = [{_listed(IMU_IN_CAM_M)}]   # lever arm of the sensor: x right, y down, z forward
+"""
