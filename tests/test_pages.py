@@ -233,6 +233,7 @@ OF_THE_HELP = {"--num_photos", "--quiet"}
 OF_OTHER_PROGRAMS = {
     "--auto_scale_poses",
     "--center_method",
+    "--config_settings",
     "--csv",
     "--orientation_method",
     "--ref_images_path",

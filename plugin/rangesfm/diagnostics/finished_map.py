@@ -127,9 +127,9 @@ def place_of_map(
 
 
 def is_placed_by_others(estimate: ScaleEstimate) -> bool:
-    """Return whether other measurements than ranges place the map in the site."""
+    """Return whether measurements place the map in the site that move it as a whole."""
     kinds = () if estimate.on_map is None else estimate.on_map.kinds
-    return any(each.places_map and not isinstance(each, RangeScale) for each in kinds)
+    return any(each.places_map and not each.fit_places_map for each in kinds)
 
 
 def _loose_ones(path: Trajectory, keyframes_m: Array) -> Iterator[str]:

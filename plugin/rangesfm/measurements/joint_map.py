@@ -50,6 +50,9 @@ class KindOnMap(ABC):
 
     kind: ClassVar[str]
     """Name of the kind."""
+    fit_places_map: ClassVar[bool] = False
+    """Whether a map at rest keeps the place of its fit, whose covariance is then the place's. Else it is moved as a
+    whole to the best estimate, as for errors that last, which the fit does not know."""
 
     @property
     def words(self) -> str:
@@ -293,6 +296,10 @@ def join_kinds(
     problem = joined(found, bending).learnt()
     if is_at_rest:
         known = problem.posterior(is_refined=True)
+        if all(each.fit_places_map for each in used if each.places_map) and known.columns.frame >= 0:
+            known = known.keeping_place(
+                (placed.scale * (path.centers - path.centers[0])).mean(axis=0) @ placed.rotation.T
+            )
     else:
         known = used[0].posterior(problem) if len(used) == 1 else problem.posterior()
     observed = {each.kind: each for each in found}

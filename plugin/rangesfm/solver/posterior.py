@@ -131,6 +131,17 @@ class Posterior:
         assert self.placement is not None, "the map is placed"
         return self.placement
 
+    def keeping_place(self, middle_m: Array) -> Posterior:
+        """Return the posterior with an estimate to which the map only changes its size.
+
+        Args:
+            middle_m: (3,) of the map, which stays where it is, from the first camera in the site's axes.
+        """
+        step, of_map = np.zeros_like(self.step), self.columns.of_map
+        step[of_map[0]] = self.step[of_map[0]]
+        step[of_map[4:]] = -step[of_map[0]] * middle_m
+        return replace(self, step=step)
+
     @classmethod
     def best(cls, linear: LinearMap, noise: Noise, formal: float) -> Posterior:
         """Return the posterior with the best weights for the errors (Gauss and Markov).

@@ -47,6 +47,7 @@ class RangeScale(KindOnMap):
     anchors: tuple[AnchorEstimate, ...] = ()
 
     kind = words = RANGES
+    fit_places_map = True
     remedy = "calibrate the radio (rangesfm ranges calibrate)"
 
     @property
