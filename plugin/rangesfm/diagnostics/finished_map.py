@@ -18,7 +18,7 @@ from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
 from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
-from rangesfm.measurements.joint_map import Doubt
+from rangesfm.measurements.joint_map import Doubt, moves_as_a_whole
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.util.geometry.similarity import path_shape, similarity_motions
@@ -109,8 +109,9 @@ def place_of_map(
     of_map, of_keyframes = by_similarity(estimate.placement, centers_m)
     if found is not None:
         of_keyframes = found.centers[np.searchsorted(found.frame_ids, path.frame_ids)]
-        # Placed by other kinds, the map was moved as a whole to where the best weights for errors that last have it.
-        of_map = of_map if is_placed_by_others(estimate) else found.similarity
+        # Some kinds have moved the map as a whole to where the best weights for errors that last have it.
+        is_moved = estimate.on_map is not None and moves_as_a_whole(estimate.on_map.kinds)
+        of_map = of_map if is_moved else found.similarity
     keyframes_m2 = np.trace(of_keyframes, axis1=1, axis2=2)
     stddevs = np.sqrt(np.maximum(np.diag(of_map), 0.0))
     heading_deg = float(np.rad2deg(stddevs[3]))
@@ -124,12 +125,6 @@ def place_of_map(
     reasons = (*((in_words,) if is_wide or not doubts else ()), *loose, *doubts)
     x_m, y_m, z_m = stddevs[4:].tolist()
     return Place("doubtful" if is_wide or doubts else "good", reasons, (x_m, y_m, z_m), heading_deg, worst_m)
-
-
-def is_placed_by_others(estimate: ScaleEstimate) -> bool:
-    """Return whether measurements place the map in the site that move it as a whole."""
-    kinds = () if estimate.on_map is None else estimate.on_map.kinds
-    return any(each.places_map and not each.fit_places_map for each in kinds)
 
 
 def _loose_ones(path: Trajectory, keyframes_m: Array) -> Iterator[str]:

@@ -257,6 +257,11 @@ def find_kind(kinds: Sequence[KindOnMap], kind: type[_Kind]) -> _Kind | None:
     return next((each for each in kinds if isinstance(each, kind)), None)
 
 
+def moves_as_a_whole(kinds: Sequence[KindOnMap]) -> bool:
+    """Return whether any that place a map at rest move it as a whole, away from the place of its fit."""
+    return any(each.is_used and each.places_map and not each.fit_places_map for each in kinds)
+
+
 def observations(
     kinds: Sequence[KindOnMap], placed: Similarity, max_num: int = MAX_NUM_OBSERVATIONS
 ) -> list[Observations]:
@@ -296,7 +301,7 @@ def join_kinds(
     problem = joined(found, bending).learnt()
     if is_at_rest:
         known = problem.posterior(is_refined=True)
-        if all(each.fit_places_map for each in used if each.places_map) and known.columns.frame >= 0:
+        if known.columns.frame >= 0 and not moves_as_a_whole(kinds):
             known = known.keeping_place(
                 (placed.scale * (path.centers - path.centers[0])).mean(axis=0) @ placed.rotation.T
             )

@@ -123,22 +123,6 @@ class BundleAdjustment:
         if tie_point is not None:
             solver.keep_from_elimination(self.adjuster, block, tie_point)
 
-    def add_prior(self, block: Array | None, mean: Array | None, stddev: float) -> None:
-        """Add the prior of a parameter block, if it is in the problem; stddev 0 fixes it, no mean leaves it free.
-
-        Args:
-            stddev: in the block's unit; it is scaled to pixels.
-        """
-        problem = self.adjuster.problem
-        if block is None or not problem.has_parameter_block(block):
-            return
-        if stddev == 0:
-            problem.set_parameter_block_constant(block)
-            return
-        if mean is not None:
-            solver.add_normal_prior(self.adjuster, block, mean, stddev / self.pixel_stddev)
-        self.keep_from_elimination(block)
-
 
 def bundle_adjustment(
     metric: pycolmap.Reconstruction,
