@@ -53,12 +53,14 @@ MODULES = {
 }
 
 OF_SENSOR = ("inertial_motions", "inertial_fit", "inertial_scale", "motion", "preintegration", "sensor_prior")
+OF_FIT = ("cost", "points_cost", "gravity", "radio", "site_positions")
+ON_MAP = ("range_scale", "length_scale", "position_scale")
 # Modules that say how a kind is measured. Others in the folder of a kind hold what was read.
 KINDS = {
     name
     for name in MODULES
     if name.startswith("measurements.")
-    and name.split(".")[-1] in ("cost", "points_cost", "gravity", "radio", "site_positions", *OF_SENSOR)
+    and name.split(".")[-1] in (*OF_FIT, *ON_MAP, *OF_SENSOR)
 }
 
 
@@ -160,10 +162,11 @@ def test_only_the_table_of_kinds_names_a_kind_of_measurement() -> None:
     """Whoever adds a kind writes its module or folder and its line in the table; no stage has to know of it."""
     assert {f"measurements.{kind}.cost" for kind in ("ranges", "lengths", "positions")} <= KINDS
     knowing = {(module, name) for module in MODULES.keys() - KINDS for name in own_imports(module) & KINDS}
-    # The kinds on a map as one piece, and what is of ranges alone.
-    on_map = {f"estimation.scale.{name}" for name in ("scale_by_ranges", "scale_problem", "scale_by_positions")}
-    of_ranges = {"estimation.with_ranges", "pipeline.make_metric_map"}
-    assert {module for module, _ in knowing} <= {"survey.kinds_in_map", *on_map, *of_ranges}
+    # What is of ranges alone, and a plan of positions.
+    of_ranges = {f"estimation.scale.{name}" for name in ("initialize", "scale_estimate", "bent_estimate")}
+    of_ranges |= {"estimation.with_ranges", "pipeline.make_metric_map", "diagnostics.finished_map"}
+    of_one_kind = {name for name in MODULES if name.startswith(("measurements.ranges.", "measurements.positions."))}
+    assert {module for module, _ in knowing} <= {"survey.kinds_in_map", "planning.expected", *of_ranges, *of_one_kind}
     logs = {"measurements.ranges.radio", "measurements.positions.site_positions"}  # several kinds are in one log
     others = {(module, name) for module in KINDS - logs for name in own_imports(module) & KINDS}
     assert not {(module, name) for module, name in others if module.split(".")[1] != name.split(".")[1]}

@@ -57,7 +57,7 @@ _HOME = {
     "trajectory_from_reconstruction": "rangesfm.util.geometry.trajectory",
     "trilaterate": "rangesfm.measurements.ranges.anchors.trilateration",
     "trilaterate_anchors": "rangesfm.measurements.ranges.anchors.trilateration",
-    "two_candidate": "rangesfm.estimation.scale.two_candidate",
+    "two_candidate": "rangesfm.measurements.ranges.scale.two_candidate",
     "write_report": "rangesfm.report",
 }
 

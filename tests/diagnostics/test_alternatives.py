@@ -7,8 +7,8 @@ import pytest
 from tests.known import known
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics import alternatives as module
-from rangesfm.diagnostics.alternatives import Alternative
+from rangesfm.measurements.ranges.mistakes import alternatives as module
+from rangesfm.measurements.ranges.mistakes.alternatives import Alternative
 
 
 def places_of(found: Alternative) -> dict[str, list[float]]:

@@ -11,10 +11,10 @@ from tests.simulated.runs import run, run_stages
 from tests.simulated.surveys import DRONE, MadeSurvey, surveyed
 from tests.studies.drifting_maps import lap_of_drift
 
-from rangesfm.diagnostics.anchor_sides import likelier_sides
-from rangesfm.diagnostics.linearized import ranges_on_map
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.measurements.joint_map import find_kind
+from rangesfm.measurements.ranges.mistakes.anchor_sides import likelier_sides
+from rangesfm.measurements.ranges.mistakes.linearized import ranges_on_map
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.pipeline.metric_result import MetricResult
 
 DRIFT_M, NUM_KEYFRAMES = 0.5, 100

@@ -8,15 +8,16 @@ from scipy.spatial.transform import Rotation
 from tests.known import known
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
-from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
+from rangesfm.estimation.scale.bent_estimate import estimate_by_bent
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.mistakes.bent_path import bends_m, bent_to_ranges
+from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, ranges_on_map
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeStatus
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import ScaleOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import align_points, rmse

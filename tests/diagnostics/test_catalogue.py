@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tests.diagnostics.test_linearized import ANCHORS_M, small_map
 
-from rangesfm.diagnostics import catalogue
-from rangesfm.diagnostics.hypothesis import Hypothesis
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized
+from rangesfm.measurements.ranges.mistakes import catalogue
+from rangesfm.measurements.ranges.mistakes.hypothesis import Hypothesis
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized, RangesOnMap, linearized
 
 
 def placed_exactly(heights_m: tuple[float, ...] = (2.0, 1.5, 3.0)) -> RangesOnMap:

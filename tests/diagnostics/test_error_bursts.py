@@ -7,9 +7,9 @@ from tests.known import known
 from tests.simulated.runs import run
 from tests.simulated.surveys import SITES, MadeSurvey, surveyed
 
-from rangesfm.diagnostics.error_bursts import likeliest_burst
-from rangesfm.diagnostics.hypothesis_tests import Factorization
-from rangesfm.diagnostics.linearized import Linearized, linearized
+from rangesfm.measurements.ranges.mistakes.error_bursts import likeliest_burst
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized
 
 DRONE = SITES[2]
 SEED = 3

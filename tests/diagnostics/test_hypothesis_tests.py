@@ -12,13 +12,13 @@ from tests.simulated.runs import run
 from tests.simulated.surveys import SITES, surveyed
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics import hypothesis_tests
-from rangesfm.diagnostics.catalogue import STANDING
-from rangesfm.diagnostics.hypothesis import Correction, Effect, Hypothesis
-from rangesfm.diagnostics.hypothesis_tests import Factorization, overlap, row_of
-from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.diagnostics.mistakes import find_mistakes
-from rangesfm.diagnostics.timed_hypotheses import SCANNING
+from rangesfm.measurements.ranges.mistakes import hypothesis_tests
+from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
+from rangesfm.measurements.ranges.mistakes.find_mistakes import find_mistakes
+from rangesfm.measurements.ranges.mistakes.hypothesis import Correction, Effect, Hypothesis
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, overlap, row_of
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
+from rangesfm.measurements.ranges.mistakes.timed_hypotheses import SCANNING
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, noncentrality
 
 

@@ -12,10 +12,10 @@ from tests.simulated.runs import run
 from tests.simulated.surveys import SITES, MadeSurvey, surveyed
 from tests.studies.mistakes import kinds
 
-from rangesfm.diagnostics.alternatives import alternatives
-from rangesfm.diagnostics.catalogue import STANDING
-from rangesfm.diagnostics.diagnosis import Diagnosis
-from rangesfm.diagnostics.linearized import Linearized, linearized
+from rangesfm.measurements.ranges.mistakes.alternatives import alternatives
+from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
+from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized, linearized
 
 HALL, YARD, DRONE = SITES
 SEED = 3

@@ -10,12 +10,12 @@ from scipy import special
 from tests.simulated.runs import run
 from tests.simulated.surveys import SITES, surveyed
 
-from rangesfm.diagnostics import hypothesis_tests
-from rangesfm.diagnostics.catalogue import anchor_places, wrong_lever_arms
-from rangesfm.diagnostics.hypothesis_tests import Factorization
-from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.diagnostics.mistakes import find_mistakes
 from rangesfm.diagnostics.scale_bound import scale_bound
+from rangesfm.measurements.ranges.mistakes import hypothesis_tests
+from rangesfm.measurements.ranges.mistakes.catalogue import anchor_places, wrong_lever_arms
+from rangesfm.measurements.ranges.mistakes.find_mistakes import find_mistakes
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.mistakes import RISK, HiddenMistake
 from rangesfm.solver.posterior import ScaleUncertainty
 

@@ -12,14 +12,6 @@ from scipy.spatial.transform import Rotation
 from tests.known_errors import known_errors
 from tests.simulated.model import SyntheticModel
 
-from rangesfm.estimation.scale.range_equation import (
-    RangeProblem,
-    RangeState,
-    columns_of,
-    predicted_ranges,
-    range_gradient,
-)
-from rangesfm.estimation.scale.range_equation import range_jacobian as jacobian_of_map
 from rangesfm.measurements.kind import LEAST_SQUARES, MapState
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.anchors.point_fit import PointProblem
@@ -27,6 +19,14 @@ from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.range_bins import by_poses
 from rangesfm.measurements.ranges.radio import ranges_of_map
 from rangesfm.measurements.ranges.range_log import RangeLog
+from rangesfm.measurements.ranges.scale.range_equation import (
+    RangeProblem,
+    RangeState,
+    columns_of,
+    predicted_ranges,
+    range_gradient,
+)
+from rangesfm.measurements.ranges.scale.range_equation import range_jacobian as jacobian_of_map
 from rangesfm.options import RefineOptions
 from rangesfm.solver import interpolated_range_cost
 from rangesfm.util.geometry.poses import Poses

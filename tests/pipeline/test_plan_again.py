@@ -13,9 +13,9 @@ from tests.conftest import SITE_M
 
 from rangesfm.arrays import Array
 from rangesfm.errors import InputError
-from rangesfm.estimation.scale.scale_verdict import CALIBRATE
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.scale.doubts import CALIBRATE
 from rangesfm.pipeline.plan_again import _planned, plan_of_result
 from rangesfm.planning.advice import advise
 from rangesfm.planning.expected import expect

@@ -10,9 +10,9 @@ import pytest
 from tests.planning.plans import FIVE_ANCHORS_M, loop, planned
 
 from rangesfm.errors import InputError
-from rangesfm.estimation.scale.scale_by_positions import scale_by_positions
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL
 from rangesfm.measurements.positions.control_points import ControlPoint
+from rangesfm.measurements.positions.position_scale import scale_by_positions
 from rangesfm.planning.expected import expect
 from rangesfm.planning.plan_file import read_plan
 from rangesfm.planning.planned import PlannedAntenna, PlannedSurvey

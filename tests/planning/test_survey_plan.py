@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
-from rangesfm.diagnostics.mistake_words import mistake_in_words
+from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.planning.advice import advise
 from rangesfm.planning.expected import expect
 from rangesfm.planning.survey_plan import SurveyPlan, plan_survey, size_in_words

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.planning.plans import COPLANAR_M, FIVE_ANCHORS_M, loop, planned
 
-from rangesfm.diagnostics.mistake_words import mistake_in_words
+from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.positions.control_points import ControlPoint
 from rangesfm.planning.paths import path_through
 from rangesfm.planning.planned_photos import PlannedPhotos

@@ -16,8 +16,8 @@ from PIL import Image
 from tests.known import known as known_scale
 
 from rangesfm.errors import InputError
-from rangesfm.estimation.scale.scale_by_lengths import lengths_between_points
 from rangesfm.mapper_options import MapperOptions
+from rangesfm.measurements.lengths.length_scale import lengths_between_points
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.options import CameraOptions

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rangesfm.estimation.scale.range_equation import RangeProblem
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
 
 Array = npt.NDArray[np.float64]
 

@@ -10,18 +10,19 @@ from unittest.mock import patch
 import numpy as np
 from tests.simulated.surveys import MadeSurvey
 
-from rangesfm.diagnostics.bent_path import bent_to_ranges, estimate_by_bent
-from rangesfm.diagnostics.diagnosis import Diagnosis, diagnose_ranges
 from rangesfm.diagnostics.finished_map import by_similarity
-from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.errors import GeometryError, SolverError
+from rangesfm.estimation.scale.bent_estimate import estimate_by_bent
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.scale.range_equation import RangeProblem, RangeState
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
+from rangesfm.measurements.ranges.mistakes.bent_path import bent_to_ranges
+from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, diagnose_ranges
+from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, ranges_on_map
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import ScaleOptions
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.run import map_in_metres
@@ -89,7 +90,7 @@ def run(survey: MadeSurvey, seed: int) -> Run:
     """Run the scale stage and the tests after it, starting near the truth if that is a valid start."""
     observations = associate(survey.log, survey.trajectory, survey.tag_in_cam_m, time_offset_s=survey.time_offset_s)
     options, frame = ScaleOptions(max_relative_stddev=1e3), survey.anchor_frame
-    near_truth = patch("rangesfm.estimation.scale.solution.site_starts", _near_truth(survey))
+    near_truth = patch("rangesfm.measurements.ranges.scale.solution.site_starts", _near_truth(survey))
     try:
         with nullcontext() if survey.needs_search else near_truth:
             estimate = initialize_scale(

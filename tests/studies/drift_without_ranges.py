@@ -44,12 +44,12 @@ from tests.studies.measured_distances import marks_in
 
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import RangesfmError
-from rangesfm.estimation.scale.scale_by_lengths import LengthScale
-from rangesfm.estimation.scale.scale_by_positions import PositionScale
+from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.lengths.tape import CONTROL, Marker, Tape, TapedDistance
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.control_points import ControlPoint, ControlPoints
 from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.measurements.positions.position_scale import PositionScale
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.options import RangesOptions

@@ -49,13 +49,13 @@ from tests.studies.known_positions import POINT_STDDEV_M, RECEIVERS, points_of, 
 from tests.studies.measured_distances import KINDS
 
 import rangesfm
-from rangesfm.diagnostics.linearized import linearized, ranges_on_map
-from rangesfm.estimation.scale.scale_by_lengths import LengthScale
-from rangesfm.estimation.scale.scale_by_positions import PositionScale
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.measurements.joint_map import find_kind
+from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.positions.grouped_positions import POSITIONS
+from rangesfm.measurements.positions.position_scale import PositionScale
+from rangesfm.measurements.ranges.mistakes.linearized import linearized, ranges_on_map
 from rangesfm.measurements.ranges.readers import write_ranges_csv
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.pipeline import result_records
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.pipeline.run_results import RunResult, write_results

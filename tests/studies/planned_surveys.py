@@ -28,9 +28,6 @@ from tests.studies.kept_runs import Row, Study, spread, study
 from rangesfm.demo.simulated_radio import CameraPath
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.scale.range_equation import RangeState
-from rangesfm.estimation.scale.scale_problem import ScaleProblem, scale_problem
-from rangesfm.estimation.scale.solution import solution_from
 from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
@@ -38,6 +35,9 @@ from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.components import COMPONENTS, stddevs_in
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.range_equation import RangeState
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem
+from rangesfm.measurements.ranges.scale.solution import solution_from
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.expected import Expected, expect
 from rangesfm.planning.paths import path_through

@@ -30,13 +30,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rangesfm.diagnostics.anchor_sides import likelier_sides
-from rangesfm.diagnostics.bent_path import bent_to_ranges, estimate_by_bent
-from rangesfm.diagnostics.diagnosis import diagnose_ranges
-from rangesfm.diagnostics.linearized import ranges_on_map
 from rangesfm.errors import GeometryError
+from rangesfm.estimation.scale.bent_estimate import estimate_by_bent
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.anchor_file import read_anchors
@@ -44,9 +40,14 @@ from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.errors.components import components, population
 from rangesfm.measurements.ranges.errors.error_curve import ErrorCurve, correct_ranges
 from rangesfm.measurements.ranges.errors.radio_calibration import calibrate_ranges
+from rangesfm.measurements.ranges.mistakes.anchor_sides import likelier_sides
+from rangesfm.measurements.ranges.mistakes.bent_path import bent_to_ranges
+from rangesfm.measurements.ranges.mistakes.diagnosis import diagnose_ranges
+from rangesfm.measurements.ranges.mistakes.linearized import ranges_on_map
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.readers import read_ranges
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import AssociationOptions, ScaleOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.reference import Reference, read_reference

@@ -23,12 +23,12 @@ import pycolmap
 from tests.studies.known_positions import NO_RANGES
 from tests.studies.real_room import interpolated, path_and_truth
 
-from rangesfm.estimation.scale.scale_by_positions import scale_by_positions
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.antenna_places import locate_antenna
 from rangesfm.measurements.positions.antenna_track import AntennaTrack
 from rangesfm.measurements.positions.clock import find_antenna_offset
 from rangesfm.measurements.positions.position_log import PositionLog
+from rangesfm.measurements.positions.position_scale import scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate

@@ -17,12 +17,12 @@ from unittest.mock import patch
 import numpy as np
 from tests.studies.real_logs import FACTOR, cases, path_of, placed, read_set
 
-from rangesfm.estimation.scale.binned_ranges import binned_ranges
-from rangesfm.estimation.scale.range_equation import predicted_ranges
-from rangesfm.estimation.scale.scale_problem import scale_problem
-from rangesfm.estimation.scale.solution import solve_scale
 from rangesfm.measurements.ranges.errors.components import components
 from rangesfm.measurements.ranges.errors.learned import learn_errors, radio_components
+from rangesfm.measurements.ranges.scale.binned_ranges import binned_ranges
+from rangesfm.measurements.ranges.scale.range_equation import predicted_ranges
+from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
+from rangesfm.measurements.ranges.scale.solution import solve_scale
 from rangesfm.options import RangeModelOptions
 
 # Medians that the logs' errors suggest at first sight, metres, and below them how far each log may differ.

@@ -15,11 +15,11 @@ import pycolmap
 from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece
 from rangesfm.colmap.reprojection import MISMATCHED, PointErrors, point_errors
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
 from rangesfm.measurements.joint_map import Doubt, moves_as_a_whole
 from rangesfm.measurements.ranges.range_observations import RangeStatus
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95
 from rangesfm.util.geometry.similarity import path_shape, similarity_motions
 from rangesfm.util.geometry.trajectory import Trajectory

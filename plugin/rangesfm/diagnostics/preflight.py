@@ -12,12 +12,12 @@ from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.colmap.reprojection import MISMATCHED, photo_errors_px, point_errors
-from rangesfm.diagnostics.catalogue import LARGEST_RIG_M, SAME_HEIGHT_M
 from rangesfm.errors import InputError, number_text
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
+from rangesfm.measurements.ranges.mistakes.catalogue import LARGEST_RIG_M, SAME_HEIGHT_M
 from rangesfm.measurements.ranges.range_log import RangeKind, RangeLog
 from rangesfm.measurements.ranges.readers.table import CANONICAL, MAPPED, TABLE
 from rangesfm.measurements.ranges.readers.units import UNITS_PER_METRE

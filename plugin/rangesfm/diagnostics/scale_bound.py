@@ -10,33 +10,15 @@ equivalence of three RAIM methods", Navigation 39, 1992).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import special
 from scipy.optimize import brentq
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis_tests import Test
-from rangesfm.diagnostics.mistake_words import mistake_in_words
-from rangesfm.solver.linear_map import noncentrality
 from rangesfm.solver.mistakes import RISK, HiddenMistake
 from rangesfm.solver.posterior import ScaleUncertainty
-
-
-def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:
-    """Return the mistakes behind tests, without those whose usual size is already in the interval of the scale."""
-    return tuple(
-        HiddenMistake(
-            words=mistake_in_words(*test.hypothesis.key),
-            slope=test.effect_on_log_scale / float(np.sqrt(noncentrality(max(test.num, 1)))),
-            threshold=test.threshold,
-            num=test.num,
-            most=test.log_scale_by_unit * test.hypothesis.most_unnoticed,
-        )
-        for test in tests
-        if not test.hypothesis.is_in_interval
-    )
 
 
 def scale_bound(uncertainty: ScaleUncertainty, hidden: Sequence[HiddenMistake]) -> tuple[float, str]:

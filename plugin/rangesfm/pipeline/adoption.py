@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.errors import GeometryError, number_text
+from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus
 from rangesfm.pipeline.make_metric_map import metric_map
 from rangesfm.pipeline.metric_result import MetricResult

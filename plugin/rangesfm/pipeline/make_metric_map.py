@@ -13,9 +13,6 @@ from rangesfm.arrays import Array
 from rangesfm.colmap.pieces import LoosePiece, loose_pieces
 from rangesfm.colmap.reprojection import point_errors
 from rangesfm.colmap.transform import rescale
-from rangesfm.diagnostics.anchor_sides import likelier_sides
-from rangesfm.diagnostics.bent_path import bends_m, bent_to_ranges, estimate_by_bent
-from rangesfm.diagnostics.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
 from rangesfm.diagnostics.finished_map import (
     doubts_of_map,
     doubts_of_pieces,
@@ -23,30 +20,34 @@ from rangesfm.diagnostics.finished_map import (
     why_broken,
 )
 from rangesfm.diagnostics.lens import doubt_of_lens, fit_lens
-from rangesfm.diagnostics.linearized import RangesOnMap, ranges_on_map
 from rangesfm.diagnostics.point_tests import Placed, diagnose_points
 from rangesfm.errors import GeometryError, SolverError
 from rangesfm.estimation.map_problem import MapProblem, map_problem
 from rangesfm.estimation.photo_bending import PhotoBending, bending_of_model, by_photos
 from rangesfm.estimation.refinement import MapAtRest, joint_errors, refine, refine_with_loops
-from rangesfm.estimation.scale.binned_ranges import RANGES
-from rangesfm.estimation.scale.scale_by_lengths import LengthScale
-from rangesfm.estimation.scale.scale_by_positions import PositionScale
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
+from rangesfm.estimation.scale.bent_estimate import estimate_by_bent
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.scale.scale_verdict import NOTHING_KNOWN, refuse_unknown
+from rangesfm.estimation.scale.scale_verdict import refuse_unknown
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.estimation.with_ranges import summarize
 from rangesfm.measurements.joint_map import Doubt, JointMap, find_kind, join_kinds, tested_kinds, upward_by
 from rangesfm.measurements.kind import MapState
+from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.lengths.locate_lengths import surveyed_distances
 from rangesfm.measurements.positions.clock import POSITIONS
+from rangesfm.measurements.positions.position_scale import PositionScale
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.clock.time_offset import REMEDY
 from rangesfm.measurements.ranges.cost import Ranges
 from rangesfm.measurements.ranges.errors.components import CLOCKS
+from rangesfm.measurements.ranges.mistakes.anchor_sides import likelier_sides
+from rangesfm.measurements.ranges.mistakes.bent_path import bends_m, bent_to_ranges
+from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
+from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, ranges_on_map
 from rangesfm.measurements.ranges.radio import RadioLog, ranges_of, ranges_of_map
+from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.source import Measured
 from rangesfm.pipeline.close_loops import RefinedMap, close_loops_of_survey
 from rangesfm.pipeline.join_models import ModelVerdict, join_models
@@ -59,7 +60,7 @@ from rangesfm.survey.kinds_in_map import MapOfPhotos, kinds_in_map, sources_in_m
 from rangesfm.survey.settings import Survey
 from rangesfm.survey.survey_run import PathOfModel, SurveyRun
 from rangesfm.util.geometry.gravity import gravity_of
-from rangesfm.util.geometry.numerics import NORMAL_95
+from rangesfm.util.geometry.numerics import NORMAL_95, NOTHING_KNOWN
 from rangesfm.util.geometry.poses import model_poses
 from rangesfm.util.geometry.similarity import IDENTITY, align_points
 from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera

@@ -12,9 +12,7 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.colmap.transform import rescale
-from rangesfm.diagnostics.diagnosis import Diagnosis
 from rangesfm.diagnostics.finished_map import Place
-from rangesfm.diagnostics.linearized import RangesOnMap
 from rangesfm.estimation.scale.scale_diagnostics import ScaleDiagnostics, scale_diagnostics
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.with_ranges import RefineSummary
@@ -24,6 +22,8 @@ from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
+from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis
+from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.pipeline.join_models import ModelVerdict
 from rangesfm.sfm.loops.loop_closure import LoopClosure

@@ -10,11 +10,11 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.estimation.scale.scale_verdict import CALIBRATE
 from rangesfm.export.metric_map import colored_points, level_axes, up_in_world
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.range_observations import RangeStatus
+from rangesfm.measurements.ranges.scale.doubts import CALIBRATE
 from rangesfm.pipeline.metric_result import MetricResult
 from rangesfm.planning.advice import advise, best_words
 from rangesfm.planning.expected import expect

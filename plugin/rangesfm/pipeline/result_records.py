@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Mask, median, rms
-from rangesfm.diagnostics.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.diagnostics.scale_bound import scale_bound
 from rangesfm.errors import number_text
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import CHECK, CONTROL, LEFT_OUT
+from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.measurements.positions.known_marks import locate_points
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import USED, RangeStatus

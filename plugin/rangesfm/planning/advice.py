@@ -12,12 +12,12 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.diagnostics.preflight import SAME_PLACE_M
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.scale_verdict import CALIBRATE, FEW_RANGES
 from rangesfm.measurements.lengths.tape import CONTROL
 from rangesfm.measurements.positions.control_points import ControlPoint
 from rangesfm.measurements.positions.known_positions import MIN_NUM_POSITIONS
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.errors.components import COMPONENTS
+from rangesfm.measurements.ranges.scale.doubts import CALIBRATE, FEW_RANGES
 from rangesfm.options import PointOptions
 from rangesfm.planning.expected import Expected, expect_roughly
 from rangesfm.planning.paths import NUM_WAVES, way_along

@@ -15,20 +15,21 @@ from rangesfm.arrays import Array, Indices
 from rangesfm.diagnostics.finished_map import by_similarity
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.free_fit import GraphBending
-from rangesfm.estimation.scale.anchor_plane import mirrored_map
-from rangesfm.estimation.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges
-from rangesfm.estimation.scale.placement_prior import PlacementPrior
-from rangesfm.estimation.scale.range_equation import antenna_positions, fit_at
-from rangesfm.estimation.scale.scale_by_positions import doubts_of_positions, planned_positions, refuse_open_turn
-from rangesfm.estimation.scale.scale_problem import ScaleProblem
-from rangesfm.estimation.scale.scale_verdict import Verdict, doubts_of_ranges, judge
-from rangesfm.estimation.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
+from rangesfm.estimation.scale.scale_verdict import Verdict, judge
 from rangesfm.estimation.vision_information import VisionInformation
 from rangesfm.measurements.lengths.lengths_on_map import lengths_on_map
 from rangesfm.measurements.lengths.tape import CHECK
+from rangesfm.measurements.positions.position_scale import doubts_of_positions, planned_positions, refuse_open_turn
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
 from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.anchor_plane import mirrored_map
+from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges
+from rangesfm.measurements.ranges.scale.doubts import doubts_of_ranges
+from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
+from rangesfm.measurements.ranges.scale.range_equation import antenna_positions, fit_at
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
+from rangesfm.measurements.ranges.scale.solution import Solution, refuse_ambiguity, solution_from, weighted
 from rangesfm.options import LENGTH_M, ScaleOptions
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.solver.bending import BENDS, MapBending, WalkBending

@@ -8,10 +8,10 @@ from itertools import combinations
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.catalogue import LARGEST_RIG_M
 from rangesfm.diagnostics.preflight import FAR_M, SAME_PLACE_M
 from rangesfm.errors import OptionError
 from rangesfm.measurements.ranges.anchors.site import coordinates_text
+from rangesfm.measurements.ranges.mistakes.catalogue import LARGEST_RIG_M
 from rangesfm.planning.planned import PlannedSurvey
 from rangesfm.planning.walls import are_outside, lead_through
 

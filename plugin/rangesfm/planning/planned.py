@@ -10,9 +10,6 @@ import numpy as np
 from pydantic import Field
 
 from rangesfm.arrays import Array
-from rangesfm.estimation.scale.placement_prior import PlacementPrior
-from rangesfm.estimation.scale.range_equation import RangeState
-from rangesfm.estimation.scale.scale_problem import ScaleProblem, scale_problem
 from rangesfm.measurements.lengths.lengths_on_map import BENDING
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.positions.antenna_places import locate_antenna
@@ -25,6 +22,9 @@ from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
+from rangesfm.measurements.ranges.scale.range_equation import RangeState
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem
 from rangesfm.option_model import Options
 from rangesfm.options import AssociationOptions, RangeModelOptions
 from rangesfm.planning.planned_photos import PlannedPhotos

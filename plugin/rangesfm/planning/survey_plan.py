@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.diagnostics.catalogue import STANDING
 from rangesfm.diagnostics.finished_map import place_in_words
-from rangesfm.diagnostics.hypothesis_tests import Factorization, row_of
-from rangesfm.diagnostics.linearized import linearized, ranges_on_map
-from rangesfm.diagnostics.mistake_words import mistake_in_words
 from rangesfm.errors import GeometryError
+from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.ranges.errors.components import component_words
+from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, row_of
+from rangesfm.measurements.ranges.mistakes.linearized import linearized, ranges_on_map
 from rangesfm.planning.advice import Advice, advise, ranked
 from rangesfm.planning.expected import OPEN, Expected, expect
 from rangesfm.planning.planned import PlannedSurvey

@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from rangesfm.diagnostics.mistake_words import mistake_in_words
+from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.report.text import count, decimals_for, fixed, keyed, known, sentence, signed
 from rangesfm.result.summary import ResultSummary
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE, NORMAL_95

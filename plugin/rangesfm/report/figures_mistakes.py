@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rangesfm.diagnostics.mistake_words import mistake_in_words
+from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.report.content import Content
 from rangesfm.report.plot import Figure, Mark, Panel, Series
 from rangesfm.report.text import percent, rough, signed

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.mistake_words import mistake_in_words
+from rangesfm.measurements.mistake_words import mistake_in_words
 from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.planning.advice import Advice
 from rangesfm.planning.survey_plan import SurveyPlan, size_in_words

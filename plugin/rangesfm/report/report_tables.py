@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from rangesfm.arrays import median, rms
-from rangesfm.diagnostics.mistake_words import CHECKED_KINDS, mistake_in_words
+from rangesfm.measurements.mistake_words import CHECKED_KINDS, mistake_in_words
 from rangesfm.measurements.ranges.errors.components import component_words
 from rangesfm.report.content import Content
 from rangesfm.report.text import count, duration, fixed, keyed, percent, plain, rough, sentence, signed

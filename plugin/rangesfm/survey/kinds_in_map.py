@@ -9,19 +9,19 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.scale_by_lengths import LengthScale, lengths_between_points
-from rangesfm.estimation.scale.scale_by_positions import PositionScale, scale_by_positions
 from rangesfm.measurements.gravity import Upwards
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import IMU, InertialScale, scale_by_sensor
 from rangesfm.measurements.joint_map import JointMap, KindOnMap, find_kind
 from rangesfm.measurements.kind import Block
 from rangesfm.measurements.lengths.cost import TapedLengths
+from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.lengths_on_map import LENGTHS
 from rangesfm.measurements.lengths.locate_lengths import locate_distances
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.grouped_positions import POSITIONS
+from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.source import Source
 from rangesfm.solver.bending import MapBending

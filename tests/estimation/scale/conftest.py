@@ -15,8 +15,8 @@ from tests.simulated.ranges import simulate_ranges_at
 
 from rangesfm.demo.simulated_radio import Radio, SimulatedRanges
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.scale.scale_by_lengths import LengthScale, lengths_between_points
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.association import associate

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.util.geometry.similarity import Similarity
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.range_equation import RangeProblem
-from rangesfm.estimation.scale.starts import agreeing_intervals, consensus_scales, local_maxima
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
+from rangesfm.measurements.ranges.scale.starts import agreeing_intervals, consensus_scales, local_maxima
 
 if TYPE_CHECKING:
     from tests.estimation.scale.conftest import MakeSurvey, Survey

@@ -19,14 +19,14 @@ from tests.simulated.positions_at_origin import known_positions
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError, InputError
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.scale.scale_by_lengths import LengthScale
-from rangesfm.estimation.scale.scale_by_positions import scale_by_positions
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.measurements.joint_map import KindOnMap
+from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.positions.known_positions import KnownPositions
+from rangesfm.measurements.positions.position_scale import scale_by_positions
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.options import CheckOptions, RangeModelOptions, ScaleOptions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import Similarity

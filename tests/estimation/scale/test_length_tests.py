@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.known import known
 
-from rangesfm.estimation.scale.scale_by_lengths import LengthScale, lengths_between_points
+from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.lengths.tape import TapedDistance
 from rangesfm.solver.bending import WalkBending

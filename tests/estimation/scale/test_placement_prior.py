@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangesfm.estimation.scale.placement_prior import PlacementPrior
+from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.util.geometry.similarity import Similarity
 
 STEP = 1e-6

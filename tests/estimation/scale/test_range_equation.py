@@ -10,9 +10,15 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangesfm.estimation.scale import range_equation
-from rangesfm.estimation.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, solve
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.ranges.scale import range_equation
+from rangesfm.measurements.ranges.scale.range_equation import (
+    RangeFit,
+    RangeProblem,
+    RangeState,
+    predicted_ranges,
+    solve,
+)
 from rangesfm.util.geometry.gravity import gravity_of
 from rangesfm.util.geometry.robust_statistics import CAUCHY, GEMAN_MCCLURE, RobustLoss
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity

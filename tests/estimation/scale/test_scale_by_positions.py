@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.positions_at_origin import known_positions
 
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.scale_by_positions import (
+from rangesfm.measurements.positions.grouped_positions import design_of_positions
+from rangesfm.measurements.positions.known_positions import KnownPositions
+from rangesfm.measurements.positions.position_scale import (
     _determine,
     _Search,
     refuse_open_turn,
     scale_by_positions,
 )
-from rangesfm.measurements.positions.grouped_positions import design_of_positions
-from rangesfm.measurements.positions.known_positions import KnownPositions
 from rangesfm.solver.bending import WalkBending
 from rangesfm.util.geometry.similarity import Similarity
 from rangesfm.util.geometry.trajectory import Trajectory, moved_similarity

@@ -12,10 +12,10 @@ from tests.known import known
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.initialize import initialize_scale
-from rangesfm.estimation.scale.scale_by_lengths import lengths_between_points
-from rangesfm.estimation.scale.scale_by_positions import doubts_of_positions
 from rangesfm.estimation.scale.scale_verdict import Verdict, judge, refuse_unknown
+from rangesfm.measurements.lengths.length_scale import lengths_between_points
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
+from rangesfm.measurements.positions.position_scale import doubts_of_positions
 from rangesfm.measurements.ranges.range_observations import RangeStatus
 from rangesfm.options import ScaleOptions
 from rangesfm.solver.bending import WalkBending

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from tests.simulated.range_problem import range_problem
 
 from rangesfm.demo.simulated_radio import Radio
-from rangesfm.estimation.scale import starts
-from rangesfm.estimation.scale.range_equation import RangeProblem, RangeState, predicted_ranges
-from rangesfm.estimation.scale.scale_problem import scale_problem
-from rangesfm.estimation.scale.starts import (
+from rangesfm.measurements.ranges.scale import starts
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, predicted_ranges
+from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
+from rangesfm.measurements.ranges.scale.starts import (
     choose_sides,
     complete_unknown_anchors,
     site_starts,

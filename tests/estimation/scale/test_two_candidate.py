@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rangesfm.estimation.scale.two_candidate import TwoCandidate, two_candidate
+from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
 
 Array = npt.NDArray[np.float64]
 

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.anchor_plane import is_line
-from rangesfm.estimation.scale.starts import MAX_NUM_STARTS, each_once
+from rangesfm.measurements.ranges.scale.starts import MAX_NUM_STARTS, each_once
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING
 from rangesfm.util.geometry.robust_statistics import CAUCHY
 from rangesfm.util.geometry.rotations import cross_matrices
@@ -143,7 +142,7 @@ def _refuse_too_few(pairs: Mapping[str, _Pair]) -> None:
         about = f"anchor {names}" if len(ids) == 1 else f"the line through {' and '.join(ids)}"
         raise GeometryError(f"of its anchors only {names} also belong to others: every turn about {about} fits")
     for places_m in ([p.target.places_m for p in pairs.values()], [p.source.places_m for p in pairs.values()]):
-        if all(is_line(path_shape(np.array(some))) for some in itertools.product(*places_m[:_MAX_NUM_TRIED])):
+        if all(path_shape(np.array(some)).is_line for some in itertools.product(*places_m[:_MAX_NUM_TRIED])):
             raise GeometryError(f"the anchors that it shares ({names}) are on a line: every turn about it fits")
 
 
@@ -167,7 +166,7 @@ def _triple_motions(pairs: Iterable[_Pair]) -> Iterator[Similarity]:
         for sides in itertools.product(*(pair.sides for pair in triple)):
             source = np.array([pair.source.places_m[side[1]] for pair, side in zip(triple, sides, strict=True)])
             target = np.array([pair.target.places_m[side[0]] for pair, side in zip(triple, sides, strict=True)])
-            if not is_line(path_shape(source)):
+            if not path_shape(source).is_line:
                 yield align_points(source, target, with_scale=False)
 
 

@@ -8,21 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
-from rangesfm.estimation.scale.binned_ranges import RANGES, shared_errors_m
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale, placement_by, with_lengths
-from rangesfm.estimation.scale.scale_estimate import NOT_KNOWN, ScaleEstimate
-from rangesfm.estimation.scale.scale_problem import scale_problem
-from rangesfm.estimation.scale.scale_verdict import judge_map_of_kinds, levelled_places
-from rangesfm.estimation.scale.sensitivity import scale_sensitivity
-from rangesfm.estimation.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
-from rangesfm.estimation.scale.two_candidate import TwoCandidate, two_candidate
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.estimation.scale.scale_verdict import judge_map_of_kinds
 from rangesfm.measurements.joint_map import KindOnMap, fit_kinds, join_kinds, tested_kinds, upward_by
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, status_by_weight
+from rangesfm.measurements.ranges.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
+from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, shared_errors_m
+from rangesfm.measurements.ranges.scale.doubts import levelled_places
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale, placement_by, with_lengths
+from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
+from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN, scale_sensitivity
+from rangesfm.measurements.ranges.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
+from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, ScaleUncertainty

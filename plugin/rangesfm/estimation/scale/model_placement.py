@@ -10,11 +10,11 @@ import numpy as np
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
 from rangesfm.estimation.scale.anchor_alignment import SAME_SHARE, PlacedAnchor, align_by_anchors
-from rangesfm.estimation.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.scale.starts import spread_subset
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_SEARCH
+from rangesfm.measurements.ranges.scale.range_equation import RangeFit, RangeProblem, RangeState, solve
+from rangesfm.measurements.ranges.scale.starts import spread_subset
 from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP, wider
 from rangesfm.util.geometry.rotations import cross_matrices
 from rangesfm.util.geometry.similarity import Similarity, path_shape, rmse

@@ -8,8 +8,8 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.scale.starts import agreeing_intervals
-from rangesfm.estimation.scale.two_candidate import two_candidate
+from rangesfm.measurements.ranges.scale.starts import agreeing_intervals
+from rangesfm.measurements.ranges.scale.two_candidate import two_candidate
 from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.trajectory import Trajectory
 

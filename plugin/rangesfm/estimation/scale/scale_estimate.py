@@ -9,40 +9,19 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
 from rangesfm.estimation.scale.scale_verdict import Verdict, judge_map_of_kinds
-from rangesfm.estimation.scale.two_candidate import TwoCandidate
 from rangesfm.measurements.joint_map import JointMap, KindOnMap
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.range_scale import RangeScale
+from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN, ScaleSensitivity
+from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
 from rangesfm.options import ScaleOptions
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.similarity import Similarity
 
 _Kind = TypeVar("_Kind", bound=KindOnMap)
-
-
-@dataclass(frozen=True)
-class ScaleSensitivity:
-    """Change of the scale, in percent, per error of the range model; estimated biases absorb their part of it.
-
-    Attributes:
-        common_bias_per_cm: if all ranges were a centimetre longer.
-        short_range_per_cm: if the shorter half of the ranges were a centimetre longer.
-        anchor_bias_per_cm: by anchor id, if the ranges to that anchor were a centimetre longer.
-        range_slope_per_percent: if all ranges were one percent longer.
-        lever_arm_per_cm: if the tag sat a centimetre further along x, y, z of the camera.
-    """
-
-    common_bias_per_cm: float
-    short_range_per_cm: float
-    anchor_bias_per_cm: dict[str, float]
-    range_slope_per_percent: float
-    lever_arm_per_cm: tuple[float, float, float]
-
-
-NOT_KNOWN = ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)

@@ -25,3 +25,6 @@ NORMAL_95: Final = 1.96
 
 DOUBTFUL_ABOVE: Final = 0.04
 """Half of the relative 95 % interval above which a scale is doubtful."""
+
+NOTHING_KNOWN: Final = 1.0
+"""Relative standard deviation of the scale from which nothing is known about it: it may as well be zero."""

@@ -10,6 +10,9 @@ from rangesfm.arrays import Array, Mask
 from rangesfm.util.geometry.numerics import ROUNDING
 from rangesfm.util.geometry.rotations import cross_matrices
 
+# Points are on a line if their second largest extent is at most this share of the largest.
+_COLLINEAR = 0.02
+
 
 @dataclass(frozen=True)
 class Similarity:
@@ -126,6 +129,11 @@ class PathShape:
     centroid: Array
     axes: Array
     stddevs: Array
+
+    @property
+    def is_line(self) -> bool:
+        """Whether one set of points leaves a turn about its line open."""
+        return bool(self.stddevs[1] <= _COLLINEAR * self.stddevs[0])
 
 
 def path_shape(points: Array) -> PathShape:

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.range_equation import RangeProblem, RangeState, antenna_positions, solve
 from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_SEARCH, multilaterate
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, antenna_positions, solve
 from rangesfm.util.geometry.numerics import SIGNIFICANT_STDDEVS, UNDETERMINED
 from rangesfm.util.geometry.robust_statistics import SAME_COST, robust_stddevs
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, off_origin, path_shape, round_middle, rounding_of

@@ -18,7 +18,7 @@ from rangesfm.solver.mistakes import MistakeTest, MistakeTests, in_axes, row_of_
 from rangesfm.util.processes.threads import with_one_blas_thread
 
 if TYPE_CHECKING:  # which imports this module
-    from rangesfm.estimation.scale.scale_by_positions import PositionScale
+    from rangesfm.measurements.positions.position_scale import PositionScale
 
 LOOK_AGAIN = "look whether its coordinates were mistyped, or its marks are of another point"
 _POINT, _CHECK_POINT = "control point", "check point"

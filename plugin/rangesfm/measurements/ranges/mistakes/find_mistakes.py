@@ -8,16 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.alternatives import Alternative, Refits, alternatives, lever_arms_in_other_axes
-from rangesfm.diagnostics.bent_path import as_given, bent_to_ranges, drifts
-from rangesfm.diagnostics.catalogue import STANDING
-from rangesfm.diagnostics.error_bursts import likeliest_burst, without
-from rangesfm.diagnostics.hypothesis import Effect, Hypothesis, corrected
-from rangesfm.diagnostics.hypothesis_tests import Factorization, Test, overlap
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, at_other_map, at_state, linearized
-from rangesfm.diagnostics.scale_bound import hidden_among
-from rangesfm.diagnostics.timed_hypotheses import SCANNING
-from rangesfm.estimation.scale.range_equation import RangeState, state_after
+from rangesfm.measurements.ranges.mistakes.alternatives import (
+    Alternative,
+    Refits,
+    alternatives,
+    lever_arms_in_other_axes,
+)
+from rangesfm.measurements.ranges.mistakes.bent_path import as_given, bent_to_ranges, drifts
+from rangesfm.measurements.ranges.mistakes.catalogue import STANDING
+from rangesfm.measurements.ranges.mistakes.error_bursts import likeliest_burst, without
+from rangesfm.measurements.ranges.mistakes.hypothesis import Effect, Hypothesis, corrected
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization, Test, hidden_among, overlap
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized, RangesOnMap, at_other_map, at_state, linearized
+from rangesfm.measurements.ranges.mistakes.timed_hypotheses import SCANNING
+from rangesfm.measurements.ranges.scale.range_equation import RangeState, state_after
 from rangesfm.solver.bending import WalkBending
 from rangesfm.solver.mistakes import HiddenMistake
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS

@@ -15,8 +15,6 @@ from scipy import special
 
 from rangesfm.arrays import Array, Indices, Mask, median, rms
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.anchor_plane import is_line
-from rangesfm.estimation.scale.position_tests import tests_of_positions
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap
 from rangesfm.measurements.lengths.tape import LEFT_OUT
 from rangesfm.measurements.positions.grouped_positions import (
@@ -33,6 +31,7 @@ from rangesfm.measurements.positions.known_positions import (
     KnownPositions,
     LearntPositions,
 )
+from rangesfm.measurements.positions.position_tests import tests_of_positions
 from rangesfm.measurements.positions.site_positions import UsedPositions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
 from rangesfm.measurements.ranges.errors.components import FRAME
@@ -390,7 +389,7 @@ def _of_triples(known: KnownPositions, rows: Indices) -> Similarity:
     for _ in range(2):
         candidates = [align_points(places, targets)]
         for chosen in map(list, _triples(len(rows))):
-            if not any(is_line(path_shape(each)) for each in (places[chosen], targets[chosen])):
+            if not any(path_shape(each).is_line for each in (places[chosen], targets[chosen])):
                 candidates.append(align_points(places[chosen], targets[chosen]))
         best = candidates[int(np.argmin([_distance_sum(each, places, targets) for each in candidates]))]
         targets = known.position_m[rows] - known.arms_m[rows] @ best.rotation.T

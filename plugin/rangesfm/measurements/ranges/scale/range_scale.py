@@ -9,18 +9,18 @@ from functools import cached_property
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.estimation.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved
-from rangesfm.estimation.scale.placement_prior import PlacementPrior
-from rangesfm.estimation.scale.range_equation import RangeProblem, RangeState, fit_at, predicted_ranges, solve
-from rangesfm.estimation.scale.scale_problem import ScaleProblem
-from rangesfm.estimation.scale.scale_verdict import doubts_of_ranges, remarks_on_anchors, remarks_on_places
-from rangesfm.estimation.scale.solution import Solution, weighted, with_unknown_anchors
 from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, join_kinds
 from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import Ranges, anchors_at
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
+from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved
+from rangesfm.measurements.ranges.scale.doubts import doubts_of_ranges, remarks_on_anchors, remarks_on_places
+from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, fit_at, predicted_ranges, solve
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
+from rangesfm.measurements.ranges.scale.solution import Solution, weighted, with_unknown_anchors
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Posterior, ScaleUncertainty
 from rangesfm.util.geometry.numerics import ROUNDING

@@ -20,10 +20,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.estimation.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.errors.noise import bias_whitening
 from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.solver.linear_map import Columns
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, ROUNDING

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,10 +10,11 @@ from scipy import special
 from scipy.linalg import solve_triangular
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis import Effect, Hypothesis
-from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.measurements.mistake_words import mistake_in_words
+from rangesfm.measurements.ranges.mistakes.hypothesis import Effect, Hypothesis
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE, EstimatedMistake, Solved, noncentrality
-from rangesfm.solver.mistakes import MistakeTest, finite, row_of_mistake
+from rangesfm.solver.mistakes import HiddenMistake, MistakeTest, finite, row_of_mistake
 from rangesfm.util.geometry.numerics import UNDETERMINED
 
 # Random surveys from which the thresholds come: 20 of them exceed one.
@@ -182,4 +183,19 @@ def row_of(test: Test) -> MistakeTest:
         effect_on_place_m=finite(test.effect_on_place_m),
         redundancy=test.redundancy,
         is_checked=test.is_checked,
+    )
+
+
+def hidden_among(tests: Iterable[Test]) -> tuple[HiddenMistake, ...]:
+    """Return the mistakes behind tests, without those whose usual size is already in the interval of the scale."""
+    return tuple(
+        HiddenMistake(
+            words=mistake_in_words(*test.hypothesis.key),
+            slope=test.effect_on_log_scale / float(np.sqrt(noncentrality(max(test.num, 1)))),
+            threshold=test.threshold,
+            num=test.num,
+            most=test.log_scale_by_unit * test.hypothesis.most_unnoticed,
+        )
+        for test in tests
+        if not test.hypothesis.is_in_interval
     )

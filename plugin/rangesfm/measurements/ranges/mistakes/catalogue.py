@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis import (
+from rangesfm.measurements.ranges.mistakes.hypothesis import (
     MEASURE_AGAIN,
     Correction,
     Effect,
@@ -20,7 +20,7 @@ from rangesfm.diagnostics.hypothesis import (
     of_bins,
     too_long,
 )
-from rangesfm.diagnostics.linearized import Linearized
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.mistakes import in_axes
 
 SAME_HEIGHT_M = 1e-3

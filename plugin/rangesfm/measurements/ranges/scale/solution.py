@@ -10,8 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.anchor_plane import is_on_side, mirrored_map, on_side
-from rangesfm.estimation.scale.range_equation import (
+from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
+from rangesfm.measurements.ranges.errors.range_errors import RangeErrors, fit_with_own_errors
+from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
+from rangesfm.measurements.ranges.scale.anchor_plane import is_on_side, mirrored_map, on_side
+from rangesfm.measurements.ranges.scale.range_equation import (
     RangeFit,
     RangeProblem,
     RangeState,
@@ -20,8 +23,8 @@ from rangesfm.estimation.scale.range_equation import (
     prior_cost,
     solve,
 )
-from rangesfm.estimation.scale.scale_problem import ScaleProblem
-from rangesfm.estimation.scale.starts import (
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
+from rangesfm.measurements.ranges.scale.starts import (
     complete_unknown_anchors,
     each_once,
     first_camera_starts,
@@ -31,9 +34,6 @@ from rangesfm.estimation.scale.starts import (
     spread_subset,
     unknown_anchor_starts,
 )
-from rangesfm.measurements.ranges.anchors.point_fit import ENOUGH_TO_JUDGE, ENOUGH_TO_SEARCH
-from rangesfm.measurements.ranges.errors.range_errors import RangeErrors, fit_with_own_errors
-from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.util.geometry.robust_statistics import MIN_COST_GAP
 from rangesfm.util.geometry.similarity import NEARLY_STRAIGHT, Similarity, path_kind, path_shape

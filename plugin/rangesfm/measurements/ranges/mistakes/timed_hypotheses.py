@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.diagnostics.catalogue import MISMEASURED_M, UNSEEN_MOVE_M, lever_arm_m, to_other_side_m
-from rangesfm.diagnostics.hypothesis import (
+from rangesfm.measurements.ranges.mistakes.catalogue import MISMEASURED_M, UNSEEN_MOVE_M, lever_arm_m, to_other_side_m
+from rangesfm.measurements.ranges.mistakes.hypothesis import (
     Correction,
     Hypothesis,
     duration_s,
@@ -19,8 +19,8 @@ from rangesfm.diagnostics.hypothesis import (
     of_bins,
     too_long,
 )
-from rangesfm.diagnostics.linearized import Linearized
-from rangesfm.estimation.scale.range_equation import antenna_positions
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
+from rangesfm.measurements.ranges.scale.range_equation import antenna_positions
 from rangesfm.solver.mistakes import in_axes
 
 # Ranges between the true time of a step and the tried time fit neither way, so the best time is refined afterwards.

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Indices
-from rangesfm.diagnostics.alternatives import LEAST_USED
-from rangesfm.diagnostics.bent_path import drifts
-from rangesfm.diagnostics.hypothesis_tests import Test, row_of
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, linearized, near_m
-from rangesfm.diagnostics.mistake_words import mistake_in_words
-from rangesfm.diagnostics.mistakes import Cause, Findings, find_mistakes
+from rangesfm.measurements.mistake_words import mistake_in_words
+from rangesfm.measurements.ranges.mistakes.alternatives import LEAST_USED
+from rangesfm.measurements.ranges.mistakes.bent_path import drifts
+from rangesfm.measurements.ranges.mistakes.find_mistakes import Cause, Findings, find_mistakes
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Test, row_of
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized, RangesOnMap, linearized, near_m
 from rangesfm.measurements.ranges.range_observations import DOWN_WEIGHTED_BELOW, OUTLIER_BELOW
 from rangesfm.solver.mistakes import MistakeTest, MistakeTests
 from rangesfm.util.geometry.numerics import DOUBTFUL_ABOVE

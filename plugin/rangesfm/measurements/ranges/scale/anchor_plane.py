@@ -6,14 +6,12 @@ import numpy as np
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.range_equation import RangeFit, RangeProblem, RangeState
+from rangesfm.measurements.ranges.scale.range_equation import RangeFit, RangeProblem, RangeState
 from rangesfm.util.geometry.gravity import UP_IN_SITE
 from rangesfm.util.geometry.similarity import PathShape, Similarity, path_shape
 
 # Anchors are coplanar if their extent across the plane is below this share of their second largest extent.
 _COPLANAR = 0.1
-# Anchors are on a line if their second largest extent is at most this share of the largest.
-_COLLINEAR = 0.02
 # Angle from the vertical, degrees, below which a line or a plane stands upright. Gravity does not fix the turn about
 # such a line, and nothing is above or below such a plane.
 _UPRIGHT_DEG = 20.0
@@ -45,18 +43,13 @@ def anchor_plane(problem: RangeProblem) -> tuple[Array, Array] | None:
     return shape.centroid, normal / np.linalg.norm(normal)
 
 
-def is_line(anchors: PathShape) -> bool:
-    """Return True if the positions leave a turn about their line open."""
-    return bool(anchors.stddevs[1] <= _COLLINEAR * anchors.stddevs[0])
-
-
 def are_on_line(places_m: Array) -> bool:
     """Return True if places (n, 3) leave a turn about their line open, also without any one of them.
 
     One that is wrong by hundreds of metres makes a line of all.
     """
     without_one = (np.delete(places_m, k, axis=0) for k in range(len(places_m)))
-    return is_line(path_shape(places_m)) and all(is_line(path_shape(some)) for some in without_one)
+    return path_shape(places_m).is_line and all(path_shape(some).is_line for some in without_one)
 
 
 def is_steep(anchors: PathShape) -> bool:

@@ -7,7 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Array, Indices
-from rangesfm.estimation.scale.range_equation import (
+from rangesfm.measurements.ranges.errors.components import CLOCKS, PLACES, OtherError
+from rangesfm.measurements.ranges.errors.learned import LearnedErrors, radio_components, widened
+from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
+from rangesfm.measurements.ranges.scale.range_equation import (
     RangeProblem,
     columns_of,
     fit_at,
@@ -18,11 +21,8 @@ from rangesfm.estimation.scale.range_equation import (
     range_jacobian,
     state_after,
 )
-from rangesfm.estimation.scale.scale_problem import ScaleProblem
-from rangesfm.estimation.scale.solution import Solution
-from rangesfm.measurements.ranges.errors.components import CLOCKS, PLACES, OtherError
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors, radio_components, widened
-from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
+from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.solver.bending import BENDS
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, Observations, Posterior
 

@@ -8,10 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis_tests import Factorization
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap, after_step, at_state, is_nearly_at, linearized
-from rangesfm.estimation.scale.range_equation import RangeState, antenna_positions
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
+from rangesfm.measurements.ranges.mistakes.linearized import (
+    Linearized,
+    RangesOnMap,
+    after_step,
+    at_state,
+    is_nearly_at,
+    linearized,
+)
+from rangesfm.measurements.ranges.scale.range_equation import RangeState, antenna_positions
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import path_shape
 

@@ -10,9 +10,6 @@ import numpy as np
 
 from rangesfm.arrays import Array, Indices, Mask
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.estimation.scale.anchor_plane import are_on_line, is_steep
-from rangesfm.estimation.scale.placement_prior import PlacementPrior
-from rangesfm.estimation.scale.range_equation import RangeProblem
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances, surveyed_distances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
@@ -21,6 +18,9 @@ from rangesfm.measurements.ranges.errors.noise import START_STDDEV_M
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.radio import lengths_by_radio
 from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.anchor_plane import are_on_line, is_steep
+from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem
 from rangesfm.options import RangeModelOptions
 from rangesfm.util.geometry.gravity import Gravity
 from rangesfm.util.geometry.similarity import Similarity, path_shape, rounding_of

@@ -9,8 +9,13 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from rangesfm.arrays import Array, Indices, Mask
-from rangesfm.estimation.scale.binned_ranges import ruled_out
-from rangesfm.estimation.scale.range_equation import (
+from rangesfm.measurements.ranges.errors.components import DRIFT_S, PLACES, WANDERING, OtherError
+from rangesfm.measurements.ranges.errors.learned import LearnedErrors, learn_errors, radio_components
+from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
+from rangesfm.measurements.ranges.range_gradient import RangeGradient
+from rangesfm.measurements.ranges.range_observations import OnPath
+from rangesfm.measurements.ranges.scale.binned_ranges import ruled_out
+from rangesfm.measurements.ranges.scale.range_equation import (
     RangeProblem,
     RangeState,
     antenna_positions,
@@ -20,13 +25,8 @@ from rangesfm.estimation.scale.range_equation import (
     range_jacobian,
     state_after,
 )
-from rangesfm.estimation.scale.scale_problem import ScaleProblem
-from rangesfm.estimation.scale.solution import Solution
-from rangesfm.measurements.ranges.errors.components import DRIFT_S, PLACES, WANDERING, OtherError
-from rangesfm.measurements.ranges.errors.learned import LearnedErrors, learn_errors, radio_components
-from rangesfm.measurements.ranges.errors.range_bins import RangeBins, by_poses, noisiness, range_bins
-from rangesfm.measurements.ranges.range_gradient import RangeGradient
-from rangesfm.measurements.ranges.range_observations import OnPath
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
+from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.linear_map import LinearMap
 from rangesfm.solver.noise import Component, noise_of_sizes, usual_sizes

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rangesfm.arrays import Array, Mask
-from rangesfm.diagnostics.linearized import Linearized, RangesOnMap
-from rangesfm.estimation.scale.range_equation import antenna_positions
 from rangesfm.measurements.ranges.anchors.point_fit import multilaterate
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized, RangesOnMap
+from rangesfm.measurements.ranges.scale.range_equation import antenna_positions
 from rangesfm.util.geometry.numerics import ROUNDING
 
 # Step, in the unit of a hypothesis, of the difference quotient for its effect: then rounding and curvature spoil it by

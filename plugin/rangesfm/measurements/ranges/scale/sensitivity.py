@@ -2,15 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.estimation.scale.range_equation import predicted_ranges, range_gradient
-from rangesfm.estimation.scale.scale_estimate import ScaleSensitivity
-from rangesfm.estimation.scale.scale_problem import ScaleProblem
-from rangesfm.estimation.scale.solution import Solution
 from rangesfm.measurements.ranges.errors.range_bins import RangeBins
+from rangesfm.measurements.ranges.scale.range_equation import predicted_ranges, range_gradient
+from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
+from rangesfm.measurements.ranges.scale.solution import Solution
 from rangesfm.util.geometry.numerics import ROUNDING
+
+
+@dataclass(frozen=True)
+class ScaleSensitivity:
+    """Change of the scale, in percent, per error of the range model; estimated biases absorb their part of it.
+
+    Attributes:
+        common_bias_per_cm: if all ranges were a centimetre longer.
+        short_range_per_cm: if the shorter half of the ranges were a centimetre longer.
+        anchor_bias_per_cm: by anchor id, if the ranges to that anchor were a centimetre longer.
+        range_slope_per_percent: if all ranges were one percent longer.
+        lever_arm_per_cm: if the tag sat a centimetre further along x, y, z of the camera.
+    """
+
+    common_bias_per_cm: float
+    short_range_per_cm: float
+    anchor_bias_per_cm: dict[str, float]
+    range_slope_per_percent: float
+    lever_arm_per_cm: tuple[float, float, float]
+
+
+NOT_KNOWN = ScaleSensitivity(0.0, 0.0, {}, 0.0, (0.0, 0.0, 0.0))
 
 
 def scale_sensitivity(solution: Solution, posed: ScaleProblem, by_bins: Array, bins: RangeBins) -> ScaleSensitivity:

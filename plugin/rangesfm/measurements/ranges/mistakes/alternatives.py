@@ -9,12 +9,18 @@ from itertools import combinations
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis import MEASURE_AGAIN, Correction, corrected, where_ranges_meet
-from rangesfm.diagnostics.linearized import RangesOnMap
-from rangesfm.estimation.scale.range_equation import RangeFit, RangeProblem, RangeState, predicted_ranges, solve
-from rangesfm.estimation.scale.starts import multilaterate_all, spread_rows
+from rangesfm.measurements.ranges.mistakes.hypothesis import MEASURE_AGAIN, Correction, corrected, where_ranges_meet
+from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap
 from rangesfm.measurements.ranges.range_observations import OUTLIER_BELOW
 from rangesfm.measurements.ranges.readers.units import FOOT_M
+from rangesfm.measurements.ranges.scale.range_equation import (
+    RangeFit,
+    RangeProblem,
+    RangeState,
+    predicted_ranges,
+    solve,
+)
+from rangesfm.measurements.ranges.scale.starts import multilaterate_all, spread_rows
 from rangesfm.solver.mistakes import in_axes
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS
 from rangesfm.util.geometry.robust_statistics import CAUCHY

@@ -13,10 +13,10 @@ import numpy as np
 from scipy import special
 
 from rangesfm.arrays import Indices
-from rangesfm.diagnostics.hypothesis import longest_m
-from rangesfm.diagnostics.hypothesis_tests import Factorization
-from rangesfm.diagnostics.linearized import Linearized
 from rangesfm.measurements.ranges.errors.components import BURSTS, LASTING_S
+from rangesfm.measurements.ranges.mistakes.hypothesis import longest_m
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
+from rangesfm.measurements.ranges.mistakes.linearized import Linearized
 from rangesfm.solver.linear_map import FALSE_ALARM_RATE
 from rangesfm.solver.noise import Component
 

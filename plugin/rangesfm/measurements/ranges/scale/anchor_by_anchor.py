@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.estimation.scale.range_equation import RangeProblem, RangeState, solve
-from rangesfm.estimation.scale.scale_problem import MIN_RANGES
-from rangesfm.estimation.scale.solution import Solution
-from rangesfm.estimation.scale.starts import choose_sides
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
+from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, solve
+from rangesfm.measurements.ranges.scale.scale_problem import MIN_RANGES
+from rangesfm.measurements.ranges.scale.solution import Solution
+from rangesfm.measurements.ranges.scale.starts import choose_sides
 from rangesfm.util.geometry.robust_statistics import GEMAN_MCCLURE, MIN_COST_GAP
 
 # An anchor gives no scale of its own if the standard deviation of the scale's logarithm is larger than this.

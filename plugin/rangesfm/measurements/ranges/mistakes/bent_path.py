@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from rangesfm.arrays import Array
-from rangesfm.diagnostics.hypothesis_tests import Factorization
-from rangesfm.diagnostics.linearized import (
+from rangesfm.measurements.ranges.mistakes.hypothesis_tests import Factorization
+from rangesfm.measurements.ranges.mistakes.linearized import (
     Linearized,
     RangesOnMap,
     after_step,
@@ -20,15 +20,9 @@ from rangesfm.diagnostics.linearized import (
     linearized,
     slopes_by_poses,
 )
-from rangesfm.estimation.scale.range_equation import RangeState
-from rangesfm.estimation.scale.scale_by_ranges import RangeScale
-from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.estimation.scale.scale_verdict import doubts_of_ranges, judge, remarks_on_anchors
-from rangesfm.measurements.ranges.range_observations import status_by_weight
-from rangesfm.options import ScaleOptions
+from rangesfm.measurements.ranges.scale.range_equation import RangeState
 from rangesfm.solver.bending import BENDS, WalkBending
 from rangesfm.solver.linear_map import regular
-from rangesfm.solver.posterior import Posterior
 from rangesfm.util.geometry.numerics import MAX_NUM_ROUNDS, SIGNIFICANT_STDDEVS
 from rangesfm.util.geometry.similarity import rmse
 
@@ -97,47 +91,6 @@ def bends_m(on_map: RangesOnMap) -> Array:
 def drifts(problem: Linearized) -> bool:
     """Return whether the ranges moved the poses by more than single ranges scatter: a rigid path then fits worse."""
     return rmse(bends_m(problem.on_map)[:, None]) > problem.scatter_m
-
-
-def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: ScaleOptions) -> ScaleEstimate:
-    """Return the estimate with the similarity that brings the path nearest to where the ranges bend it.
-
-    The estimate is returned unchanged if the bending is smaller than the scatter of the ranges, as a rigid path then
-    fits as well.
-
-    Args:
-        estimate: of the path as one piece. on_map: the path bent to the ranges.
-
-    Raises:
-        GeometryError: refused, because the scale is less certain than ``options.max_relative_stddev`` allows.
-    """
-    ranges, bent_by_m = estimate.find(RangeScale), bends_m(on_map)
-    if ranges is None or not len(bent_by_m):
-        return estimate
-    posed, solution = ranges.posed, ranges.solution
-    problem = linearized(on_map).with_learnt_errors()
-    if not drifts(problem):
-        return estimate
-    known = Posterior.best(problem, problem.errors, estimate.uncertainty.formal)
-    uncertainty, state = known.uncertainty, on_map.state
-    fit = replace(solution.fit, state=state, weights=problem.bins.robust_weight)
-    bent = replace(solution, fit=fit)
-    doubts, remarks = doubts_of_ranges(posed, bent, uncertainty, {}), remarks_on_anchors(bent, estimate.anchors)
-    judged = judge(doubts, remarks, uncertainty, options)
-    positions = zip(estimate.anchors, state.anchors_m, strict=True)
-    drift = f"the path drifts by {rmse(bent_by_m[:, None]):.2g} m (root mean square) from where the ranges have it"
-    status, stddev_m = estimate.observations.status.copy(), estimate.errors.stddev_m.copy()
-    status[posed.rows] = status_by_weight(problem.bins.robust_weight)
-    stddev_m[posed.rows] = problem.scatter_m
-    return estimate.judged(
-        replace(judged, reasons=(*judged.reasons, drift)),
-        metric_from_sfm=state.metric_from_model @ posed.first_camera_from_sfm,
-        uncertainty=uncertainty,
-        placement=known.placement,
-        observations=replace(estimate.observations, status=status),
-        errors=replace(estimate.errors, stddev_m=stddev_m),
-        anchors=tuple(replace(anchor, position_m=at) for anchor, at in positions),
-    )
 
 
 def _bent_once(problem: Linearized) -> RangesOnMap:
