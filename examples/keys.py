@@ -8,9 +8,9 @@ from rangesfm.survey.settings import KEYS, SURVEY_TABLES
 
 HEAD = """# Keys of a survey file
 
-Made by `python examples/keys.py > examples/keys.md`. Every key is optional; `rangesfm run` takes each also as the flag
-beside it, in place of the file's. Paths are relative to the survey file, those of flags to the working directory.
-The [glossary](glossary.md) explains the words.
+Every key is optional. `rangesfm run` takes each also as the flag beside it, which overrides the file. Paths are
+relative to the survey file, those of flags to the working directory. The [glossary](glossary.md) explains the words.
+This page is written by `python examples/keys.py > examples/keys.md`.
 """
 
 
@@ -27,12 +27,15 @@ def main() -> None:
                 flag = f"`--{key.flag}`" + (f", `--no_{key.flag}`" if key.type is bool else "")
                 print(f"| `{key.name}` | {flag} | {cell(key.expected)} | {cell(key.meaning)} |")
         print()
-    print("# Keys of a plan\n\nOf the file that `rangesfm plan` reads; [how to plan a survey](planning.md).\n")
+    print(
+        "# Keys of a plan\n\nThese are for the file that `rangesfm plan` reads; [how to plan a survey](planning.md).\n"
+    )
     for table, options in PLAN_TABLES.items():
         print(f"## [{table}] of a plan\n\n{options.__doc__}\n\n| key | value | meaning |\n|---|---|---|")
         for key in options.keys().values():
             print(f"| `{key.name}` | {cell(key.expected)} | {cell(key.meaning)} |")
         print()
+    print("This is the end of the tour. [Back to its start](../README.md).")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
-from tests.conftest import TAG_IN_CAM_M, TIME_OFFSET_S
+from tests.conftest import SITE_M, TAG_IN_CAM_M, TIME_OFFSET_S
 from tests.simulated.path import loop_path
 
 from rangesfm.cli.arguments import Commands, normalize, parse
@@ -43,12 +43,13 @@ PAGES = (README, *sorted((ROOT / "examples").glob("*.md")))
 # Pages that begin with a model; the others begin with a survey that has photos, run once.
 WITH_A_MODEL = {
     "existing_model",
+    "conventions",
     "unknown_anchors",
-    "calibration",
-    "checks",
-    "refinement",
-    "several_surveys",
+    "lengths",
     "verdicts",
+    "checks",
+    "radios",
+    "many_surveys",
 }
 
 
@@ -91,7 +92,7 @@ def model_folder(
     (folder / "survey.toml").write_text(MODEL_SURVEY)
     shutil.copytree(folder / "sparse", folder / "out" / "sparse")
     path, times = loop_path(42.0, start_s=99.0, seed=3), np.arange(99.5, 140.5, 0.1)
-    tag_m = path.centers(times) + path.world_from_cam(times) @ np.array(TAG_IN_CAM_M)
+    tag_m = SITE_M + path.centers(times) + path.world_from_cam(times) @ np.array(TAG_IN_CAM_M)
     rows = [",".join(map(repr, row)) for row in np.column_stack([times - TIME_OFFSET_S, tag_m]).tolist()]
     (folder / "tag.csv").write_text("\n".join(["timestamp_s,x_m,y_m,z_m", *rows]) + "\n")
     flags = ("survey.toml", "--input_path", "sparse/0", "--output_path", "monday/out", "--no_report")
@@ -199,11 +200,15 @@ def test_links_lead_to_what_is_there(page: Path) -> None:
             assert anchor in {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-def test_every_page_is_linked_from_the_readme() -> None:
+def test_the_pages_are_one_tour() -> None:
+    """The README lists every page once, in the order in which the last line of each leads to the next."""
     text = README.read_text(encoding="utf-8")
-    linked = {Path(target).name for target in re.findall(r"\(examples/([\w.]+)", text)}
-    # radios.md belongs to the page about verdicts, which links it
-    assert {page.name for page in PAGES} - linked - {"README.md"} == {"radios.md"}
+    tour = re.findall(r"\(examples/(\w+\.md)\)", text[text.index("## The tour") : text.index("## Compatibility")])
+    assert sorted(tour) == sorted(page.name for page in PAGES if page != README)
+    last_lines = [(ROOT / "examples" / name).read_text(encoding="utf-8").splitlines()[-1] for name in tour]
+    assert [re.findall(r"^Next\b.*?\]\(([\w.]+)\)", line) for line in last_lines] == [[name] for name in tour[1:]] + [
+        []
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -239,7 +244,7 @@ OF_OTHER_PROGRAMS = {
     "--ref_images_path",
     "--transform_path",
 }
-OF_STUDIES = {"--data", "--leave_radio_out", "--model", "--photos", "--quick", "--room", "--store"}
+OF_STUDIES = {"--data", "--leave_radio_out", "--photos", "--quick", "--room", "--store"}
 
 
 def test_the_survey_file_on_its_page_is_one(tmp_path: Path) -> None:

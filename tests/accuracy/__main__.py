@@ -11,7 +11,7 @@ Each figure is compared with the stored one over the cases that both have: over 
 names differ only in the number at their end, which mostly is the seed. It is worse if more cases are worse, and by
 more, than chance makes so. Prints the table; exit status 1 if a figure is worse.
 
-``--store`` stores the cases, and writes the table into ``examples/measured.md``.
+``--store`` stores the cases, and writes the tables into ``examples/measured.md``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
-from tests.accuracy.figures import Cases, Loss, Values
+from tests.accuracy.figures import Cases, Loss, Values, kind_of
 from tests.accuracy.groups import GROUPS, Group, Task, cases_of
 
 STORED = Path(__file__).with_name("stored.json")
@@ -94,26 +95,35 @@ def rows(found: dict[str, Cases]) -> Iterator[str]:
             yield f"| {group.words} (`{group.name}`) | {len(cases)} | {figures} |"
 
 
-def case_rows(group: Group, cases: Cases) -> Iterator[str]:
-    """Yield a table with the values of each case of a group."""
-    figures = [figure for figure in group.figures if figure.key not in ("covered", "in_stddevs", "named", "refused")]
+def kind_rows(group: Group, cases: Cases) -> Iterator[str]:
+    """Yield a table with the medians of each kind of case of a group."""
+    figures = [
+        replace(figure, over="median")
+        for figure in group.figures
+        if figure.key not in ("covered", "in_stddevs", "named", "refused")
+    ]
     yield f"\n## {group.title}\n"
     yield f"| | {' | '.join(figure.words for figure in figures)} |"
     yield "|---" * (len(figures) + 1) + "|"
-    for case, values in cases.items():
-        yield f"| {case} | {' | '.join(figure.text({case: values}) for figure in figures)} |"
+    for kind in dict.fromkeys(map(kind_of, cases)):
+        of_kind = {case: values for case, values in cases.items() if kind_of(case) == kind}
+        yield f"| {kind} | {' | '.join(figure.text(of_kind) for figure in figures)} |"
 
 
 def store(found: dict[str, Cases]) -> None:
-    """Store the cases, and write the table into the page of what is measured."""
+    """Store the cases with the state that they were measured on, and write the page of what is measured."""
     state = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True)
     content = {"state": state.stdout.strip(), "groups": found}
     STORED.write_text(json.dumps(content, indent=0, sort_keys=True) + "\n", encoding="utf-8")
-    page = PAGE.read_text(encoding="utf-8")
-    before, rest = page.split(BEGIN)
-    of_cases = [row for group in GROUPS if group.title for row in case_rows(group, found.get(group.name, {}))]
-    table = "\n".join([f"\nMeasured on `{state.stdout.strip()}`:\n", *rows(found), *of_cases, "\n"])
-    PAGE.write_text(before + BEGIN + table + END + rest.split(END, 1)[1], encoding="utf-8")
+    write_page(found)
+
+
+def write_page(found: dict[str, Cases]) -> None:
+    """Write the tables into the page of what is measured."""
+    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    of_kinds = [row for group in GROUPS if group.title for row in kind_rows(group, found.get(group.name, {}))]
+    tables = "\n".join(["", *rows(found), *of_kinds, "\n"])
+    PAGE.write_text(before + BEGIN + tables + END + rest.split(END, 1)[1], encoding="utf-8")
 
 
 if __name__ == "__main__":

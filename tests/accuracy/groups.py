@@ -227,8 +227,8 @@ MISTAKE_FIGURES = (
     Figure("found", "found", "mean", "%", "lower"),
     Figure("named first", "first", "mean", "%", "lower"),
     Figure("good with a wrong scale or place", "good_and_wrong", "mean", "%", "higher"),
-    Figure("clean ones with a mistake named", "clean_named", "mean", "%", "higher"),
-    Figure("doubted", "clean_doubted", "mean", "%", "higher"),
+    Figure("named without one", "clean_named", "mean", "%", "higher"),
+    Figure("doubtful without one", "clean_doubted", "mean", "%", "higher"),
 )
 
 
@@ -414,7 +414,7 @@ GROUPS: Sequence[Group] = (
             RMSE,
             Figure("after SE(3)", "rmse_se3", "median", "m", "higher"),
             Figure("after Sim(3)", "rmse_sim3", "median", "m", "higher"),
-            Figure("time after the mapping, of that up to it", "after_mapping", "median", "%", None),
+            Figure("time after the mapping over that until then", "after_mapping", "median", "%", None),
         ),
         room_tasks,
         "The hand-held room",
@@ -427,7 +427,7 @@ GROUPS: Sequence[Group] = (
     ),
     Group(
         "drifting maps",
-        "Clean surveys whose maps drift: laps, halls, paths without points",
+        "Surveys whose maps drift: laps, halls, paths without points",
         (*scale_figures(), RMSE, PLACES, Figure("better refinements kept", "kept", "mean", "%", "lower")),
         lap_tasks,
     ),
@@ -440,7 +440,7 @@ GROUPS: Sequence[Group] = (
     ),
     Group(
         "random surveys",
-        "Whole honest surveys drawn at random over all that users have, by commands",
+        "Surveys drawn at random over all kinds of input, run by commands",
         (
             *scale_figures()[:4],
             Figure("good with a wrong scale", "good_and_wrong", "mean", "%", "higher"),
@@ -448,7 +448,7 @@ GROUPS: Sequence[Group] = (
         ),
         random_tasks,
     ),
-    Group("mistakes", "Surveys with a mistake, and clean ones", MISTAKE_FIGURES, mistake_tasks),
+    Group("mistakes", "Surveys with a mistake, and without one", MISTAKE_FIGURES, mistake_tasks),
     Group(
         "growth",
         "500 and 2000 keyframes with loops, refined",

@@ -76,7 +76,7 @@ def test_what_there_is_of_cuda_is_said_and_is_never_wrong(
 
 
 def test_no_wheel_of_pycolmap_solves_a_bundle_adjustment_on_a_gpu() -> None:
-    """examples/gpu.md says so. If this test fails, try a GPU with range residuals and update that page."""
+    """examples/big_surveys.md says so. If this test fails, try a GPU with range residuals and update that page."""
     code = """if True:
         import pycolmap  # and not pyceres, which has a Ceres of its own
         options = pycolmap.BundleAdjustmentOptions().ceres.solver_options
