@@ -59,8 +59,7 @@ ON_MAP = ("range_scale", "length_scale", "position_scale")
 KINDS = {
     name
     for name in MODULES
-    if name.startswith("measurements.")
-    and name.split(".")[-1] in (*OF_FIT, *ON_MAP, *OF_SENSOR)
+    if name.startswith("measurements.") and name.split(".")[-1] in (*OF_FIT, *ON_MAP, *OF_SENSOR)
 }
 
 
