@@ -28,8 +28,8 @@ _SCALE_ALONE = (
     "(rangesfm run and rangesfm refine make one, with [refine] covariance); bends of the map are not in them"
 )
 _NO_HEIGHTS = (
-    "no height differences: the map is in the first camera's frame, and nobody said which way is up (surveyed anchors, "
-    "or [scale] up_in_first_camera)"
+    "no height differences: the map is in the first camera's frame, and its upward direction is unknown (surveyed "
+    "anchors, an inertial sensor or [scale] up_in_first_camera give it)"
 )
 
 
