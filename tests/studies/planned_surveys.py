@@ -36,7 +36,7 @@ from rangesfm.measurements.ranges.errors.components import COMPONENTS, stddevs_i
 from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.range_equation import RangeState
-from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
 from rangesfm.measurements.ranges.scale.solution import solution_from
 from rangesfm.options import ScaleOptions
 from rangesfm.planning.expected import Expected, expect
@@ -213,9 +213,8 @@ def one_run(planned: PlannedSurvey, keyframe: int | None, seed: int, *, is_whole
             )
             metric_from_map, found["stated"] = estimate.metric_from_sfm, estimate.uncertainty.empirical
         else:
-            posed = scale_problem(
-                observations, trajectory, anchors, planned.anchor_frame, planned.range_model, distances
-            )
+            given = (observations, trajectory, anchors, planned.anchor_frame, planned.range_model, distances)
+            posed = scale_problem(RangesOnPath(*given))
             fit = solution_from(posed, truth(planned, posed)).fit
             metric_from_map = fit.state.metric_from_model @ posed.first_camera_from_sfm
     except GeometryError as error:

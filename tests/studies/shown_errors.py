@@ -21,9 +21,8 @@ from rangesfm.measurements.ranges.errors.components import components
 from rangesfm.measurements.ranges.errors.learned import learn_errors, radio_components
 from rangesfm.measurements.ranges.scale.binned_ranges import binned_ranges
 from rangesfm.measurements.ranges.scale.range_equation import predicted_ranges
-from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, scale_problem
 from rangesfm.measurements.ranges.scale.solution import solve_scale
-from rangesfm.options import RangeModelOptions
 
 # Medians that the logs' errors suggest at first sight, metres, and below them how far each log may differ.
 START = {"white": 0.05, "time": 0.04, "drift": 0.01, "place": 0.03, "view": 0.035, "bias": 0.045, "common_bias": 0.2}
@@ -58,8 +57,8 @@ def shown(data: Path, described: dict[str, object]) -> dict[str, float]:
     path = path_of(reference)
     case = next(case for case in cases(log, anchors, path) if case.name == "known")
     observations = placed(log, case, path, described, by_photo=False)
-    posed = scale_problem(observations, path, case.anchors, case.frame, RangeModelOptions())
-    solution = solve_scale(posed, camera_side=None, seed=0)
+    posed = scale_problem(RangesOnPath(observations, path, case.anchors, case.frame))
+    solution = solve_scale(posed)
     state = solution.fit.state
     true = replace(
         state,

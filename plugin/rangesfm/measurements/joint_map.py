@@ -45,18 +45,37 @@ class Doubt(NamedTuple):
     advice: str = ""
 
 
-class KindOnMap(ABC):
-    """Measurements of one kind, located in a map that moves as a whole."""
+class Located(ABC):
+    """Measurements of one kind in a map, where they are found beside those of all others."""
 
     kind: ClassVar[str]
     """Name of the kind."""
+
+    @abstractmethod
+    def beside(self, others: Sequence[KindOnMap]) -> KindOnMap:
+        """Return them on the map, given the kinds that need no others to be found."""
+
+
+class KindOnMap(Located):
+    """Measurements of one kind, located in a map that moves as a whole."""
+
+    is_solved: ClassVar[bool] = False
+    """Whether they were solved with unknowns of their own, so that a map with them is linear about their solution."""
     fit_places_map: ClassVar[bool] = False
     """Whether a map at rest keeps the place of its fit, whose covariance is then the place's. Else it is moved as a
     whole to the best estimate, as for errors that last, which the fit does not know."""
 
+    notes: tuple[str, ...] = ()
+    """What is said of them whatever becomes of the map, in words."""
+
     @property
     def words(self) -> str:
         """What they are, for people."""
+        return self.kind
+
+    @property
+    def method(self) -> str:
+        """How they give a map its scale, if it rests on them first of all."""
         return self.kind
 
     @property
@@ -112,6 +131,20 @@ class KindOnMap(ABC):
             is_last: whether it was found before which are left out, so that they are only tested.
         """
         del placed, others, is_last
+        return self
+
+    def beside(self, others: Sequence[KindOnMap]) -> Self:
+        """Return them as they are."""
+        del others
+        return self
+
+    def with_their_share(self) -> Self:
+        """Return them as they count beside other kinds."""
+        return self
+
+    def concluded(self, on_map: JointMap) -> Self:
+        """Return them with what the whole map says of them."""
+        del on_map
         return self
 
     def moved(self, known: Posterior) -> Self:
@@ -226,6 +259,10 @@ class JointMap:
         problem = self.problem.without(kind, name)
         return replace(self, problem=problem, posterior=problem.posterior(is_refined=True))
 
+    def concluded(self) -> JointMap:
+        """Return the map with what it says of each kind."""
+        return replace(self, kinds=tuple(kind.concluded(self) for kind in self.kinds))
+
     def moved(self) -> tuple[KindOnMap, ...]:
         """Return the kinds on the map that was moved to its estimate."""
         return tuple(kind.moved(self.posterior) for kind in self.kinds)
@@ -293,6 +330,12 @@ def tested_kinds(
     )
 
 
+def beside_others(located: Sequence[Located], others: Sequence[KindOnMap]) -> tuple[KindOnMap, ...]:
+    """Return all kinds on the map in their order, those that need others to be found beside these."""
+    found = {each.kind: each for each in others}
+    return tuple(found[each.kind] if each.kind in found else each.beside(others) for each in located)
+
+
 def join_kinds(
     kinds: Sequence[KindOnMap], path: Trajectory, placed: Similarity, bending: MapBending, *, is_at_rest: bool = False
 ) -> JointMap:
@@ -314,14 +357,19 @@ def join_kinds(
 def fit_kinds(kinds: Sequence[KindOnMap], path: Trajectory, placed: Similarity, bending: MapBending) -> JointMap:
     """Join all measurements at the placement that they give, starting from another one.
 
-    The equations are not linear in the logarithm of the scale.
+    The equations are not linear in the logarithm of the scale. Kinds that were solved have theirs at their solution.
     """
-    for _ in range(MAX_NUM_ROUNDS):
+    for _ in range(1 if any(each.is_solved for each in kinds) else MAX_NUM_ROUNDS):
         found = join_kinds(kinds, path, placed, bending)
         if abs(found.posterior.step[0]) < NEGLIGIBLE_STDDEVS**2 * found.posterior.uncertainty.empirical:
             break
         placed = found.estimate
     return found
+
+
+def place_first(kinds: Sequence[KindOnMap]) -> KindOnMap:
+    """Return the kind at whose placement a map starts: the first that places it, or the first of all."""
+    return next((each for each in kinds if each.places_map), kinds[0])
 
 
 def upward_by(kinds: Sequence[KindOnMap], given: Gravity | None) -> Gravity | None:

@@ -30,7 +30,16 @@ from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
 from rangesfm.estimation.scale.scale_verdict import refuse_unknown
 from rangesfm.estimation.vision_information import LoopPoses
 from rangesfm.estimation.with_ranges import summarize
-from rangesfm.measurements.joint_map import Doubt, JointMap, find_kind, join_kinds, tested_kinds, upward_by
+from rangesfm.measurements.joint_map import (
+    Doubt,
+    JointMap,
+    KindOnMap,
+    beside_others,
+    find_kind,
+    join_kinds,
+    tested_kinds,
+    upward_by,
+)
 from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.lengths.length_scale import LengthScale
 from rangesfm.measurements.lengths.locate_lengths import surveyed_distances
@@ -45,7 +54,7 @@ from rangesfm.measurements.ranges.mistakes.anchor_sides import likelier_sides
 from rangesfm.measurements.ranges.mistakes.bent_path import bends_m, bent_to_ranges
 from rangesfm.measurements.ranges.mistakes.diagnosis import Diagnosis, causes_in_words, diagnose_ranges
 from rangesfm.measurements.ranges.mistakes.linearized import RangesOnMap, ranges_on_map
-from rangesfm.measurements.ranges.radio import RadioLog, ranges_of, ranges_of_map
+from rangesfm.measurements.ranges.radio import RadioLog, ranges_of_map
 from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
 from rangesfm.measurements.source import Measured
@@ -162,7 +171,7 @@ def scale_by_survey(run: SurveyRun, path: PathOfModel, *, is_a_start: bool) -> M
     if not is_a_start and (on_map := _ranges_on_scaled(estimate, bending)) is not None:
         sides = likelier_sides(on_map)
         on_map, estimate = sides.on_map, estimate_by_bent(estimate, sides.on_map, survey.scale)
-        estimate = replace(estimate, anchors=sides.applied_to(estimate.anchors))
+        estimate = estimate.with_anchors(sides.applied_to(estimate.anchors))
     rivals = _by_rivals(run, path, estimate)
     scaled = rescale(path.sfm, estimate.metric_from_sfm)
     ranges = _ranges(run, path.trajectory, estimate, estimate.anchors)
@@ -357,7 +366,7 @@ def _given_ranges(run: SurveyRun, metric: MetricResult) -> Ranges:
     """Return the ranges of a scaled map, with the errors that all other measurements may correct."""
     estimate = metric.estimate
     ranges = _ranges(run, metric.trajectory, estimate, metric.anchors)
-    return replace(ranges, shared_errors_m=estimate.shared_errors_m)
+    return replace(ranges, shared_errors_m=estimate.ranges.shared_errors_m)
 
 
 def _ranges(run: SurveyRun, path: Trajectory, estimate: ScaleEstimate, anchors: Sequence[AnchorEstimate]) -> Ranges:
@@ -396,6 +405,7 @@ def _finished(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> RefinedM
         if survey.refine.time_offset_stddev_s and at.find(RangeScale) is not None:
             at = at.without(RANGES, CLOCKS)
         factor = at.problem.bending_factor
+        at = at.concluded()
         for kind in at.kinds:
             rest = rest.with_learnt(kind.learnt_errors(at))
     covariance = None
@@ -441,7 +451,7 @@ def _with_anchors_on_likelier_sides(run: SurveyRun, start: MetricResult, refined
     if at is None or metric.kept_refinement is None:
         return refined
     sides = likelier_sides(ranges_on_map(at.posed, at.solution, at.bending))
-    estimate = replace(start.estimate, anchors=sides.applied_to(start.estimate.anchors))
+    estimate = start.estimate.with_anchors(sides.applied_to(start.estimate.anchors))
     if sides.has_crossed:
         again = refine_map(run, replace(start, estimate=estimate))
         return refined if again.metric.kept_refinement is None else again
@@ -471,12 +481,13 @@ def _measured_at_rest(run: SurveyRun, metric: MetricResult, rest: MapAtRest) -> 
     scale = align_points(metric.trajectory.centers[is_firm], path.centers[is_firm]).scale
     bending = _bending_at_rest(rest, path, scale)
     inputs = replace(run.inputs, tape=metric.tape, positions=metric.positions)
-    others, _ = kinds_in_map(inputs, MapOfPhotos(model, path, bending, scale, rest.state.blocks, start.kinds))
-    kinds = tested_kinds(others, IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True) if others else ()
-    if (before := start.find(RangeScale)) is not None:
-        ranges = ranges_of(rest.problem.kinds, _given_ranges(run, metric))
-        kinds = (before.on_refined_map(path, scale, ranges, rest.state, kinds, bending), *kinds)
-    return replace(join_kinds(kinds, path, IDENTITY, bending, is_at_rest=True), metres_per_unit=scale)
+    of_model = MapOfPhotos(model, path, bending, run.survey, metric.observations, scale, start.kinds, rest)
+    located, _ = kinds_in_map(inputs, of_model)
+    others = tested_kinds(
+        [each for each in located if isinstance(each, KindOnMap)], IDENTITY, MAX_NUM_OBSERVATIONS, is_last=True
+    )
+    joined = join_kinds(beside_others(located, others), path, IDENTITY, bending, is_at_rest=True)
+    return replace(joined, metres_per_unit=scale)
 
 
 def judge_map(run: SurveyRun, metric: MetricResult, known_doubts: Sequence[Doubt]) -> MetricResult:

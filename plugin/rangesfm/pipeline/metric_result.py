@@ -197,8 +197,7 @@ class MetricResult:
         estimate = replace(
             self.estimate,
             metric_from_sfm=shift @ self.estimate.metric_from_sfm,
-            anchors=tuple(_moved_anchor(anchor, offset_m) for anchor in self.estimate.anchors),
-        )
+        ).with_anchors(tuple(_moved_anchor(anchor, offset_m) for anchor in self.estimate.anchors))
         refinement = self.refinement and replace(
             self.refinement, anchors=tuple(_moved_anchor(anchor, offset_m) for anchor in self.refinement.anchors)
         )

@@ -24,7 +24,7 @@ from rangesfm.measurements.ranges.range_log import RangeLog
 from rangesfm.measurements.ranges.range_observations import RangeObservations
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeState
-from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem, scale_problem
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
 from rangesfm.option_model import Options
 from rangesfm.options import AssociationOptions, RangeModelOptions
 from rangesfm.planning.planned_photos import PlannedPhotos
@@ -213,7 +213,7 @@ class PlannedSurvey:
         from_site = self.site_from_first_camera.inverse() if self.anchor_frame == "first_camera" else IDENTITY
         told = [replace(a, position_m=from_site.apply(at)) for a, at in zip(self.anchors, self.anchors_m, strict=True)]
         given = (observations, self.trajectory, told, self.anchor_frame, self.range_model, self.taped_lengths)
-        return scale_problem(*given, placement=placement)
+        return scale_problem(RangesOnPath(*given), placement)
 
     def state(self, posed: ScaleProblem) -> RangeState:
         """Return the true state in the frame of the problem."""

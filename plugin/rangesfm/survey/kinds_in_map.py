@@ -1,32 +1,39 @@
-"""The table of kinds: what a survey has measured besides ranges, located in a map. No stage names a kind."""
+"""The table of kinds: what a survey has measured, located in a map. No stage names a kind."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError
+from rangesfm.estimation.refinement import MapAtRest
 from rangesfm.measurements.gravity import Upwards
 from rangesfm.measurements.imu.inertial_fit import InertialProblem
 from rangesfm.measurements.imu.inertial_scale import IMU, InertialScale, scale_by_sensor
-from rangesfm.measurements.joint_map import JointMap, KindOnMap, find_kind
+from rangesfm.measurements.joint_map import JointMap, KindOnMap, Located, find_kind
 from rangesfm.measurements.kind import Block
 from rangesfm.measurements.lengths.cost import TapedLengths
 from rangesfm.measurements.lengths.length_scale import LengthScale, lengths_between_points
 from rangesfm.measurements.lengths.lengths_on_map import LENGTHS
-from rangesfm.measurements.lengths.locate_lengths import locate_distances
+from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, locate_distances
 from rangesfm.measurements.lengths.tape import Tape
 from rangesfm.measurements.positions.cost import ARM, CLOCK
 from rangesfm.measurements.positions.grouped_positions import POSITIONS
 from rangesfm.measurements.positions.position_scale import PositionScale, scale_by_positions
 from rangesfm.measurements.positions.surveyed_positions import SurveyedPositions
+from rangesfm.measurements.ranges.cost import Ranges
+from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.binned_ranges import RANGES
+from rangesfm.measurements.ranges.scale.range_scale import RangesAtRest, RangeScale, RangesToSolve
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
 from rangesfm.measurements.source import Source
 from rangesfm.solver.bending import MapBending
 from rangesfm.survey.inputs import RangingInputs
-from rangesfm.util.geometry.gravity import Gravity
+from rangesfm.survey.settings import Survey
+from rangesfm.util.geometry.gravity import Gravity, gravity_of
 from rangesfm.util.geometry.similarity import IDENTITY
 from rangesfm.util.geometry.trajectory import Trajectory
 
@@ -37,21 +44,43 @@ class MapOfPhotos:
 
     Attributes:
         model: the map. path: of its keyframes. bending: of the map.
+        survey: options. observations: ranges of the log on the path of the unscaled model.
         metres_per_unit: of the unscaled model, in the world of the path.
-        blocks: parameters that a refinement of the map has estimated, by name.
         before: the kinds on the map before its refinement; empty for a map that moves as one piece.
+        rest: the map at rest; None for a map that moves as one piece.
     """
 
     model: pycolmap.Reconstruction
     path: Trajectory
     bending: MapBending
+    survey: Survey
+    observations: RangeObservations
     metres_per_unit: float = 1.0
-    blocks: Mapping[Block, Array] = field(default_factory=dict)
     before: tuple[KindOnMap, ...] = ()
+    rest: MapAtRest | None = None
+
+
+def _ranges(inputs: RangingInputs, at: MapOfPhotos) -> Located | None:
+    survey, before, distances = at.survey, find_kind(at.before, RangeScale), NO_DISTANCES
+    if not len(inputs.log):
+        return None
+    if at.rest is not None and before is not None:
+        [ranges] = (kind for kind in at.rest.problem.kinds if isinstance(kind, Ranges))
+        return RangesAtRest(before, at.path, at.metres_per_unit, ranges, at.rest.state, at.bending)
+    if inputs.tape.distances:
+        distances = locate_distances(inputs.tape, at.model, inputs.log.anchor_ids)
+    given = RangesOnPath(
+        *(at.observations, at.path, inputs.anchors, inputs.anchor_frame, survey.ranges, distances),
+        gravity=gravity_of(survey.scale.up_in_first_camera),
+        camera_side=survey.scale.camera_side,
+        site=inputs.site,
+        seed=survey.output.seed,
+    )
+    return RangesToSolve(given, at.bending)
 
 
 def _positions(inputs: RangingInputs, at: MapOfPhotos) -> PositionScale | None:
-    surveyed = _with_antenna_at(inputs.positions, at.blocks)
+    surveyed = _with_antenna_at(inputs.positions, {} if at.rest is None else at.rest.state.blocks)
     known = surveyed.located(at.model, at.path)
     if known is None or known.is_check.all():
         return None
@@ -90,22 +119,28 @@ def _inertial(inputs: RangingInputs, at: MapOfPhotos) -> InertialScale | None:
     return scale_by_sensor(problem, at.bending, at.metres_per_unit)
 
 
-KINDS: dict[str, Callable[[RangingInputs, MapOfPhotos], KindOnMap | None]] = {
+KINDS: dict[str, Callable[[RangingInputs, MapOfPhotos], Located | None]] = {
+    RANGES: _ranges,
     POSITIONS: _positions,
     LENGTHS: _lengths,
     IMU: _inertial,
 }
-"""How each kind is located in a map, by its name. Without ranges, the first that is used decides what is doubtful."""
-_WORDS = {POSITIONS: "known positions", LENGTHS: "known lengths", IMU: "readings of the inertial sensor"}
+"""How each kind is located in a map, by its name. The first that is used decides what is doubtful."""
+_WORDS = {
+    RANGES: "ranges",
+    POSITIONS: "known positions",
+    LENGTHS: "known lengths",
+    IMU: "readings of the inertial sensor",
+}
 
 
-def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[KindOnMap, ...], tuple[str, ...]]:
+def kinds_in_map(inputs: RangingInputs, at: MapOfPhotos) -> tuple[tuple[Located, ...], tuple[str, ...]]:
     """Return the kinds in a map, and why others are not used, in words.
 
     Raises:
         InputError: a measurement cannot be in the map. GeometryError: what was used before no longer can be.
     """
-    found, remarks = list[KindOnMap](), list[str]()
+    found, remarks = list[Located](), list[str]()
     for kind, locate in KINDS.items():
         if at.before and all(kind != each.kind for each in at.before):
             continue

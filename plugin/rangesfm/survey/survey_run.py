@@ -11,14 +11,14 @@ import pycolmap
 
 from rangesfm.arrays import Array
 from rangesfm.errors import GeometryError, InputError
-from rangesfm.estimation.scale.initialize import initialize_scale
+from rangesfm.estimation.scale.initialize import estimate_scale
 from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
-from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, locate_distances
 from rangesfm.measurements.ranges.association import associate
 from rangesfm.measurements.ranges.clock.offset import TimeOffset
 from rangesfm.measurements.ranges.clock.time_offset import estimate_time_offset
 from rangesfm.measurements.ranges.range_log import RangeKind
 from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, hold_out
+from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.progress import Journal
 from rangesfm.solver.bending import MapBending, WalkBending
 from rangesfm.survey.inputs import RangingInputs
@@ -117,7 +117,7 @@ class SurveyRun:
         return hold_out(placed, options, self.survey.output.seed)
 
     def estimate_scale(self, path: PathOfModel, bending: MapBending | None = None) -> ScaleEstimate:
-        """Estimate the scale of a model by ``initialize_scale``, with the options and measured lengths of the survey.
+        """Estimate the scale of a model by all that the survey has measured in it.
 
         Args:
             path: model with the ranges on its path.
@@ -126,28 +126,14 @@ class SurveyRun:
         Raises:
             GeometryError: the scale is not determined.
         """
-        survey, inputs, distances = self.survey, self.inputs, NO_DISTANCES
-        bending = bending or WalkBending(in_first_camera(path.trajectory))
-        others, remarks = kinds_in_map(inputs, MapOfPhotos(path.sfm, path.trajectory, bending))
-        if not (others or len(inputs.log)):
+        bending, log = bending or WalkBending(in_first_camera(path.trajectory)), path.observations
+        at = MapOfPhotos(path.sfm, path.trajectory, bending, self.survey, log)
+        located, remarks = kinds_in_map(self.inputs, at)
+        if not located:
             why = remarks or ("nothing that was measured is in the map",)
             raise GeometryError(f"the scale is not determined: {'; '.join(why)}")
-        if inputs.tape.distances and len(inputs.log):
-            distances = locate_distances(inputs.tape, path.sfm, path.observations.log.anchor_ids)
-        found = initialize_scale(
-            path.observations,
-            path.trajectory,
-            inputs.anchors,
-            anchor_frame=inputs.anchor_frame,
-            options=survey.scale,
-            range_model=survey.ranges,
-            distances=distances,
-            others=others,
-            bending=bending,
-            site=inputs.site,
-            seed=survey.output.seed,
-        )
-        return found.remarked(remarks)
+        begun = RangeEstimate.begun(log, self.survey.ranges)
+        return estimate_scale(located, path.trajectory, bending, self.survey.scale, begun).remarked(remarks)
 
 
 def _why_no_range_has_a_place(placed: RangeObservations, trajectory: Trajectory, offset_s: float) -> str:

@@ -14,14 +14,13 @@ from tests.simulated.range_problem import range_problem
 from rangesfm.demo.simulated_radio import Radio
 from rangesfm.measurements.ranges.scale import starts
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, predicted_ranges
-from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, scale_problem
 from rangesfm.measurements.ranges.scale.starts import (
     choose_sides,
     complete_unknown_anchors,
     site_starts,
     sphere_swaps,
 )
-from rangesfm.options import RangeModelOptions
 from rangesfm.util.geometry.gravity import UP_IN_SITE, Gravity
 from rangesfm.util.geometry.similarity import IDENTITY, Similarity, path_shape
 
@@ -49,7 +48,7 @@ def placed_at(similarity: Similarity, num: int = 60, gravity: Gravity | None = N
 
 def unknown_anchors(survey: Survey) -> RangeProblem:
     anchors = survey.anchors("unknown", "")
-    return scale_problem(survey.observations(), survey.trajectory, anchors, "unknown", RangeModelOptions()).ranges
+    return scale_problem(RangesOnPath(survey.observations(), survey.trajectory, anchors, "unknown")).ranges
 
 
 @pytest.mark.parametrize("seed", range(4))

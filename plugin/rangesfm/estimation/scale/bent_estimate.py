@@ -51,7 +51,10 @@ def estimate_by_bent(estimate: ScaleEstimate, on_map: RangesOnMap, options: Scal
         metric_from_sfm=state.metric_from_model @ posed.first_camera_from_sfm,
         uncertainty=uncertainty,
         placement=known.placement,
-        observations=replace(estimate.observations, status=status),
-        errors=replace(estimate.errors, stddev_m=stddev_m),
-        anchors=tuple(replace(anchor, position_m=at) for anchor, at in positions),
+        ranges=replace(
+            estimate.ranges,
+            observations=replace(estimate.observations, status=status),
+            errors=replace(estimate.errors, stddev_m=stddev_m),
+            anchors=tuple(replace(anchor, position_m=at) for anchor, at in positions),
+        ),
     )

@@ -1,35 +1,41 @@
-"""Scale initialisation: metres per SfM unit, and their uncertainty, from ranges and an unscaled path."""
+"""Scale initialisation: metres per SfM unit, and their uncertainty, from all that is measured in an unscaled map.
+
+These are steps 1 and 2 of section 5 of ``model.md``, and what follows from them for a map that is only scaled.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from rangesfm.errors import GeometryError
-from rangesfm.estimation.scale.scale_estimate import ScaleEstimate
+from rangesfm.estimation.scale.scale_estimate import ScaleEstimate, told_of_ranges
 from rangesfm.estimation.scale.scale_verdict import judge_map_of_kinds
-from rangesfm.measurements.joint_map import KindOnMap, fit_kinds, join_kinds, tested_kinds, upward_by
+from rangesfm.measurements.joint_map import (
+    JointMap,
+    KindOnMap,
+    Located,
+    beside_others,
+    fit_kinds,
+    place_first,
+    tested_kinds,
+)
 from rangesfm.measurements.lengths.locate_lengths import NO_DISTANCES, LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import Anchor
 from rangesfm.measurements.ranges.anchors.site import Site
-from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
-from rangesfm.measurements.ranges.range_observations import RangeObservations, RangeStatus, status_by_weight
-from rangesfm.measurements.ranges.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
-from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, shared_errors_m
-from rangesfm.measurements.ranges.scale.doubts import levelled_places
-from rangesfm.measurements.ranges.scale.range_scale import RangeScale, placement_by, with_lengths
-from rangesfm.measurements.ranges.scale.scale_problem import scale_problem
-from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN, scale_sensitivity
-from rangesfm.measurements.ranges.scale.solution import OpenPlaceError, Solution, solution_from, solve_scale
-from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
+from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+from rangesfm.measurements.ranges.scale.range_scale import RangesToSolve
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath
+from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN
 from rangesfm.options import RangeModelOptions, ScaleOptions
 from rangesfm.solver.bending import MapBending, WalkBending
-from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, ScaleUncertainty
+from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, ScaleByKind, ScaleUncertainty
 from rangesfm.util.geometry.gravity import gravity_of
-from rangesfm.util.geometry.trajectory import Trajectory, first_camera_from, in_first_camera
-from rangesfm.util.processes.threads import both, with_one_blas_thread
+from rangesfm.util.geometry.trajectory import Trajectory, in_first_camera
+from rangesfm.util.processes.threads import with_one_blas_thread
 
 # Number of observations with which it is tested which of them contradict the others.
 _NUM_OF_TESTS = 120
@@ -45,7 +51,7 @@ def initialize_scale(
     options: ScaleOptions = ScaleOptions(),
     range_model: RangeModelOptions = RangeModelOptions(),
     distances: LocatedDistances = NO_DISTANCES,
-    others: Sequence[KindOnMap] = (),
+    others: Sequence[Located] = (),
     bending: MapBending | None = None,
     site: Site = Site(),
     seed: int = 0,
@@ -69,155 +75,81 @@ def initialize_scale(
         GeometryError: the scale is not determined.
     """
     bending = bending or WalkBending(in_first_camera(trajectory))
-    if not len(observations.log):
-        return _without_ranges(observations, trajectory, others, bending, options, range_model)
-    start = _RangeStart(
-        observations, trajectory, anchors, anchor_frame, options, range_model, distances, bending, site, seed
+    given = RangesOnPath(
+        *(observations, trajectory, anchors, anchor_frame, range_model, distances),
+        gravity=gravity_of(options.up_in_first_camera),
+        camera_side=options.camera_side,
+        site=site,
+        seed=seed,
     )
-    return start.estimate(_tested_without_ranges(others))
+    ranges = (RangesToSolve(given, bending),) if len(observations.log) else ()
+    log = RangeEstimate.begun(observations, range_model)
+    return estimate_scale((*ranges, *others), trajectory, bending, options, log)
 
 
-def _without_ranges(
-    observations: RangeObservations,
-    trajectory: Trajectory,
-    given: Sequence[KindOnMap],
-    bending: MapBending,
-    options: ScaleOptions,
-    range_model: RangeModelOptions,
+def estimate_scale(
+    located: Sequence[Located], path: Trajectory, bending: MapBending, options: ScaleOptions, log: RangeEstimate
 ) -> ScaleEstimate:
-    """Return the estimate in the site if a kind places the map there, or else in the first camera's frame."""
-    kinds = _tested_without_ranges(given)
-    used = [each for each in kinds if each.is_used]
-    if not used:
-        raise GeometryError("the scale is not determined: nothing that was measured is in the map")
-    if len(used) == 1:
-        on_map = replace(used[0].alone, kinds=kinds)
-    else:
-        on_map = fit_kinds(kinds, trajectory, _first(used).start, bending)
-    judged = judge_map_of_kinds(on_map, options)
-    return ScaleEstimate(
+    """Estimate scale and frame of an unscaled path from all that is measured in its map.
+
+    Args:
+        located: measurements of all kinds in the map, in the order of the table. bending: of the map.
+        log: what is known of the ranges before, which may be none.
+
+    Raises:
+        GeometryError: the scale is not determined.
+    """
+    on_map, by_kind = _started(located, path, bending)
+    on_map = on_map.concluded()
+    judged, known = judge_map_of_kinds(on_map, options), on_map.posterior
+    used = [each for each in on_map.kinds if each.is_used]
+    estimate = ScaleEstimate(
         on_map.estimate,
-        frame="site" if _first(used).places_map else "first_camera",
-        method=used[0].kind,
-        uncertainty=on_map.posterior.uncertainty,
+        frame="site" if place_first(used).places_map else "first_camera",
+        method=used[0].method,
+        uncertainty=known.uncertainty,
         verdict=judged.verdict,
         reasons=judged.reasons,
         advice=judged.advice,
-        observations=observations,
-        errors=RangeErrors.begin(observations, observations.placed_rows, range_model),
-        placement=on_map.posterior.placement,
+        ranges=told_of_ranges(on_map, log),
         on_map=on_map,
-        by_kind={} if len(used) == 1 and used[0].places_map else {each.kind: each.alone.scale for each in used},
-    )
+        placement=known.placement,
+        by_kind=by_kind,
+    ).remarked(tuple(note for each in on_map.kinds for note in each.notes))
+    if options.method == "robust" or not len(log.observations.log):
+        return estimate
+    return _by_paper(estimate, is_checked=options.method == "two-candidate")
 
 
-def _tested_without_ranges(kinds: Sequence[KindOnMap]) -> tuple[KindOnMap, ...]:
-    """Return the kinds with that left out which contradicts all others, before ranges have their say."""
-    return tested_kinds(kinds, _first(kinds).start, MAX_NUM_OBSERVATIONS, is_last=False) if kinds else ()
+def _started(
+    located: Sequence[Located], path: Trajectory, bending: MapBending
+) -> tuple[JointMap, Mapping[str, ScaleByKind]]:
+    """Return the map fitted as one piece to all kinds, without what contradicts all else, and the scale by each alone.
 
-
-def _first(kinds: Sequence[KindOnMap]) -> KindOnMap:
-    """Return the kind at whose placement a map starts: the first that places it, or the first of all."""
-    return next((each for each in kinds if each.places_map), kinds[0])
-
-
-@dataclass(frozen=True)
-class _RangeStart:
-    """Arguments of ``initialize_scale`` with ranges."""
-
-    observations: RangeObservations
-    trajectory: Trajectory
-    anchors: Sequence[Anchor]
-    anchor_frame: str
-    options: ScaleOptions
-    range_model: RangeModelOptions
-    distances: LocatedDistances
-    bending: MapBending
-    site: Site
-    seed: int
-
-    def estimate(self, others: tuple[KindOnMap, ...], *, is_last: bool = False) -> ScaleEstimate:
-        """Return the estimate by ranges and the other kinds.
-
-        Args:
-            is_last: whether the ranges had their say on what is left out of the other kinds.
-        """
-        observations, options = self.observations, self.options
-        solved, open_place = self._solved(others)
-        ranges, used = solved, [each for each in others if each.is_used]
-        by_kind = {each.kind: each.alone.scale for each in used}
-        if used:
-            by_kind = {RANGES: solved.alone.scale, **by_kind}
-            ranges = solved.with_their_share
-            others, before = tested_kinds([ranges, *others], ranges.placed, _NUM_OF_TESTS, is_last=is_last)[1:], others
-            if [each.left_out for each in others] != [each.left_out for each in before]:
-                return self.estimate(others, is_last=True)
-        on_map, per_anchor = both(
-            lambda: join_kinds((ranges, *others), self.trajectory, ranges.placed, self.bending),
-            lambda: scale_per_anchor(ranges.solution, observations.log.anchor_ids),
-        )
-        known, after = on_map.posterior, ranges.moved(on_map.posterior)
-        found = anchor_estimates(after.solution, observations.log.anchor_ids, known.covariance)
-        judged_ranges = replace(ranges, per_anchor=per_anchor, anchors=found)
-        on_map = replace(on_map, kinds=(judged_ranges, *others))
-        judged, problem, solution = judge_map_of_kinds(on_map, options), ranges.posed, ranges.solution
-        gravity, remarks = upward_by(others, gravity_of(options.up_in_first_camera)), open_place
-        if gravity is not None and problem.frame == "first_camera" and self.anchor_frame == "site":
-            remarks = (*remarks, *levelled_places(gravity, self.anchors, found))
-        learned = ranges.learnt(on_map)
-        errors = replace(solution.errors, learned=learned).spread(problem.rows, len(observations.log))
-        status = observations.status.copy()
-        status[observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
-        status[problem.rows] = status_by_weight(solution.fit.weights)
-        robust = ScaleEstimate(
-            metric_from_sfm=after.placed,
-            frame=problem.frame,
-            method="robust",
-            uncertainty=known.uncertainty,
-            verdict=judged.verdict,
-            reasons=judged.reasons,
-            advice=judged.advice,
-            sensitivity=scale_sensitivity(
-                after.solution, problem, on_map.problem.of_kind(RANGES, known.gains), learned.bins
-            ),
-            per_anchor=per_anchor,
-            two_candidate=_paper_table(solution),
-            anchors=found,
-            observations=replace(observations, status=status),
-            errors=errors,
-            noise_stddev_m=solution.noise_stddev_m,
-            placement=known.placement,
-            on_map=on_map,
-            by_kind=by_kind,
-            shared_errors_m=shared_errors_m(solution, learned, errors.learned.of_range)
-            if by_kind and errors.learned
-            else np.zeros((len(observations.log), 0)),
-        ).remarked(remarks)
-        return robust if options.method == "robust" else _by_paper(robust, is_checked=options.method == "two-candidate")
-
-    def _solved(self, others: Sequence[KindOnMap]) -> tuple[RangeScale, tuple[str, ...]]:
-        """Return the ranges at the best solution of their problem, and why the map's place is open, if it is."""
-        path, gravity = self.trajectory, upward_by(others, gravity_of(self.options.up_in_first_camera))
-        posing = (
-            *(self.observations, path, self.anchors, self.anchor_frame, self.range_model),
-            *(with_lengths(self.distances, others), gravity, placement_by(others, first_camera_from(path))),
-        )
-        problem, why_open = scale_problem(*posing, site=self.site), tuple[str, ...]()
-        try:
-            solution = solve_scale(problem, camera_side=self.options.camera_side, seed=self.seed)
-        except OpenPlaceError as error:
-            why_open = (f"the map gets metres, but no place in the site: {error}",)
-            problem = scale_problem(*posing, place_is_open=True, site=self.site)
-            solution = solution_from(problem, error.in_first_camera)
-        return RangeScale(problem, solution, path, 1.0, self.bending), why_open
-
-
-def _paper_table(solution: Solution) -> TwoCandidate | None:
-    """Return the paper's table, with the anchors carried into the first camera's frame."""
-    state, problem = solution.fit.state, solution.problem
-    placed = state.metric_from_model
-    anchors = (state.anchors_m - placed.translation) @ placed.rotation
-    return two_candidate(problem.centers, problem.tag_from_center, anchors[problem.anchor_index], problem.range_m)
+    What is left out is first found without the kinds that are solved beside the others, and then once more with them.
+    """
+    others = tuple(each for each in located if isinstance(each, KindOnMap))
+    if others:
+        others = tested_kinds(others, place_first(others).start, MAX_NUM_OBSERVATIONS, is_last=False)
+    for is_last in (False, True):
+        kinds = beside_others(located, others)
+        used = [each for each in kinds if each.is_used]
+        if not used:
+            raise GeometryError("the scale is not determined: nothing that was measured is in the map")
+        # One kind that gives both the map's scale and its place is no scale beside others.
+        is_all = len(used) == 1 and (used[0].places_map or used[0].is_solved)
+        by_kind = {} if is_all else {each.kind: each.alone.scale for each in used}
+        if len(used) == 1:
+            return replace(used[0].alone, kinds=kinds), by_kind
+        kinds = tuple(each.with_their_share() for each in kinds)
+        placed = place_first([each for each in kinds if each.is_used]).start
+        if len(others) == len(kinds):
+            break
+        kinds, before = tested_kinds(kinds, placed, _NUM_OF_TESTS, is_last=is_last), others
+        others = tuple(each for each in kinds if not each.is_solved)
+        if [each.left_out for each in others] == [each.left_out for each in before]:
+            break
+    return fit_kinds(kinds, path, placed, bending), by_kind
 
 
 def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:
@@ -243,8 +175,7 @@ def _by_paper(robust: ScaleEstimate, *, is_checked: bool) -> ScaleEstimate:
         verdict="doubtful",
         reasons=("two-candidate, for comparison: nothing is known of its error", *robust.remarks),
         advice=("use the robust method",),
-        sensitivity=NOT_KNOWN,
-        per_anchor={},
+        ranges=replace(robust.ranges, sensitivity=NOT_KNOWN, per_anchor={}),
         by_kind={},
         on_map=None,
         placement=None,

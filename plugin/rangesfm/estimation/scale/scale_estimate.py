@@ -14,8 +14,9 @@ from rangesfm.measurements.joint_map import JointMap, KindOnMap
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.errors.range_errors import RangeErrors
 from rangesfm.measurements.ranges.range_observations import RangeObservations
+from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
 from rangesfm.measurements.ranges.scale.range_scale import RangeScale
-from rangesfm.measurements.ranges.scale.sensitivity import NOT_KNOWN, ScaleSensitivity
+from rangesfm.measurements.ranges.scale.sensitivity import ScaleSensitivity
 from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate
 from rangesfm.options import ScaleOptions
 from rangesfm.solver.posterior import ScaleByKind, ScaleUncertainty
@@ -36,18 +37,10 @@ class ScaleEstimate:
         verdict: "good" or "doubtful" (a refused scale is a GeometryError).
         reasons: why, in words.
         advice: what to do about it, in words; for a finished survey also what would improve the next one most.
-        sensitivity: change of the scale per error of the range model.
-        per_anchor: scale from each anchor alone, by id; anchors that do not determine one are missing.
-        two_candidate: the paper's table; None where too few ranges have candidates.
-        anchors: estimates in the order of the log.
-        observations: all ranges, with their status by final weight.
-        errors: of all n ranges of the log, as weighted; their inflation widens the formal standard deviation.
-        noise_stddev_m: standard deviation of an ordinary range.
+        ranges: what is said of the ranges of the log, which may be none.
         on_map: what the estimate was computed from; None with two-candidate.
         placement: (7, 7) covariance of the logarithm of the scale, a turn (rad) and a shift (m) of the map about the
             first camera, from all error components; None in the first camera's frame.
-        shared_errors_m: (n, k) errors that the log's ranges share, for k independent standard deviations: what other
-            kinds of measurement may correct. k is 0 where there are only ranges.
         remarks: those of the reasons that a refinement does not change.
         refined_value: scale of the refined map, to which the uncertainty then refers; None without a refinement.
         by_kind: scale by each kind of measurement alone, such as "ranges"; empty where one gave place and scale.
@@ -60,19 +53,51 @@ class ScaleEstimate:
     verdict: str
     reasons: tuple[str, ...]
     advice: tuple[str, ...]
-    observations: RangeObservations
-    errors: RangeErrors
-    sensitivity: ScaleSensitivity = NOT_KNOWN
-    per_anchor: Mapping[str, float] = field(default_factory=dict)
-    two_candidate: TwoCandidate | None = None
-    anchors: tuple[AnchorEstimate, ...] = ()
-    noise_stddev_m: float = np.nan
+    ranges: RangeEstimate
     on_map: JointMap | None = None
     placement: Array | None = None
     by_kind: Mapping[str, ScaleByKind] = field(default_factory=dict)
-    shared_errors_m: Array = field(default_factory=lambda: np.zeros((0, 0)))
     remarks: tuple[str, ...] = ()
     refined_value: float | None = None
+
+    @property
+    def observations(self) -> RangeObservations:
+        """All ranges of the log, with their status by final weight."""
+        return self.ranges.observations
+
+    @property
+    def errors(self) -> RangeErrors:
+        """Errors of all ranges of the log, as weighted."""
+        return self.ranges.errors
+
+    @property
+    def noise_stddev_m(self) -> float:
+        """Standard deviation of an ordinary range."""
+        return self.ranges.noise_stddev_m
+
+    @property
+    def anchors(self) -> tuple[AnchorEstimate, ...]:
+        """Estimates of the anchors in the order of the log."""
+        return self.ranges.anchors
+
+    @property
+    def per_anchor(self) -> Mapping[str, float]:
+        """Scale from each anchor alone, by id; anchors that do not determine one are missing."""
+        return self.ranges.per_anchor
+
+    @property
+    def sensitivity(self) -> ScaleSensitivity:
+        """Change of the scale per error of the range model."""
+        return self.ranges.sensitivity
+
+    @property
+    def two_candidate(self) -> TwoCandidate | None:
+        """The paper's table; None where too few ranges have candidates."""
+        return self.ranges.two_candidate
+
+    def with_anchors(self, anchors: tuple[AnchorEstimate, ...]) -> ScaleEstimate:
+        """Return the estimate with others of the anchors."""
+        return replace(self, ranges=replace(self.ranges, anchors=anchors))
 
     def find(self, kind: type[_Kind]) -> _Kind | None:
         """Return the measurements of a kind that took part, or were tested; None without any."""
@@ -95,16 +120,10 @@ class ScaleEstimate:
         Raises:
             GeometryError: refused, as the scale is less certain than ``options.max_relative_stddev``.
         """
-        known, found = on_map.posterior, self
-        if (ranges := on_map.find(RangeScale)) is not None:
-            learned = ranges.learnt(on_map).spread(ranges.posed.rows, len(self.observations.log))
-            found = replace(
-                self,
-                errors=replace(self.errors, learned=learned),
-                noise_stddev_m=ranges.solution.noise_stddev_m,
-            )
-        return found.judged(
+        known = on_map.posterior
+        return self.judged(
             judge_map_of_kinds(on_map, options),
+            ranges=told_of_ranges(on_map, self.ranges),
             refined_value=on_map.scale.value,
             uncertainty=known.uncertainty,
             placement=known.placement,
@@ -135,3 +154,9 @@ class ScaleEstimate:
         """Return the scale with its interval and its verdict on one line."""
         low, high = self.interval_95
         return f"<scale {self.value:.6g} m per SfM unit, 95 % interval {low:.6g} to {high:.6g}, {self.verdict}>"
+
+
+def told_of_ranges(on_map: JointMap, before: RangeEstimate) -> RangeEstimate:
+    """Return what a map says of the ranges; what was known of them before if they have no part in it."""
+    ranges = on_map.find(RangeScale)
+    return before if ranges is None else ranges.told

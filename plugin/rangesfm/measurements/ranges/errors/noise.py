@@ -79,8 +79,8 @@ def bias_whitening(own_stddev_m: Array, common_stddev_m: float) -> Array:
 
 def stretch_labels(times_s: Array, length_s: float) -> Indices:
     """Return (n,) labels of stretches of time in which errors may be correlated; there are at least eight."""
-    since = times_s - times_s.min()
-    length_s = max(min(length_s, float(since.max()) / _MIN_NUM_STRETCHES), 1e-9)
+    since = times_s - times_s.min(initial=np.inf)
+    length_s = max(min(length_s, float(since.max(initial=0.0)) / _MIN_NUM_STRETCHES), 1e-9)
     return np.asarray(np.floor(since / length_s).astype(np.int64))
 
 

@@ -3,24 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from rangesfm.arrays import Array
-from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, join_kinds
+from rangesfm.measurements.joint_map import Doubt, JointMap, KindOnMap, Located, join_kinds, upward_by
 from rangesfm.measurements.kind import MapState
 from rangesfm.measurements.lengths.locate_lengths import LocatedDistances
 from rangesfm.measurements.ranges.anchors.anchor import AnchorEstimate
 from rangesfm.measurements.ranges.cost import Ranges, anchors_at
 from rangesfm.measurements.ranges.errors.learned import LearnedErrors
-from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved
-from rangesfm.measurements.ranges.scale.doubts import doubts_of_ranges, remarks_on_anchors, remarks_on_places
+from rangesfm.measurements.ranges.range_observations import RangeStatus, status_by_weight
+from rangesfm.measurements.ranges.scale.anchor_by_anchor import anchor_estimates, scale_per_anchor
+from rangesfm.measurements.ranges.scale.binned_ranges import RANGES, BinnedRanges, binned_ranges, moved, shared_errors_m
+from rangesfm.measurements.ranges.scale.doubts import (
+    doubts_of_ranges,
+    levelled_places,
+    remarks_on_anchors,
+    remarks_on_places,
+)
 from rangesfm.measurements.ranges.scale.placement_prior import PlacementPrior
 from rangesfm.measurements.ranges.scale.range_equation import RangeProblem, RangeState, fit_at, predicted_ranges, solve
-from rangesfm.measurements.ranges.scale.scale_problem import ScaleProblem
-from rangesfm.measurements.ranges.scale.solution import Solution, weighted, with_unknown_anchors
+from rangesfm.measurements.ranges.scale.range_estimate import RangeEstimate
+from rangesfm.measurements.ranges.scale.scale_problem import RangesOnPath, ScaleProblem, scale_problem
+from rangesfm.measurements.ranges.scale.sensitivity import scale_sensitivity
+from rangesfm.measurements.ranges.scale.solution import (
+    OpenPlaceError,
+    Solution,
+    solution_from,
+    solve_scale,
+    weighted,
+    with_unknown_anchors,
+)
+from rangesfm.measurements.ranges.scale.two_candidate import TwoCandidate, two_candidate
 from rangesfm.solver.bending import MapBending
 from rangesfm.solver.posterior import MAX_NUM_OBSERVATIONS, JointProblem, Posterior, ScaleUncertainty
 from rangesfm.util.geometry.numerics import ROUNDING
@@ -35,7 +52,8 @@ class RangeScale(KindOnMap):
     Attributes:
         posed: the scale problem. solution: the state of the map, with its errors.
         path: of the map. unit: of it in the units of the problem, which has the same path. bending: of the map.
-        per_anchor: scale from each anchor alone, by id. anchors: estimates. They are judged with the scale.
+        told: what is said of the ranges, as far as it is known.
+        notes: as of ``KindOnMap``.
     """
 
     posed: ScaleProblem
@@ -43,11 +61,12 @@ class RangeScale(KindOnMap):
     path: Trajectory
     unit: float
     bending: MapBending
-    per_anchor: Mapping[str, float] = field(default_factory=dict)
-    anchors: tuple[AnchorEstimate, ...] = ()
+    told: RangeEstimate
+    notes: tuple[str, ...] = ()
 
     kind = words = RANGES
-    fit_places_map = True
+    method = "robust"
+    fit_places_map = is_solved = True
     remedy = "calibrate the radio (rangesfm ranges calibrate)"
 
     @property
@@ -90,12 +109,13 @@ class RangeScale(KindOnMap):
 
     @cached_property
     def _without_others(self) -> RangeScale:
+        if self.posed.ranges.placement is None and not self.posed.ranges.distances.is_between_points.any():
+            return self
         posed = replace(self.posed, ranges=_ranges_alone(self.posed.ranges))
         return replace(self, posed=posed, solution=_solved(self.solution, _ranges_alone(self.solution.problem)))
 
-    @property
     def with_their_share(self) -> RangeScale:
-        """The ranges solved beside other kinds with all of them weighted by how well they know the scale.
+        """Return the ranges solved beside other kinds with all of them weighted by how well they know the scale.
 
         That is the formal over the learnt variance of the scale by ranges alone, at most 1. Where ranges alone say
         nothing of the scale, they keep a share that has no effect: with none at all, nothing would place the anchors.
@@ -114,45 +134,39 @@ class RangeScale(KindOnMap):
         """Return the ranges on the map at the estimate of a posterior, with the same robust weights."""
         return replace(self, solution=moved(self.solution, known))
 
-    def on_refined_map(
-        self,
-        path: Trajectory,
-        scale: float,
-        ranges: Ranges,
-        at: MapState,
-        others: Sequence[KindOnMap],
-        bending: MapBending,
-    ) -> RangeScale:
-        """Return the ranges on the map that the scaled one became, as a scale problem in the unit of the latter.
+    def concluded(self, on_map: JointMap) -> RangeScale:
+        """Return the ranges with what the whole map says of them."""
+        posed, solution, told = self.posed, self.solution, self.told
+        log, learned = posed.observations.log, self.learnt(on_map)
+        if on_map.is_at_rest:
+            errors = replace(told.errors, learned=learned.spread(posed.rows, len(log)))
+            return replace(self, told=replace(told, errors=errors, noise_stddev_m=solution.noise_stddev_m))
+        known, after = on_map.posterior, self.moved(on_map.posterior)
+        errors = replace(solution.errors, learned=learned).spread(posed.rows, len(log))
+        status = posed.observations.status.copy()
+        status[posed.observations.has_place] = RangeStatus.UNKNOWN_ANCHOR
+        status[posed.rows] = status_by_weight(solution.fit.weights)
+        found = RangeEstimate(
+            replace(posed.observations, status=status),
+            errors,
+            solution.noise_stddev_m,
+            anchor_estimates(after.solution, log.anchor_ids, known.covariance),
+            scale_per_anchor(solution, log.anchor_ids),
+            scale_sensitivity(after.solution, posed, on_map.problem.of_kind(RANGES, known.gains), learned.bins),
+            _paper_table(solution),
+            np.zeros((len(log), 0)),
+        )
+        if len(on_map.observed) > 1:
+            of_range = learned.spread(posed.rows, len(log)).of_range
+            found = replace(found, shared_errors_m=shared_errors_m(solution, learned, of_range))
+        return replace(self, told=found, notes=(*self.notes, *self._levelled(found.anchors)))
 
-        Args:
-            path: of the refined map, in the metric world. scale: its metres per unit of the unscaled model.
-            ranges: as weighted in the refined map. at: its state.
-            others: measurements of other kinds on it. bending: of it.
-        """
-        unit, trajectory = 1 / scale, path.transformed(1 / scale, np.eye(3), np.zeros(3))
-        placed = Similarity(scale, first_camera_from(trajectory).rotation.T, path.centers[0])
-        tags_m, centers_m = ranges.antennas_m(at)
-        problem = replace(
-            self.posed.ranges,
-            centers=placed.inverse().apply(centers_m),
-            tag_from_center=(tags_m - centers_m) @ placed.rotation,
-            distances=with_lengths(self.posed.ranges.distances, others, scale),
-            # The model's frame is that of the first camera, in the unit of the unscaled model.
-            placement=placement_by(others, replace(IDENTITY, scale=unit) @ first_camera_from(path)),
-        )
-        anchors = anchors_at(ranges.anchors, at.blocks)
-        state = RangeState(
-            placed,
-            np.array([anchor.position_m for anchor in anchors]),
-            np.array([anchor.range_bias_m for anchor in anchors]),
-        )
-        by_errors, errors = weighted(problem, ranges.errors), ranges.errors
-        off_m = predicted_ranges(problem, state) + ranges.shared_m(at)[ranges.rows] - problem.range_m
-        fit = fit_at(by_errors, state, errors.robust_weights(off_m))
-        solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
-        posed = replace(self.posed, ranges=problem, trajectory=trajectory)
-        return RangeScale(posed, solution, path, unit, bending, anchors=self.anchors)
+    def _levelled(self, found: Sequence[AnchorEstimate]) -> tuple[str, ...]:
+        """Describe where gravity puts the first camera if the site's anchors do not fix the map's heading."""
+        given = self.posed.given
+        if given.gravity is None or given.anchor_frame != "site" or self.places_map:
+            return ()
+        return levelled_places(given.gravity, given.anchors, found)
 
     def learnt(self, on_map: JointMap) -> LearnedErrors:
         """Return the errors of the ranges as learnt on a map, with those of the map."""
@@ -166,17 +180,105 @@ class RangeScale(KindOnMap):
 
     def doubts(self, uncertainty: ScaleUncertainty) -> Iterator[Doubt]:
         """Yield the faults of the path, of the anchors and of the ranges."""
-        return doubts_of_ranges(self.posed, self.solution, uncertainty, self.per_anchor)
+        return doubts_of_ranges(self.posed, self.solution, uncertainty, self.told.per_anchor)
 
     def remarks(self, on_map: JointMap) -> Iterator[Doubt]:
         """Yield what is not determined, and that the anchors' coordinates widen the interval."""
-        yield from remarks_on_anchors(self.solution, self.anchors)
+        yield from remarks_on_anchors(self.solution, self.told.anchors)
         if np.isfinite(self.posed.ranges.anchor_stddev_m).any():
             posed, solution = with_unknown_anchors(self.posed, self.solution.fit.state)
             unknown = replace(self, posed=posed, solution=solution)
             others = [unknown if each is self else each for each in on_map.kinds]
             unplaced = on_map.rejoined(others, unknown.placed).posterior.uncertainty
             yield from remarks_on_places(on_map.posterior.uncertainty, unplaced)
+
+
+def _paper_table(solution: Solution) -> TwoCandidate | None:
+    """Return the paper's table, with the anchors carried into the first camera's frame."""
+    state, problem = solution.fit.state, solution.problem
+    placed = state.metric_from_model
+    anchors = (state.anchors_m - placed.translation) @ placed.rotation
+    return two_candidate(problem.centers, problem.tag_from_center, anchors[problem.anchor_index], problem.range_m)
+
+
+@dataclass(frozen=True)
+class RangesToSolve(Located):
+    """Ranges on an unscaled path: where the map and its anchors are is found beside the other kinds.
+
+    Attributes:
+        given: the ranges. bending: of the map.
+    """
+
+    given: RangesOnPath
+    bending: MapBending
+
+    kind = RANGES
+
+    def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
+        """Return the ranges at the best solution of their problem.
+
+        Raises:
+            InputError: an anchor of the log is not given. GeometryError: the scale is not determined.
+        """
+        path, distances = self.given.trajectory, with_lengths(self.given.distances, others)
+        given = replace(self.given, distances=distances, gravity=upward_by(others, self.given.gravity))
+        placement = placement_by(others, first_camera_from(path))
+        problem, why_open = scale_problem(given, placement), tuple[str, ...]()
+        try:
+            solution = solve_scale(problem)
+        except OpenPlaceError as error:
+            why_open = (f"the map gets metres, but no place in the site: {error}",)
+            problem = scale_problem(given, placement, place_is_open=True)
+            solution = solution_from(problem, error.in_first_camera)
+        told = RangeEstimate.begun(given.observations, given.range_model)
+        return RangeScale(problem, solution, path, 1.0, self.bending, told, why_open)
+
+
+@dataclass(frozen=True)
+class RangesAtRest(Located):
+    """Ranges on the map that the scaled one became, as a scale problem in the unit of the latter.
+
+    Attributes:
+        before: on the scaled map.
+        path: of the refined map, in the metric world. scale: its metres per unit of the unscaled model.
+        ranges: as weighted in the refined map. state: of it. bending: of it.
+    """
+
+    before: RangeScale
+    path: Trajectory
+    scale: float
+    ranges: Ranges
+    state: MapState
+    bending: MapBending
+
+    kind = RANGES
+
+    def beside(self, others: Sequence[KindOnMap]) -> RangeScale:
+        """Return the ranges where the map has them."""
+        path, scale, ranges, posed = self.path, self.scale, self.ranges, self.before.posed
+        unit, trajectory = 1 / scale, path.transformed(1 / scale, np.eye(3), np.zeros(3))
+        placed = Similarity(scale, first_camera_from(trajectory).rotation.T, path.centers[0])
+        tags_m, centers_m = ranges.antennas_m(self.state)
+        problem = replace(
+            posed.ranges,
+            centers=placed.inverse().apply(centers_m),
+            tag_from_center=(tags_m - centers_m) @ placed.rotation,
+            distances=with_lengths(posed.ranges.distances, others, scale),
+            # The model's frame is that of the first camera, in the unit of the unscaled model.
+            placement=placement_by(others, replace(IDENTITY, scale=unit) @ first_camera_from(path)),
+        )
+        anchors = anchors_at(ranges.anchors, self.state.blocks)
+        state = RangeState(
+            placed,
+            np.array([anchor.position_m for anchor in anchors]),
+            np.array([anchor.range_bias_m for anchor in anchors]),
+        )
+        by_errors, errors = weighted(problem, ranges.errors), ranges.errors
+        off_m = predicted_ranges(problem, state) + ranges.shared_m(self.state)[ranges.rows] - problem.range_m
+        fit = fit_at(by_errors, state, errors.robust_weights(off_m))
+        solution = Solution(by_errors, fit, errors, float(np.median(errors.stddev_m)))
+        posed = replace(posed, ranges=problem, given=replace(posed.given, trajectory=trajectory))
+        return RangeScale(posed, solution, path, unit, self.bending, self.before.told, self.before.notes)
 
 
 def placement_by(others: Sequence[KindOnMap], first_camera_from_model: Similarity) -> PlacementPrior | None:

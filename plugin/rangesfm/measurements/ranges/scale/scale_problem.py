@@ -31,34 +31,82 @@ MIN_RANGES = 8
 
 
 @dataclass(frozen=True)
+class RangesOnPath:
+    """The ranges of a log on an unscaled path, with all that is known of anchors and radio before.
+
+    Attributes:
+        observations: all ranges of the log.
+        trajectory: path of the unscaled model.
+        anchors: every anchor of the log, with its prior knowledge, in the order of their file.
+        anchor_frame: of their positions: "site" (the map is carried there), "first_camera" (that of the first
+            keyframe, metres) or "unknown" (positions are ignored; the map stays in the first camera's frame).
+        range_model: what is assumed of the radio.
+        distances: measured ones, with the anchors of the log in its order; those measured by radio between anchors are
+            in the log.
+        gravity: the upward direction in the first camera; None if it is not known.
+        camera_side: side of the anchors' plane on which the camera was, as in the scale options; None if not known.
+        site: frame of the anchors' positions here, from which texts get the coordinates in their file.
+        seed: of searches by chance.
+    """
+
+    observations: RangeObservations
+    trajectory: Trajectory
+    anchors: Sequence[Anchor]
+    anchor_frame: str
+    range_model: RangeModelOptions = field(default_factory=RangeModelOptions)
+    distances: LocatedDistances = NO_DISTANCES
+    gravity: Gravity | None = None
+    camera_side: str | None = None
+    site: Site = field(default_factory=Site)
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class ScaleProblem:
     """A RangeProblem and how it belongs to the survey.
 
     Attributes:
+        given: the ranges on the path.
         ranges: the problem; its model world is the first camera's frame, unscaled.
         errors: prior errors of its ranges, before anything is estimated.
-        observations: all ranges of the log.
         rows: (k,) rows of the observations that its ranges are.
-        trajectory: path of the unscaled model.
-        frame: metric world of the solution: "site" or "first_camera".
         anchors_are_known: whether given anchor positions are used.
         notes: why the map has no place in the site frame, for the user.
         left_out: anchors with too few ranges on the path to be placed.
-        order_given: ids of the anchors in the order of their file.
-        site: frame of their positions here, from which texts get the coordinates in that file.
     """
 
+    given: RangesOnPath
     ranges: RangeProblem
     errors: RangeErrors
-    observations: RangeObservations
     rows: Indices
-    trajectory: Trajectory
-    frame: str
     anchors_are_known: bool
     notes: tuple[str, ...]
     left_out: tuple[str, ...]
-    order_given: tuple[str, ...]
-    site: Site = field(default_factory=Site)
+
+    @property
+    def observations(self) -> RangeObservations:
+        """All ranges of the log."""
+        return self.given.observations
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Path of the unscaled model."""
+        return self.given.trajectory
+
+    @property
+    def frame(self) -> str:
+        """Metric world of the solution: "site" or "first_camera"."""
+        return "site" if self.ranges.frame_is_free else "first_camera"
+
+    @property
+    def order_given(self) -> tuple[str, ...]:
+        """Ids of the anchors in the order of their file."""
+        return tuple(anchor.anchor_id for anchor in self.given.anchors)
+
+    @property
+    def site(self) -> Site:
+        """Frame of the anchors' positions."""
+        return self.given.site
 
     @property
     def first_camera_from_sfm(self) -> Similarity:
@@ -108,56 +156,44 @@ class ScaleProblem:
 
 
 def scale_problem(
-    observations: RangeObservations,
-    trajectory: Trajectory,
-    anchors: Sequence[Anchor],
-    anchor_frame: str,
-    range_model: RangeModelOptions,
-    distances: LocatedDistances = NO_DISTANCES,
-    gravity: Gravity | None = None,
-    placement: PlacementPrior | None = None,
-    *,
-    place_is_open: bool = False,
-    site: Site = Site(),
+    given: RangesOnPath, placement: PlacementPrior | None = None, *, place_is_open: bool = False
 ) -> ScaleProblem:
     """Set up the range problem.
 
     Args:
-        distances: measured ones, with the anchors of the log in its order; distances measured by radio between anchors
-            are added from the log.
-        gravity: the upward direction, as given by the user.
+        given: the ranges.
         placement: what known positions say of the map's place, for the first camera's frame; None without any.
         place_is_open: whether the map has more than one possible place in the site. Then only the distances between
             surveyed anchors are used, not their positions.
-        site: frame of the anchors' positions.
 
     Raises:
-        InputError: an anchor of the log is not among ``anchors``.
+        InputError: an anchor of the log is not among the anchors.
         GeometryError: too few ranges have a place on the path.
     """
+    observations, anchor_frame, range_model = given.observations, given.anchor_frame, given.range_model
     log = observations.log
-    in_log = _anchors_of_log(log.anchor_ids, anchors)
-    given = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
-    rows, heard = _usable_ranges(observations, given)
-    known, notes = _usable_positions(in_log, given & heard, anchor_frame, gravity is not None)
+    in_log = _anchors_of_log(log.anchor_ids, given.anchors)
+    surveyed = np.array([a.position_m is not None for a in in_log], dtype=bool) & (anchor_frame != "unknown")
+    rows, heard = _usable_ranges(observations, surveyed)
+    known, notes = _usable_positions(in_log, surveyed & heard, anchor_frame, given.gravity is not None)
     known &= not place_is_open
     if placement is not None:  # any number of surveyed anchors helps a map that has its place
-        known, notes = given & heard, []
+        known, notes = surveyed & heard, []
     # A surveyed anchor whose ranges are all held out keeps its position, so that they can be checked against it.
-    placed = known | (given & known.any())
+    placed = known | (surveyed & known.any())
     left_out = tuple(a.anchor_id for a, k in zip(in_log, heard | placed, strict=True) if not k)
     bias_m = np.array([a.range_bias_m for a in in_log])
     bias_stddev_m = np.array([_bias_stddev(a, range_model) for a in in_log])
-    measured = [distances]
+    measured = [given.distances]
     if anchor_frame == "site" and not known.any():
-        measured += _between_surveyed(in_log, given & heard)
+        measured += _between_surveyed(in_log, surveyed & heard)
     noise_m, common_stddev_m = range_model.range_stddev_m or START_STDDEV_M, range_model.common_bias_stddev_m
     pairs, length_m, stddev_m = lengths_by_radio(log, noise_m, bias_m, bias_stddev_m, common_stddev_m)
     measured.append(LocatedDistances.control(length_m, stddev_m, anchor_pair=pairs))
     errors = RangeErrors.begin(observations, rows, range_model)
     ranges = RangeProblem(
-        centers=_centers_in_first_camera(observations.centers[rows], trajectory),
-        tag_from_center=observations.tag_from_center[rows] @ trajectory.world_from_cam[0],
+        centers=_centers_in_first_camera(observations.centers[rows], given.trajectory),
+        tag_from_center=observations.tag_from_center[rows] @ given.trajectory.world_from_cam[0],
         anchor_index=log.anchor_index[rows],
         range_m=log.range_m[rows],
         stddev_m=errors.stddev_m,
@@ -170,23 +206,10 @@ def scale_problem(
         common_bias_stddev_m=common_stddev_m,
         frame_is_free=placement is not None or (anchor_frame == "site" and bool(known.any())),
         distances=_control(functools.reduce(LocatedDistances.joined, measured), heard | placed),
-        gravity=gravity if anchor_frame == "site" and bool(known.any()) else None,
+        gravity=given.gravity if anchor_frame == "site" and bool(known.any()) else None,
         placement=placement,
     )
-    frame = "site" if ranges.frame_is_free else "first_camera"
-    return ScaleProblem(
-        ranges,
-        errors,
-        observations,
-        rows,
-        trajectory,
-        frame,
-        bool(known.any()),
-        tuple(notes),
-        left_out,
-        tuple(anchor.anchor_id for anchor in anchors),
-        site,
-    )
+    return ScaleProblem(given, ranges, errors, rows, bool(known.any()), tuple(notes), left_out)
 
 
 def _control(distances: LocatedDistances, has_place: Mask) -> LocatedDistances:

@@ -99,11 +99,8 @@ class Solution:
     rivals: tuple[RangeState, ...] = ()
 
 
-def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> Solution:
+def solve_scale(posed: ScaleProblem) -> Solution:
     """Solve from all starts, estimate the noise, and refuse if two different maps fit equally well.
-
-    Args:
-        camera_side: the scale option of this name.
 
     Raises:
         GeometryError: nothing fits, or two different maps fit (OpenPlaceError: they have the same scale).
@@ -112,8 +109,8 @@ def solve_scale(posed: ScaleProblem, *, camera_side: str | None, seed: int) -> S
     if problem.placement is not None:  # known positions say where the map is, so that there is nothing to search for
         start = RangeState(problem.placement.mean, problem.anchor_mean_m.copy(), problem.bias_mean_m.copy())
         return solution_from(posed, complete_unknown_anchors(problem, start))
-    camera_side = camera_side if problem.frame_is_free else None
-    fits = on_side(problem, _distinct_fits(problem, posed.anchors_are_known, seed), camera_side)
+    camera_side = posed.given.camera_side if problem.frame_is_free else None
+    fits = on_side(problem, _distinct_fits(problem, posed.anchors_are_known, posed.given.seed), camera_side)
     starts = [fit.state for fit in fits]
     if posed.anchors_are_known and not problem.frame_is_free:
         starts += _consensus_states(problem)
